@@ -884,7 +884,7 @@ def test_entries_that_cannot_be_used(tmp_path: Path, installed: Callable[[Path],
     assert (table["other"], table["half"].title) == (own, "half")
     for name, said in (
         ("gone", r"toy-twin 1.0: the entry gone = no_such_module:Toy of space_camera_twin.toys cannot be loaded \(Mod"),
-        ("number", "number = toy_twin:BAR of space_camera_twin.toys is of type tuple, not Estimator; mend"),
+        ("number", "number = toy_twin:BAR of space_camera_twin.toys is of type tuple, not Estimator; repair"),
         ("own", "own = .* has the name of an entry of the twin or .*; rename .* pip uninstall toy-twin"),
         ("twice", "toy-twin 1.0: .* has the name of an entry of a-toy; rename it there, or pip uninstall toy-twin"),
     ):

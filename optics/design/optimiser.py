@@ -243,12 +243,12 @@ def descend(
     current, evaluations, converged = start, 0, False
     first = merit.evaluate(start).envelope
     for step in range(1, steps + 1):
-        eased = operands
+        relaxed = operands
         if operands.envelope is not None:
-            eased = replace(operands, envelope=first + step / steps * (operands.envelope - first))
-        most = iterations if step == steps else min(STEP_ITERATIONS, iterations)
-        current, spent, converged = _step(replace(merit, operands=eased), current, variables, most)
-        evaluations += spent
+            relaxed = replace(operands, envelope=first + step / steps * (operands.envelope - first))
+        limit = iterations if step == steps else min(STEP_ITERATIONS, iterations)
+        current, used, converged = _step(replace(merit, operands=relaxed), current, variables, limit)
+        evaluations += used
         if advance is not None:
             advance(step, steps)
     after = merit.evaluate(current)

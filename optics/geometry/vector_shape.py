@@ -100,8 +100,8 @@ class Polygon:
         out: np.ndarray = np.empty(np.broadcast_shapes(kx.shape, ky.shape), complex)
         rows = max(1, _BLOCK // out.shape[1])
         for begin in range(0, len(out), rows):
-            here = slice(begin, begin + rows)
-            bx, by = (k if len(k) == 1 else k[here] for k in (kx, ky))
+            block = slice(begin, begin + rows)
+            bx, by = (k if len(k) == 1 else k[block] for k in (kx, ky))
             square = bx * bx + by * by
             low = square * radius**2 < 1.0
             square[low] = 1.0
@@ -112,7 +112,7 @@ class Polygon:
                 part[low] = edges.sum_near_zero(lx, ly, self.area)
             part *= _phasor(bx, middle[0])
             part *= _phasor(by, middle[1])
-            out[here] = part
+            out[block] = part
         return out.reshape(shape)
 
     def mapped(self, point_map: PointMap, tolerance: float = BEND_TOLERANCE) -> Polygon:
@@ -393,10 +393,10 @@ def _polyline(
         bend = np.maximum.reduceat(np.max(deviation, axis=1), first)
         if np.all(bend <= tolerance):
             return corners
-        more = np.maximum(pieces + 1, np.ceil(pieces * np.sqrt(bend / tolerance)))
-        if np.max(more[bend > tolerance]) > _MOST_PIECES:
+        refined = np.maximum(pieces + 1, np.ceil(pieces * np.sqrt(bend / tolerance)))
+        if np.max(refined[bend > tolerance]) > _MOST_PIECES:
             raise UnphysicalError(f"the map bends an edge too much for a tolerance of {tolerance:.3g} m")
-        pieces = np.where(bend > tolerance, more, pieces).astype(int)
+        pieces = np.where(bend > tolerance, refined, pieces).astype(int)
 
 
 def _apply(point_map: PointMap, points: np.ndarray) -> np.ndarray:
@@ -409,11 +409,11 @@ def _apply(point_map: PointMap, points: np.ndarray) -> np.ndarray:
     return mapped
 
 
-def _vector(value: np.ndarray, what: str) -> np.ndarray:
+def _vector(value: np.ndarray, name: str) -> np.ndarray:
     """Return a read-only vector (2,), after checking shape and finiteness."""
     out = _frozen(value)
     if out.shape != (2,) or not np.all(np.isfinite(out)):
-        raise ValueError(f"{what} needs two finite numbers, found {value}")
+        raise ValueError(f"{name} needs two finite numbers, found {value}")
     return out
 
 

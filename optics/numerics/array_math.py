@@ -145,12 +145,12 @@ class UnphysicalError(PhysicalError, ValueError):
     """A value is physically impossible together with the others; the message says which and why."""
 
 
-def check_range(what: str, values: np.ndarray | float, low: float, high: float, rounding: float) -> None:
+def check_range(name: str, values: np.ndarray | float, low: float, high: float, tolerance: float) -> None:
     """Raise UnphysicalError if any value lies outside a physical range.
 
     Parameters
     ----------
-    what : str
+    name : str
         Name of the quantity, for the message.
     values : ndarray or float
         Values of any shape; NaN for unknown ones, which pass.
@@ -158,7 +158,7 @@ def check_range(what: str, values: np.ndarray | float, low: float, high: float, 
         Smallest possible value.
     high : float
         Largest possible value.
-    rounding : float
+    tolerance : float
         Tolerance at both ends.
 
     Raises
@@ -169,29 +169,29 @@ def check_range(what: str, values: np.ndarray | float, low: float, high: float, 
     array = np.asarray(values, dtype=np.float64)
     known = array[~np.isnan(array)]
     excess = np.maximum(low - known, known - high)
-    if np.any(excess > rounding):
+    if np.any(excess > tolerance):
         worst = float(known[int(np.argmax(excess))])
         raise UnphysicalError(
-            f"{what}: {worst:.6g} is outside the physical range {low:g} to {high:g} (tolerance {rounding:g})"
+            f"{name}: {worst:.6g} is outside the physical range {low:g} to {high:g} (tolerance {tolerance:g})"
         )
 
 
 def check_at_most(
-    what: str, values: np.ndarray | float, bounds: np.ndarray | float, than: str, rounding: float
+    name: str, values: np.ndarray | float, bounds: np.ndarray | float, bound_name: str, tolerance: float
 ) -> None:
     """Raise UnphysicalError if any value exceeds its bound.
 
     Parameters
     ----------
-    what : str
+    name : str
         Name of the quantity, for the message.
     values : ndarray or float
         Values of any shape; NaN for unknown ones, which pass.
     bounds : ndarray or float
         Upper bounds, of a shape that broadcasts.
-    than : str
+    bound_name : str
         Name of the bounds, for the message.
-    rounding : float
+    tolerance : float
         Tolerance above the bounds.
 
     Raises
@@ -199,25 +199,27 @@ def check_at_most(
     UnphysicalError
         A value exceeds its bound.
     """
-    if (worst := _worst_beyond(values, bounds, rounding, lambda apart: apart)) is not None:
+    if (worst := _worst_beyond(values, bounds, tolerance, lambda apart: apart)) is not None:
         value, bound = worst
-        raise UnphysicalError(f"{what}: {value:.6g} exceeds {than}, {bound:.6g} (tolerance {rounding:g})")
+        raise UnphysicalError(f"{name}: {value:.6g} exceeds {bound_name}, {bound:.6g} (tolerance {tolerance:g})")
 
 
-def check_close(what: str, values: np.ndarray | float, others: np.ndarray | float, to: str, apart: float) -> None:
+def check_close(
+    name: str, values: np.ndarray | float, others: np.ndarray | float, other_name: str, tolerance: float
+) -> None:
     """Raise UnphysicalError if values differ from an independent computation of them.
 
     Parameters
     ----------
-    what : str
+    name : str
         Name of the quantity, for the message.
     values : ndarray or float
         Values of any shape; NaN for unknown ones, which pass.
     others : ndarray or float
         Values to compare with, of a shape that broadcasts.
-    to : str
+    other_name : str
         Name of the other values, for the message.
-    apart : float
+    tolerance : float
         Largest allowed difference.
 
     Raises
@@ -225,9 +227,9 @@ def check_close(what: str, values: np.ndarray | float, others: np.ndarray | floa
     UnphysicalError
         Two values differ by more.
     """
-    if (worst := _worst_beyond(values, others, apart, np.abs)) is not None:
+    if (worst := _worst_beyond(values, others, tolerance, np.abs)) is not None:
         value, other = worst
-        raise UnphysicalError(f"{what}: {value:.6g} differs from {to}, {other:.6g}, by more than {apart:g}")
+        raise UnphysicalError(f"{name}: {value:.6g} differs from {other_name}, {other:.6g}, by more than {tolerance:g}")
 
 
 def _worst_beyond(

@@ -79,10 +79,10 @@ class ExtensionTable(UserDict[str, Value]):
         return table
 
     def __getitem__(self, name: str) -> Value:
-        found = self.data[name]
-        if isinstance(found, EntryPointError):
-            raise found
-        value: Value = _loaded(found, self._kind) if isinstance(found, Entry) else found
+        entry = self.data[name]
+        if isinstance(entry, EntryPointError):
+            raise entry
+        value: Value = _loaded(entry, self._kind) if isinstance(entry, Entry) else entry
         return value
 
 

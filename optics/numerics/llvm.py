@@ -101,8 +101,8 @@ def _check_loaded() -> None:
     drjit.has_backend(drjit.JitBackend.LLVM)
     version = tuple(drjit.detail.llvm_version())
     if version[0] < OLDEST:
-        found = ".".join(str(part) for part in version)
+        loaded = ".".join(str(part) for part in version)
         raise LibraryMissing(
-            f"drjit was imported before optics and has loaded LLVM {found}, but needs {OLDEST} or newer: "
+            f"drjit was imported before optics and has loaded LLVM {loaded}, but needs {OLDEST} or newer: "
             f"import optics first, or set {VARIABLE}"
         )

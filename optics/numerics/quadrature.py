@@ -36,7 +36,7 @@ class PupilNodes:
 
 
 @cache
-def disk(rings: int, arms: int | None = None, inner: float = 0.0, turn: float = 0.0) -> PupilNodes:
+def disk(rings: int, arms: int | None = None, inner: float = 0.0, rotation: float = 0.0) -> PupilNodes:
     """Return Gauss quadrature over the unit disk (annulus): Gauss-Legendre in r^2, equal arms in azimuth.
 
     Exact for polynomials of degree below min(4 * rings, arms); integrals of smooth wavefronts converge exponentially,
@@ -50,7 +50,7 @@ def disk(rings: int, arms: int | None = None, inner: float = 0.0, turn: float = 
         Number of azimuthal nodes, by default 4 * rings.
     inner : float
         Radius of a central hole, 0 to less than 1.
-    turn : float
+    rotation : float
         Rotation of all arms, in steps from one arm to the next. With half a step, an integrand whose structure in
         azimuth is too fine gets the opposite error.
 
@@ -78,7 +78,7 @@ def disk(rings: int, arms: int | None = None, inner: float = 0.0, turn: float = 
     s, w = gauss(rings)
     low = inner**2
     r2 = low + (1.0 - low) * 0.5 * (s + 1.0)
-    angle = 2.0 * np.pi * (np.arange(arms) + 0.5 + turn) / arms
+    angle = 2.0 * np.pi * (np.arange(arms) + 0.5 + rotation) / arms
     r = np.sqrt(r2)[:, None]
     weight = np.broadcast_to((w * 0.25 * (1.0 - low))[:, None] * (2.0 * np.pi / arms), (rings, arms))
     return _frozen((r * np.cos(angle)).ravel(), (r * np.sin(angle)).ravel(), weight.ravel())
@@ -127,7 +127,7 @@ def second_disk_for(phase: float) -> PupilNodes:
         Largest phase, radians, as for ``disk_for``.
     """
     rings, arms = disk_size(phase)
-    return disk(rings + 2, arms, turn=0.5)
+    return disk(rings + 2, arms, rotation=0.5)
 
 
 def disk_size(phase: float) -> tuple[int, int]:

@@ -320,11 +320,11 @@ def periscope(mount: Mount) -> ReflectorParts:
     return _on_frame(mount, mirrors, (0.0, 0.0, 0.0), 1)
 
 
-def _require_length(mount: Mount, what: str, does: str, least: float) -> None:
+def _require_length(mount: Mount, parts: str, verb: str, least: float) -> None:
     """Raise UnphysicalError if the reflector displaces the beam by less than ``least`` metres and would vignette it."""
     if mount.length < least:
         width, length = 1e3 * mount.width, 1e3 * mount.length
-        text = f"{mount.path}: {what} of width {width:.4g} mm cannot {does} the beam by only {length:.4g} mm"
+        text = f"{mount.path}: {parts} of width {width:.4g} mm cannot {verb} the beam by only {length:.4g} mm"
         raise UnphysicalError(f"{text}; at least {1e3 * least:.4g} mm")
 
 

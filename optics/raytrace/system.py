@@ -445,38 +445,41 @@ class _Design:
         twice = replace(placed, scale=np.full_like(placed.scale, 2.0))
 
         def values(placed: PlacedBodies) -> tuple[tuple[ElementNumbers, ...], list[np.ndarray | None]]:
-            own, grids = zip(
-                *(chains.local_numbers(assembly, i, one, ({},), placed) for i, one in enumerate(structure)), strict=True
+            local, grids = zip(
+                *(chains.local_numbers(assembly, i, kind, ({},), placed) for i, kind in enumerate(structure)),
+                strict=True,
             )
-            return tuple(ElementNumbers(frame, o.surface, o.aperture, o.before, o.after) for o in own), grids
+            return tuple(ElementNumbers(frame, o.surface, o.aperture, o.before, o.after) for o in local), grids
 
         designed, grids = values(placed)
         form = form_of((designed, frame))
-        numbers, doubled = (np.array(numbers_in((own, frame))) for own in (designed, values(twice)[0]))
+        numbers, doubled = (
+            np.array(numbers_in((element_form, frame))) for element_form in (designed, values(twice)[0])
+        )
         # each scales with a power of its body's size, which follows exactly from the numbers at twice the size
         known = (numbers != 0.0) & (doubled != 0.0)
         power = np.frexp(np.divide(doubled, numbers, out=np.ones_like(numbers), where=known))[1] - 1
         element = np.zeros(len(numbers), int)
-        for i, own in enumerate(form[0]):
-            element[numbers_in(own)] = i
+        for i, element_form in enumerate(form[0]):
+            element[numbers_in(element_form)] = i
         scaling = {}
-        for one in set(power.ravel().tolist()) - {0}:
-            rows, columns = np.nonzero(power == one)
-            scaling[one] = rows, columns, chains.bodies[columns, element[rows]]
-        frames = np.array([numbers_in(f) for f in (*(own.frame for own in form[0]), form[1])])
+        for exponent in set(power.ravel().tolist()) - {0}:
+            rows, columns = np.nonzero(power == exponent)
+            scaling[exponent] = rows, columns, chains.bodies[columns, element[rows]]
+        frames = np.array([numbers_in(f) for f in (*(element_form.frame for element_form in form[0]), form[1])])
         return cls(chains, structure, form, numbers, tuple(grids), scaling, cls._sides(chains, form[0]), frames)
 
     @staticmethod
     def _sides(chains: _Chains, form: tuple[ElementNumbers, ...]) -> dict[str, _Sides]:
         """Return glass body -> sides of elements on which it lies."""
-        found: dict[str, list[tuple[Any, int, int]]] = {}
+        by_solid: dict[str, list[tuple[Any, int, int]]] = {}
         for c, media in enumerate(chains.media):
-            for i, own in enumerate(form):
-                for medium, side in ((media[i], own.before), (media[i + 1], own.after)):
+            for i, element in enumerate(form):
+                for medium, side in ((media[i], element.before), (media[i + 1], element.after)):
                     if medium.solid is not None:
-                        found.setdefault(medium.solid, []).append((side, c, int(chains.bodies[c, i])))
+                        by_solid.setdefault(medium.solid, []).append((side, c, int(chains.bodies[c, i])))
         out = {}
-        for solid, sides in found.items():
+        for solid, sides in by_solid.items():
             index, columns, bodies = (
                 np.array(column) for column in zip(*((s.index, c, b) for s, c, b in sides), strict=True)
             )
@@ -615,16 +618,16 @@ def assemble(
     if step is None and not np.iscomplexobj(placed.rotation):
         numbers = design.in_states(assembly, states, placed)
         numbers[design.frame_rows[-1]] = world.last_rows()
-        for i, here in enumerate(design.form[0]):
+        for i, element in enumerate(design.form[0]):
             if not shapes.gridded.isdisjoint(chains.depends[i]):
-                own, grids[i] = chains.local_numbers(assembly, i, structure[i], states, placed)
-                rows = numbers_in((here.surface, here.aperture, here.before, here.after))
-                numbers[rows] = numbers_in((own.surface, own.aperture, own.before, own.after))
+                local, grids[i] = chains.local_numbers(assembly, i, structure[i], states, placed)
+                rows = numbers_in((element.surface, element.aperture, element.before, element.after))
+                numbers[rows] = numbers_in((local.surface, local.aperture, local.before, local.after))
         return SystemBatch(structure, design.form, numbers, world, None, None, size, tuple(grids), len(states))
     values = []
     for i, frame in enumerate(frames_of(placed, chains.bodies)):
-        own, grids[i] = chains.local_numbers(assembly, i, structure[i], states, placed, step)
-        values.append(ElementNumbers(FrameNumbers.of(frame), own.surface, own.aperture, own.before, own.after))
+        local, grids[i] = chains.local_numbers(assembly, i, structure[i], states, placed, step)
+        values.append(ElementNumbers(FrameNumbers.of(frame), local.surface, local.aperture, local.before, local.after))
     numbers = np.array([number.real for number in numbers_in((tuple(values), world.last()))])
     tangents, world_tangents = None, None
     if step is not None:

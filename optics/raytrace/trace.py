@@ -400,8 +400,8 @@ class _TracePlan:
             None for a single system.
         """
         table, grids, stride, start, systems = numbers
-        own = self._system(rays[0], shared) if systems is None else systems
-        lookup = _Lookup(self.backend, table, stride, start, own, form[0][0].frame.x.shift)
+        system = self._system(rays[0], shared) if systems is None else systems
+        lookup = _Lookup(self.backend, table, stride, start, system, form[0][0].frame.x.shift)
         hits: list[Any] = []
         outside: list[Any] = []
         for first in range(0, len(self.structure), self.section):
@@ -582,12 +582,12 @@ def _recorded(plan: _TracePlan, form: Any) -> Any:
     return function
 
 
-def require_rays(valid: np.ndarray, what: str) -> None:
+def require_rays(valid: np.ndarray, name: str) -> None:
     """Raise BeamMissedError when some system of ``valid`` (B, N) has no valid ray at all."""
     alive = np.asarray(np.any(valid.reshape(len(valid), -1), axis=1))
     if not alive.all():
         raise BeamMissedError(
-            f"no ray passes through {what} in {int((~alive).sum())} of {len(alive)} cases; the perturbation moves the "
+            f"no ray passes through {name} in {int((~alive).sum())} of {len(alive)} cases; the perturbation moves the "
             "beam off a mirror or an aperture"
         )
 
@@ -865,8 +865,8 @@ def jvp(
         dr.set_grad(rays.direction, steps[1])
         dr.enable_grad(rays.path)
         dr.set_grad(rays.path, path_step)
-        kept = [i - first for i in keep if first <= i < last]
-        traced = trace(backend, uploaded.section(first, last), rays, keep=kept, evaluate=False)
+        requested = [i - first for i in keep if first <= i < last]
+        traced = trace(backend, uploaded.section(first, last), rays, keep=requested, evaluate=False)
         local = traced.local
         intersections = list(traced.hits.values())
         # interior gradients are kept: an intermediate intersection is an input of the final rays
@@ -877,8 +877,8 @@ def jvp(
         dr.eval(steps, path_step, gradients, local.position, local.direction, local.path, local.valid, intersections)
         hits.update({first + i: dr.detach(vector) for i, vector in traced.hits.items()})
         slopes.update({first + i: slope for i, slope in zip(traced.hits, gradients, strict=True)})
-        place, heading, path = (dr.detach(array) for array in (local.position, local.direction, local.path))
-        rays = Rays(place, heading, path, local.valid, systems.count)
+        end, heading, path = (dr.detach(array) for array in (local.position, local.direction, local.path))
+        rays = Rays(end, heading, path, local.valid, systems.count)
     return RayTangents(
         rows(steps[0], systems.count),
         rows(steps[1], systems.count),

@@ -101,10 +101,10 @@ class EdgeProfile:
         normal.setflags(write=False)
         sampling = _edge_sampling(cutoff, extent)
         f = sampling.frequency
-        both = _evaluated(transfer, np.append(f, 0.0) * normal[0], np.append(f, 0.0) * normal[1])
-        level = float(both[-1].real)
+        transfers = _evaluated(transfer, np.append(f, 0.0) * normal[0], np.append(f, 0.0) * normal[1])
+        level = float(transfers[-1].real)
         with one_blas_thread():
-            table = (sampling.coarse * (sampling.share * both[:-1])) @ sampling.fine
+            table = (sampling.coarse * (sampling.share * transfers[:-1])) @ sampling.fine
         distance = sampling.distance
         values = 0.5 * level + table.imag.ravel()[: len(distance)]
         return cls(normal, extent, level, make_interp_spline(distance, values, k=5))

@@ -337,14 +337,14 @@ def _bisected(nodes: np.ndarray, tetrahedra: np.ndarray, spacing: float) -> tupl
     pairs = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
     while True:
         ends = np.sort(tetrahedra[:, pairs], axis=-1)  # (T, 6, 2)
-        edges, which = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
-        which = which.reshape(-1, 6)
+        edges, edge_index = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
+        edge_index = edge_index.reshape(-1, 6)
         length = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
         # equal lengths must not be ordered by rounding errors: compare 9 digits, then the index
         rank = np.empty(len(edges), int)
         rank[np.lexsort((np.arange(len(edges)), np.round(length / spacing, 9)))] = np.arange(len(edges))
-        longest = which[np.arange(len(which)), np.argmax(rank[which], axis=1)]
-        around = np.bincount(which.ravel(), minlength=len(edges))
+        longest = edge_index[np.arange(len(edge_index)), np.argmax(rank[edge_index], axis=1)]
+        around = np.bincount(edge_index.ravel(), minlength=len(edges))
         cut = (np.bincount(longest, minlength=len(edges)) == around) & (length > spacing * (1.0 + 1e-9))
         if not np.any(cut):
             return nodes, tetrahedra

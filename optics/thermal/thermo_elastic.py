@@ -439,8 +439,8 @@ class ElasticBody:
         if change.shape != (len(points),):
             raise ValueError(f"a temperature field needs one value for each of {len(points)} points: {change.shape}")
         if not np.all(np.isfinite(change)):
-            where = points[int(np.argmin(np.isfinite(change)))]
-            raise ValueError(f"the temperature change is not finite at {where.tolist()} m")
+            point = points[int(np.argmin(np.isfinite(change)))]
+            raise ValueError(f"the temperature change is not finite at {point.tolist()} m")
         bulk = self._material.expansion / (1.0 - 2.0 * self._material.poisson_ratio)  # (3 lambda + 2 mu) a / E
         forces = bulk * np.einsum("eiq,eq->ei", self._weighted, change.reshape(self._points.shape[:2]))
         return np.bincount(self._dofs.ravel(), forces.ravel(), 3 * len(self.nodes))

@@ -279,7 +279,7 @@ def _from_samples(
     np.multiply(parts[0] ** 2 + parts[1] ** 2, 1.0 / field.wavelength**2, out=out)
 
 
-def _real_rows(first: np.ndarray, turn: np.ndarray, count: int) -> np.ndarray:
+def _real_rows(first: np.ndarray, factor: np.ndarray, count: int) -> np.ndarray:
     """Return real, then imaginary parts of first * turn^n, n = 0 .. count - 1, of phasors (B, N): (B, 2 count, N).
 
     The powers are built by doubling as in ``_waves``.
@@ -288,10 +288,10 @@ def _real_rows(first: np.ndarray, turn: np.ndarray, count: int) -> np.ndarray:
     table[:, 0] = first
     done = 1
     while done < count:
-        more = min(done, count - done)
-        np.multiply(table[:, :more], turn[:, None], out=table[:, done : done + more])
-        turn = turn * turn
-        done += more
+        added = min(done, count - done)
+        np.multiply(table[:, :added], factor[:, None], out=table[:, done : done + added])
+        factor = factor * factor
+        done += added
     return np.concatenate([table.real, table.imag], axis=1)
 
 
@@ -388,13 +388,13 @@ def _waves(frequency: np.ndarray, grid: Grid, factor: np.ndarray | float, kind: 
     """
     out = np.empty((*frequency.shape, grid.count), kind)
     out[..., 0] = factor * np.exp(1j * frequency * grid.start)
-    turn = np.exp(1j * frequency * grid.step)
+    phasor = np.exp(1j * frequency * grid.step)
     done = 1
     while done < grid.count:
-        more = min(done, grid.count - done)
-        np.multiply(out[..., :more], turn.astype(kind)[..., None], out=out[..., done : done + more])
-        turn = turn * turn
-        done += more
+        added = min(done, grid.count - done)
+        np.multiply(out[..., :added], phasor.astype(kind)[..., None], out=out[..., done : done + added])
+        phasor = phasor * phasor
+        done += added
     return out
 
 

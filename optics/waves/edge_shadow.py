@@ -142,10 +142,10 @@ def converged_shadows(
     UnphysicalError
         There are too many pieces, or the largest number of sides is too small.
     """
-    few, *more = ROUND_SIDES
+    few, *finer_sides = ROUND_SIDES
     pieces = _require_few(outlines(few).shadows(count, further))
     share = shares_of_stop(pieces)
-    for sides_of_round in more:
+    for sides_of_round in finer_sides:
         finer = outlines(sides_of_round).shadows(count, further)
         before, share = share, shares_of_stop(finer)
         change = float(np.max(np.abs(share - before), initial=0.0))
@@ -155,8 +155,8 @@ def converged_shadows(
         if change < COARSE_SHARE:
             return pieces, change / 3.0
     raise UnphysicalError(
-        f"the shadow of round edges changes by {change:.2g} of the pupil between polygons of {more[-1]} sides and "
-        "of half as many: edges nearly coincide"
+        f"the shadow of round edges changes by {change:.2g} of the pupil between polygons of {ROUND_SIDES[-1]} sides "
+        "and of half as many: edges nearly coincide"
     )
 
 
@@ -410,15 +410,15 @@ def _on_stop(outline: np.ndarray, terms: np.ndarray) -> np.ndarray:
     return np.where(empty[:, None, None], points[:, :1], points)
 
 
-def _surface_positions(terms: np.ndarray, at: np.ndarray, step: float = 1e-5) -> tuple[np.ndarray, np.ndarray]:
+def _surface_positions(terms: np.ndarray, centre: np.ndarray, step: float = 1e-5) -> tuple[np.ndarray, np.ndarray]:
     """Return surface positions of rays through points of the stop, both (B, V, 2), and derivatives (B, V, 2, 2)."""
 
     def value(points: np.ndarray) -> np.ndarray:
         return np.asarray(products(points[..., 0], points[..., 1], DEGREE) @ terms)
 
-    ways = step * np.eye(2)
-    rise = np.stack([(value(at + way) - value(at - way)) / (2.0 * step) for way in ways], axis=-1)
-    return value(at), rise
+    shifts = step * np.eye(2)
+    rise = np.stack([(value(centre + shift) - value(centre - shift)) / (2.0 * step) for shift in shifts], axis=-1)
+    return value(centre), rise
 
 
 def _outside_of(bright: np.ndarray) -> np.ndarray:

@@ -256,19 +256,19 @@ def _counterclockwise(polygon: np.ndarray) -> np.ndarray:
     return polygon[::-1] if clockwise else polygon
 
 
-def _rotated(cut: VignettedPupil, turn: complex) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return clear outlines, the pupil's own edge first, and blocked ones, rotated so that ``turn`` is along x."""
+def _rotated(cut: VignettedPupil, unit: complex) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return clear outlines, the pupil's own edge first, and blocked ones, rotated so that ``unit`` is along x."""
     angle = 2.0 * np.pi * np.arange(RIM_SIDES) / RIM_SIDES
     rim = _counterclockwise(np.sqrt(angle[1] / np.sin(angle[1])) * cut.pupil.edge.boundary(angle)[0])
-    back = np.conj(turn)
+    back = np.conj(unit)
     return [back * p for p in (rim, *cut.clear)], [back * p for p in cut.blocked]
 
 
-def _rotated_tables(pupil: PupilFunction, turn: complex) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coefficients of eikonal and amplitude in coordinates whose x is ``turn``, (D + 1, D + 1) each."""
+def _rotated_tables(pupil: PupilFunction, unit: complex) -> tuple[np.ndarray, np.ndarray]:
+    """Return the coefficients of eikonal and amplitude in coordinates whose x is ``unit``, (D + 1, D + 1) each."""
     count = len(pupil.eikonal_terms)
     node, to_table = _chebyshev_nodes(count)
-    points = (node[:, None] + 1j * node).reshape(1, -1) * turn
+    points = (node[:, None] + 1j * node).reshape(1, -1) * unit
     first, second = (
         to_table @ values.reshape(count, count) @ to_table.T
         for values in polynomials((pupil.eikonal_terms[None], pupil.amplitude_terms[None]), points)
@@ -285,9 +285,9 @@ def _chebyshev_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
     return node, matrix
 
 
-def _first_nodes(pitch: float, turn: float) -> int:
-    """Return the initial number of nodes on a cell over which the phase changes by up to ``turn`` radians."""
-    more = nodes_for(turn, 0) if turn > 1.0 else int(turn > _TURNS)
+def _first_nodes(pitch: float, phase: float) -> int:
+    """Return the initial number of nodes on a cell over which the phase changes by up to ``phase`` radians."""
+    more = nodes_for(phase, 0) if phase > 1.0 else int(phase > _TURNS)
     return int(np.searchsorted(_SHORT_CELLS, pitch)) + 1 + more
 
 
@@ -360,8 +360,8 @@ class _Lines:
         begins = np.maximum.accumulate(np.concatenate([start[:, None], right], axis=1), axis=1)
         ends = np.minimum(np.concatenate([left, stop[:, None]], axis=1), stop[:, None])
         bright = ends > begins
-        most = max(int(np.max(np.sum(bright, axis=1), initial=0)), 1)
-        first = np.argsort(~bright, axis=1, kind="stable")[:, :most]
+        width = max(int(np.max(np.sum(bright, axis=1), initial=0)), 1)
+        first = np.argsort(~bright, axis=1, kind="stable")[:, :width]
         begins, ends, bright = (np.take_along_axis(a, first, axis=1) for a in (begins, ends, bright))
         rim = clear[0].real
         begins, ends = (np.where(bright, a, start[:, None]) for a in (begins, ends))
@@ -528,14 +528,14 @@ class _Edges:
 
         The share steps up and down at the edges; in their cells it is the share behind the edge.
         """
-        some = slice(*np.searchsorted(self.row, [start, start + lines]))
-        at, many, nodes = (self.row[some] - start) * cells + self.cell[some], lines * cells, len(weight)
-        sign, out = self.sign[some], np.empty((lines, nodes, cells))
-        for i, behind in enumerate(self.behind[:, some] / weight[:, None]):
-            here = np.bincount(at, sign * behind, many)
-            here[1:] += np.bincount(at, sign * (1.0 - behind), many)[:-1]
-            np.cumsum(here.reshape(lines, cells), axis=1, out=out[:, i])
-        first = (self.row[some] - start) * (nodes * cells) + self.cell[some]
+        rows = slice(*np.searchsorted(self.row, [start, start + lines]))
+        cell_index, size, nodes = (self.row[rows] - start) * cells + self.cell[rows], lines * cells, len(weight)
+        sign, out = self.sign[rows], np.empty((lines, nodes, cells))
+        for i, behind in enumerate(self.behind[:, rows] / weight[:, None]):
+            steps = np.bincount(cell_index, sign * behind, size)
+            steps[1:] += np.bincount(cell_index, sign * (1.0 - behind), size)[:-1]
+            np.cumsum(steps.reshape(lines, cells), axis=1, out=out[:, i])
+        first = (self.row[rows] - start) * (nodes * cells) + self.cell[rows]
         return out, first + cells * np.arange(nodes)[:, None]
 
     def pairs(

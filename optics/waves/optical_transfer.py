@@ -236,16 +236,16 @@ def _blocks(
         # the first of a block has the longest span along the chords; across them, the longest of the block counts
         count = nodes_for(float(along[order[start]]), LEAST_ALONG)
         room = min(_BLOCK_NODES, _BLOCK // layers) // count
-        most = order[start : start + max(1, room // LEAST_ACROSS)]
-        rows = nodes_for(float(np.max(across[most])), LEAST_ACROSS)
+        candidates = order[start : start + max(1, room // LEAST_ACROSS)]
+        rows = nodes_for(float(np.max(across[candidates])), LEAST_ACROSS)
         if rows * count > MOST_NODES:
             raise UnphysicalError(
                 f"a transfer function needs {rows * count:.2g} nodes at a frequency (at most {MOST_NODES:.2g}): the "
                 "image is blurred by hundreds of waves"
             )
-        some = most[: max(1, room // rows)]
-        yield used[some], rows, count
-        start += len(some)
+        chosen = candidates[: max(1, room // rows)]
+        yield used[chosen], rows, count
+        start += len(chosen)
 
 
 FINER = (4, 8, 16, 32, 64)
@@ -386,9 +386,9 @@ class TransferTable:
         rings, arms = 24, 16
         while True:
             # the shortest wavelength has the largest phases
-            own = np.abs(_polar_terms(pupil, np.min(wavelengths, keepdims=True), defocus, centroid, rings, arms)[0])
-            radial = np.max(own[3 * rings // 4 :])
-            around = np.max(own[:, np.abs(np.fft.fftfreq(2 * arms)) > 3 / 8])
+            series = np.abs(_polar_terms(pupil, np.min(wavelengths, keepdims=True), defocus, centroid, rings, arms)[0])
+            radial = np.max(series[3 * rings // 4 :])
+            around = np.max(series[:, np.abs(np.fft.fftfreq(2 * arms)) > 3 / 8])
             if radial < TABLE_TAIL and around < TABLE_TAIL:
                 break
             rings = rings if radial < TABLE_TAIL else 4 * rings // 3
@@ -400,13 +400,13 @@ class TransferTable:
         radius = np.arange(-_PAD, cells + _PAD) / cells
         around_dense = np.zeros((len(radius), directions), complex)
         order = np.rint(np.fft.fftfreq(2 * arms) * 2 * arms).astype(int)
-        kept = np.abs(order) < min(arms, directions // 2)
-        for wavelength, part, own in zip(wavelengths, share, terms, strict=True):
+        used = np.abs(order) < min(arms, directions // 2)
+        for wavelength, part, series in zip(wavelengths, share, terms, strict=True):
             ratio = radius * (wavelength / np.min(wavelengths))
             rows = ratio < 1.0
-            place = np.arccos(ratio[rows]) * (4.0 / np.pi) - 1.0
-            values = np.polynomial.chebyshev.chebvander(place, rings - 1) @ own[:, kept]
-            around_dense[np.ix_(rows, order[kept] % directions)] += part * values
+            node = np.arccos(ratio[rows]) * (4.0 / np.pi) - 1.0
+            values = np.polynomial.chebyshev.chebvander(node, rings - 1) @ series[:, used]
+            around_dense[np.ix_(rows, order[used] % directions)] += part * values
         dense = np.fft.ifft(around_dense, axis=-1) * directions
         if pupil.shadow is not None:
             dense += _shadow_table(pupil, wavelengths, share, defocus, centroid, radius, directions)
@@ -511,10 +511,12 @@ def _shadow_table(
     wanted = 2.0 * np.pi * np.arange(directions) / directions
     knots = np.arange(rings + _PAD) / rings
     out = np.zeros((len(radius), directions), complex)
-    for wavelength, part, own in zip(wavelengths, share, around, strict=True):
-        at = radius * (wavelength / np.min(wavelengths))
-        rows = at < 1.0
-        out[rows] += part * make_interp_spline(knots, make_interp_spline(angle, own, axis=1)(wanted))(at[rows])
+    for wavelength, part, values in zip(wavelengths, share, around, strict=True):
+        scaled_ratio = radius * (wavelength / np.min(wavelengths))
+        rows = scaled_ratio < 1.0
+        out[rows] += part * make_interp_spline(knots, make_interp_spline(angle, values, axis=1)(wanted))(
+            scaled_ratio[rows]
+        )
     return out
 
 
@@ -603,14 +605,14 @@ class VariedTransfer:
     @property
     def known(self) -> float:
         """MTF of the known pupil."""
-        return float(abs(sum(np.sum(one.phasors) for one in self.colours)))
+        return float(abs(sum(np.sum(terms.phasors) for terms in self.colours)))
 
     def modulation(self, paths: np.ndarray) -> np.ndarray:
         """Return the MTF for optical paths longer than those of the known pupil by ``paths`` (..., K N), metres."""
         whole: np.ndarray | int = 0
-        for one in self.colours:
-            phase = paths[..., one.paths] @ one.phase_matrix.T
-            whole = whole + (np.cos(phase) @ one.phasors + 1j * (np.sin(phase) @ one.phasors))
+        for terms in self.colours:
+            phase = paths[..., terms.paths] @ terms.phase_matrix.T
+            whole = whole + (np.cos(phase) @ terms.phasors + 1j * (np.sin(phase) @ terms.phasors))
         return np.asarray(np.abs(whole))
 
     def curvature(self, slopes: np.ndarray) -> np.ndarray:
@@ -622,11 +624,11 @@ class VariedTransfer:
             Derivatives of the rays' optical paths by the parameters, metres per unit.
         """
         whole, first, second = 0j, 0j, 0j
-        for one in self.colours:
-            phases = slopes[:, one.paths] @ one.phase_matrix.T
-            whole = whole + np.sum(one.phasors)
-            first = first + 1j * phases @ one.phasors
-            second = second - (phases * one.phasors) @ phases.T
+        for terms in self.colours:
+            phases = slopes[:, terms.paths] @ terms.phase_matrix.T
+            whole = whole + np.sum(terms.phasors)
+            first = first + 1j * phases @ terms.phasors
+            second = second - (phases * terms.phasors) @ phases.T
         size = abs(whole)
         along = np.real(np.conj(whole) * first) / size
         across = np.real(np.outer(np.conj(first), first) + np.conj(whole) * second)
@@ -641,16 +643,16 @@ def _wavelength_terms(
     right, left, inside = pupil.edge.corners(shift)
     if not inside[0]:
         return None
-    own = [pupil.edge.overlap(shift, right, left, gauss(ACROSS), gauss(ALONG))]
+    quadratures = [pupil.edge.overlap(shift, right, left, gauss(ACROSS), gauss(ALONG))]
     if pupil.shadow is not None:
         taken, area = pupil.shadow.overlap(shift[None], IN_SHADOW)
-        own.append((taken[0], area[0]))
-    points, weight = (np.concatenate(arrays, axis=1)[0] for arrays in zip(*own, strict=True))
+        quadratures.append((taken[0], area[0]))
+    points, weight = (np.concatenate(arrays, axis=1)[0] for arrays in zip(*quadratures, strict=True))
     ahead, behind = points + 0.5 * shift, points - 0.5 * shift
     (path, light), (path_behind, light_behind) = pupil.values(ahead), pupil.values(behind)
     wave = 2.0 * np.pi / wavelength
     scale = abs(np.linalg.det(pupil.axes)) / pupil.power
     phasors = scale * weight * light * light_behind * np.exp(1j * wave * (path - path_behind))
-    place = np.linalg.solve(pupil.axes, (cosines - pupil.centre).T)
+    nodes = np.linalg.solve(pupil.axes, (cosines - pupil.centre).T)
     steps = products(ahead.real, ahead.imag, degree) - products(behind.real, behind.imag, degree)
-    return phasors, wave * steps @ np.linalg.pinv(products(place[0], place[1], degree))
+    return phasors, wave * steps @ np.linalg.pinv(products(nodes[0], nodes[1], degree))

@@ -135,8 +135,8 @@ class PupilShadow:
         parts = self.parts(shift, count)
         middle = parts.points - 0.5 * (parts.sign * shift[parts.pupil, parts.step])[:, None]
         rows = parts.pupil * shift.shape[1] + parts.step
-        order, column, most = in_rows(rows, shift.size)
-        points, weights = np.zeros((shift.size, most, count**2), complex), np.zeros((shift.size, most, count**2))
+        order, column, width = in_rows(rows, shift.size)
+        points, weights = np.zeros((shift.size, width, count**2), complex), np.zeros((shift.size, width, count**2))
         points[rows[order], column], weights[rows[order], column] = middle[order], parts.weights[order]
         return points.reshape(*shift.shape, -1), weights.reshape(*shift.shape, -1)
 
@@ -148,13 +148,13 @@ class PupilShadow:
         # c + sign s/2 lies in the shadow and c - sign s/2 in the pupil: the shadow within the pupil moved by sign s
         sign = np.array([1.0, -1.0])
         offset = sign[:, None] * moves[:, :, None]
-        least, most = _least(self.radius), _most(self.radius)
+        smallest, largest = _least(self.radius), _most(self.radius)
         x, y = (self.pieces[:, None, None, ..., k] - offset[..., None, None, k] for k in (0, 1))
-        inside = np.max(x * x + y * y, axis=-1) < least[:, None, None, None] ** 2
+        inside = np.max(x * x + y * y, axis=-1) < smallest[:, None, None, None] ** 2
         centre = np.mean(self.pieces, axis=2)
         size = np.sqrt(np.max(np.sum((self.pieces - centre[:, :, None]) ** 2, axis=-1), axis=-1))
         near = centre[:, None, None] - offset[..., None, :]
-        near = np.hypot(near[..., 0], near[..., 1]) - size[:, None, None] < most[:, None, None, None]
+        near = np.hypot(near[..., 0], near[..., 1]) - size[:, None, None] < largest[:, None, None, None]
         full_at = np.nonzero(inside & full[:, None, None])
         b, s, g, k = np.nonzero(~inside & near & full[:, None, None])
         corners = self._corners
@@ -166,12 +166,12 @@ class PupilShadow:
         pair = self._pairs(moves, full)
         shared_points, shared_weights = np.empty((len(pair[0]), count**2), complex), np.empty((len(pair[0]), count**2))
         for group, (corner_limit, others) in _similar(corners[pair[0], pair[2]], corners[pair[0], pair[3]]):
-            at, step, first, second = (index[group] for index in pair)
+            pupil, step, first, second = (index[group] for index in pair)
             windows = self.pieces[:, :, :others]
             normal, limit = sides(windows.reshape(-1, *windows.shape[2:]))
-            normal, limit = (a.reshape(*windows.shape[:2], *a.shape[1:])[at, second] for a in (normal, limit))
-            limit = limit + np.einsum("fwx,fx->fw", normal, moves[at, step])
-            shared = intersect(self.pieces[at, first, :corner_limit], normal, limit)
+            normal, limit = (a.reshape(*windows.shape[:2], *a.shape[1:])[pupil, second] for a in (normal, limit))
+            limit = limit + np.einsum("fwx,fx->fw", normal, moves[pupil, step])
+            shared = intersect(self.pieces[pupil, first, :corner_limit], normal, limit)
             shared_points[group], shared_weights[group] = quadrature(shared, count)
             if not np.all(np.abs(np.sum(shared_weights[group], axis=-1) - np.abs(area(shared))) < _AREA_TOLERANCE):
                 raise UnphysicalError("the quadrature of the intersection of two shadows does not have its area")
@@ -207,16 +207,16 @@ _CORNER_LIMITS = (12, 20, 32, 52)
 
 def _similar(*corners: np.ndarray) -> Iterator[tuple[np.ndarray | slice, tuple[int | None, ...]]]:
     """Yield groups of F sets of polygons with similar numbers of corners, and upper bounds of these; None for all."""
-    if max((int(np.max(one, initial=0)) for one in corners), default=0) <= _CORNER_LIMITS[0]:
+    if max((int(np.max(count, initial=0)) for count in corners), default=0) <= _CORNER_LIMITS[0]:
         yield slice(None), (None,) * len(corners)
         return
-    bounds = [np.searchsorted(_CORNER_LIMITS, one) for one in corners]
+    bounds = [np.searchsorted(_CORNER_LIMITS, count) for count in corners]
     code = np.ravel_multi_index(tuple(bounds), (len(_CORNER_LIMITS) + 1,) * len(corners))
     for value in np.unique(code):
-        which = np.unravel_index(value, (len(_CORNER_LIMITS) + 1,) * len(corners))
+        limits = np.unravel_index(value, (len(_CORNER_LIMITS) + 1,) * len(corners))
         yield (
             np.flatnonzero(code == value),
-            tuple(_CORNER_LIMITS[k] if k < len(_CORNER_LIMITS) else None for k in which),
+            tuple(_CORNER_LIMITS[k] if k < len(_CORNER_LIMITS) else None for k in limits),
         )
 
 
@@ -363,16 +363,16 @@ def edge_radius(harmonics: np.ndarray) -> np.ndarray:
         angles = angles - error
     terms = np.fft.rfft(np.abs(point), axis=-1)[:, : 2 * used + 1] / count
     terms[:, 1:] *= 2.0
-    some = np.flatnonzero(np.max(np.abs(terms), axis=0) > _MIN_TERM)
-    return np.asarray(terms[:, : some[-1] + 1])
+    significant = np.flatnonzero(np.max(np.abs(terms), axis=0) > _MIN_TERM)
+    return np.asarray(terms[:, : significant[-1] + 1])
 
 
-def _radius(terms: np.ndarray, turn: np.ndarray) -> np.ndarray:
+def _radius(terms: np.ndarray, phasor: np.ndarray) -> np.ndarray:
     """Return the radius (N, ...) of edges with ``terms`` (N, K) in directions exp(i angle), (N, ...)."""
-    over = (slice(None),) + (None,) * (turn.ndim - 1)
-    total = np.zeros_like(turn)
+    over = (slice(None),) + (None,) * (phasor.ndim - 1)
+    total = np.zeros_like(phasor)
     for k in range(terms.shape[1] - 1, 0, -1):
-        total = (total + terms[:, k][over]) * turn
+        total = (total + terms[:, k][over]) * phasor
     return np.asarray(total.real + terms[:, 0].real[over])
 
 
@@ -393,12 +393,12 @@ def cut(polygons: np.ndarray, radius: np.ndarray, rim_sides: int) -> np.ndarray:
     number = polygons.shape[1]
     flat = polygons.reshape(-1, *polygons.shape[2:])
     flat = np.where((area(flat) < 0.0)[:, None, None], flat[:, ::-1], flat)
-    reach = np.max(np.hypot(flat[..., 0], flat[..., 1]), axis=-1, initial=0.0)
-    beyond = np.flatnonzero((reach > np.repeat(_least(radius), number)) & (area(flat) > SMALLEST))
+    extent = np.max(np.hypot(flat[..., 0], flat[..., 1]), axis=-1, initial=0.0)
+    beyond = np.flatnonzero((extent > np.repeat(_least(radius), number)) & (area(flat) > SMALLEST))
     if len(beyond):
         step = 2.0 * np.pi / rim_sides
-        turn = np.broadcast_to(np.exp(1j * step * np.arange(rim_sides)), (len(radius), rim_sides))
-        rim = turn * _radius(radius, turn) * np.sqrt(step / np.sin(step))
+        phasor = np.broadcast_to(np.exp(1j * step * np.arange(rim_sides)), (len(radius), rim_sides))
+        rim = phasor * _radius(radius, phasor) * np.sqrt(step / np.sin(step))
         # a polygon has few sides inside the rim
         inner = compact(intersect(np.stack([rim.real, rim.imag], axis=-1)[beyond // number], *sides(flat[beyond])))
         flat = padded(flat, inner.shape[1]).copy()
@@ -512,14 +512,14 @@ def _direction(point: np.ndarray) -> np.ndarray:
     return np.asarray(np.where(size > 0.0, point, 1.0) / np.where(size > 0.0, size, 1.0))
 
 
-def _radius_and_slope(terms: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _radius_and_slope(terms: np.ndarray, phasor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the radius and its derivative by the angle, as ``_radius``."""
-    over = (slice(None),) + (None,) * (turn.ndim - 1)
-    total, slope = np.zeros_like(turn), np.zeros_like(turn)
+    over = (slice(None),) + (None,) * (phasor.ndim - 1)
+    total, slope = np.zeros_like(phasor), np.zeros_like(phasor)
     for k in range(terms.shape[1] - 1, 0, -1):
-        slope = slope * turn + (1j * k) * terms[:, k][over]
-        total = (total + terms[:, k][over]) * turn
-    return total.real + terms[:, 0].real[over], (slope * turn).real
+        slope = slope * phasor + (1j * k) * terms[:, k][over]
+        total = (total + terms[:, k][over]) * phasor
+    return total.real + terms[:, 0].real[over], (slope * phasor).real
 
 
 def in_rows(owner: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray, int]:

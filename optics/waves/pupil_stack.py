@@ -184,20 +184,20 @@ class PupilStack:
         position = np.linalg.solve(axes, cosines - centre[..., None])
         plain = products(position[:, 0], position[:, 1], degree)
         design = plain * root[:, None]
-        both = np.stack([eikonal, density], axis=-1)
+        values = np.stack([eikonal, density], axis=-1)
         if bright is None:
             transposed, weight = np.swapaxes(design, 1, 2), np.sum(nodes.weight)
-            solution = np.linalg.solve(transposed @ design, transposed @ (both * root[:, None]))
+            solution = np.linalg.solve(transposed @ design, transposed @ (values * root[:, None]))
         else:
-            parts = zip((both[..., :1], both[..., 1:]), (DARK_WEIGHT, EVEN_WEIGHT), strict=True)
+            parts = zip((values[..., :1], values[..., 1:]), (DARK_WEIGHT, EVEN_WEIGHT), strict=True)
             solution = np.concatenate([smooth_terms(plain, nodes.weight, bright, *part) for part in parts], axis=-1)
-            both = np.where(bright[..., None], both, plain @ solution)
+            values = np.where(bright[..., None], values, plain @ solution)
             weight = (bright @ nodes.weight)[:, None]
-        both = both * root[:, None]
-        rest = np.sqrt(np.sum((both - design @ solution) ** 2, axis=1) / weight)
+        values = values * root[:, None]
+        rest = np.sqrt(np.sum((values - design @ solution) ** 2, axis=1) / weight)
         level = i + j < 2
         plane = (design[..., level] @ solution[:, level, :1])[..., 0]
-        bent = (both[..., 0] - plane) / root
+        bent = (values[..., 0] - plane) / root
         table = np.zeros((2, len(u), degree + 1, degree + 1))
         table[:, :, i, j] = np.moveaxis(solution, -1, 0)
         mean = np.mean(density, axis=-1) if bright is None else np.mean(density, axis=-1, where=bright)
@@ -332,13 +332,13 @@ class PupilStack:
         edges = PupilEdge(np.repeat(self.harmonics, steps, axis=1))
         right, left, inside = edges.corners(shift.ravel())
         values = np.zeros(shift.shape, complex)
-        for which, across, along in self._pieces(float(np.max(wave)), steps, _BLOCK):
-            flat = (which[:, None] * steps + np.arange(steps)).ravel()
+        for rows, across, along in self._pieces(float(np.max(wave)), steps, _BLOCK):
+            flat = (rows[:, None] * steps + np.arange(steps)).ravel()
             part = PupilEdge(edges.harmonics[:, flat])
             rules = (gauss(count) for count in (across, along))
             points, weight = part.overlap(shift.ravel()[flat], right[:, flat], left[:, flat], *rules)
-            shape = (len(which), steps, -1)
-            values[which] = self.take(which)._sums(points.reshape(shape), weight.reshape(shape), shift[which], wave)
+            shape = (len(rows), steps, -1)
+            values[rows] = self.take(rows)._sums(points.reshape(shape), weight.reshape(shape), shift[rows], wave)
         values *= inside.reshape(shift.shape)
         return np.asarray(np.einsum("k,bkm->bm", share, values.reshape(len(values), len(share), len(frequency))))
 
@@ -348,24 +348,24 @@ class PupilStack:
         """Return the shadows' contribution to ``_clear``."""
         shift, wave = self._shifts(frequency, wavelengths)
         values = np.zeros(shift.shape, complex)
-        for which, _, along in self._pieces(float(np.max(wave)), 1, _BLOCK_SHADOWS):
-            stack, moved = self.take(which), shift[which]
-            parts = shadow.take(which).parts(moved, LEAST_SHADOW + along - LEAST_ALONG)
+        for rows, _, along in self._pieces(float(np.max(wave)), 1, _BLOCK_SHADOWS):
+            stack, moved = self.take(rows), shift[rows]
+            parts = shadow.take(rows).parts(moved, LEAST_SHADOW + along - LEAST_ALONG)
             # whole pieces are evaluated once for all shifts, other regions and those in the other pupil one by one
             pieces, count = parts.whole.shape[1], len(parts.piece)
             other = parts.points - (parts.sign * moved[parts.pupil, parts.step])[:, None]
-            owner = np.concatenate([np.repeat(np.arange(len(which)), pieces), parts.pupil, parts.pupil[count:]])
+            owner = np.concatenate([np.repeat(np.arange(len(rows)), pieces), parts.pupil, parts.pupil[count:]])
             points = np.concatenate([parts.whole.reshape(-1, other.shape[1]), other, parts.points[count:]])
             path, light = stack._values_at(owner, points)
-            first, last = len(which) * pieces, len(which) * pieces + len(other)
+            first, last = len(rows) * pieces, len(rows) * pieces + len(other)
             indices = np.concatenate([parts.pupil[:count] * pieces + parts.piece, np.arange(last, len(owner))])
             phase = (parts.sign * wave[parts.step])[:, None] * (path[indices] - path[first:last])
             light = light[indices] * light[first:last] * parts.weights
-            at = parts.pupil * shift.shape[1] + parts.step
+            index = parts.pupil * shift.shape[1] + parts.step
             real, imaginary = (
-                np.bincount(at, np.einsum("fq,fq->f", part(phase), light), moved.size) for part in (np.cos, np.sin)
+                np.bincount(index, np.einsum("fq,fq->f", part(phase), light), moved.size) for part in (np.cos, np.sin)
             )
-            values[which] = (real + 1j * imaginary).reshape(moved.shape)
+            values[rows] = (real + 1j * imaginary).reshape(moved.shape)
         return np.asarray(np.einsum("k,bkm->bm", share, values.reshape(len(values), len(share), len(frequency))))
 
     def _pieces(self, wave: float, shifts: int, points: int) -> Iterator[tuple[np.ndarray, int, int]]:
@@ -452,9 +452,9 @@ def _edges(terms: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray, np.n
     centre = harmonic[..., 0].real
     # u = centre + 2 Re(h e^{ia}): the ellipse of the first harmonic
     axes = 2.0 * np.stack([harmonic[..., 1].real, -harmonic[..., 1].imag], axis=-1)
-    place = np.linalg.solve(axes, rim - centre[..., None])
+    normalised = np.linalg.solve(axes, rim - centre[..., None])
     order = np.arange(-degree, degree + 1)
-    harmonics = (np.fft.fft(place[:, 0] + 1j * place[:, 1], axis=-1) / samples)[:, order].T
+    harmonics = (np.fft.fft(normalised[:, 0] + 1j * normalised[:, 1], axis=-1) / samples)[:, order].T
     harmonics[np.abs(order) <= 1] = np.array([0.0, 0.0, 1.0])[:, None]
     return centre, axes, harmonics
 
@@ -524,8 +524,8 @@ class PupilFunction:
     def cutoff(self, direction: np.ndarray, wavelength: float) -> np.ndarray:
         """Return cut-off frequencies, cycles/m, (M,), along directions (M, 2) in detector x, y (need not be unit)."""
         unit = np.asarray(direction) / np.linalg.norm(direction, axis=-1, keepdims=True)
-        way = self.normalised(unit[..., 0], unit[..., 1])
-        return np.asarray(self.edge.reach(np.angle(way))[0] / (np.abs(way) * wavelength))
+        shift = self.normalised(unit[..., 0], unit[..., 1])
+        return np.asarray(self.edge.reach(np.angle(shift))[0] / (np.abs(shift) * wavelength))
 
     @cached_property
     def power(self) -> float:
@@ -585,16 +585,16 @@ def fit_pupils(
     stopped = ~(field.amplitude > 0.0) & (True if bright is None else bright)
     dark = np.any(stopped, axis=-1)
     if np.any(dark):
-        which = int(np.argmax(dark))
-        share = float(np.mean(stopped[which]))
+        k = int(np.argmax(dark))
+        share = float(np.mean(stopped[k]))
         raise UnphysicalError(
-            f"{share:.1%} of the pupil of image {which} carries no light: a beam vignetted by another aperture than "
+            f"{share:.1%} of the pupil of image {k} carries no light: a beam vignetted by another aperture than "
             "the stop has no smooth pupil; enlarge that aperture or move the field point inward"
         )
     if bright is not None and np.any(few := np.sum(bright, axis=-1) < MIN_ILLUMINATED):
-        which = int(np.argmax(few))
+        k = int(np.argmax(few))
         raise UnphysicalError(
-            f"edges pass only {int(np.sum(bright[which]))} of {nodes.count} rays of image {which}: too few for a fit"
+            f"edges pass only {int(np.sum(bright[k]))} of {nodes.count} rays of image {k}: too few for a fit"
         )
     with one_blas_thread():
         traced = field.u, field.v, field.eikonal, field.amplitude, nodes

@@ -289,13 +289,13 @@ class PupilEdge:
         want = np.arccos(np.minimum(size / longest, 1.0))
         out = []
         for sign in (-1.0, 1.0):
-            way, mean = want.copy(), direction + 0.5 * np.pi
+            angle, mean = want.copy(), direction + 0.5 * np.pi
             for _ in range(_ITERATIONS):
-                half = middle + sign * way
+                half = middle + sign * angle
                 mean, length = self._chord(direction, mean, half)
                 if np.all((np.abs(length - size) < _CLOSE) | ~inside):
                     break
-                way = way + want - np.arccos(np.clip(length / longest, -1.0, 1.0))
+                angle = angle + want - np.arccos(np.clip(length / longest, -1.0, 1.0))
             out.append((mean - half, mean + half))
         return np.stack([a for a, _ in out]), np.stack([b for _, b in out]), inside
 
