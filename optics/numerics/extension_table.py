@@ -9,7 +9,7 @@ from functools import cache, cached_property
 from importlib.metadata import EntryPoint, distribution, distributions
 from typing import Any, TypeVar
 
-# written in two parts: the wheel build puts the one word before module names
+# written in two parts, since in a wheel the joined word is the prefix of the modules' names
 PREFIX = "space_camera_twin" + "."
 """Prefix of the names of the groups of entry points; the name of the table follows."""
 

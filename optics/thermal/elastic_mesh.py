@@ -19,8 +19,8 @@ MERGE_DISTANCE = 1e-3
 The effect of a facet so small is far below the resolution of the elements.
 """
 
-_FLAT = 1e-9  # relative size below which a body counts as flat
-_PLANE = 1e-11  # and that of the steps between two triangles below which they are one face
+_FLAT = 1e-9  # relative thickness below which a body counts as flat
+_PLANE = 1e-11  # relative distance from a common plane below which two triangles are one face
 _INNER_SQUARE = 0.55  # half-diagonal of the inner block of a disk's mesh, in radii; gives about equal cells
 
 

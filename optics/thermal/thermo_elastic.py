@@ -32,10 +32,7 @@ from optics.numerics.number_tree import FrozenMap
 _INSIDE = 1e-9  # largest distance outside a cell, in cells, at which it is accepted at once
 _NEAR = 1e-3  # largest distance at which it is accepted if no cell contains the point: a curved face or rim
 _BEYOND = 0.02  # largest distance outside the mesh, in cells, to which its field is extrapolated
-_CANDIDATES = (
-    (12, _INSIDE),
-    (150, _NEAR),
-)  # number of nearest cells to try for points that are not yet located so well
+_CANDIDATES = ((12, _INSIDE), (150, _NEAR))  # numbers of nearest cells to try, until the distance is reached
 
 
 @dataclass(frozen=True, eq=False)
