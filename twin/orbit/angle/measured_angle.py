@@ -275,7 +275,7 @@ def _measurements(run: SimulatedAngleRun) -> PassMeasurements:
     ground = GroundPoints.of(
         ids,
         np.concatenate([raw.strips[name].points for name in flight.lines]),
-        # the analysis adds its least sigma to all points
+        # the analysis adds LEAST_SIGMA to all points
         max(spec.errors.points**2 - LEAST_SIGMA**2, 0.0) * np.eye(3),
         "control",
     )

@@ -90,8 +90,8 @@ NETWORK: Record[Network] = Record(
 
 
 def _four(get: Callable[[CameraChange], np.ndarray | None], k: int) -> Callable[[CameraChange], Any]:
-    def value(one: CameraChange) -> Any:
-        row = get(one)
+    def value(change: CameraChange) -> Any:
+        row = get(change)
         return None if row is None else row[k]
 
     return value
@@ -130,7 +130,7 @@ BLOCK: Record[BlockRun] = Record(
     Quantity("groups", lambda run: run.adjustment.groups, "group of observations, or law -> its test", record=GROUP),
     Quantity(
         "laws",
-        lambda run: {one.group: one for one in run.laws},
+        lambda run: {law.group: law for law in run.laws},
         "law with a course in time -> test of the readings' independence",
         record=LAW,
     ),
@@ -212,12 +212,12 @@ def _sections(run: BlockRun) -> tuple[Section, ...]:
         "Observations and laws",
         "Variance of the residuals over that of the sigmas, with the redundancy of the group. Each law of the readings'"
         " errors is a group.",
-        {name: GROUP(one) for name, one in run.adjustment.groups.items()},
+        {name: GROUP(group) for name, group in run.adjustment.groups.items()},
         label="group",
     )
     omitted = ("_sigma_before",) if run.drawn is not None else ("_sigma_before", "_true")
-    keys = [one.key for one in CHANGE if not one.key.endswith(omitted)]
-    changes = {name: CHANGE(one) for name, one in run.cameras.items()}
+    keys = [quantity.key for quantity in CHANGE if not quantity.key.endswith(omitted)]
+    changes = {name: CHANGE(change) for name, change in run.cameras.items()}
     cameras = CHANGE.table(
         "cameras", "Cameras", "Changes of the cameras since the calibration, by scene.", changes, keys, "scene"
     )
@@ -227,7 +227,7 @@ def _sections(run: BlockRun) -> tuple[Section, ...]:
         "Change of the unknowns for one prior sigma. Ratio: prior sigma over the sigma of the observations alone, in"
         " percent.",
         ("change of", "ratio [%]"),
-        [(str(one).rsplit(" (", 1)[0], 100.0 * one.sigma_ratio) for one in run.open if one.sigma_ratio < _WEAK],
+        [(str(c).rsplit(" (", 1)[0], 100.0 * c.sigma_ratio) for c in run.open if c.sigma_ratio < _WEAK],
         (None, 3),
     )
     ids = run.adjustment.assembly.block.points.ids
@@ -260,7 +260,7 @@ def _warnings(run: BlockRun) -> tuple[str, ...]:
             f"the control points are shifted by {d.east:+.2f} m east, {d.north:+.2f} m north and {d.up:+.2f} m up "
             f"against the rest of the block (p = {run.datum_p_value:.1g}): are they given in another datum?"
         )
-    warnings += [str(one) for one in run.laws if one.p_value < ALARM]
+    warnings += [str(law) for law in run.laws if law.p_value < ALARM]
     for name, group in run.adjustment.groups.items():
         if group.p_value < ALARM:
             size = float(np.sqrt(group.ratio))

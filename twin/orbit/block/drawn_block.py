@@ -442,7 +442,7 @@ def _known_points(
     noise = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), random.standard_normal(ground.shape))
     lon, lat, _ = earth.geodetic(ground)
     shift = np.array(spec.datum) @ east_north_up(lon, lat)
-    # where the mean height is: what a first intersection gives as well
+    # first coordinates at the mean height, as accurate as a first intersection
     rough = earth.ecef(lon, lat, np.full(len(lon), spec.area.height))
     start = np.where((role == "control")[:, None], ground + noise + shift, rough)
     ids = np.array(point_names(role), object)

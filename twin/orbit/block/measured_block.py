@@ -120,7 +120,7 @@ def measured_block(
     for measured in passes:
         for line, rays in data[measured.name].rays(measured.images).items():
             raw[f"{measured.name}/{line}"] = rays
-    given = np.where((points.role == "tie")[:, None], np.nan, points.start)
+    coordinates = np.where((points.role == "tie")[:, None], np.nan, points.start)
     points = _first_coordinates(points, raw, models, number)
     earth = Earth()
     height = earth.geodetic(points.start)[2]
@@ -148,7 +148,7 @@ def measured_block(
         points=points,
         monitored=_monitored(setup, lines, expected, epochs, monitor),
     )
-    return block, given
+    return block, coordinates
 
 
 def _middle(scenes: Sequence[model.Scene], name: str) -> float | None:

@@ -226,7 +226,7 @@ IMAGES: Record[Campaign] = Record(
     Quantity("total", lambda campaign: campaign, "sums over all fields and lines", record=TOTAL),
     Quantity(
         "fields",
-        lambda campaign: {one.name: _by_line(one) for one in campaign.images or ()},
+        lambda campaign: {images.name: _by_line(images) for images in campaign.images or ()},
         "by sort of points and line",
         record=MATCHING,
     ),

@@ -39,7 +39,7 @@ def calibration_report(run: CalibrationRun) -> Report:
     plan, height = (values_of(run.before, what).mean() for what in ("plan_rms", "height_rms"))
     limits = setup.test.limits
     good = run.within_limits
-    # of averaged parameters the scheme with most fields; the last one lets each field use its own
+    # the scheme that averages most fields; in the last one each field uses its own parameters
     scheme = list(run.schemes)[-2:][0]
     after = [values_of(run.schemes[scheme], what).mean() for what in ("plan_rms", "height_rms")]
     verdict, more = answer(

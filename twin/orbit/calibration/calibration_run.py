@@ -379,21 +379,21 @@ def true_values(campaign: Campaign, names: tuple[str, ...]) -> np.ndarray:
 
     Biases and offsets are those at the middle of the field, rates the mean of the fields.
     """
-    known = {
+    values = {
         f"{line} {name}": value
         for line, camera in campaign.truth.items()
         for name, value in zip(INTERIOR, camera.interior, strict=True)
     }
     for field_pass in campaign.passes:
-        known |= {f"{field_pass.name} {name}": v for name, v in zip(BIAS, field_pass.bias, strict=True)}
-        known |= {
+        values |= {f"{field_pass.name} {name}": v for name, v in zip(BIAS, field_pass.bias, strict=True)}
+        values |= {
             f"{field_pass.name} offset {name}": v for name, v in zip(OFFSET, field_pass.truth.offset, strict=True)
         }
     rates = [(field_pass.truth.bias_at(1.0) - field_pass.truth.bias_at(-1.0)) / 2.0 for field_pass in campaign.passes]
-    known |= dict(zip(RATE, np.mean(rates, axis=0), strict=True))
+    values |= dict(zip(RATE, np.mean(rates, axis=0), strict=True))
     for field_pass, rate in zip(campaign.passes, rates, strict=True):
-        known |= {f"{field_pass.name} {name}": v for name, v in zip(RATE, rate, strict=True)}
-    return np.array([known[name] for name in names])
+        values |= {f"{field_pass.name} {name}": v for name, v in zip(RATE, rate, strict=True)}
+    return np.array([values[name] for name in names])
 
 
 def third_differences(field_pass: FieldPass) -> tuple[ThirdDifference | None, ThirdDifference | None]:
@@ -460,7 +460,7 @@ def _test(setup: AnyCalibration) -> dict[str, Any]:
         nothing = {"noise": ["0 m"] * 3, "interval": gps["interval"]}
         errors = {"gps": nothing, "star_tracker": {"noise": ["0 arcsec"] * 3, "interval": tracker["interval"]}}
     drawn = setup.test.images is None
-    # drawn points have the errors that their sigmas say, and no gross ones
+    # simulated points have errors according to their sigmas, and no gross errors
     return common | {
         "errors": errors,
         "screening": "none" if drawn else "robust",

@@ -295,9 +295,9 @@ def _monitoring(run: CalibrationRun) -> Section:
     study, spec = run.monitoring, run.campaign.simulated
     assert study is not None
     drifts = "; ".join(
-        f"{name} {', '.join(format_quantity(v, ANGLE) for v in one.angles)}, "
-        f"Δf {format_quantity(one.principal_distance, LENGTH)}"
-        for name, one in spec.drift.items()
+        f"{name} {', '.join(format_quantity(v, ANGLE) for v in drift.angles)}, "
+        f"Δf {format_quantity(drift.principal_distance, LENGTH)}"
+        for name, drift in spec.drift.items()
     )
     text = [
         f"Each line camera differs in every field from its reference state, 1σ of Δα, Δβ, Δγ: {drifts}. "
@@ -310,8 +310,8 @@ def _monitoring(run: CalibrationRun) -> Section:
     rows: Rows = []
     for size in study.sizes:
         cells: list[Cell] = [size.factor, size.factor * study.angle / ARCSEC]
-        for one in (size.without, size.monitored):
-            cells += (None,) * 3 if one is None else (*astuple(one.together), one.p_value)
+        for treatment in (size.without, size.monitored):
+            cells += (None,) * 3 if treatment is None else (*astuple(treatment.together), treatment.p_value)
         rows.append(tuple(cells))
     none, nominal = study.at(0.0).without, study.at(1.0)
     cases = {"no drift": none.schemes, "no monitor": nominal.without.schemes}

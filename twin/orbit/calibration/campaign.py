@@ -166,7 +166,7 @@ class PassData:
         if not isinstance(path, TabulatedTrajectory):
             return 0.0
         time, step = path.table.attitude_time, path.attitude_interval
-        # a table may begin with an odd end
+        # the first interval of a table may differ from the others
         reading = float(time[1 + int(np.argmin(np.abs(np.diff(time[1:]) - step)))]) if len(time) > 2 else float(time[0])
         phase = reading - step * round(reading / step)
         return phase if abs(phase) > _SAME_PHASE * step else 0.0
@@ -209,7 +209,7 @@ class PassData:
             seconds = sensor.time(row.line)
             image = self.places(name, row.pixel)
             station, attitude = sensor.trajectory.position(seconds), sensor.trajectory.body_to_itrs(seconds)
-            # the noise of readings is shared by its own clock, which ticks at the readings
+            # times relative to the readings, between which the model of shared noise interpolates
             rays = Rays.of(row.point, image, station, attitude, seconds - self.phase)
             rays_by_line[name] = (
                 rays if self.unit is None else replace(rays, spread=self.spread(name, row) / self.unit**2)
@@ -255,7 +255,7 @@ class PassData:
         ValueError
             A point lies outside the image.
         """
-        # the calibration's own check comes first: a place without a height has no refraction
+        # the check of the coordinates comes first: refraction needs a height
         field = CalibrationField.of(self.name, self.rays(images), ground, covariance, control)
         return replace(field, rays=self.corrected(field.rays, images, removed, self._heights(ground)))
 
@@ -594,7 +594,7 @@ class FieldPass:
                 beyond = ~path.covers(time + seconds)
                 there = time + np.where(beyond, -seconds, seconds)
                 station, attitude = path.position(there), path.body_to_itrs(there)
-                if np.any(beyond):  # the motion goes on as it came
+                if np.any(beyond):  # continued by reflection
                     at_exposure = path.body_to_itrs(time[beyond])
                     station[beyond] = 2.0 * path.position(time[beyond]) - station[beyond]
                     attitude[beyond] = at_exposure @ np.swapaxes(attitude[beyond], 1, 2) @ at_exposure
@@ -899,7 +899,7 @@ def _field_pass(measured: PassMeasurements, payload: ThreeLineCameraSpec, ties_a
     data = pass_data(measured.name, payload, TabulatedTrajectory(measured.platform), times, float(np.mean(height)))
     check = (role == "check") & (rays > 1)
     tie = (role == "tie") & (rays > 1)
-    # control points first, ties after them
+    # control points first, followed by tie points
     calibrating = np.concatenate([np.flatnonzero(is_control), np.flatnonzero(tie & (not ties_apart))])
     where = measured.ground.taken(calibrating)
     checks = np.flatnonzero(check)

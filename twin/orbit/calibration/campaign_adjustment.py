@@ -75,11 +75,11 @@ def _rate_priors(campaign: Campaign, passes: Sequence[FieldPass], common: Sequen
     sigma = _rates_of(campaign)
     if not np.any(sigma):
         return tuple(common)
-    known = {next(iter(p.weights)): (p.value, p.sigma) for p in common}
+    common_rates = {next(iter(p.weights)): (p.value, p.sigma) for p in common}
     priors = []
     for field_pass in passes:
         for name, scatter in zip(RATE, np.maximum(sigma, _LEAST_RATE).tolist(), strict=True):
-            value, error = known.get(name, (0.0, 0.0))
+            value, error = common_rates.get(name, (0.0, 0.0))
             priors.append(
                 Prior({f"{field_pass.name} {name}": 1.0}, value, float(np.hypot(scatter, error)), "bias rate")
             )
@@ -307,10 +307,10 @@ def rate_priors(campaign: Campaign, fits: tuple[LatitudeFit, ...]) -> tuple[Prio
 def _sine_rate(field_pass: FieldPass, reference: float) -> float:
     """Return the rate of sin(latitude - reference) at a pass's middle, from the measured orbit, in 1/s."""
     path, middle, step = field_pass.measured, field_pass.middle, np.array([-1.0, 1.0])
-    known = path.covers(middle + step)[:, None]
-    # by the velocity where a second farther there are no readings
+    covered = path.covers(middle + step)[:, None]
+    # where readings end within a second, extrapolated by the velocity
     on = path.position(middle) + step[:, None] * path.velocity(middle)
-    ends = np.where(known, path.position(middle + np.where(known[:, 0], step, 0.0)), on)
+    ends = np.where(covered, path.position(middle + np.where(covered[:, 0], step, 0.0)), on)
     latitude = field_pass.data.earth.geodetic(ends)[1]
     return float(np.diff(np.sin(latitude - reference))[0] / 2.0)
 
@@ -332,7 +332,7 @@ def fit_latitude(axis: str, latitude: np.ndarray, value: np.ndarray, covariance:
     chi_square = solved(0.0)[2]
     remainder = 0.0
     if chi_square > freedom:
-        # with this much extra the chi-square is below a thousandth of the degrees of freedom
+        # at this upper bound the chi-square is below a thousandth of the degrees of freedom
         upper = float(np.linalg.norm(value - value.mean())) * 100.0
         remainder = float(brentq(lambda s: solved(s)[2] - freedom, 0.0, upper, xtol=1e-12))
     best, spread, _ = solved(remainder)

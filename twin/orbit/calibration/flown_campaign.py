@@ -200,7 +200,7 @@ class Imager:
                 ("images", "points"),
                 f"{_LEAST_CONTROL} control and 2 check points or more: {POINTS_REMEDY}",
             )
-        # one error in plan moves all points of a patch: each of n weighs as if it had n times the variance
+        # an error in plan is common to all points of a patch: each of n points gets n times the variance
         share = np.sqrt(control_points.count / len(patches))
         sigma = self.spec.control.sigma * share, self.spec.points.height_sigma
         both = control_points.followed_by(tie)
@@ -369,10 +369,10 @@ def fly_fields(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: A
     measured, readings, pictures, truths = zip(*flown, strict=True)
     campaign = campaign_of(spec, payload, measured, spec.images is None)
     passes = tuple(
-        replace(one, known_truth=truth, readings=reading)
-        for one, truth, reading in zip(campaign.passes, truths, readings, strict=True)
+        replace(field_pass, known_truth=truth, readings=reading)
+        for field_pass, truth, reading in zip(campaign.passes, truths, readings, strict=True)
     )
-    images = tuple(one for one in pictures if one is not None)
+    images = tuple(images for images in pictures if images is not None)
     truth = FrozenMap({k: line_model(changed, k) for k in LINES})
     return replace(campaign, passes=passes, images=images or None, known_truth=truth)
 
@@ -399,14 +399,16 @@ def _pass(
     pictures, drift = stream(seed, _PICTURES), _sample_drift(spec, seed)
     readings = _sample_readings(spec, drift, seed)
     cameras = line_cameras(drifted_payload(changed, drift))
-    place, image, ground, season, data = (np.random.default_rng(s) for s in seed.spawn(5))
+    random_places, random_image, random_ground, random_season, random_errors = (
+        np.random.default_rng(s) for s in seed.spawn(5)
+    )
     trajectory = _trajectory(name, field, spec, earth, seed)
     errors = spec.errors
-    rotation = np.array(errors.star_tracker.bias) + np.array(errors.season) * season.standard_normal(3)
+    rotation = np.array(errors.star_tracker.bias) + np.array(errors.season) * random_season.standard_normal(3)
     tracker = errors.star_tracker.model_copy(update={"bias": tuple(rotation.tolist())})
     terms = TERMS if errors.switched_on else ("attitude_bias",)
     measured = trajectory.with_errors(
-        errors.model_copy(update={"star_tracker": tracker}), int(data.integers(2**31)), terms
+        errors.model_copy(update={"star_tracker": tracker}), int(random_errors.integers(2**31)), terms
     )
     platform = PlatformTable.sampled(measured, errors.gps.interval, errors.star_tracker.interval)
     effects = light_effects(spec.effects)
@@ -418,7 +420,9 @@ def _pass(
     images = None
     if imager is None:
         assert spec.points is not None
-        points = _simulated_points(field, spec, spec.points, sensors, pass_info, (place, image, ground))
+        points = _simulated_points(
+            field, spec, spec.points, sensors, pass_info, (random_places, random_image, random_ground)
+        )
     else:
         points, images = imager.measured(field, sensors, pass_info, effects, pictures)
     ties: Mapping[str, ImagePoints] = {}
@@ -481,8 +485,8 @@ def _measurements_of(
         coordinates = coordinates + np.array(datum) @ east_north_up(lon, lat)
     count, checks = len(coordinates), len(points.check_ground)
     more = 1 + max((int(r.point.max()) for r in ties.values() if len(r.point)), default=-1)
-    known = np.where(is_control[:, None], coordinates, np.nan)
-    itrs = np.concatenate([known, points.check_ground, np.full((more, 3), np.nan)])
+    given = np.where(is_control[:, None], coordinates, np.nan)
+    itrs = np.concatenate([given, points.check_ground, np.full((more, 3), np.nan)])
     role = np.array(["control" if c else "tie" for c in is_control] + ["check"] * checks + ["tie"] * more, object)
     covariance = np.zeros((len(role), 3, 3))
     covariance[:count][is_control] = level_covariance(coordinates[is_control], *points.sigma)
@@ -504,8 +508,8 @@ def _simulated_points(
     random: tuple[np.random.Generator, np.random.Generator, np.random.Generator],
 ) -> FieldPoints:
     """Draw ground points, their image points and the control coordinates, from three random streams."""
-    place, image, ground = random
-    points, seen = _points(data.name, field, spec, wanted, sensors, place)
+    random_places, image, ground = random
+    points, seen = _points(data.name, field, spec, wanted, sensors, random_places)
     errors = spec.errors
     sigma, control = (v * errors.switched_on for v in (errors.image, errors.control))
     images = {}
@@ -553,7 +557,7 @@ def _points(
     radius = float(np.linalg.norm(trajectory.position(0.0)))
     speed = float(np.linalg.norm(trajectory.velocity(0.0))) * (1.0 - above / radius)
     half_time = 0.5 * counts.length / speed
-    if half_time > 0.99 * spec.span:  # the image ends a line before the orbit
+    if half_time > 0.99 * spec.span:  # the image is a line shorter than the orbit
         raise BenchError("the pass is shorter than the field", ("span",), f"more than {half_time:.3g} s")
     line = (random.uniform(-half_time, half_time, len(height)) - nadir.first_line_time) / spec.line_time
     points = nadir.ground(line, pixel, height)

@@ -289,7 +289,7 @@ def _expected(campaign: Campaign) -> dict[str, tuple[float, float]]:
     start = dict(zip(inner, np.ravel([campaign.laboratory[line].interior for line in campaign.lines]), strict=True))
     expected = {name: (start[name], launch.interior) for name in inner}
     for field_pass in campaign.passes:
-        # a season's part is no surprise either
+        # the season's part is expected, too
         spread = np.hypot(launch.bias, np.array(errors.season))
         expected |= {
             f"{field_pass.name} {axis}": (0.0, s) for axis, s in zip(BIAS, spread.tolist(), strict=True) if s > 0.0
@@ -348,7 +348,7 @@ class AttitudeDrift:
             sigma = np.array([adjustment.sigma[n] for n in adjustment.names])
             change = np.linalg.norm(adjustment.rates.bias, axis=1) * ARCSEC / seconds
             effect = {n: float(c / s) for n, c, s in zip(adjustment.names, change, sigma, strict=True) if s > 0.0}
-            # of a test of all rates together, each alone
+            # detectable size of each rate alone in a test of all rates together
             power = np.sqrt(chi2.isf(FALSE_ALARM, max(adjustment.rates.degrees_of_freedom, 1)))
             alone = adjustment.rates.sigma_alone.reshape(-1, 3)
             detectable = power * np.sqrt(1.0 / np.mean(alone**-2.0, axis=0) / len(alone)) * seconds
@@ -434,10 +434,10 @@ class ChipStep:
         limit = float(norm.isf(0.5 * _STEP_ALARM / max(steps.size, 1)))
         chip_steps = []
         for k, (value, sigma) in enumerate(zip(test.estimate.tolist(), test.sigma.tolist(), strict=True)):
-            line, place = steps.places[k // 2]
+            line, position = steps.places[k // 2]
             values = (value, sigma, limit * sigma, abs(value) > limit * sigma)
             chip_steps.append(
-                cls(line, "xy"[k % 2], place, *(values if np.isfinite(sigma) else (0.0, None, None, False)))
+                cls(line, "xy"[k % 2], position, *(values if np.isfinite(sigma) else (0.0, None, None, False)))
             )
         return tuple(chip_steps)
 

@@ -217,7 +217,7 @@ def repeat_campaigns(setup: CalibrationSetup, seed: np.random.SeedSequence, adva
     count = setup.test.repeats
     test = setup.test
     if test.effects.corrected:
-        # what a correction leaves, 0.004 px, is no part of the scatter; flying without effects takes half of the time
+        # the remainder of a correction, 0.004 px, does not affect the scatter; without effects it is twice as fast
         none = test.effects.model_copy(update=dict.fromkeys(EFFECTS, False))
         setup = setup.model_copy(update={"test": test.model_copy(update={"effects": none})})
     plan, height = [], []
@@ -337,7 +337,7 @@ def adjust_strips(campaign: Campaign, advance: Advance) -> Strips | None:
     calibrated, strips = {}, {}
 
     def in_strip(field_pass: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray) -> CheckErrors:
-        # those of the last scheme, with each field's own parameters, stay
+        # strips of the last scheme, with each field's own parameters, replace the others
         strips[field_pass.name] = strip = adjust_pass_strip(campaign, field_pass, cameras, bias)
         advance("strips", next(done), parts)
         return strip_check_errors(campaign, field_pass, strip, cameras, bias)

@@ -50,7 +50,7 @@ _LEAST_OF_LINE = 8
 """Least number of control points in a line for which wrong names are looked for."""
 _SLOPE_POINTS = 500
 """Largest number of points from which the slope of the misclosures is computed."""
-_Kept = dict[str, dict[str, np.ndarray]]
+_Accepted = dict[str, dict[str, np.ndarray]]
 
 
 def mislabelled_points(campaign: Campaign, field_pass: FieldPass) -> tuple[dict[str, np.ndarray], np.ndarray]:
@@ -72,17 +72,17 @@ def mislabelled_points(campaign: Campaign, field_pass: FieldPass) -> tuple[dict[
         wrong[name] = np.zeros(len(control), bool)
         if control.sum() < _LEAST_OF_LINE:
             continue
-        known, model = rays.taken(control), campaign.laboratory[name]
-        miss = misclosure(model, known, field_pass.control.ground[known.point], still, still)
+        control_rays, model = rays.taken(control), campaign.laboratory[name]
+        miss = misclosure(model, control_rays, field_pass.control.ground[control_rays.point], still, still)
         sample = np.unique(np.linspace(0, len(miss) - 1, min(_SLOPE_POINTS, len(miss))).round().astype(int))
-        fits = [siegelslopes(miss[sample, k], known.image[sample, 1]) for k in (0, 1)]
+        fits = [siegelslopes(miss[sample, k], control_rays.image[sample, 1]) for k in (0, 1)]
 
         def size(rays: Rays, miss: np.ndarray, fits: list[Any] = fits) -> np.ndarray:
             return np.hypot(*(miss[:, k] - fits[k][1] - fits[k][0] * rays.image[:, 1] for k in (0, 1)))
 
-        scatter = np.sqrt(robust_variance(size(known, miss) ** 2))
+        scatter = np.sqrt(robust_variance(size(control_rays, miss) ** 2))
         limit = max(_FAR_SCATTERS * scatter, _FAR_SIGMAS * campaign.noise.image)
-        wrong[name][control] = size(known, miss) > limit
+        wrong[name][control] = size(control_rays, miss) > limit
         if name in field_pass.check:
             check = field_pass.check[name]
             away = misclosure(model, check, field_pass.check_ground[check.point], still, still)
@@ -111,9 +111,9 @@ def _without_mislabelled(campaign: Campaign) -> tuple[Campaign, dict[str, Reject
     passes, gross = [], {}
     for field_pass in campaign.passes:
         wrong, wrong_check = mislabelled_points(campaign, field_pass)
-        kept = {name: ~mask for name, mask in wrong.items()}
-        gross[field_pass.name] = _rejected(field_pass, kept, ~wrong_check, {})
-        passes.append(_reduced(field_pass, kept, np.ones(len(field_pass.control_ground), bool), ~wrong_check))
+        accepted = {name: ~mask for name, mask in wrong.items()}
+        gross[field_pass.name] = _rejected(field_pass, accepted, ~wrong_check, {})
+        passes.append(_reduced(field_pass, accepted, np.ones(len(field_pass.control_ground), bool), ~wrong_check))
     if not any(field_pass.points or field_pass.check_points for field_pass in gross.values()):
         return campaign, gross
     return _with_light(campaign, tuple(passes)), gross
@@ -134,59 +134,59 @@ def screen_campaign(campaign: Campaign) -> Campaign:
         The campaign cannot be adjusted.
     """
     gross: dict[str, Rejected] = {}
-    if campaign.images is None:  # names of points that were matched here are right
+    if campaign.images is None:  # points matched by this program have the right names
         campaign, gross = _without_mislabelled(campaign)
-    adjustment, kept = _robust(campaign)
+    adjustment, accepted = _robust(campaign)
     total: dict[tuple[str, str], float] = {(p.name, line): 1.0 for p in campaign.passes for line in p.control_images}
     for _ in range(_ROUNDS):
-        factors = _factors(adjustment, kept)
+        factors = _factors(adjustment, accepted)
         if not factors:
             break
         for key, factor in factors.items():
             total[key] *= factor
         campaign = _rescaled(campaign, factors)
-        adjustment, kept = _robust(campaign)
+        adjustment, accepted = _robust(campaign)
     passes, rejected, judged = [], {}, []
     for k, field_pass in enumerate(campaign.passes):
-        reduced, keep_check = _without(campaign, field_pass, kept[field_pass.name], adjustment)
+        reduced, keep_check = _without(campaign, field_pass, accepted[field_pass.name], adjustment)
         passes.append(reduced)
         factors_of_pass = FrozenMap({line: total[field_pass.name, line] for line in field_pass.control_images})
-        rejected[field_pass.name] = _rejected(field_pass, kept[field_pass.name], keep_check, factors_of_pass)
+        rejected[field_pass.name] = _rejected(field_pass, accepted[field_pass.name], keep_check, factors_of_pass)
         if campaign.images is None:
             rejected[field_pass.name] = rejected[field_pass.name].after(gross[field_pass.name])
         else:
             shown = campaign.images[k]
-            judged.append(replace(shown, screening=_counted(field_pass, shown, kept[field_pass.name], keep_check)))
+            judged.append(replace(shown, screening=_counted(field_pass, shown, accepted[field_pass.name], keep_check)))
     images = None if campaign.images is None else tuple(judged)
     return _with_light(replace(campaign, images=images, rejected=FrozenMap(rejected)), tuple(passes))
 
 
-def _robust(campaign: Campaign) -> tuple[Adjustment, _Kept]:
+def _robust(campaign: Campaign) -> tuple[Adjustment, _Accepted]:
     """Return the adjustment with robust weights, and masks of the accepted image points, field -> line."""
     adjustment = simultaneous(campaign, robust="igg")
-    kept: _Kept = {}
+    accepted: _Accepted = {}
     for name, lines in adjustment.residual.items():
-        kept[name] = {}
+        accepted[name] = {}
         for line, residual in lines.items():
             far = np.linalg.norm(residual, axis=1) > REJECT
-            kept[name][line] = (adjustment.weight[name][line] > 0.0) & ~far
-    return adjustment, kept
+            accepted[name][line] = (adjustment.weight[name][line] > 0.0) & ~far
+    return adjustment, accepted
 
 
-def _factors(adjustment: Adjustment, kept: _Kept) -> dict[tuple[str, str], float]:
+def _factors(adjustment: Adjustment, accepted: _Accepted) -> dict[tuple[str, str], float]:
     """Return factors on image sigmas by (field, line), from the median of the accepted standardised residuals.
 
     A line has a factor of its own where its residuals stand out from the sigmas and from all other lines; all others
     share one factor. The result is empty where no factor is needed.
     """
     squares = {
-        (name, line): np.sum(residual**2, axis=1)[kept[name][line]]
+        (name, line): np.sum(residual**2, axis=1)[accepted[name][line]]
         for name, lines in adjustment.residual.items()
         for line, residual in lines.items()
     }
     separate: dict[tuple[str, str], float] = {}
     while len(separate) < len(squares):
-        # the worst first: its residuals are no measure of the others
+        # the worst line first, so that its residuals do not affect the variance of the others
         variances = {key: robust_variance(row) for key, row in squares.items() if key not in separate and len(row)}
         if not variances:
             break
@@ -224,7 +224,7 @@ def _rescaled(campaign: Campaign, factors: Mapping[tuple[str, str], float]) -> C
 
 
 def _without(
-    campaign: Campaign, field_pass: FieldPass, kept: dict[str, np.ndarray], adjustment: Adjustment
+    campaign: Campaign, field_pass: FieldPass, accepted: dict[str, np.ndarray], adjustment: Adjustment
 ) -> tuple[FieldPass, np.ndarray]:
     """Return a pass without rejected points, and the mask of accepted check points.
 
@@ -233,8 +233,8 @@ def _without(
     count = len(field_pass.control_ground)
     seen = np.zeros(count, int)
     for name, row in field_pass.control_images.items():
-        np.add.at(seen, row.point[kept[name]], 1)
-    stays = np.where(field_pass.is_control, seen > 0, seen > 1)
+        np.add.at(seen, row.point[accepted[name]], 1)
+    retained = np.where(field_pass.is_control, seen > 0, seen > 1)
     keep = np.ones(len(field_pass.check_ground), bool)
     if field_pass.check:
         intersection = intersect(
@@ -243,44 +243,49 @@ def _without(
             campaign.noise,
             bias=adjustment.bias(field_pass.name),
         )
-        # three rays are six conditions of three coordinates
+        # two conditions per ray, less three coordinates
         keep = intersection.chi_square <= statistics.limit_of(_FALSE_ALARM, 2 * intersection.rays - 3)
-    return _reduced(field_pass, kept, stays, keep), keep
+    return _reduced(field_pass, accepted, retained, keep), keep
 
 
-def _reduced(field_pass: FieldPass, kept: dict[str, np.ndarray], stays: np.ndarray, keep: np.ndarray) -> FieldPass:
+def _reduced(
+    field_pass: FieldPass, accepted: dict[str, np.ndarray], retained: np.ndarray, accepted_checks: np.ndarray
+) -> FieldPass:
     """Return a pass with the selected image points (masks by line), ground points (n,) and check points (m,) alone."""
     images = {
-        name: _renumbered(row.taken(kept[name] & stays[row.point]), stays)
+        name: _renumbered(row.taken(accepted[name] & retained[row.point]), retained)
         for name, row in field_pass.control_images.items()
     }
-    check = {name: _renumbered(row.taken(keep[row.point]), keep) for name, row in field_pass.check_images.items()}
+    check = {
+        name: _renumbered(row.taken(accepted_checks[row.point]), accepted_checks)
+        for name, row in field_pass.check_images.items()
+    }
     return replace(
         field_pass,
         control_images=FrozenMap(images),
-        control_ground=field_pass.control_ground[stays],
-        control_covariance=field_pass.control_covariance[stays],
-        is_control=field_pass.is_control[stays],
-        control_ids=field_pass.control_ids[stays],
+        control_ground=field_pass.control_ground[retained],
+        control_covariance=field_pass.control_covariance[retained],
+        is_control=field_pass.is_control[retained],
+        control_ids=field_pass.control_ids[retained],
         check_images=FrozenMap(check),
-        check_ground=field_pass.check_ground[keep],
-        check_ids=field_pass.check_ids[keep],
+        check_ground=field_pass.check_ground[accepted_checks],
+        check_ids=field_pass.check_ids[accepted_checks],
     )
 
 
-def _renumbered(row: ImagePoints, stays: np.ndarray) -> ImagePoints:
+def _renumbered(row: ImagePoints, retained: np.ndarray) -> ImagePoints:
     """Return image points renumbered for the ground points that remain, given as a mask (n,)."""
-    return replace(row, point=(np.cumsum(stays) - 1)[row.point])
+    return replace(row, point=(np.cumsum(retained) - 1)[row.point])
 
 
 def _rejected(
-    field_pass: FieldPass, kept: dict[str, np.ndarray], check: np.ndarray, factors: Mapping[str, float]
+    field_pass: FieldPass, accepted: dict[str, np.ndarray], check: np.ndarray, factors: Mapping[str, float]
 ) -> Rejected:
     """Return the names of the rejected points and the counts before and after."""
     points = [
         (str(field_pass.control_ids[point]), name)
         for name, row in field_pass.control_images.items()
-        for point in row.point[~kept[name]].tolist()
+        for point in row.point[~accepted[name]].tolist()
     ]
     entered = sum(len(row.point) for row in field_pass.control_images.values())
     rejected_checks = tuple(str(name) for name in field_pass.check_ids[~check])
@@ -289,10 +294,12 @@ def _rejected(
     )
 
 
-def _counted(field_pass: FieldPass, shown: FieldImages, kept: dict[str, np.ndarray], check: np.ndarray) -> Screening:
+def _counted(
+    field_pass: FieldPass, shown: FieldImages, accepted_by_line: dict[str, np.ndarray], check: np.ndarray
+) -> Screening:
     entered = left = wrong_entered = wrong_left = right_lost = 0
     for name, row in field_pass.control_images.items():
-        wrong, stays = shown.wrong[name][row.point], kept[name]
+        wrong, stays = shown.wrong[name][row.point], accepted_by_line[name]
         entered, left = entered + len(wrong), left + int(stays.sum())
         wrong_entered, wrong_left = wrong_entered + int(wrong.sum()), wrong_left + int((wrong & stays).sum())
         right_lost += int((~wrong & ~stays).sum())

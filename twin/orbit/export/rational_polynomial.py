@@ -217,7 +217,7 @@ def _from_tiff(path: Path) -> RationalPolynomial:
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             with rasterio.open(path, driver="GTiff") as image:
                 rpc = image.rpcs
-    # the library's errors are many
+    # the library raises many kinds of errors
     except Exception as error:
         raise InputError(Issue(f"cannot be read: {why_unreadable(error)}", file, allowed=_WHAT)) from None
     if rpc is None:

@@ -81,12 +81,12 @@ class SteadyPlatform:
         span = begin, end
         fixes, looks = (_inside(time, begin, end, path) for time in (path.table.orbit_time, path.table.attitude_time))
         degree = _ORBIT + int((end - begin) / _PER)
-        place = _chebyshev_fit(fixes, path.position(fixes), span, degree)
-        draft = cls(span, place, np.zeros((1, 3)), np.eye(3), path.law)
+        position = _chebyshev_fit(fixes, path.position(fixes), span, degree)
+        draft = cls(span, position, np.zeros((1, 3)), np.eye(3), path.law)
         against = Rotation.from_matrix(np.einsum("nji,njk->nik", draft._orbital(looks), path.body_to_itrs(looks)))
         middle = against.mean().as_matrix()
         rotation = (Rotation.from_matrix(middle).inv() * against).as_rotvec()
-        return cls(span, place, _chebyshev_fit(looks, rotation, span, _ATTITUDE), middle, path.law)
+        return cls(span, position, _chebyshev_fit(looks, rotation, span, _ATTITUDE), middle, path.law)
 
     def position(self, seconds: Any) -> np.ndarray:
         """Return the position in the ITRS, in metres; (...) -> (..., 3)."""
@@ -237,8 +237,8 @@ def sights_of(
     lines = _lines(measurements, cameras, names, shared, search, effects)
     order = sorted(names, key=lambda name: _moment(lines[name], lines))
     prior = _prior_of(measurements, lines, shared, search)
-    place = _improved_positions(lines, shared, prior)
-    observations, residual = _whitened_observations(lines, order, shared, place, prior, search)
+    ground = _improved_positions(lines, shared, prior)
+    observations, residual = _whitened_observations(lines, order, shared, ground, prior, search)
     pixel = float(np.median([_pixel(cameras[name]) for name in order]))
     gaps, pairs = _pairs(lines, order, len(measurements.ground), residual)
     return Sights(observations, tuple(order), gaps, pixel, len(shared), pairs)
@@ -264,9 +264,9 @@ def _lines(
     lines = {}
     for name, row in rows.items():
         sensor = Sensor.of_lines(cameras[name], steady, Earth(), times[name], effects)
-        place = np.stack([row.line - first[name], row.pixel], axis=-1)
+        position = np.stack([row.line - first[name], row.pixel], axis=-1)
         about = tuple(replace(sensor, trajectory=platform) for platform in rotated)
-        lines[name] = _Line(sensor, row.point, place, row.covariance, times[name].at(place[:, 0]), about)
+        lines[name] = _Line(sensor, row.point, position, row.covariance, times[name].at(position[:, 0]), about)
     return lines
 
 
@@ -311,14 +311,14 @@ class _Prior:
         """Inverse covariances (n, 3, 3), singular for tie points."""
         return np.asarray(self.root.swapaxes(1, 2) @ self.root)
 
-    def of(self, rows: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def of(self, rows: np.ndarray, ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the prior's observations of some points, all of them ties or none.
 
         They are the derivatives (n, k, 3) by a step from positions (n, 3), and the residuals (n, k) of the prior's
         positions.
         """
         root = self.root[rows][:, :1] if self.tie[rows[0]] else self.root[rows]
-        return root, (root @ (self.ground[rows] - place)[..., None])[..., 0]
+        return root, (root @ (self.ground[rows] - ground)[..., None])[..., 0]
 
 
 def _prior_of(
@@ -358,10 +358,10 @@ def _improved_positions(lines: Mapping[str, _Line], shared: np.ndarray, prior: _
     return np.asarray(prior.ground + np.where(alone[:, None], 0.0, step))
 
 
-def _residual_and_slope(line: _Line, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _residual_and_slope(line: _Line, ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return measured less expected line and pixel (n, 2), and their derivatives by position (n, 2, 3), per metre."""
-    expected = np.stack(line.sensor.image(place), axis=-1)
-    by = [(np.stack(line.sensor.image(place + _STEP * axis), axis=-1) - expected) / _STEP for axis in np.eye(3)]
+    expected = np.stack(line.sensor.image(ground), axis=-1)
+    by = [(np.stack(line.sensor.image(ground + _STEP * axis), axis=-1) - expected) / _STEP for axis in np.eye(3)]
     return line.image - expected, np.stack(by, axis=-1)
 
 
@@ -369,7 +369,7 @@ def _whitened_observations(
     lines: Mapping[str, _Line],
     order: list[str],
     shared: np.ndarray,
-    place: np.ndarray,
+    ground: np.ndarray,
     prior: _Prior,
     search: JitterSearchSpec,
 ) -> tuple[Observations, dict[str, np.ndarray]]:
@@ -385,7 +385,7 @@ def _whitened_observations(
     for k, name in enumerate(order):
         line = lines[name]
         which = np.searchsorted(shared, line.point)
-        positions = place[which]
+        positions = ground[which]
         difference, slope = _residual_and_slope(line, positions)
         expected = line.image - difference
         rotations = [(np.stack(s.image(positions), axis=-1) - expected) / _TURN for s in line.axes]
@@ -408,7 +408,7 @@ def _whitened_observations(
         m, n = len(used), len(rows)
         root = np.linalg.inv(np.linalg.cholesky(spread[rows][:, used][:, :, :, used].reshape(n, 2 * m, 2 * m)))
         seen_by = root @ by[rows][:, used].reshape(n, 2 * m, 3)
-        before, difference = prior.of(rows, place[rows])
+        before, difference = prior.of(rows, ground[rows])
         # combinations of observations that do not depend on the ground position
         free = np.linalg.svd(np.concatenate([seen_by, before], axis=1))[0][:, :, 3:].swapaxes(1, 2)
         measured = np.concatenate([(root @ value[rows][:, used].reshape(n, 2 * m, 1))[..., 0], difference], axis=1)

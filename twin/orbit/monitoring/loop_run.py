@@ -183,7 +183,7 @@ def _optics(setup: MonitorSetup, name: str, defocus: float) -> LineOptics:
     camera = setup.cameras[setup.instrument.cameras[name].camera]
     band = camera.bands[target_band(camera)]
     f_number = camera.focal_length / camera.entrance_pupil
-    # rms of the focus term of a defocus over a round pupil
+    # rms wavefront of a defocus over a round pupil
     image = LineImageSpec.model_construct(
         f_number=f_number,
         transmission=_TRANSMISSION,
@@ -433,11 +433,11 @@ def run_loop(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance)
     closed, opened = (_outcome_of(setup, course, nominal, ground_seed, advance) for course in courses)
     # height and foci of the pair
     rows = np.stack([opened.slopes.mean(axis=0), *(model.unit(name, "defocus") for name in pair)])
-    analyses = {one.name: _analyse_loop(model, k, closed.course) for k, one in enumerate(model.correctors)}
+    analyses = {c.name: _analyse_loop(model, k, closed.course) for k, c in enumerate(model.correctors)}
     loops = (
-        [one.loop_gain for one in analyses.values()],
-        [one.spec.delay for one in model.correctors],
-        [one.row for one in model.correctors],
+        [analysis.loop_gain for analysis in analyses.values()],
+        [corrector.spec.delay for corrector in model.correctors],
+        [corrector.row for corrector in model.correctors],
     )
     return LoopRun(
         setup,

@@ -242,7 +242,7 @@ class MonitorSeries:
         AimError, BeamMissedError
             Light is lost.
         """
-        # a stream of its own: states are numbered from 0
+        # the number beyond the last state gives a separate random stream
         first = self._reference_spots(self._exposed(self.reference, seed, len(states)))
         exposed, expected = self._observed(
             states,

@@ -296,7 +296,7 @@ PASS: Record[tuple[LoopRun, LoopOutcome]] = Record(
     Quantity("heights", lambda of: SUMMARY(of[1].heights), "errors at the check points", converted=False),
     Quantity("focus", lambda of: {name: (*of, name) for name in of[0].model.cameras}, "by camera", record=FOCUS),
     Quantity("series", lambda of: of[1], "over the moments", record=MOMENTS),
-    Quantity("images", lambda of: [(of[1], one) for one in of[1].images] or None, record=IMAGES, where_known=True),
+    Quantity("images", lambda of: [(of[1], pair) for pair in of[1].images] or None, record=IMAGES, where_known=True),
     Quantity("chi_square", lambda of: float(of[1].course.chi_square.sum()), "chi-square of all readings"),
     Quantity("degrees_of_freedom", lambda of: of[1].course.degrees, "degrees of freedom of chi-square"),
     Quantity("chi_square_limit", lambda of: of[1].course.limit, "limit of chi-square"),

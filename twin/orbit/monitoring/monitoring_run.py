@@ -484,7 +484,7 @@ def simulate_monitoring(setup: MonitorSetup, backend: Backend, seed: int, advanc
     advance("monitor", 2, parts)
     angle = np.array([look_angle(line[pair[0]], line[pair[1]]) for line in lines])
     worst = int(np.argmax(np.abs(angle - angle[spec.reference_index])))
-    # before the images, which take longer
+    # computed before the images, which take longer, so that errors appear early
     views = view_check_points(spec, pair, lines, ground_seed, advance)
     monitor = MonitorSeries(experiment, spec, reference, pair)
     noisy, clean = monitor.measured(states, number)
