@@ -131,11 +131,11 @@ _PROCEDURES: dict[str, Procedure] = {
         export="twin.laboratory.export:export_focus",
         varied=True,
         about="""
-    Align a mis-set focal plane: through-focus MTF of a slanted edge in every field and band, a weighted plane,
-    shims, and the same again.
+    Align a misaligned focal plane: through-focus MTF of a slanted edge in every field and band, a weighted plane fit,
+    shims, and a repetition as a check.
 
     focus.json holds, for every round, the confocal error, the line's level, MTF at Nyquist by band and the shims,
-    and under `truth` what the exact trace says.
+    and under `truth` the values of the exact ray trace.
 
     Example: `python -m twin.lab focus scenes/lab/focus.yaml`
     """,
@@ -151,10 +151,10 @@ _PROCEDURES: dict[str, Procedure] = {
         varied=True,
         about="""
     Measure principal distance, principal point and distortion: a pinhole's spots on the line CCD while a turntable
-    turns the camera, with raw and with compensated angles.
+    rotates the camera, with raw and with compensated angles.
 
-    distortion.json: `rms_raw_um` and `rms_compensated_um` are what a laboratory can state, the scatter of the points
-    about a smooth curve; how wrong the distortion is stands under `truth`, `error_rms_raw_um` and
+    distortion.json: `rms_raw_um` and `rms_compensated_um` are the scatter of the points about a smooth curve, which a
+    laboratory can measure; the true errors of the distortion are under `truth`, `error_rms_raw_um` and
     `error_rms_compensated_um`.
 
     Example: `python -m twin.lab distortion scenes/lab/distortion.yaml`
@@ -184,14 +184,14 @@ _PROCEDURES: dict[str, Procedure] = {
         report="twin.orbit.block.block_report:block_report",
         varied=True,
         about="""
-    One adjustment of all scenes of a block: image points, control, the cameras' monitor, star trackers and their
-    angles, a laser altimeter and a terrain model, with the stated laws of the readings' errors.
+    Adjust all scenes of a block together: image points, control, the cameras' monitor, star trackers and their
+    angles, a laser altimeter and a terrain model, with time laws for the errors of the readings.
 
     A file with `data: DIR` runs on the measurements of that folder, as `calibrate` does.
 
     block.json holds the errors in plan and height at check points, with all sensors and without each, the tests of
-    observations and laws, what the observations leave to what is known beforehand, and the cameras' changes.
-    `--without SENSOR` adjusts without a sensor that the file has.
+    observations and laws, the parameters that the prior determines more than the observations, and the cameras'
+    changes. `--without SENSOR` excludes a sensor of the file.
 
     Example: `python -m twin.orbit adjust scenes/orbit/adjust.yaml`
     """,
@@ -206,12 +206,12 @@ _PROCEDURES: dict[str, Procedure] = {
         export="twin.orbit.angle.measured_angle:angle_exported",
         varied=True,
         about="""
-    Intersection angles of a three-line camera by planes through the station and ground points (paper 000), with
-    space resection as the second method.
+    Measure intersection angles of a three-line camera by planes through the station and ground points (paper 000),
+    with space resection as the second method.
 
     A file with `data: DIR` runs on the measurements of that folder, as `calibrate` does: the angles of every pass,
-    against those of the laboratory. `--export DIR` writes such a folder of what a simulation measured, with a test file
-    angle.yaml.
+    against those of the laboratory. `--export DIR` writes a simulation's measurements to such a folder, with a test
+    file angle.yaml.
 
     angle.json holds the angles with sigmas, the truth, planes minus resection, and the sensitivity to errors of the
     station and of the points.
@@ -229,11 +229,11 @@ _PROCEDURES: dict[str, Procedure] = {
         export="twin.orbit.calibration.calibration_run:exported",
         varied=True,
         about="""
-    Interior orientation and attitude biases of a three-line camera over test fields, and schemes of averaged
-    parameters tested on all fields without ground control (paper 003); simulated, or on measured passes.
+    Calibrate interior orientation and attitude biases of a three-line camera over test fields, and test schemes of
+    averaged parameters on all fields without ground control (paper 003); simulated, or on measured passes.
 
     A file with `data: DIR` runs on the measurements of that folder: orbit, attitude, line times, ground and image
-    points. `--export DIR` writes such a folder of what the run measured, with a test file calibrate.yaml.
+    points. `--export DIR` writes the run's measurements to such a folder, with a test file calibrate.yaml.
 
     calibration.json holds the parameters with sigmas and truth, correlations, null vectors and gauge, and the errors in
     plan and height of every field before calibration and by each scheme.
@@ -251,14 +251,14 @@ _PROCEDURES: dict[str, Procedure] = {
         judged=False,
         seeded=False,
         about="""
-    Conventions of a pass in files: every reading of what is mistaken for one another (order and sense of the
-    quaternion, frames, time scales, an offset of the line times, origins and axes of pixels and lines), alone and two
-    at once, is tried on the ground points and ranked.
+    Check the conventions of a pass in files: alternatives of each convention (order and sense of the quaternion,
+    frames, time scales, an offset of the line times, origins and axes of pixels and lines), singly and in pairs, are
+    compared on the ground points and ranked.
 
-    check.json holds the readings with residuals and likelihoods, what the points tell of each convention and what they
-    cannot, and where the first points would fall under each reading. Exit codes: 0 the stated reading stands, 3 another
-    one does, 4 none explains the points. With `--export DIR` a pass whose conventions stand goes into a folder that
-    `twin.orbit calibrate` reads.
+    check.json holds the alternatives with residuals and likelihoods, the conventions that the points determine and
+    those that they do not, and the computed positions of the first points. Exit codes: 0 the stated conventions are
+    confirmed, 3 others fit better, 4 none explains the points. With `--export DIR` a pass with confirmed conventions is
+    written to a folder that `twin.orbit calibrate` reads.
 
     Example: `python -m twin.orbit check scenes/orbit/measured/check.yaml`
     """,
@@ -274,14 +274,14 @@ _PROCEDURES: dict[str, Procedure] = {
         varied=True,
         judged=False,
         about="""
-    Jitter of the attitude from what two or more lines or bands saw of the same places one after the other:
-    oscillations with frequency, amplitude and false-alarm rate, the frequencies that the lines are blind at, and the
-    attitude over time with its covariance.
+    Search for jitter of the attitude in images of the same ground that two or more lines or bands took one after the
+    other: oscillations with frequency, amplitude and false-alarm rate, the frequencies at which the lines are blind,
+    and the attitude over time with its covariance.
 
     A file with `data: DIR` runs on the points of that folder, as `match --export DIR` writes it. `--export DIR` writes
-    such a folder of what a simulation measured, with a test file jitter.yaml.
+    a simulation's measurements to such a folder, with a test file jitter.yaml.
 
-    jitter.json holds the oscillations with sigmas, blind frequencies, and what would have been found.
+    jitter.json holds the oscillations with sigmas, blind frequencies, and detection limits.
 
     Example: `python -m twin.orbit jitter scenes/orbit/jitter.yaml`
     """,
@@ -296,11 +296,11 @@ _PROCEDURES: dict[str, Procedure] = {
         judged=False,
         seeded=False,
         about="""
-    Points measured in a user's line images: distinct places of an orthophoto with heights of an elevation model, and
-    tie points, are sought in every image by least squares matching, as in a simulated patch.
+    Measure points in a user's line images: distinct points of an orthophoto with heights of an elevation model, and
+    tie points, are located in every image by least squares matching, as in a simulated patch.
 
-    match.json holds for every line how many points were matched and what by. With `--export DIR` the points go with
-    orbit, attitude and line times into a folder that `twin.orbit calibrate` reads.
+    match.json holds for every line the number of matched points and how they were matched. With `--export DIR` they are
+    written with orbit, attitude and line times to a folder that `twin.orbit calibrate` reads.
 
     Example: `python -m twin.orbit match scenes/orbit/measured/match.yaml`
     """,
@@ -313,13 +313,14 @@ _PROCEDURES: dict[str, Procedure] = {
         report="twin.orbit.monitoring.monitoring_report:monitor_report",
         varied=True,
         about="""
-    Height errors of a stereo pair along its orbit with and without on-board monitoring of its cameras (paper 001's
-    monitor, heights as in papers 000 and 003). With `mechanisms:` the loop is closed: what rendered spots say moves
-    mechanisms that point and refocus, with gain, delay and steps, beside the same orbit with the loop open.
+    Compute height errors of a stereo pair along its orbit with and without on-board monitoring of its cameras (paper
+    001's monitor, heights as in papers 000 and 003). With `mechanisms:` the loop is closed: readings of rendered spots
+    control mechanisms that point and refocus, with gain, delay and steps, compared with the same orbit in open loop.
 
     monitor.json holds the true and the monitored changes, errors in plan and height as calibrated, monitored at every
-    time and at an interval, the interval's table, metres per arcsecond, and where the rest comes from; of a closed loop
-    under `loop` what is left of angle, focus and height with sigmas, gain and phase margins, and what no spot shows.
+    time and at an interval, the table of intervals, metres per arcsecond, and the sources of the remaining errors; for
+    a closed loop under `loop` the remaining errors of angle, focus and height with sigmas, gain and phase margins, and
+    unobservable modes.
 
     Example: `python -m twin.orbit monitor scenes/orbit/monitor.yaml`
     """,
@@ -332,11 +333,11 @@ _PROCEDURES: dict[str, Procedure] = {
         report="twin.orbit.images.simulate_report:simulation_report",
         export="twin.orbit.images.simulate_run:simulation_exported",
         about="""
-    Images of a patch of ground by every line of a camera, physically rendered, with an orthophoto, an elevation
-    model and the measured orbit and attitude: all that an in-orbit calibration from images needs.
+    Render images of a patch of ground by every line of a camera, with an orthophoto, an elevation model and the
+    measured orbit and attitude: all inputs of an in-orbit calibration from images.
 
-    simulate.json holds for every line where its window lies, grey values, ground sample distance and MTF. What only the
-    truth knows is in artefacts/truth.json. `--export DIR` writes points, orbit and attitude as tables that `calibrate`
+    simulate.json holds for every line the position of its window, grey values, ground sample distance and MTF. The
+    true values are in artefacts/truth.json. `--export DIR` writes points, orbit and attitude as tables that `calibrate`
     reads.
 
     Example: `python -m twin.orbit simulate scenes/orbit/simulate.yaml`
@@ -350,9 +351,9 @@ _PROCEDURES: dict[str, Procedure] = {
         report="twin.design.design_report:design_report",
         judged=False,
         about="""
-    Optimise a camera's prescription: curvatures, conics, aspheric terms and places vary; the wavefront error over
-    the field is made least, with the focal length, the envelope, the anamorphism and free beams as constraints.
-    It is done from several starts (``starts:``), and said whether they agree.
+    Optimise a camera's prescription: curvatures, conics, aspheric terms and positions vary; the wavefront error over
+    the field is minimised, with the focal length, the envelope, the anamorphism and free beams as constraints.
+    Several starts (``starts:``) show whether the optimum depends on the starting point.
 
     Example: `python -m twin.design camera scenes/examples/design_gf7_short.yaml`
 
@@ -377,13 +378,13 @@ _PROCEDURES: dict[str, Procedure] = {
         numbers="twin.asbuilt.asbuilt_run:ASBUILT",
         report="twin.asbuilt.asbuilt_report:asbuilt_report",
         about="""
-    Estimate the state of one instrument: all motions of its prior from everything that was measured, with the
-    combinations that are known, what is possible for the camera beside what the design promises, and the next move.
+    Estimate the state of one instrument: all motions of its prior from all of its measurements, with the observable
+    combinations, the performance of the camera compared with that of the design, and the next alignment move.
 
-    asbuilt.json holds the motions and combinations with their sigmas, the agreement of every measurement with all
+    asbuilt.json holds the motions and combinations with their sigmas, the consistency of every measurement with all
     others, the merits with their quantiles under the prior, as built and after the next move, and that move.
-    artefacts/ gets the instrument as built, which every command takes as its instrument, and what is still unknown of
-    it as a disturbances file.
+    artefacts/ gets the instrument as built, which every command accepts as its instrument, and its remaining
+    uncertainty as a disturbances file.
 
     Example: `python -m twin.asbuilt scenes/examples/asbuilt_gf7.yaml`
     """,
@@ -396,11 +397,11 @@ _PROCEDURES: dict[str, Procedure] = {
         report="twin.asbuilt.orientation_check:check_report",
         judged=False,
         about="""
-    Tell which way round measured wavefronts lie: eight orientations and two signs are tried against what the prior and
-    the moves that were made predict, and those that the data do not tell apart are named together.
+    Determine the orientation of measured wavefronts: eight orientations and two signs are compared with the prediction
+    from the prior and the moves; those that the data do not distinguish are listed together.
 
-    orientation.json holds all readings with their chi-squares. Exit codes: 0 the stated reading stands, 3 another one
-    does, 4 none explains the wavefronts.
+    orientation.json holds all orientations with their chi-squares. Exit codes: 0 the stated orientation is confirmed, 3
+    another one fits better, 4 none explains the wavefronts.
 
     Example: `python -m twin.asbuilt check scenes/examples/asbuilt_gf7.yaml`
     """,

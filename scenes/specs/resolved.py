@@ -571,7 +571,7 @@ def _of_job(resolved: ResolvedJob, file: str, name: str | None) -> CameraSetup:
     job = resolved.job
     if job.course is not None:
         allowed = "a job without a course; python -m twin.render follows the course"
-        raise job.error("the camera is analysed in one state, not in a course", ("course",), allowed=allowed)
+        raise job.error("a camera is analysed in one state, and this job has a course", ("course",), allowed=allowed)
     chosen = _chosen(tuple(resolved.instrument.cameras), file, name)
     camera = resolved.cameras[resolved.instrument.cameras[chosen].camera]
     return CameraSetup.model_construct(
