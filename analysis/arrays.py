@@ -133,8 +133,8 @@ def summary(value: Any, unit: str = "") -> str:
     if dims is not None and hasattr(value, "values"):
         size = " x ".join(f"{n} {name}" for name, n in zip(dims, value.shape, strict=True))
         return f"{size}{_range(np.asarray(value.values), unit)}"
-    if isinstance(value, tuple | list) and not all(isinstance(one, int | float | np.number) for one in value):
-        texts = [one if isinstance(one, str) else summary(one, unit) for one in value]
+    if isinstance(value, tuple | list) and not all(isinstance(element, int | float | np.number) for element in value):
+        texts = [element if isinstance(element, str) else summary(element, unit) for element in value]
         return _cut(", ".join(texts), LONGEST) if len(value) <= FEW else f"{len(value)} of them"
     if isinstance(value, np.ndarray | tuple | list):
         return _array(np.asarray(value), unit)
@@ -147,7 +147,7 @@ def _default_fields(value: Any) -> list[tuple[str, str]]:
     """Return the fields that a dataclass's default repr would print, each without a unit."""
     if not is_dataclass(value):
         return []
-    return [(one.name, "") for one in fields(value) if one.repr and not one.name.startswith("_")]
+    return [(item.name, "") for item in fields(value) if item.repr and not item.name.startswith("_")]
 
 
 def _label(path: str, unit: str) -> str:
@@ -226,18 +226,18 @@ class StateArrays:
         parts : sequence of the class
             At least one result; a field is None in all of them or in none.
         """
-        return cls(**{name: _joined([getattr(one, name) for one in parts]) for name in _names(cls)})
+        return cls(**{name: _joined([getattr(part, name) for part in parts]) for name in _names(cls)})
 
 
 def _names(result: StateArrays | type[StateArrays]) -> list[str]:
-    return [one.name for one in fields(cast(Any, result))]
+    return [item.name for item in fields(cast(Any, result))]
 
 
 def _at(value: Any, states: slice) -> Any:
     if value is None:
         return None
     if isinstance(value, Mapping):
-        return {name: _at(one, states) for name, one in value.items()}
+        return {name: _at(part, states) for name, part in value.items()}
     return value.at(states) if hasattr(value, "at") else value[states]
 
 
@@ -246,5 +246,5 @@ def _joined(values: list[Any]) -> Any:
     if first is None:
         return None
     if isinstance(first, Mapping):
-        return {name: _joined([one[name] for one in values]) for name in first}
+        return {name: _joined([value[name] for value in values]) for name in first}
     return type(first).joined(values) if hasattr(first, "joined") else np.concatenate(values)

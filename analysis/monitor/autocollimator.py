@@ -149,12 +149,12 @@ class ReadingMap:
     residual: float
 
     @classmethod
-    def fit(cls, place: ArrayLike, reading: ArrayLike, degree: int = 5) -> ReadingMap:
+    def fit(cls, position: ArrayLike, reading: ArrayLike, degree: int = 5) -> ReadingMap:
         """Fit the map by least squares over P known rotations.
 
         Parameters
         ----------
-        place : (P, 2) array_like
+        position : (P, 2) array_like
             Positions of the spot (row, column), px.
         reading : (P, 2) array_like
             Known rotations about X and about Y, rad.
@@ -166,32 +166,32 @@ class ReadingMap:
         ValueError
             There are too few rotations.
         """
-        spots, known = np.asarray(place, np.float64), np.asarray(reading, np.float64)
-        if spots.ndim != 2 or spots.shape[1] != 2 or known.shape != spots.shape:
-            raise ValueError(f"reading map: place {spots.shape} and reading {known.shape} must both be (P, 2)")
+        spots, readings = np.asarray(position, np.float64), np.asarray(reading, np.float64)
+        if spots.ndim != 2 or spots.shape[1] != 2 or readings.shape != spots.shape:
+            raise ValueError(f"reading map: position {spots.shape} and reading {readings.shape} must both be (P, 2)")
         centre = 0.5 * (spots.min(axis=0) + spots.max(axis=0))
         scale = float(np.max(np.abs(spots - centre)))
         design = _monomials((spots - centre) / max(scale, 1e-300), degree)
-        solution, _, rank, _ = np.linalg.lstsq(design, known, rcond=None)
+        solution, _, rank, _ = np.linalg.lstsq(design, readings, rcond=None)
         if rank < design.shape[1]:
             raise UndeterminedError(f"reading map: {len(spots)} spots do not settle a polynomial of degree {degree}")
-        rms = float(np.sqrt(np.mean((design @ solution - known) ** 2)))
+        rms = float(np.sqrt(np.mean((design @ solution - readings) ** 2)))
         return cls(centre, scale, degree, np.asarray(solution, dtype=np.float64), rms)
 
-    def __call__(self, place: ArrayLike) -> Array:
+    def __call__(self, position: ArrayLike) -> Array:
         """Return readings (..., 2), rad, for spots (..., 2) in px."""
-        reduced = (np.asarray(place, np.float64) - self.centre) / self.scale
+        reduced = (np.asarray(position, np.float64) - self.centre) / self.scale
         return np.asarray(_monomials(reduced, self.degree) @ self.coefficients)
 
-    def slope(self, place: ArrayLike) -> Array:
+    def slope(self, position: ArrayLike) -> Array:
         """Return the derivatives of the reading by (row, column), (..., 2, 2) rad/px."""
-        spot = np.asarray(place, np.float64)
+        spot = np.asarray(position, np.float64)
         step = 0.5 * np.eye(2)
         return np.stack([self(spot + step[k]) - self(spot - step[k]) for k in range(2)], axis=-1)
 
-    def covariance(self, place: ArrayLike, spot_covariance: ArrayLike) -> Array:
+    def covariance(self, position: ArrayLike, spot_covariance: ArrayLike) -> Array:
         """Return the covariance of readings, (..., 2, 2) rad^2, from that of the spots, (..., 2, 2) px^2."""
-        slope = self.slope(place)
+        slope = self.slope(position)
         return np.asarray(slope @ np.asarray(spot_covariance, np.float64) @ np.swapaxes(slope, -1, -2))
 
 

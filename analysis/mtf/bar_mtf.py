@@ -327,21 +327,21 @@ def _start(grey: Array, frequency: ArrayLike | None) -> Array:
         allowed = np.any(np.abs(cells) * shape[:, None, None] > 2.0, axis=0)
         allowed &= (cells[1] > 0) | ((cells[1] == 0) & (cells[0] > 0)) | (cells[1] == -0.5) | (cells[0] == -0.5)
         return _peak(power, cells, allowed)
-    wanted = np.asarray(frequency, dtype=np.float64)
-    if wanted.shape not in ((), (2,)) or not np.all(np.isfinite(wanted)) or not np.any(wanted):
+    target = np.asarray(frequency, dtype=np.float64)
+    if target.shape not in ((), (2,)) or not np.all(np.isfinite(target)) or not np.any(target):
         raise BarError(
             "the frequency must be one number or two (down the column, along the row), in cycles/pixel, not 0"
         )
-    if wanted.shape == (2,):
-        near = cells + np.round(wanted[:, None, None] - cells)
-        allowed = np.all(np.abs(near - wanted[:, None, None]) * shape[:, None, None] <= 1.0, axis=0)
+    if target.shape == (2,):
+        near = cells + np.round(target[:, None, None] - cells)
+        allowed = np.all(np.abs(near - target[:, None, None]) * shape[:, None, None] <= 1.0, axis=0)
         return _peak(power, near, allowed)
-    turns = np.arange(-math.ceil(abs(wanted)), math.ceil(abs(wanted)) + 1)
+    turns = np.arange(-math.ceil(abs(target)), math.ceil(abs(target)) + 1)
     best, strongest = np.zeros(2), -1.0
     for row_turn in turns:
         for column_turn in turns:
             shifted = cells + np.array([row_turn, column_turn])[:, None, None]
-            allowed = np.abs(np.hypot(*shifted) - abs(wanted)) * shape.min() <= 1.0
+            allowed = np.abs(np.hypot(*shifted) - abs(target)) * shape.min() <= 1.0
             allowed &= (shifted[1] > 0) | ((shifted[1] == 0) & (shifted[0] > 0))
             if allowed.any() and power[allowed].max() > strongest * (1.0 + 1e-9):
                 best, strongest = _peak(power, shifted, allowed), float(power[allowed].max())
@@ -392,22 +392,22 @@ def _separable(frequency: Array, shape: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(separable)
 
 
-def _waves(place: Array, frequency: Array, numbers: tuple[int, ...]) -> Array:
+def _waves(position: Array, frequency: Array, numbers: tuple[int, ...]) -> Array:
     """Return rows of 1, then cosine and sine of the fundamental and of each harmonic, (3 + 2 K, N)."""
-    phase = 2.0 * np.pi * (frequency @ place)
+    phase = 2.0 * np.pi * (frequency @ position)
     turned = np.outer((1, *numbers), phase)
     pairs = np.stack([np.cos(turned), np.sin(turned)], axis=1).reshape(-1, phase.size)
     return np.concatenate([np.ones((1, phase.size)), pairs])
 
 
-def _design(place: Array, frequency: Array, numbers: tuple[int, ...], parameters: Array) -> Array:
+def _design(position: Array, frequency: Array, numbers: tuple[int, ...], parameters: Array) -> Array:
     """Return the waves, then the derivatives with respect to the two components of the frequency, (P, N)."""
-    waves = _waves(place, frequency, numbers)
+    waves = _waves(position, frequency, numbers)
     slope = np.zeros(waves.shape[1])
     for k, h in enumerate((1, *numbers)):
         cosine, sine = waves[1 + 2 * k], waves[2 + 2 * k]
         slope += 2.0 * np.pi * h * (parameters[2 + 2 * k] * cosine - parameters[1 + 2 * k] * sine)
-    return np.concatenate([waves, slope * place])
+    return np.concatenate([waves, slope * position])
 
 
 def _gram(first: Array, second: Array) -> Array:
@@ -424,25 +424,25 @@ def _solved(design: Array, value: Array, weight: Array) -> Array:
     return np.asarray(np.linalg.solve(_gram(weighted, design), weighted @ value))
 
 
-def _fit(place: Array, value: Array, weight: Array, start: Array, numbers: tuple[int, ...]) -> tuple[Array, Array]:
+def _fit(position: Array, value: Array, weight: Array, start: Array, numbers: tuple[int, ...]) -> tuple[Array, Array]:
     """Fit frequency (2,) and amplitudes (3 + 2 K,) by Gauss-Newton steps."""
     frequency = start
-    limit: Array = np.asarray(0.5 / np.ptp(place, axis=1))
+    limit: Array = np.asarray(0.5 / np.ptp(position, axis=1))
     for _ in range(_STEPS):
-        waves = _waves(place, frequency, numbers)
+        waves = _waves(position, frequency, numbers)
         parameters = _solved(waves, value, weight)
-        step = _solved(_design(place, frequency, numbers, parameters), value - parameters @ waves, weight)[-2:]
+        step = _solved(_design(position, frequency, numbers, parameters), value - parameters @ waves, weight)[-2:]
         frequency = np.asarray(frequency + np.clip(step, -limit, limit))
         if np.all(np.abs(step) < 1e-7 * limit):
             break
-    return frequency, _solved(_waves(place, frequency, numbers), value, weight)
+    return frequency, _solved(_waves(position, frequency, numbers), value, weight)
 
 
 def _check_filled(
-    place: Array, shape: tuple[int, ...], residual: Array, frequency: Array, amplitude: float, variance: float
+    position: Array, shape: tuple[int, ...], residual: Array, frequency: Array, amplitude: float, variance: float
 ) -> None:
-    wave = np.exp(-2j * np.pi * (frequency @ place))
-    quarter = (place[0] > 0) * 2 + (place[1] > 0)
+    wave = np.exp(-2j * np.pi * (frequency @ position))
+    quarter = (position[0] > 0) * 2 + (position[1] > 0)
     for number in range(4):
         part = quarter == number
         rest = 2.0 * abs(np.mean(residual[part] * wave[part]))
@@ -528,8 +528,8 @@ def measure_bar_pages(
 
 def _waves_of_page(shape: tuple[int, ...], bars: BarMtf) -> Array:
     """Return 1, and the fundamental of unit amplitude with its derivative by the phase, (3, N)."""
-    place = np.stack(np.meshgrid(*(np.arange(n) - (n - 1) / 2.0 for n in shape), indexing="ij")).reshape(2, -1)
-    phase = 2.0 * np.pi * (bars.frequency @ place) + bars.phase
+    position = np.stack(np.meshgrid(*(np.arange(n) - (n - 1) / 2.0 for n in shape), indexing="ij")).reshape(2, -1)
+    phase = 2.0 * np.pi * (bars.frequency @ position) + bars.phase
     return np.stack([np.ones(phase.size), np.cos(phase), -np.sin(phase)])
 
 

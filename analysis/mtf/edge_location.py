@@ -247,11 +247,11 @@ def _refined(rising: Array, offset: float, slope: float) -> tuple[float, float]:
     rows, columns = rising.shape
     row = np.arange(rows) - (rows - 1) / 2.0
     rise = rising[:, 1:] - rising[:, :-1]
-    place = np.arange(columns - 1) + 0.5
+    position = np.arange(columns - 1) + 0.5
     line = offset + slope * row
     _check_contrast(rising, line)
     for half in _HALF_WINDOWS:
-        distance = place - line[:, None]
+        distance = position - line[:, None]
         window = np.cos(np.clip(distance, -half, half) * (np.pi / 2.0 / half)) ** 2
         weight = window * rise
         total = weight.sum(axis=1)

@@ -91,12 +91,12 @@ def _energy(
     border[border_px:-border_px, border_px:-border_px] = False
     background = image[:, border].mean(axis=1)
     signal = image - background[:, None, None]
-    place = np.stack([row, column], axis=1)
+    position = np.stack([row, column], axis=1)
     converged = np.zeros(count, dtype=bool)
     iteration = 0
     while iteration < 100 and not np.all(converged):
         iteration += 1
-        mask, _ = spot_image.soft_window(place, height, width, radius)
+        mask, _ = spot_image.soft_window(position, height, width, radius)
         energy = mask * signal
         flux = energy.sum(axis=(1, 2))
         moments = [energy.sum(axis=2) @ np.arange(height), energy.sum(axis=1) @ np.arange(width)]
@@ -105,11 +105,11 @@ def _energy(
         spot_image.reject(
             ~np.all(np.isfinite(new), axis=1) | (flux <= 0), "no energy above the background in the window"
         )
-        converged = np.max(np.abs(new - place), axis=1) < 1e-7
-        place = new
-        spot_image.check_edge(place, height, width, radius)
-    mask, slope = spot_image.soft_window(place, height, width, radius)
-    arm = spot_image.arms(place, height, width)
+        converged = np.max(np.abs(new - position), axis=1) < 1e-7
+        position = new
+        spot_image.check_edge(position, height, width, radius)
+    mask, slope = spot_image.soft_window(position, height, width, radius)
+    arm = spot_image.arms(position, height, width)
     flux = (mask * signal).sum(axis=(1, 2))[:, None, None]
     # The window moves with the centre: c = C(image, c), so dc = (1 - dC/dc)^-1 dC/d(image).
     follow = np.einsum("bihw,bjhw->bij", arm * signal[:, None], slope) / flux
@@ -119,7 +119,7 @@ def _energy(
     maps = np.linalg.solve(np.eye(2) - follow, direct.reshape(count, 2, -1)).reshape(direct.shape)
     flux, nothing = flux[:, 0, 0], np.full(count, np.nan)
     return spot_image.positions(
-        place, maps, image, frames, noise, keep_maps, flux, background, converged, iteration, nothing
+        position, maps, image, frames, noise, keep_maps, flux, background, converged, iteration, nothing
     )
 
 
@@ -174,12 +174,12 @@ def _gauss(image: Array, frames: int, noise: NoiseModel, radius: float, elliptic
     corner = np.clip(corner, 0, full - [height, width])
     rows = (corner[:, :1] + np.arange(height))[:, :, None]
     columns = (corner[:, 1:] + np.arange(width))[:, None, :]
-    whole, spot = image, np.arange(count)[:, None, None]
-    image = whole[spot, rows, columns]
+    full_image, spot = image, np.arange(count)[:, None, None]
+    image = full_image[spot, rows, columns]
     row, column = row - corner[:, 0], column - corner[:, 1]
-    shape = 2 * np.log(2) * np.pi / area  # from the area above half maximum
-    rest = [shape, np.zeros(count), shape] if elliptical else [shape]
-    theta = np.stack([row, column, peak, background, *rest], axis=1)
+    width_term = 2 * np.log(2) * np.pi / area  # from the area above half maximum
+    shape_terms = [width_term, np.zeros(count), width_term] if elliptical else [width_term]
+    theta = np.stack([row, column, peak, background, *shape_terms], axis=1)
     flat = image.reshape(count, -1)
     converged = np.zeros(count, dtype=bool)
     iteration = 0
@@ -202,7 +202,7 @@ def _gauss(image: Array, frames: int, noise: NoiseModel, radius: float, elliptic
     design, weighted, model = spot_image.gaussian(theta, height, width, radius, noise, frames)
     size = theta.shape[1]
     slope = np.empty((count, size, size))
-    scale = np.maximum(np.abs(theta), [1.0, 1.0, 1.0, 1.0, *[shape.mean()] * (size - 4)]) * 1e-5
+    scale = np.maximum(np.abs(theta), [1.0, 1.0, 1.0, 1.0, *[width_term.mean()] * (size - 4)]) * 1e-5
     scale[:, :2] = 1e-4
     for k in range(size):
         ends = []
@@ -222,10 +222,10 @@ def _gauss(image: Array, frames: int, noise: NoiseModel, radius: float, elliptic
     chi = ((flat - model) ** 2 * weight).sum(axis=1) / freedom
     determinant = theta[:, 4] * theta[:, 6] - theta[:, 5] ** 2 if elliptical else theta[:, 4] ** 2
     flux = 2 * np.pi * theta[:, 2] / np.sqrt(determinant)
-    everywhere = np.zeros((count, 2, full_height, full_width))
-    everywhere[spot[..., None], np.arange(2), rows[..., None], columns[..., None]] = maps.transpose(0, 2, 3, 1)
-    place = np.asarray(theta[:, :2] + corner, dtype=np.float64)
-    spot_image.check_edge(place, full_height, full_width, radius)
+    full_maps = np.zeros((count, 2, full_height, full_width))
+    full_maps[spot[..., None], np.arange(2), rows[..., None], columns[..., None]] = maps.transpose(0, 2, 3, 1)
+    position = np.asarray(theta[:, :2] + corner, dtype=np.float64)
+    spot_image.check_edge(position, full_height, full_width, radius)
     return spot_image.positions(
-        place, everywhere, whole, frames, noise, True, flux, theta[:, 3], converged, iteration, chi
+        position, full_maps, full_image, frames, noise, True, flux, theta[:, 3], converged, iteration, chi
     )

@@ -543,50 +543,50 @@ def _compared(stack: _Stack, noise: NoiseModel) -> _Compared:
         )
     threshold = float(norm.isf(FALSE_ALARM / (2.0 * count * pixels)))
     # the basis is the same for all frames that have not moved
-    middle = stack.median(filled=True) if count > 2 else None
-    places = np.zeros((count, 2))
-    shown: Mask | None = np.ones(stack.shape, dtype=bool)
-    if middle is not None:
-        shown = reliable_pixels(middle, noise, count, follows)
-        if shown is not None and np.all(shown):
-            middle, places = aligned_median(stack.each, len(stack), middle, follows)
-    still = None if middle is None else frame_basis(middle)
+    median = stack.median(filled=True) if count > 2 else None
+    positions = np.zeros((count, 2))
+    reliable: Mask | None = np.ones(stack.shape, dtype=bool)
+    if median is not None:
+        reliable = reliable_pixels(median, noise, count, follows)
+        if reliable is not None and np.all(reliable):
+            median, positions = aligned_median(stack.each, len(stack), median, follows)
+    still = None if median is None else frame_basis(median)
     excess = 1.0 + MEDIAN / count if count > 2 else 2.0
-    others = repeat(middle) if middle is not None else (values for values, _ in stack.each(backwards=True))
+    others = repeat(median) if median is not None else (values for values, _ in stack.each(backwards=True))
     light, level, sigmas, light_sigmas = np.empty((4, count))
     offset, spread = np.empty((count, 2)), np.empty((count, 2, 2))
     hits, replaced = np.empty(count, np.int64), []
     for k, ((frame, finite), reference) in enumerate(zip(stack.each(), others, strict=False)):
         usable = finite & follows
         weight = usable / (excess * noise.frame_variance_dn2(reference))
-        weight = weight if shown is None else weight * shown
-        place = places[k]
+        weight = weight if reliable is None else weight * reliable
+        position = positions[k]
         for _ in range(MOST_MOVES):
-            if np.any(place):
-                basis = frame_basis(ndimage.shift(reference, place, order=3, mode="nearest"))
+            if np.any(position):
+                basis = frame_basis(ndimage.shift(reference, position, order=3, mode="nearest"))
             else:
                 basis = frame_basis(reference) if still is None else still
             solution, inverse = robust_fit(basis, frame, weight)
             # without light a movement is undefined
             share = max(abs(float(solution[0])), _LEAST_SHARE)
             further = -solution[1:3] / share
-            if np.max(np.abs(further)) < _SMALL_PX or np.max(np.abs(place + further)) > _LARGEST_PX:
+            if np.max(np.abs(further)) < _SMALL_PX or np.max(np.abs(position + further)) > _LARGEST_PX:
                 break
-            place = place + further
+            position = position + further
         model = np.tensordot(solution, basis, 1)
         sigma = np.sqrt(excess * noise.frame_variance_dn2(model))
         z = np.where(usable, (frame - model) / sigma, 0.0)
         light[k], level[k], sigmas[k] = solution[0], solution[-1], math.sqrt(max(float(inverse[-1, -1]), 0.0))
         light_sigmas[k] = math.sqrt(max(float(inverse[0, 0]), 0.0))
         # a spot that has moved by d is its reference minus d times the slope
-        offset[k] = place + further
+        offset[k] = position + further
         spread[k] = np.clip(inverse[1:3, 1:3], -_UNKNOWN, _UNKNOWN) / share**2
         # of two frames that differ, the brighter one was hit
         struck = _grown(z > threshold if count == 2 else np.abs(z) > threshold, np.abs(z) > GROWTH_SIGMAS)
         where = np.flatnonzero(struck | ~finite)
         hits[k] = np.count_nonzero(struck)
         replaced.append((where, model.flat[where]))
-    moved = np.zeros((2, 2)) if shown is None else position_scatter(offset, spread, count)
+    moved = np.zeros((2, 2)) if reliable is None else position_scatter(offset, spread, count)
     known = float(sigmas.max()), float(light_sigmas.max())
     return _Compared(pixels, hits, tuple(replaced), light, level, *known, offset, spread, moved)
 

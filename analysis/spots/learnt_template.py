@@ -368,10 +368,10 @@ def _by_image(learnt: LearntTemplate, spot: FittedSpot, maps: Array) -> Array:
     ``maps`` are the derivatives of these quantities with respect to the state's image.
     """
     shape = SmearedShape(_shape_of(learnt, spot))
-    place, flux = spot.positions.position[0], float(spot.positions.flux[0])
-    lights = np.vstack([[*place, 1.0], spot.others])
-    back = sum(share * shape.returned(maps, row, column, spot.smear) for row, column, share in lights)
-    return learnt.returned(np.asarray(back) * (flux / learnt.light))
+    position, flux = spot.positions.position[0], float(spot.positions.flux[0])
+    lights = np.vstack([[*position, 1.0], spot.others])
+    derivatives = sum(share * shape.returned(maps, row, column, spot.smear) for row, column, share in lights)
+    return learnt.returned(np.asarray(derivatives) * (flux / learnt.light))
 
 
 def _second_order(

@@ -270,7 +270,7 @@ def fit_screened(
     used = int(np.count_nonzero(use))
     shape = mean.shape
     core = use & (design[2] > CORE_SHARE * design[2].max())
-    places = [model.other(theta, inverse, k) for k in range(len(terms.others))]
+    fits_of_others = [model.other(theta, inverse, k) for k in range(len(terms.others))]
     positions = SpotPositions(
         row=theta[0:1],
         column=theta[1:2],
@@ -287,8 +287,8 @@ def fit_screened(
     return ScreenedFit(
         positions=positions,
         terms=terms,
-        others=np.array([place for place, _ in places]).reshape(-1, 3),
-        others_sigma=np.array([sigma for _, sigma in places]).reshape(-1, 3),
+        others=np.array([place for place, _ in fits_of_others]).reshape(-1, 3),
+        others_sigma=np.array([sigma for _, sigma in fits_of_others]).reshape(-1, 3),
         smear=model.smear_of(theta),
         level=level.reshape(shape),
         variance=_variance(level, many, noise).reshape(shape),

@@ -92,12 +92,12 @@ def reject(bad: NDArray[np.bool_], reason: str) -> None:
         raise SpotError({int(n): reason for n in np.flatnonzero(bad)})
 
 
-def check_edge(place: Array, height: int, width: int, distance: float) -> None:
+def check_edge(position: Array, height: int, width: int, distance: float) -> None:
     """Raise SpotError for centres nearer than `distance` to the outermost pixel centres.
 
     Parameters
     ----------
-    place : (B, 2) ndarray
+    position : (B, 2) ndarray
         Row and column of the centres, px.
     height : int
         Number of rows H.
@@ -107,14 +107,14 @@ def check_edge(place: Array, height: int, width: int, distance: float) -> None:
         Least distance, px.
     """
     high = np.array([height, width]) - 1 - distance
-    bad = ~np.all((place >= distance) & (place <= high), axis=1)
+    bad = ~np.all((position >= distance) & (position <= high), axis=1)
     if np.any(bad):
         raise SpotError(
             {
                 int(
                     n
-                ): f"too near the edge: ({place[n, 0]:.2f}, {place[n, 1]:.2f}) px is less than {distance:g} px from"
-                f" the edge of the {height} x {width} image"
+                ): f"too near the edge: ({position[n, 0]:.2f}, {position[n, 1]:.2f}) px is less than {distance:g} px"
+                f" from the edge of the {height} x {width} image"
                 for n in np.flatnonzero(bad)
             }
         )
@@ -179,32 +179,32 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
     return row, column, background, peak, area
 
 
-def arms(place: Array, height: int, width: int) -> Array:
+def arms(position: Array, height: int, width: int) -> Array:
     """Return each pixel's row and column minus the centre's, (B, 2, H, W) px.
 
     Parameters
     ----------
-    place : (B, 2) ndarray
+    position : (B, 2) ndarray
         Row and column of the centres, px.
     height : int
         Number of rows H.
     width : int
         Number of columns W.
     """
-    out = np.empty((place.shape[0], 2, height, width))
-    out[:, 0] = (np.arange(height) - place[:, :1])[:, :, None]
-    out[:, 1] = (np.arange(width) - place[:, 1:])[:, None, :]
+    out = np.empty((position.shape[0], 2, height, width))
+    out[:, 0] = (np.arange(height) - position[:, :1])[:, :, None]
+    out[:, 1] = (np.arange(width) - position[:, 1:])[:, None, :]
     return out
 
 
-def soft_window(place: Array, height: int, width: int, radius: float) -> tuple[Array, Array]:
+def soft_window(position: Array, height: int, width: int, radius: float) -> tuple[Array, Array]:
     """Return a circular window about each centre and its derivatives with respect to the centre.
 
     The window, (B, H, W), falls from 1 to 0 over one pixel at `radius`; the derivatives have the shape (B, 2, H, W).
 
     Parameters
     ----------
-    place : (B, 2) ndarray
+    position : (B, 2) ndarray
         Row and column of the centres, px.
     height : int
         Number of rows H.
@@ -213,7 +213,7 @@ def soft_window(place: Array, height: int, width: int, radius: float) -> tuple[A
     radius : float
         Radius of the circle, px.
     """
-    arm = arms(place, height, width)
+    arm = arms(position, height, width)
     distance = np.hypot(arm[:, 0], arm[:, 1])
     mask = np.clip(radius + 0.5 - distance, 0.0, 1.0)
     edge = (mask > 0) & (mask < 1)
@@ -306,7 +306,7 @@ def excess(level: Array, weight: Array, noise: NoiseModel, frames: int) -> Array
 
 def template_model(
     theta: Array,
-    which: NDArray[np.intp],
+    index: NDArray[np.intp],
     template: SpotTemplate,
     part: tuple[NDArray[np.intp], tuple[int, int]] | None = None,
     out: Array | None = None,
@@ -328,7 +328,7 @@ def template_model(
     """
     count, (height, width) = theta.shape[0], template.shape if part is None else part[1]
     design = np.empty((count, 4, height * width)) if out is None else out
-    template.fill_design(design.reshape(count, 4, height, width), theta, which, part)
+    template.fill_design(design.reshape(count, 4, height, width), theta, index, part)
     level = design[:, 2] * theta[:, 2, None]
     level += theta[:, 3, None]
     return design, level
@@ -355,7 +355,7 @@ def propagate(maps: Array, level: Array, noise: NoiseModel, frames: int) -> tupl
 
 
 def positions(
-    place: Array,
+    position: Array,
     maps: Array,
     image: Array,
     frames: int,
@@ -374,7 +374,7 @@ def positions(
 
     Parameters
     ----------
-    place : (B, 2) ndarray
+    position : (B, 2) ndarray
         Row and column, px.
     maps : (B, 2, H, W) ndarray
         Derivatives of the position with respect to each pixel, px/DN.
@@ -397,11 +397,11 @@ def positions(
     chi : (B,) ndarray
         Reduced chi-square of each fit.
     """
-    count = place.shape[0]
+    count = position.shape[0]
     temporal, fixed = propagate(maps.reshape(count, 2, -1), image.reshape(count, -1), noise, frames)
     return SpotPositions(
-        row=place[:, 0].copy(),
-        column=place[:, 1].copy(),
+        row=position[:, 0].copy(),
+        column=position[:, 1].copy(),
         temporal_covariance=temporal,
         fixed_covariance=fixed,
         flux=flux,

@@ -299,17 +299,17 @@ class SpotTemplate:
             A position is outside `supported`.
         """
         self.check_range(theta[:, 0], theta[:, 1], index)
-        place = theta[:, :2] - (0 if part is None else part[0])
-        self._fill(out[:, :2].swapaxes(0, 1), out[:, 2], place[:, 0], place[:, 1], index, theta[:, 2])
+        position = theta[:, :2] - (0 if part is None else part[0])
+        self._fill(out[:, :2].swapaxes(0, 1), out[:, 2], position[:, 0], position[:, 1], index, theta[:, 2])
         out[:, 3] = 1.0
 
     def _fill(
-        self, slopes: Array, value: Array, rows: Array, columns: Array, which: NDArray[np.intp], flux: Array
+        self, slopes: Array, value: Array, rows: Array, columns: Array, index: NDArray[np.intp], flux: Array
     ) -> None:
         """Write values (B, H, W), and slopes by row and column (2, B, H, W) times flux (B,), for checked positions."""
         height, width = value.shape[1:]
-        a = self._shift(self._polynomials[0], self.centre[which, 0], rows, which, height, flux)
-        b = self._shift(self._polynomials[1], self.centre[which, 1], columns, which, width, flux).swapaxes(2, 3)
+        a = self._shift(self._polynomials[0], self.centre[index, 0], rows, index, height, flux)
+        b = self._shift(self._polynomials[1], self.centre[index, 1], columns, index, width, flux).swapaxes(2, 3)
         np.matmul(a[:, 0], b[:, 0], out=value)
         np.matmul(a[:, 1], b[:, 0], out=slopes[0])
         np.matmul(a[:, 0], b[:, 1], out=slopes[1])
@@ -325,7 +325,7 @@ class SpotTemplate:
         return out[0], out[1]
 
     def _shift(
-        self, polynomials: Array, centre: Array, position: Array, which: NDArray[np.intp], pixels: int, flux: Array
+        self, polynomials: Array, centre: Array, position: Array, index: NDArray[np.intp], pixels: int, flux: Array
     ) -> Array:
         """Evaluate the spline along one axis: (B, 2, pixels, R).
 
@@ -345,10 +345,10 @@ class SpotTemplate:
         first = base - (_TAPS // 2 - 1)
         for spot in range(position.size):
             span = slice(first[spot], first[spot] + step * (pixels - 1) + 1, step)
-            np.matmul(weights[spot], polynomials[which[spot], :, span].reshape(_TAPS, -1), out=out[spot])
+            np.matmul(weights[spot], polynomials[index[spot], :, span].reshape(_TAPS, -1), out=out[spot])
         return out.reshape(position.size, 2, pixels, rank)
 
-    def check_range(self, rows: Array, columns: Array, which: NDArray[np.intp]) -> None:
+    def check_range(self, rows: Array, columns: Array, index: NDArray[np.intp]) -> None:
         """Raise TemplateRangeError for positions outside `supported`.
 
         Parameters
@@ -360,18 +360,18 @@ class SpotTemplate:
         which : (B,) ndarray of int
             Index of each spot's shape.
         """
-        limits = np.array([self.supported(t) for t in range(self.count)])[which]
-        place = np.stack([rows, columns], axis=1)
+        limits = np.array([self.supported(t) for t in range(self.count)])[index]
+        position = np.stack([rows, columns], axis=1)
         # written so that NaN is outside
-        inside = np.all((place >= limits[:, :, 0]) & (place <= limits[:, :, 1]), axis=1)
+        inside = np.all((position >= limits[:, :, 0]) & (position <= limits[:, :, 1]), axis=1)
         if np.all(inside):
             return
         bad = np.flatnonzero(~inside)
         first = int(bad[0])
         raise TemplateRangeError(
-            f"spot template: spot {first} at ({place[first, 0]:.3f}, {place[first, 1]:.3f}) px is outside the supported"
-            f" rows {limits[first, 0, 0]:.2f} to {limits[first, 0, 1]:.2f} and columns {limits[first, 1, 0]:.2f} to"
-            f" {limits[first, 1, 1]:.2f} ({bad.size} such spots); calibrate with a larger margin",
+            f"spot template: spot {first} at ({position[first, 0]:.3f}, {position[first, 1]:.3f}) px is outside the"
+            f" supported rows {limits[first, 0, 0]:.2f} to {limits[first, 0, 1]:.2f} and columns"
+            f" {limits[first, 1, 0]:.2f} to {limits[first, 1, 1]:.2f} ({bad.size} such spots); calibrate with a larger margin",
             [int(n) for n in bad],
         )
 
@@ -471,10 +471,10 @@ class SmearedShape:
         along = [ndimage.spline_filter1d(np.eye(size), _DEGREE, mode="mirror", axis=0) for size in out.shape[1:]]
         return np.asarray(along[0].T @ out @ along[1])
 
-    def _splines(self, centre: float, place: float, pixels: int) -> tuple[Array, slice]:
+    def _splines(self, centre: float, position: float, pixels: int) -> tuple[Array, slice]:
         """Return the samples' weights in every pixel with two derivatives, and the range of samples."""
         step = self._template.oversampling
-        start = centre - step * place
+        start = centre - step * position
         base = int(np.floor(start))
         power, pixel = np.arange(_TAPS), np.arange(pixels)
         powers = np.zeros((3, _TAPS))

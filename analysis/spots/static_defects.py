@@ -411,15 +411,15 @@ def _others(
     edges = np.zeros_like(good)
     terms, fit = _needed_spots(fitted, good, terms, fit)
     while len(terms.others) < MOST_OTHERS:
-        position = _second_light(mean, fit, good & ~edges, template, terms.learnt)
-        if position is None:
+        start = _second_light(mean, fit, good & ~edges, template, terms.learnt)
+        if start is None:
             break
-        if any(not low + 1.0 < at < high - 1.0 for at, (low, high) in zip(position, template.supported(), strict=True)):
+        if any(not low + 1.0 < at < high - 1.0 for at, (low, high) in zip(start, template.supported(), strict=True)):
             row, column = np.indices(good.shape)
-            edges = edges | (good & (np.hypot(row - position[0], column - position[1]) <= _EDGE_LIGHT_PX))
+            edges = edges | (good & (np.hypot(row - start[0], column - start[1]) <= _EDGE_LIGHT_PX))
             fit = fitted(good & ~edges, terms, fit)
             continue
-        wider = replace(terms, others=(*((float(r), float(c)) for r, c, _ in fit.others), position))
+        wider = replace(terms, others=(*((float(r), float(c)) for r, c, _ in fit.others), start))
         try:
             tried = fitted(good & ~edges, wider, fit)
         except SpotError:
@@ -446,7 +446,7 @@ def _needed_spots(fitted: _Fit, good: Mask, terms: FitTerms, fit: ScreenedFit) -
 
 
 def _second_light(
-    mean: Array, fit: ScreenedFit, good: Mask, template: SpotTemplate, missing: bool
+    mean: Array, fit: ScreenedFit, good: Mask, template: SpotTemplate, either_sign: bool
 ) -> tuple[float, float] | None:
     """Return the position where the residuals match a further spot, or a missing one, best; None if not significant."""
     height, width = mean.shape
@@ -455,13 +455,13 @@ def _second_light(
     reach = min(20, *middle)
     stamp = stamp[middle[0] - reach : middle[0] + reach + 1, middle[1] - reach : middle[1] + reach + 1]
     weight = np.where(fit.used, 1.0 / fit.variance, 0.0)
-    turned = stamp[::-1, ::-1]
-    amplitude = signal.fftconvolve((mean - fit.level) * weight, turned, mode="same")
-    power = np.maximum(signal.fftconvolve(weight, turned**2, mode="same"), 1e-300)
+    flipped = stamp[::-1, ::-1]
+    amplitude = signal.fftconvolve((mean - fit.level) * weight, flipped, mode="same")
+    power = np.maximum(signal.fftconvolve(weight, flipped**2, mode="same"), 1e-300)
     score = np.where(power > 0.3 * np.median(power), amplitude / np.sqrt(power), 0.0)
     row, column = np.indices(mean.shape)
     away = np.hypot(row - fit.positions.row[0], column - fit.positions.column[0])
-    score = np.where(good & (away > NEAREST_PX), np.abs(score) if missing else score, 0.0)
+    score = np.where(good & (away > NEAREST_PX), np.abs(score) if either_sign else score, 0.0)
     limit = float(norm.isf(FALSE_ALARM / mean.size))
     for _ in range(5):
         top = np.unravel_index(int(np.argmax(score)), score.shape)
