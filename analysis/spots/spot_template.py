@@ -371,7 +371,8 @@ class SpotTemplate:
         raise TemplateRangeError(
             f"spot template: spot {first} at ({position[first, 0]:.3f}, {position[first, 1]:.3f}) px is outside the"
             f" supported rows {limits[first, 0, 0]:.2f} to {limits[first, 0, 1]:.2f} and columns"
-            f" {limits[first, 1, 0]:.2f} to {limits[first, 1, 1]:.2f} ({bad.size} such spots); calibrate with a larger margin",
+            f" {limits[first, 1, 0]:.2f} to {limits[first, 1, 1]:.2f} ({bad.size} such spots);"
+            " calibrate with a larger margin",
             [int(n) for n in bad],
         )
 
