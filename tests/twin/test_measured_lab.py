@@ -416,7 +416,7 @@ def test_focus_agrees_with_scipy(folder: Path) -> None:
         assert 2.0 * found.cost == pytest.approx(vertex.chi_square, rel=1e-6)
     plane = run_.shimmings[0].plane
     spread = np.hypot(run_.states[0].defocus_sigma, plane.extra_sigma)
-    design = np.column_stack([np.ones(len(spread)), plane.place])
+    design = np.column_stack([np.ones(len(spread)), plane.position])
     found = least_squares(
         lambda x: (-run_.states[0].defocus - design @ x) / spread, np.zeros(3), x_scale=[1e-5, 1e-4, 1e-4]
     )
