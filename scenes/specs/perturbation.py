@@ -225,7 +225,7 @@ def perturbation_issues(
     what : PlainPerturbationSpec
         The perturbation.
     key : KeyPath
-        Its key path.
+        Key path of the perturbation.
     """
     if path not in nodes:
         return [no_such_node(owner, nodes, path, key)]

@@ -480,8 +480,8 @@ class BaseSpec(Spec):
     command : str
         Command that runs it, as in `python -m twin.COMMAND`.
     file : Reference
-        Its file, or the config.yaml of one of its runs, relative to the study's file; for lab and orbit also a name in
-        the library.
+        File of the job or test, or the config.yaml of one of its runs, relative to the study's file; for lab and orbit
+        also a name in the library.
     """
 
     command: Annotated[str, OneOf(studied_commands)]

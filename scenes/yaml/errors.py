@@ -24,7 +24,7 @@ class Issue:
     Attributes
     ----------
     problem : str
-        What is wrong, in a few words.
+        Short text of the fault.
     file : str
         Path as the user wrote it; "" if the input did not come from a file.
     line : int | None
@@ -132,7 +132,7 @@ def unknown(
     Parameters
     ----------
     problem : str
-        What is wrong, such as "no such line".
+        Short text of the fault, such as "no such line".
     name : object
         The name that was found.
     known : Iterable[str]

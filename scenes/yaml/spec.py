@@ -274,7 +274,7 @@ class Spec(BaseModel):
         Parameters
         ----------
         problem : str | Problem
-            What is wrong; or a Problem, which holds everything but the key.
+            Short text of the fault; or a Problem, which holds everything but the key.
         key : KeyPath
             Key path in this specification.
         told : Unpack[_Told]
@@ -368,7 +368,7 @@ def require_one(
     problem : str
         Text of the problem.
     allowed : str | None
-        What may be written.
+        Text of what is allowed.
     within : KeyPath
         Key at which the problem is reported.
 
