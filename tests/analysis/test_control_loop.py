@@ -10,7 +10,7 @@ from analysis.monitor.control_loop import common_margin, limit_cycle, margins, o
 DELAYS = (0, 1, 2, 3, 7)
 
 
-def left_over(gain: float, delay: int, course: np.ndarray) -> np.ndarray:
+def simulated_residual(gain: float, delay: int, course: np.ndarray) -> np.ndarray:
     """What is left of a course when images are taken, reading by reading: a recursion that shares nothing with the
     module.
     """
@@ -26,7 +26,7 @@ def left_over(gain: float, delay: int, course: np.ndarray) -> np.ndarray:
 def test_just_below_the_limit_errors_decay_and_just_above_they_grow(delay: int) -> None:
     limit, step = margins(0.1, delay).limit, np.ones(20_000)
     # 1 % off the limit errors change by e in some hundred readings, twenty thousand are enough for any delay here
-    below, above = (np.abs(left_over(factor * limit, delay, step)) for factor in (0.99, 1.01))
+    below, above = (np.abs(simulated_residual(factor * limit, delay, step)) for factor in (0.99, 1.01))
     assert below[-100:].max() < 1e-6
     assert above[-100:].max() > 1e6
     assert margins(0.99 * limit, delay).stable
@@ -49,7 +49,7 @@ def test_margins_are_those_of_the_open_loop(gain: float, delay: int) -> None:
 def test_the_share_that_is_left_of_a_swing(gain: float, delay: int, frequency: float) -> None:
     k = np.arange(6000)
     swing = np.exp(2j * np.pi * frequency * k)
-    left = left_over(gain, delay, swing.real) + 1j * left_over(gain, delay, swing.imag)
+    left = simulated_residual(gain, delay, swing.real) + 1j * simulated_residual(gain, delay, swing.imag)
     assert np.abs(left[-500:]).max() == pytest.approx(float(rejection(gain, delay, frequency)), rel=1e-6, abs=1e-9)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.spots import frame_screening
-from analysis.spots.frame_screening import noise_ratio, screen_frames, observed_noise
+from analysis.spots.frame_screening import noise_ratio, observed_noise, screen_frames
 from analysis.spots.noise import NoiseModel
 from tests.tiers import quick
 
