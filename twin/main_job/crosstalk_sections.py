@@ -32,7 +32,7 @@ from twin.monitor.crosstalk import PRINTED, CameraCrosstalk
 
 WRONG = 0.1
 """A reading that departs from the truth by more than this part of it is marked ..."""
-UNSEEN = 0.01
+UNOBSERVED = 0.01
 """... if that is also more than this part of the run's noise: what a hundred units would not show is not marked."""
 
 
@@ -108,7 +108,7 @@ def _crosstalk(run: RenderRun, camera: int) -> Table:
     name, table = list(run.crosstalk.items())[camera]
     columns = [_columns(run, table, p) for p in range(len(parameters.CAMERA_PARAMETERS))]
     own = [row for row in run.reading.table.rows if row.estimator == run.judged and row.camera == name]
-    floors = [max(SAME, UNSEEN * row.noise) for row in own]  # SAME where the estimator has no value
+    floors = [max(SAME, UNOBSERVED * row.noise) for row in own]  # SAME where the estimator has no value
     bodies = [motion.body for motion in table.motions]
     rows: list[list[Cell]] = []
     bands: dict[int, str] = {}
