@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optics.camera.prescription import Camera
-from optics.camera.ray_bundle import Field, chief_point, direction_of, launch_rays, light_nodes, shadow_pieces, trace
+from optics.camera.ray_bundle import (
+    Field,
+    chief_point,
+    direction_of,
+    launch_rays,
+    light_nodes,
+    shadow_pieces,
+    trace_stop,
+)
 from optics.geometry import zernike
 from optics.geometry.polygon import covered
 from optics.numerics.array_math import UnphysicalError
@@ -132,7 +140,7 @@ def wavefront(camera: Camera, field: Field = (0.0, 0.0), terms: int = 28) -> Wav
     nodes = light_nodes(camera, field, _STATISTICS_PHASE)
     origin, radius = _chief(camera, field)
     points = np.concatenate([np.zeros((1, 2)), np.stack([nodes.x, nodes.y], axis=-1)])
-    rays = trace(camera, *launch_rays(camera, field, points))
+    rays = trace_stop(camera, field, points)
     path = path_to_sphere(rays.position, rays.direction, rays.path, origin, radius)
     error = -(path[1:] - path[0]) / camera.wavelength
     fit = fit_part(nodes.x, nodes.y, nodes.weight, error, terms)

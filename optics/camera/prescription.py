@@ -103,8 +103,9 @@ class OpticalSurface:
         """Check the numbers."""
         if not abs(self.radius) > 0.0:
             raise ValueError(f"radius must not be 0 or NaN (a plane has math.inf), got {self.radius}")
-        if not isfinite(self.thickness) or not isfinite(self.conic):
-            raise ValueError(f"thickness and conic must be finite, got {self.thickness} and {self.conic}")
+        numbers = self.thickness, self.conic, *self.asphere, *self.offset, *self.decenter, *self.tilt
+        if not all(map(isfinite, numbers)):
+            raise ValueError(f"thickness, conic, asphere, offset, decenter and tilt must be finite, got {numbers}")
         if not 0.0 <= self.inner_diameter < self.diameter:
             raise ValueError(f"0 <= inner_diameter < diameter is needed, got {self.inner_diameter} and {self.diameter}")
         if not isinstance(self.material, str) and not 1.0 <= self.material < inf:

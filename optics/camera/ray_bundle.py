@@ -48,6 +48,8 @@ class TracedRays:
         Optical path from the launch points, metres.
     valid : (N,) ndarray of bool
         Rays that meet every surface within its clear aperture; other numbers of the rest mean nothing.
+    reached : (N,) ndarray of bool
+        Rays that meet every surface and are not totally reflected in glass, be they within the clear apertures or not.
     hits : (N, K, 3) ndarray
         Points on each of the K surfaces, metres, in the surface's own frame.
     """
@@ -56,6 +58,7 @@ class TracedRays:
     direction: np.ndarray
     path: np.ndarray
     valid: np.ndarray
+    reached: np.ndarray
     hits: np.ndarray
 
 
@@ -116,8 +119,8 @@ def launch_rays(camera: Camera, field: Field = (0.0, 0.0), pupil: ArrayLike | No
     """
     nodes = disk(RINGS)
     points = np.stack([nodes.x, nodes.y], axis=-1) if pupil is None else np.asarray(pupil, float)
-    if points.ndim != 2 or points.shape[1] != 2 or not np.all(np.isfinite(points)):
-        raise ValueError(f"pupil must be finite points of shape (N, 2), got shape {points.shape}")
+    if points.ndim != 2 or points.shape[1] != 2 or not points.size or not np.all(np.isfinite(points)):
+        raise ValueError(f"pupil must be finite points of shape (N, 2), N at least 1, got shape {points.shape}")
     rim = camera.aperture
     light, target = direction_of(field), rim.radius * points + np.array(rim.centre)
     try:
@@ -164,19 +167,39 @@ def trace(camera: Camera, position: ArrayLike, direction: ArrayLike) -> TracedRa
     array([3., 3., 3.])
     """
     start, light = np.atleast_2d(np.asarray(position, float)), np.asarray(direction, float)
-    if start.ndim != 2 or start.shape[1] != 3 or light.shape not in ((3,), start.shape):
-        raise ValueError(f"position must be (N, 3) and direction (N, 3) or (3,), got {start.shape} and {light.shape}")
+    if start.ndim != 2 or start.shape[1] != 3 or not start.size or light.shape not in ((3,), start.shape):
+        raise ValueError(
+            f"position must be (N, 3), N at least 1, and direction (N, 3) or (3,), got {start.shape} and {light.shape}"
+        )
     length = np.linalg.norm(light, axis=-1, keepdims=True)
     if not np.all(np.isfinite(start)) or not np.all(np.isfinite(length)) or not np.all(length > 0.0):
         raise ValueError("positions must be finite, and directions finite and not zero")
     system, elements = camera.systems[0], camera.assembly.sequence("image")
     sent = make_rays(default_backend(), start, np.broadcast_to(light / length, start.shape))
     traced = trace_systems(default_backend(), system, sent, keep=range(len(camera.surfaces)), world=True)
-    place, leaving, path, valid = (array[0] for array in traced.numpy(traced.world))
+    place, leaving, path, reached = (array[0] for array in traced.numpy(traced.world))
     hits = np.stack([traced.hit(k)[0] for k in range(len(camera.surfaces))], axis=1)
+    valid = reached
     for k, element in enumerate(elements[:-1]):
         valid = valid & element.clear(hits[:, k, 0], hits[:, k, 1])
-    return TracedRays(place, leaving, path, valid, hits)
+    return TracedRays(place, leaving, path, valid, reached, hits)
+
+
+def trace_stop(camera: Camera, field: Field, points: np.ndarray) -> TracedRays:
+    """Trace rays of a far point through points of the stop (N, 2), in units of its radius, stopped or not.
+
+    Raises
+    ------
+    LightLostError
+        A ray within the rim of the stop misses a surface or is totally reflected.
+    """
+    rays = trace(camera, *launch_rays(camera, field, points))
+    if not np.all(rays.reached | (np.hypot(*points.T) > 1.0)):
+        raise LightLostError(
+            f"rays of the field {field} rad miss a surface or are totally reflected in glass; a smaller stop or field "
+            "is needed"
+        )
+    return rays
 
 
 def shadow_pieces(camera: Camera, field: Field, ring: bool = True) -> np.ndarray | None:
@@ -195,9 +218,10 @@ def shadow_pieces(camera: Camera, field: Field, ring: bool = True) -> np.ndarray
     edges = {name: own for name, own in every.items() if own}
     if not edges:
         return None
-    hits = trace(camera, *launch_rays(camera, field)).hits
+    nodes = disk(RINGS)
+    hits = trace_stop(camera, field, np.stack([nodes.x, nodes.y], axis=-1)).hits
     places = {name: hits[None, :, int(name[1:]), :2] for name in edges}
-    pieces, _ = converged_shadows(SurfaceEdges(edges, places, disk(RINGS)).outlines, 1)
+    pieces, _ = converged_shadows(SurfaceEdges(edges, places, nodes).outlines, 1)
     return pieces if pieces.shape[1] else None
 
 
@@ -242,7 +266,7 @@ def light_nodes(camera: Camera, field: Field, phase: float) -> PupilNodes:
 
 def chief_point(camera: Camera, field: Field) -> np.ndarray:
     """Return where the chief ray of a field meets the image plane, stopped or not, (3,), metres."""
-    return np.asarray(trace(camera, *launch_rays(camera, field, np.zeros((1, 2)))).position[0])
+    return np.asarray(trace_stop(camera, field, np.zeros((1, 2))).position[0])
 
 
 def spot_radius(camera: Camera, field: Field = (0.0, 0.0)) -> float:
@@ -279,7 +303,7 @@ def spot_radius(camera: Camera, field: Field = (0.0, 0.0)) -> float:
     True
     """
     nodes = light_nodes(camera, field, 0.0)
-    rays = trace(camera, *launch_rays(camera, field, np.stack([nodes.x, nodes.y], axis=-1)))
+    rays = trace_stop(camera, field, np.stack([nodes.x, nodes.y], axis=-1))
     offset = rays.position[:, :2] - nodes.share @ rays.position[:, :2]
     return float(np.sqrt(max(nodes.share @ np.sum(offset**2, axis=-1), 0.0)))
 

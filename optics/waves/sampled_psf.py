@@ -7,10 +7,10 @@ from numpy.typing import ArrayLike
 
 
 def _checked(psf: ArrayLike, step: float) -> np.ndarray:
-    """Return the samples of an image. Raise ValueError unless they are finite, of two axes and of positive step."""
+    """Return the samples of an image. Raise ValueError unless sum and step are positive."""
     samples = np.asarray(psf, float)
-    if samples.ndim != 2 or not np.all(np.isfinite(samples)):
-        raise ValueError(f"psf must be finite and of shape (rows, columns), got shape {samples.shape}")
+    if samples.ndim != 2 or not np.all(np.isfinite(samples)) or not np.sum(samples) > 0.0:
+        raise ValueError(f"psf must be finite, of shape (rows, columns) and of positive sum, got {samples.shape}")
     if not 0.0 < step < np.inf:
         raise ValueError(f"step must be positive, in metres, got {step}")
     return samples
@@ -117,8 +117,6 @@ def mtf_from_psf(psf: ArrayLike, step: float) -> tuple[np.ndarray, np.ndarray, n
     True
     """
     samples = _checked(psf, step)
-    if not np.sum(samples):
-        raise ValueError("psf must not sum to 0")
     size = max(samples.shape)
     lines = (np.abs(np.fft.rfft(samples.sum(axis=axis), size)) for axis in (0, 1))
     along_x, along_y = (line / line[0] for line in lines)
