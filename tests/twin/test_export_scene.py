@@ -173,8 +173,8 @@ def test_polynomials_alone_are_corrected(folder: Path, tmp_path: Path, form: str
     )
     assert "ISD" not in result.output
     for options, message in (
-        ((), "nothing to do"),
-        ((*points, "--attitude-sigma", "1 arcsec"), "no camera and no orbit"),
+        ((), "need control points"),
+        ((*points, "--attitude-sigma", "1 arcsec"), "uncertainties need a rigorous model"),
     ):
         refused(tmp_path / form, tmp_path / "bad", options, message)
 

@@ -177,5 +177,5 @@ def test_maps_of_a_pass(sensors) -> None:
     with pytest.raises(ValueError, match="two lines"):
         intersected_accuracy({"nadir": sensors["nadir"]}, uncertainty(), HEIGHT)
     short = replace(sensors["forward"], first_line_time=sensors["forward"].first_line_time, lines=20)
-    with pytest.raises(ValueError, match="nowhere"):
+    with pytest.raises(ValueError, match="do not overlap"):
         intersected_accuracy({"nadir": replace(sensors["nadir"], lines=20), "forward": short}, uncertainty(), HEIGHT)

@@ -348,7 +348,7 @@ def test_a_loop_near_its_limit_or_that_makes_anything_worse_leads_the_verdict(id
     gains = {"tilt": 9.0, "roll": 1.03, "focus": 2.0}
     loops = {name: replace(one, margins=replace(one.margins, gain=gains[name])) for name, one in idle.loops.items()}
     near = monitor_report(replace(idle, margin=1.03, radius=0.99, loops=loops))
-    assert near.warnings[0].endswith("lower gains, that of roll first")
+    assert near.warnings[0].endswith("lower the gains, that of roll first")
     assert near.verdict.startswith("The loop is barely stable; with the loop closed")
     assert near.warnings[0].startswith(
         "the loop is barely stable: gains of 1.03 times the stated ones make it unstable"

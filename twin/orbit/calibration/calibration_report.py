@@ -43,7 +43,7 @@ def calibration_report(run: CalibrationRun) -> Report:
     scheme = list(run.schemes)[-2:][0]
     after = [values_of(run.schemes[scheme], what).mean() for what in ("plan_rms", "height_rms")]
     verdict, more = answer(
-        f"Calibration reduces the errors at check points from {plan:.0f} m in plan and {height:.0f} m in height to "
+        f"Calibration changes the errors at check points from {plan:.0f} m in plan and {height:.0f} m in height to "
         f"{after[0]:.2f} m and {after[1]:.2f} m (scheme {scheme}, mean of the fields' RMS)",
         f"{('schemes ' if len(good) > 1 else 'scheme ') + ', '.join(good) if good else 'no scheme'} "
         f"{'meet' if len(good) > 1 else 'meets'} the limits of {limits.plan:g} m in plan and {limits.height:g} m in "

@@ -327,7 +327,7 @@ def _gain(run: MonitorRun) -> str:
     fits = "agrees with" if chosen.agrees else "contradicts"
     return (
         f"smoothing the same measurements reduces the height error by the cameras to "
-        f"{chosen.case.camera_height_rms:.2f} m, {_times(chosen.factor, 'less')} than linear interpolation, which "
+        f"{chosen.case.camera_height_rms:.2f} m, {_times(chosen.factor, 'less')} than linear interpolation; this "
         f"{fits} the predicted sigma of {rms(chosen.sigma):.2f} m"
     )
 
