@@ -113,7 +113,7 @@ class WavefrontReadingsSpec(ReadingsSpec):
         first, last = (noll(term) for term in self.terms)
         if not 4 <= first <= last <= MAX_NOLL:
             found = f"{self.terms[0]} to {self.terms[1]}"
-            raise Problem("not a range of Zernike terms", found, f"Z4 to Z11, at most Z{MAX_NOLL}", within=("terms",))
+            raise Problem("not a range of terms", found, f"Z4 to Z11, at most Z{MAX_NOLL}", within=("terms",))
         if self.zernikes is not None and self.maps is not None:
             raise Problem("coefficients and maps", "zernikes and maps", "one of them", within=("maps",))
         if self.maps is not None and len(self.maps) != len(self.fields):

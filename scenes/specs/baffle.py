@@ -151,9 +151,7 @@ class BaffleSpec(Spec):
             if present != needed:
                 what = "needs" if needed else "has no"
                 allowed = f"for a {self.shape}: {', '.join(_NEEDS[self.shape])}"
-                raise Problem(
-                    f"a {self.shape} {what} {name}", "a value" if present else "no value", allowed, within=(name,)
-                )
+                raise Problem(f"a {self.shape} {what} {name}", "it" if present else "nothing", allowed, within=(name,))
         if self.shape == "ring" and not self.hole < self.diameter:  # type: ignore[operator]
             problem = "the hole is not smaller than the ring"
             raise Problem(problem, f"{self.hole:g} m", "a smaller hole", within=("hole",))

@@ -137,12 +137,7 @@ class TimeLawSpec(Spec):
             allowed = "trend alone or with period, relaxation or jump alone, event alone or with drift and period"
             raise Problem("not a time law: these cannot be multiplied", self.text, allowed)
         if self.since is not None and not {"trend", "relaxation"} & keys:
-            raise Problem(
-                "only trend and relaxation have a start",
-                self.text,
-                "since beside trend or relaxation",
-                within=("since",),
-            )
+            raise Problem("only trend and relaxation have a start", self.text, "trend or relaxation", within=("since",))
         return self
 
     @property
@@ -213,9 +208,7 @@ class CorrelationSpec(Spec):
     @model_validator(mode="after")
     def _is_a_matrix(self) -> "CorrelationSpec":
         if (self.correlation is None) == (self.matrix is None):
-            raise Problem(
-                "the correlation must be given once", "correlation and matrix", "one of correlation and matrix"
-            )
+            raise Problem("the correlation must be given once", "correlation and matrix", "one of them")
         if len(set(self.between)) != len(self.between):
             raise Problem("a component is named twice", ", ".join(self.between), "each once", within=("between",))
         if self.matrix is not None:

@@ -190,7 +190,7 @@ def checked(owner: Spec, key: KeyPath, spec: TableSpec) -> TableSpec:
             raise owner.error(text, (*key, wrong), allowed=f"no {wrong}")
     elif spec.unit is None:
         raise owner.error(
-            "the file of a mesh does not contain its unit", table_key, found=spec.table, allowed="a key unit: mm"
+            "a mesh file does not contain its unit", table_key, found=spec.table, allowed="a key unit: mm"
         )
     elif isinstance(spec, TableTemperatureSpec) and spec.values is None:
         text = "the file of a mesh does not say whether its temperatures are changes or absolute"

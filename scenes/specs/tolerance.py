@@ -72,9 +72,7 @@ class Varied(Spec):
     def _is_a_motion(self) -> Varied:
         node, kind, _, amount, _ = self.parts
         if amount:
-            raise Problem(
-                "a motion without an amount is needed", shown(self.motion), f"{node} {kind} ...", within=("motion",)
-            )
+            raise Problem("the motion has an amount", shown(self.motion), f"{node} {kind} ...", within=("motion",))
         if self.carrying and kind not in ("shift", "rotate"):
             raise Problem("only shift and rotate carry others", kind, "shift or rotate", within=("carrying",))
         return self
@@ -194,9 +192,7 @@ class ToleranceSpec(Varied):
             first, last = (noll(term) for term in self.terms)
             if not 4 <= first < last <= MAX_NOLL:
                 found = f"{self.terms[0]} to {self.terms[1]}"
-                raise Problem(
-                    "not a range of Zernike terms", found, f"Z5 to Z36, at most Z{MAX_NOLL}", within=("terms",)
-                )
+                raise Problem("not a range of terms", found, f"Z5 to Z36, at most Z{MAX_NOLL}", within=("terms",))
             if self.law != "normal" or self.mean is not None or self.measured is not None:
                 problem = "the terms of a figure error are distributed normally about zero"
                 raise Problem(problem, None, "no law, mean or measured", within=("law",))

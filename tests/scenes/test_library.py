@@ -300,7 +300,7 @@ def test_an_instrument_is_a_camera(tmp_path: Path) -> None:
     data = parse_yaml(setup.to_yaml()).data
     whole = data.pop("instrument")
     for change, words in (
-        ({}, "exactly one camera is needed; found 'neither'"),
+        ({}, "one camera is needed; found 'neither'"),
         ({"camera": whole}, "camera"),
         ({"instrument": whole, "cameras": {"gf8": data["cameras"]["gf7"]}}, "camera 'gf7' of the instrument's forward"),
     ):

@@ -114,9 +114,7 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
         """Return the set-up with default angles, after a check that angles, changes and strips fit the lines."""
         if (self.camera is None) == (self.instrument is None):
             found = "neither" if self.camera is None else "both"
-            raise self.error(
-                "exactly one camera is needed", ("camera",), found=found, allowed="`camera:` or `instrument:`"
-            )
+            raise self.error("one camera is needed", ("camera",), found=found, allowed="`camera:` or `instrument:`")
         for name, mounted in self.instrument.cameras.items() if self.instrument is not None else ():
             if mounted.camera not in self.cameras:
                 problem = f"camera {mounted.camera!r} of the instrument's {name} is missing"
@@ -571,9 +569,7 @@ def _require_several(test: Spec, named: tuple[str, ...] | None, camera: ThreeLin
             raise test.error(unknown("no such line", name, names, allowed=allowed), ("lines", k))
     if len(named or names) < 2:
         found = f"{names_text(names)} in {camera.name}"
-        raise test.error(
-            "a search for jitter needs two lines", ("camera",), found=found, allowed="a camera with several lines"
-        )
+        raise test.error("a search for jitter needs two lines", ("camera",), found=found, allowed="a camera with two")
 
 
 _THREE_LINES = "a camera with lines forward, nadir and backward"
