@@ -119,6 +119,7 @@ def wavefront(camera: Camera, field: Field = (0.0, 0.0), terms: int = 28) -> Wav
     A mirror whose figure is wrong by 1/28 wave rms has a wavefront error of 1/14 wave and, by Marechal's rule, a Strehl
     ratio of 0.8:
 
+    >>> from dataclasses import replace
     >>> wave = 550e-9
     >>> bent = OpticalSurface(-4.0, -2.0, -1.0, "mirror", diameter=0.4, figure={11: wave / 28})
     >>> error = wavefront(Camera([bent], wave))
@@ -126,6 +127,14 @@ def wavefront(camera: Camera, field: Field = (0.0, 0.0), terms: int = 28) -> Wav
     (1.0, 0.82)
     >>> zernike_name(int(np.argmax(np.abs(error.coefficients))) + 1)
     'spherical aberration'
+
+    Over a ring the coefficients are means of the error times annular Zernike terms:
+
+    >>> ring = replace(bent, inner_diameter=0.1, figure={})
+    >>> error = wavefront(Camera([ring], wave), field=(0.0, 2e-3))
+    >>> coma = annular_zernike(7, error.x, error.y, inner=0.25)
+    >>> bool(abs(error.weight @ (error.error * coma) - error.coefficients[6]) < 1e-15)
+    True
 
     At the rim, at r from the axis, a spherical mirror of radius R is ahead of its paraxial sphere by r^4 / (4 R^3) of
     path, and the Zernike term of spherical aberration is 1 / (6 sqrt(5)) of that:

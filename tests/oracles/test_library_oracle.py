@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import optics
+from optics.geometry.pose import rotation_matrix
 from scenes.specs.load import load_camera
 from twin.camera.camera_optics import CameraOptics
 
@@ -75,6 +76,29 @@ def test_rays_are_those_of_batoid() -> None:
     assert np.max(np.abs(rays.v - ours.direction)) < 1e-12
     assert np.max(np.abs(rays.t - ours.path)) < 1e-12
     assert ours.valid.tolist() == [True, True, False, True]
+
+
+@pytest.mark.skipif(find_spec("batoid") is None, reason="batoid not installed (extra `oracles`)")
+def test_rays_through_a_moved_asphere_of_glass_are_those_of_batoid() -> None:
+    import batoid
+
+    shift, tilt, wave = (1e-3, -2e-3), (2e-3, -3e-3, 0.0), 600e-9
+    front = optics.OpticalSurface(
+        0.08, 0.006, -0.5, "N-BK7", diameter=0.03, asphere=(20.0, -3e3), decenter=shift, tilt=tilt
+    )
+    camera = optics.Camera([front, optics.OpticalSurface(-0.3, 0.1)], wave)
+    position, direction = optics.launch_rays(camera, (0.02, -0.03), pupil=[(0.0, 0.0), (0.5, 0.5), (-0.9, 0.1)])
+    ours = optics.trace(camera, position, direction)
+    rays = batoid.RayVector(*position.T, *direction.T, 0.0, wave, 1.0)
+    vacuum, glass = (batoid.ConstMedium(n) for n in (1.0, optics.glass("N-BK7").vacuum_index(wave)))
+    moved = batoid.CoordSys([*shift, 0.0], rotation_matrix(tilt))
+    batoid.Asphere(0.08, -0.5, [20.0, -3e3]).refract(rays, vacuum, glass, coordSys=moved)
+    batoid.Quadric(-0.3, 0.0).refract(rays, glass, vacuum, coordSys=batoid.CoordSys([0.0, 0.0, 0.006]))
+    batoid.Plane().intersect(rays, coordSys=batoid.CoordSys([0.0, 0.0, 0.106]))
+    rays.toCoordSys(batoid.CoordSys())
+    assert np.max(np.abs(rays.r - ours.position)) < 1e-14
+    assert np.max(np.abs(rays.t - ours.path)) < 1e-14
+    assert ours.valid.all()
 
 
 def test_numbers_of_a_camera_are_those_of_the_twin(backend) -> None:
