@@ -383,7 +383,7 @@ def test_a_missing_file_is_missing_though_there_is_a_picture_of_it(images, tmp_p
         MeasurementSetup.read(tmp_path / "measurement.yaml")
     told = str(caught.value)
     assert "no frames of forward/left after" in told
-    assert "forward_left_after.png is a picture with 8 bits" in told
+    assert "forward_left_after.png is an 8-bit preview" in told
     assert "forward_left_after.tiff" in told
     cv2.imwrite(str(folder / "forward_left_after.png"), np.full((32, 32), 7, np.uint16))
     setup = MeasurementSetup.read(tmp_path / "measurement.yaml")
