@@ -73,7 +73,7 @@ def test_terms_of_a_map_are_those_of_poppy() -> None:
     ("call", "said"),
     [
         (lambda: analysis.fit_spot(np.zeros(9), NOISE), r"image must be \(H, W\)"),
-        (lambda: analysis.fit_spot(np.zeros((31, 31)), NOISE, method="moment"), "gaussian, energy, template"),
+        (lambda: analysis.fit_spot(np.zeros((31, 31)), NOISE, method="moment"), "gaussian, energy, ml"),
         (lambda: analysis.fit_rpc(np.zeros((9, 2)), np.zeros((9, 2))), r"ground \(N, 3\)"),
         (lambda: analysis.fit_rpc(np.full((9, 2), np.nan), np.zeros((9, 3))), "must be finite"),
         (lambda: analysis.fit_rpc(np.zeros((9, 2)), np.zeros((9, 3))), "at least 39"),

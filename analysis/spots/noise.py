@@ -160,6 +160,8 @@ class FurtherNoise(Protocol):
 class NoiseModel:
     """Noise of a detector as its data sheet gives it.
 
+    With the default values a grey value is an electron, and the only noise is shot noise and rounding.
+
     Attributes
     ----------
     gain_dn_per_e : float

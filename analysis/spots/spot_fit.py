@@ -14,8 +14,8 @@ from analysis.spots.likelihood import maximum_likelihood_fit, require_convergenc
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_template import SpotTemplate
 
-METHODS = ("gaussian", "energy", "template")
-"""Methods of `fit_spot`."""
+METHODS = ("gaussian", "energy", "ml")
+"""Methods of `fit_spot`, by their names in `analysis.spots.CENTROIDS`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,14 +71,14 @@ def fit_spot(
         Noise of the detector.
     frames : int
         Number of frames of which each image is the mean.
-    method : {"gaussian", "energy", "template"}
+    method : {"gaussian", "energy", "ml"}
         Weighted least squares of a Gaussian, first moment in a window that follows the centre, or maximum-likelihood
         fit of a calibrated spot shape.
     radius : float, optional
         Radius of the window of "gaussian" or "energy", in pixels. The default is an eighth ("gaussian") or a quarter
         ("energy") of the smaller side of the image.
     template : SpotTemplate, optional
-        Calibrated shape, for "template" only.
+        Calibrated shape, for "ml" only.
 
     Returns
     -------
@@ -124,10 +124,10 @@ def fit_spot(
     >>> centroid = analysis.fit_spot(image, analysis.NoiseModel(), method="energy", radius=10)
     >>> round(centroid.row, 3), round(centroid.column, 3)
     (15.3, 13.75)
-    >>> analysis.fit_spot(image, analysis.NoiseModel(), method="template")
+    >>> analysis.fit_spot(image, analysis.NoiseModel(), method="ml")
     Traceback (most recent call last):
         ...
-    ValueError: fit_spot: method must be gaussian, energy, template (with template=), found 'template'
+    ValueError: fit_spot: method must be gaussian, energy, ml (needs template=), found 'ml'
     """
     pixels = np.asarray(image)
     if pixels.ndim not in (2, 3):
@@ -137,10 +137,10 @@ def fit_spot(
         positions = gaussian_fit(stack, frames, noise, radius)
     elif method == "energy":
         positions = energy_centroid(stack, frames, noise, radius)
-    elif method == "template" and template is not None:
+    elif method == "ml" and template is not None:
         positions = maximum_likelihood_fit(stack, frames, noise, template)
     else:
-        raise ValueError(f"fit_spot: method must be {', '.join(METHODS)} (with template=), found {method!r}")
+        raise ValueError(f"fit_spot: method must be {', '.join(METHODS)} (needs template=), found {method!r}")
     require_convergence(positions)
     values = positions.row, positions.column, positions.flux, positions.background, positions.reduced_chi_square
     row, column, flux, background, chi = values if pixels.ndim == 3 else (float(value[0]) for value in values)

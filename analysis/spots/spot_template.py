@@ -61,7 +61,9 @@ _VALUE = _tap_polynomials()
 
 @dataclass(frozen=True, eq=False)
 class SpotTemplate:
-    """One or several (T) calibrated spot shapes of unit flux. Make it with `from_image` or `stack`.
+    """Calibrated shapes of T spots, of unit flux.
+
+    `from_image` makes the template of one spot, and `stack` joins several.
 
     Attributes
     ----------
@@ -91,7 +93,7 @@ class SpotTemplate:
     >>> template.count, template.shape
     (1, (33, 33))
     >>> image = 100 + 5000 * airy(16.25, 15.6, 33)
-    >>> fit = analysis.fit_spot(image, analysis.NoiseModel(), method="template", template=template)
+    >>> fit = analysis.fit_spot(image, analysis.NoiseModel(), method="ml", template=template)
     >>> round(fit.row, 3), round(fit.column, 3)
     (16.25, 15.6)
     """
