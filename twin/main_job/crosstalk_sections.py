@@ -1,4 +1,4 @@
-"""What the report says of single motions: moves of the spots, readings of all estimators, factors of the formulas."""
+"""Report sections on elementary motions: spot shifts, readings of all estimators, factors of the printed formulas."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from twin.main_job.result_sections import IN_PAGE, figure
 from twin.monitor.crosstalk import PRINTED, CameraCrosstalk
 
 WRONG = 0.1
-"""A reading that departs from the truth by more than this part of it is marked ..."""
+"""Relative error above which a reading is marked as wrong, if it also exceeds the limit by ``UNOBSERVED``."""
 UNOBSERVED = 0.01
-"""... if that is also more than this part of the run's noise: what a hundred units would not show is not marked."""
+"""Share of the run's noise below which an error is not marked: a hundred units of the motion would not be noticed."""
 
 
 def motion_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
-    """Moves of the spots by each motion, and three ways to change the principal distance."""
+    """Return the section with the spot shifts of each motion and three ways to change the principal distance."""
     caption = (
         "Move of each spot on its area CCD in µm per unit of each motion (1 µm, 1 arcsec, 1 ppm, or 1 nm rms of a "
         "figure term), of one body alone, to first order; x is along the flight direction, y along the line. Colours "
@@ -61,7 +61,7 @@ _TYPESET = (*SYMBOLS.items(), (" um", " µm"), ("[um]", "[µm]"), ('"', " arcsec
 
 
 def _pretty(parts: list[str], labels: set[str], keep: bool = False) -> str:
-    """A statement as reports write it; a motion's label that it begins with is kept or left out."""
+    """Typeset a statement for reports; the motion's label at its start is removed unless ``keep`` is set."""
     known = len(parts) > 1 and parts[0] in labels
     text = parts[1] if known and not keep else ": ".join(parts)
     for plain_text, typeset in _TYPESET:
@@ -72,7 +72,7 @@ def _pretty(parts: list[str], labels: set[str], keep: bool = False) -> str:
 
 
 def _motions(run: RenderRun) -> Table:
-    """Per unit of each motion: where the spots go, the true change, and every estimator's reading."""
+    """Return the table with spot shifts, true change and reading of every estimator per unit of each motion."""
     pitch = 1e6 * run.experiment.path.pitch
     places = list(dict.fromkeys(place for table in run.crosstalk.values() for place in table.coordinates))
     heads = ["camera", "motion", "body", "per", *(f"{place} [µm]" for place in places)]
@@ -92,7 +92,7 @@ def _motions(run: RenderRun) -> Table:
 
 
 def crosstalk_section(run: RenderRun) -> Section:
-    """Per unit of motion what is true and what every estimator reads, a table for each camera."""
+    """Return the section that compares true changes and readings per unit of motion, a table for each camera."""
     about = (
         "Per unit of motion: the true change of the camera (bold) and the reading of every estimator, to first order. "
         f"Underlined: wrong by more than {round(100 * WRONG)} % of the truth and by more than a hundredth of this "
@@ -135,7 +135,9 @@ def _crosstalk(run: RenderRun, camera: int) -> Table:
 
 
 def _columns(run: RenderRun, table: CameraCrosstalk, parameter: int) -> list[tuple[str, str]]:
-    """(heading, estimator) of one parameter; the two printed sets share a column where they are the same formula."""
+    """Return (heading, estimator) of one parameter; the two printed sets share a column where they are the same
+    formula.
+    """
     single, joint = (table.readings[e][parameter] for e in ("paper_single", "paper_joint"))
     same = np.allclose(single, joint, rtol=1e-9, atol=0.0)
     columns = []
@@ -150,7 +152,7 @@ def _columns(run: RenderRun, table: CameraCrosstalk, parameter: int) -> list[tup
 
 
 def _short(label: str) -> str:
-    """A motion's label without its body, which stands above the rows."""
+    """Return a motion's label without its body, which heads the group of rows."""
     for word in ("figure ", "along ", "about "):
         if word in label:
             return (word + label.partition(word)[2]).removeprefix("figure ")
@@ -158,12 +160,15 @@ def _short(label: str) -> str:
 
 
 def is_wrong(reading: float, true: float, floor: float = SAME) -> bool:
-    """Whether a reading departs from the truth by more than ``WRONG`` of it and by more than ``floor``."""
+    """Return True if a reading departs from the truth by more than ``WRONG`` times the truth and by more than
+    ``floor``.
+    """
     return abs(reading - true) > max(WRONG * abs(true), floor)
 
 
 def formula_section(run: RenderRun) -> Section:
-    """Factors of the printed formulas, two columns for each camera, and what explains them."""
+    """Return the section with the factors of the printed formulas, two columns for each camera, and their explanation.
+    """
     about = (
         "Each printed formula is fed with the spot shifts that the exact trace gives for the one motion it was derived "
         "for. A factor of 1 is a correct formula."
@@ -210,7 +215,7 @@ def formula_section(run: RenderRun) -> Section:
 
 
 def _factor_text(run: RenderRun, name: str) -> str:
-    """The numbers behind a camera's factors."""
+    """Return a sentence with the numbers that explain a camera's factors."""
     geometry, factors = run.experiment.geometry(name), run.crosstalk[name].factors
     f, f_x = geometry.principal_distance_m, geometry.principal_distance_across_m or geometry.principal_distance_m
     by_model = {(one.estimator, one.parameter): float(one.by_model) for one in factors}

@@ -22,7 +22,7 @@ FIELD_COLOURS = {"left edge": svg.SKY, "centre": svg.BLUE, "right edge": svg.PUR
 _CHANNEL_COLOURS = (svg.VERMILION, svg.ORANGE, svg.BROWN, svg.GREY, svg.YELLOW, svg.INK)
 """Colours of a camera's monitor beams, in the order of its channels; they repeat if there are more channels."""
 ARROW = 0.3
-"""Length of the arrow along a line of sight, metres."""
+"""Length of the arrow along a line of sight, in metres."""
 # fills: red, green, blue and opacity
 _GLASS, _BLOCK, _FRAME = (0.34, 0.71, 0.91, 0.25), (0.0, 0.62, 0.45, 0.22), (0.42, 0.45, 0.50, 0.35)
 _FACE = "#4b91c7"
@@ -30,7 +30,8 @@ _UP, _DOWN = 1 + RIM // 4, 1 + 3 * RIM // 4  # edge rays at +y and -y of the sto
 
 
 def side_view_svg(instrument: Instrument, paths: LightPaths) -> str:
-    """Base X-Z plane, metres; the mirrors are cut in the camera's plane of symmetry."""
+    """Draw the instrument in the base's X-Z plane, in metres, with the mirrors cut in the camera's plane of symmetry.
+    """
     with svg.look("side-view"):
         spread = np.concatenate([b.vertices.reshape(-1, 3) for b in paths.beams])
         low, high = spread[:, [0, 2]].min(axis=0) - 0.3, spread[:, [0, 2]].max(axis=0) + 0.3 + 0.5 * ARROW
@@ -68,13 +69,13 @@ def _channel(beam: Beam) -> str:
 
 
 def _colours(instrument: Instrument) -> dict[str, str]:
-    """Name of a channel -> colour, the same in all cameras."""
+    """Return channel name -> colour, identical in all cameras."""
     names = dict.fromkeys(channel.name for channel in instrument.channels)
     return {name: _CHANNEL_COLOURS[i % len(_CHANNEL_COLOURS)] for i, name in enumerate(names)}
 
 
 def _seen(instrument: Instrument, camera: str) -> list[Channel]:
-    """The channels that the side view shows: those at -Y lie behind others, where both ends have some."""
+    """Return the channels that the side view shows: those at +Y, which hide those at -Y, or all if none is at +Y."""
     own = [c for c in instrument.channels if c.camera == camera]
     return [c for c in own if c.ccd[1] > 0.0] or own
 
@@ -124,7 +125,7 @@ def _fill(solid: Solid) -> tuple[float, float, float, float]:
 
 
 def _prisms(axes: Axes, instrument: Instrument, paths: LightPaths) -> None:
-    """Outlines of all glass bodies and frames; one label for each camera's."""
+    """Draw the outlines of all glass bodies and frames, with one label for each camera."""
     small: list[tuple[np.ndarray, str]] = []
     large: dict[str, list[tuple[np.ndarray, str]]] = {}
     labelled = {c.prism_body(PRISM_180): c.camera for camera in instrument.cameras for c in _seen(instrument, camera)}
@@ -152,13 +153,13 @@ def _prisms(axes: Axes, instrument: Instrument, paths: LightPaths) -> None:
 
 
 def _outline(solid: Solid, paths: LightPaths) -> np.ndarray:
-    """A convex body as the side view sees it: corners of its outline in order, x and z, metres."""
+    """Return the outline of a convex body in the side view: its corners in order, (n, 2) array of x and z, metres."""
     corners = paths.placed.pose(solid.path).apply(solid_mesh(solid, paths.placed).vertices)[:, [0, 2]]
     return np.asarray(corners[ConvexHull(corners).vertices])
 
 
 def _focal_plane(axes: Axes, paths: LightPaths, camera: str) -> None:
-    """Seen along the line CCD a focal plane is a point: it is drawn as a bar wide enough to be seen."""
+    """Draw a focal plane, a point when seen along the line CCD, as a bar that is wide enough to be visible."""
     pose = paths.placed.pose(f"{BASE}/{camera}/focal_plane")
     bar = pose.apply(np.array([[-0.06, 0.0, 0.0], [0.06, 0.0, 0.0]]))
     axes.plot(bar[:, 0], bar[:, 2], color=svg.GREEN, lw=4, solid_capstyle="butt", zorder=5)
@@ -170,21 +171,21 @@ def _focal_plane(axes: Axes, paths: LightPaths, camera: str) -> None:
 
 
 def _widest(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of the diameter of a disk, of two, that is longer in the side view: their x and z."""
+    """Return x and z of the ends of that one of a disk's two diameters that is longer in the side view."""
     pairs = ends.reshape(2, 2, 3)[..., [0, 2]]
     best = int(np.argmax(np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=-1)))
     return pairs[best, :, 0], pairs[best, :, 1]
 
 
 def _section(model: CameraModel, mirror: str) -> np.ndarray:
-    """Points of a mirror in its plane of symmetry, in its own frame."""
+    """Return points of a mirror in its plane of symmetry, (25, 3) array in the mirror's frame, metres."""
     _, _, low, high = model.apertures[mirror].bounds
     y = np.linspace(low, high, 25)
     return np.stack([np.zeros_like(y), y, model.surfaces[mirror].sag(np.zeros_like(y), y)], axis=-1)
 
 
 def _fan(axes: Axes, beam: Beam, colour: str, alpha: float) -> None:
-    """A beam as seen from the side: shaded segment by segment, its middle ray and its outermost rays drawn."""
+    """Draw a beam in the side view: shaded segment by segment, with its middle ray and its outermost rays."""
     flat = beam.vertices[:, :, [0, 2]]
     for k in range(flat.shape[1] - 1):
         outline = np.concatenate([flat[[_UP, _DOWN], k], flat[[_DOWN, _UP], k + 1]])
@@ -211,11 +212,13 @@ def _label(
 
 
 MOST_COLUMNS = 5
-"""Of the drawing of footprints; a camera with more surfaces gets more lines."""
+"""Largest number of columns in the drawing of footprints; a camera with more surfaces gets more rows."""
 
 
 def footprints_svg(instrument: Instrument, paths: LightPaths) -> str:
-    """Where the beams meet each mirror, millimetres in the mirror's own x, y; one row per camera, or several."""
+    """Draw the footprints of the beams on each mirror, in millimetres of the mirror's frame, one or more rows per
+    camera.
+    """
     with svg.look("footprints"):
         shown = [
             (camera, name)
@@ -252,8 +255,7 @@ def footprints_svg(instrument: Instrument, paths: LightPaths) -> str:
 
 
 def _style(colour: str, filled: bool) -> dict[str, Any]:
-    """Line style of a beam's footprint. Footprints of both ends may coincide: those at +Y are filled, the others
-    outlines.
+    """Return the line style of a footprint: filled at +Y, an outline at -Y, since footprints of both ends may coincide.
     """
     return {"fc": colour, "ec": colour, "alpha": 0.5} if filled else {"fill": False, "ec": colour, "lw": 1.4}
 

@@ -1,4 +1,4 @@
-"""What the images of a monitor say, wherever they come from, and its JSON form (the contract of recovered.json)."""
+"""Result of reading a monitor's images, simulated or recorded, and its JSON form (the content of recovered.json)."""
 
 from __future__ import annotations
 
@@ -30,33 +30,33 @@ from twin.uncertainty.monitor_limits import short_text, unseen_texts
 @shows("cameras", "frames", "centroid", "recovery")
 @dataclass(frozen=True, eq=False)
 class MonitorReading:
-    """One state's reading.
+    """Reading of one state of a monitor, with its covariance and the checks of it.
 
     Attributes
     ----------
-    channels : tuple[tuple[str, str], ...]
-        Camera and name of the channel of every spot, in the order of the spots.
+    channels : tuple of (str, str)
+        Camera and channel name of every spot, in the order of the spots.
     cameras : Mapping[str, CameraCalibration]
-        What is calibrated of each.
-    ground : GroundGeometry | None
-        How a pair of known altitude sees the ground, else None.
-    disturbances : Disturbances | None
-        What is stated to move, None for nothing.
+        Calibration of each camera's monitor.
+    ground : GroundGeometry or None
+        Viewing geometry of a pair of cameras at a known altitude.
+    disturbances : Disturbances or None
+        Prior on the disturbances, None if there is none.
     recovery : Recovery
-        What the images say (one state).
+        Spot positions and estimates from the images (one state).
     crosstalk : Mapping[str, CameraCrosstalk]
-        Camera -> response to elementary motions, by which a contradiction is explained; empty where no instrument is
-        modelled.
+        Response of each camera to elementary motions, used to explain a contradiction of the prior; empty without a
+        model of the instrument.
     frames : int
-        Of each spot after.
+        Number of frames of each spot after the change.
     centroid : str
-        By which method the spots were found.
-    found_wrong : tuple[str, ...]
-        Why sigma does not hold, as far as it was found before the spots were read.
-    truth : Truth | None
-        Of the state, where it is simulated.
+        Method that locates the spots.
+    found_wrong : tuple of str
+        Reasons why sigma does not hold that were known before the spots were read.
+    truth : Truth or None
+        True changes, for simulated states.
     together : int
-        Number of measurements, of which this is one, that have one false-alarm rate together.
+        Number of measurements, this one included, that share one false-alarm rate.
     """
 
     channels: tuple[tuple[str, str], ...]
@@ -73,28 +73,31 @@ class MonitorReading:
 
     @property
     def estimators(self) -> dict[str, Estimator]:
-        """Those that stand in the results, by their names there: all but those that need what is not stated."""
+        """Estimators in the results, by name: all whose requirements (a prior, for instance) are met."""
         return applicable(self.cameras, self.disturbances)
 
     @property
     def judged(self) -> str:
-        """The estimator of the verdict: `posterior` where stated disturbances change any reading, else `model`."""
+        """Estimator of the verdict: `posterior` where the prior's disturbances change any reading, else `model`."""
         return preferred_estimator(name for name in self.estimators if self.table.of(name))
 
     @cached_property
     def table(self) -> ReadingTable:
-        """All readings, beside the truth where there is one."""
+        """All readings, beside the truth where it is known."""
         return reading_table(self.recovery, self.cameras, self.truth, self.ground, self.disturbances).at(0)
 
     @cached_property
     def gains(self) -> dict[str, np.ndarray]:
-        """Estimator -> (4 x cameras, 2 x spots) parameters (rad, m) per pixel of shift, at this measurement."""
+        """Gain of each estimator at this measurement: (4 x cameras, 2 x spots) parameters (rad, m) per pixel of shift.
+        """
         return estimator_gains(self.cameras, self.disturbances, self.recovery.shift_covariance[0])
 
     @cached_property
     def doubts(self) -> tuple[str, ...]:
-        """Why sigma does not hold for this measurement: spots that are not as calibrated, readings that are not linear
-        and cannot be worked out anew, and shifts that contradict the prior. Sentences without their end.
+        """Reasons why sigma does not hold for this measurement, as sentences without full stops.
+
+        They are spots that differ from their calibration, readings that are not linear and cannot be relinearised, and
+        shifts that contradict the prior.
         """
         out = list(self.found_wrong)
         evidence = self.recovery.evidence
@@ -111,12 +114,12 @@ class MonitorReading:
 
     @property
     def contradiction(self) -> tuple[str, ...]:
-        """The sentence that the shifts contradict the prior, where they do."""
+        """Sentence that the shifts contradict the prior; empty where they agree with it."""
         return contradicted(self.disturbances, self.consistency)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was worked out anew since it is not linear; sentences without their end."""
+        """Readings that were relinearised because they are not linear, as sentences without full stops."""
         return tuple(
             f"the motions that the {self.estimators[name].title} reads are not small: {self._off(name)} against the "
             "state traced again, so that its readings are those of Gauss and Newton's steps to their end"
@@ -135,7 +138,7 @@ class MonitorReading:
         return unseen_texts(stated, noise, self._quantities, self.gains[self.judged])
 
     def _off(self, name: str) -> str:
-        """The quantity whose linear reading is off by most, and by how much."""
+        """Return the quantity whose linear reading departs most from the retraced state, and by how much, as text."""
         worst, size = self.recovery.curvature[name].worst()
         if not math.isfinite(size):
             return "its light is lost"
@@ -147,14 +150,15 @@ class MonitorReading:
 
     @property
     def sigma_holds(self) -> bool:
-        """Whether there are no doubts."""
+        """True if there are no doubts."""
         return not self.doubts
 
     @cached_property
     def from_statement(self) -> dict[str, dict[str, float | None]]:
-        """Group -> key -> share of the posterior's variance that no spot constrains, however little noise it has: what
-        rests on the statement alone; None of what no stated motion changes. Empty where nothing is stated, and without
-        noise.
+        """Group -> key -> share of the posterior's variance that stays without image noise, so that it rests on the
+        prior alone.
+
+        None for a quantity that no motion of the prior changes. Empty without a prior and without noise.
         """
         stated, noise = self.disturbances, self.recovery.shift_covariance[0]
         if stated is None or not np.any(noise):
@@ -171,8 +175,10 @@ class MonitorReading:
 
     @cached_property
     def consistency(self) -> Consistency | None:
-        """Do the shifts agree with the stated disturbances? None where none are stated, and where shifts have no noise:
-        a body that is stated to stand still would then be a contradiction by rounding.
+        """Chi-square test of the shifts against the prior on disturbances.
+
+        None without a prior, and where shifts have no noise: a body that the prior holds fixed would then contradict it
+        by rounding.
         """
         if self.disturbances is None or not np.any(self.recovery.shift_covariance):
             return None
@@ -181,12 +187,17 @@ class MonitorReading:
         return consistency(found.shift[0], found.shift_covariance[0], self.disturbances, others, rate)
 
     def any_motions(self, stated: Disturbances) -> dict[str, np.ndarray]:
-        """Body -> what its motions do to all spots, px per table unit, stated or not.
+        """Return the response of all spots to the motions of each body, in the prior or not.
 
         Parameters
         ----------
         stated : Disturbances
-            For how many spots.
+            Prior, which gives the number of spot coordinates.
+
+        Returns
+        -------
+        dict of str to (2 C, M) ndarray
+            Body -> spot shifts, in pixels per table unit of each of its motions.
         """
         columns: dict[tuple[str, str, int], np.ndarray] = {}
         for name, table in self.crosstalk.items():
@@ -199,15 +210,17 @@ class MonitorReading:
         return {b: np.stack([c for (body, _, _), c in columns.items() if body == b], axis=1) for b in bodies}
 
     def worst_of(self, shifts: np.ndarray, covariance: np.ndarray) -> tuple[int, Consistency] | None:
-        """The state of a series whose shifts agree least with the prior, and its consistency. The limit is that of the
-        largest value of all times, at the same false-alarm rate. None without a prior.
+        """Return the state of a series whose shifts agree least with the prior, and its consistency; None without a
+        prior.
+
+        The limit is that of the largest value of all times, at the same false-alarm rate.
 
         Parameters
         ----------
-        shifts : np.ndarray
-            (T, 2 C) px.
-        covariance : np.ndarray
-            (T, 2 C, 2 C) px^2 of these.
+        shifts : (T, 2 C) ndarray
+            Spot shifts at each time, in pixels.
+        covariance : (T, 2 C, 2 C) ndarray
+            Covariance of the shifts, in px^2.
         """
         stated, false_alarm = self.disturbances, FALSE_ALARM / len(shifts)
         if stated is None:
@@ -218,7 +231,7 @@ class MonitorReading:
 
     @property
     def checks(self) -> Iterator[SelfCheck]:
-        """What was checked of the fits, of the statement and of what is linear."""
+        """Checks of the spot fits, of the prior and of the linearity of the readings."""
         evidence = self.recovery.evidence
         if evidence is not None:
             yield from _fits("spots before", evidence.before)
@@ -233,7 +246,7 @@ class MonitorReading:
                 yield SelfCheck(f"linear readings of {name} against the state traced again", size, None, "sigma", says)
 
     def recovered_dict(self) -> dict[str, Any]:
-        """Contents of recovered.json."""
+        """Return the contents of recovered.json."""
         read = self.table.groups()
         spots: dict[str, Any] = {}
         r = self.recovery
@@ -253,7 +266,7 @@ class MonitorReading:
         }
 
     def _retraced(self, name: str) -> dict[str, Any]:
-        """What the state that an estimator's readings stand for says of them."""
+        """Return the comparison of an estimator's readings with the trace of the state that they describe."""
         found = self.recovery.curvature[name]
         worst, size = found.worst()
         quantity = self._quantities[worst]
@@ -265,7 +278,9 @@ class MonitorReading:
         }
 
     def _stated(self, found: Consistency | None) -> dict[str, Any]:
-        """What the total sigmas rest on, and whether shifts agree with it; None without a prior or without noise."""
+        """Return the name of the prior and the test of the shifts against it; its numbers are None without prior or
+        noise.
+        """
         name = None if self.disturbances is None else self.disturbances.name
         numbers = {key: None if found is None else of(found) for key, of in _STATED.items()}
         suspects = [
@@ -278,18 +293,18 @@ class MonitorReading:
 def contradicted(
     stated: Disturbances | None, found: Consistency | None, when: str = "", rate: str = f"{FALSE_ALARM:g}"
 ) -> tuple[str, ...]:
-    """A warning if the shifts of one measurement contradict the prior.
+    """Return a warning if the shifts of a measurement contradict the prior.
 
     Parameters
     ----------
-    stated : Disturbances | None
-        What is stated to move, None for nothing.
-    found : Consistency | None
-        Whether its shifts agree with that.
+    stated : Disturbances or None
+        Prior on the disturbances.
+    found : Consistency or None
+        Test of the shifts against the prior.
     when : str
-        Which measurement it is, where there are several.
+        Text that names the measurement, where there are several.
     rate : str
-        Of false alarms.
+        False-alarm rate, as text.
     """
     if stated is None or found is None or found.agrees:
         return ()
@@ -317,7 +332,7 @@ def _suspected(found: Consistency, stated: Sequence[str]) -> str:
 
 
 def _fits(what: str, fits: FitStates) -> Iterator[SelfCheck]:
-    """The worst fit of some spots, over its limit."""
+    """Yield the check of the worst fit among some spots: its chi-square over its limit."""
     ratio = np.fmax(fits.whole / fits.whole_limit, fits.core / fits.core_limit)
     if np.any(np.isfinite(ratio) & (ratio > 0.0)):
         says = f"reduced chi-square over its limit; false-alarm rate {SPOT_ALARM:g} a fit; beyond 1 sigma is widened"
@@ -325,26 +340,26 @@ def _fits(what: str, fits: FitStates) -> Iterator[SelfCheck]:
 
 
 def stated_check(name: str, told: Consistency) -> SelfCheck:
-    """Whether shifts agree with what is stated to move.
+    """Return the check of spot shifts against the prior on disturbances.
 
     Parameters
     ----------
     name : str
-        Of the check.
+        Name of the check.
     told : Consistency
-        How they do.
+        Test of the shifts against the prior.
     """
     says = f"chi-square of {told.degrees} degrees; false-alarm rate {told.false_alarm:.2g}; a warning beyond it"
     return SelfCheck(name, told.chi_square, told.limit, "", says)
 
 
 def worst_checks(readings: Iterable[MonitorReading]) -> tuple[SelfCheck, ...]:
-    """The worst check of each name among several readings.
+    """Return the worst check of each name among several readings.
 
     Parameters
     ----------
     readings : Iterable[MonitorReading]
-        Of states or times.
+        Readings of several states or times.
     """
     out: dict[str, SelfCheck] = {}
     for check in (check for reading in readings for check in reading.checks):
@@ -356,7 +371,7 @@ def worst_checks(readings: Iterable[MonitorReading]) -> tuple[SelfCheck, ...]:
 SHARE, OFF = 3, 1
 """Decimals of shares, and of how far linear readings are off in sigmas: noise does not move them but by chance."""
 STATED = 6
-"""Decimals of a reading's sigma to which files state the reading."""
+"""Decimals of a reading in files, counted in units of its sigma."""
 _STATED: Mapping[str, Callable[[Consistency], Any]] = {
     "chi_square": lambda found: _to_digits(found.chi_square),
     "chi_square_sigma_noise": lambda found: found.sigma_noise,
@@ -367,11 +382,11 @@ _STATED: Mapping[str, Callable[[Consistency], Any]] = {
     "chance_sigma_noise": lambda found: found.chance_sigma_noise,
     "agrees": lambda found: found.agrees,
 }
-"""Key of the agreement with the prior in files -> its number."""
+"""Key in files -> number of the test against the prior."""
 _STATED_SIGMA = 8
-"""Significant digits of a sigma, and of a chi-square."""
+"""Significant digits of a sigma and of a chi-square in files."""
 _SIGMAS = ("_sigma", "_sigma_noise", "_rms_m")
-"""Endings of the keys of sigmas."""
+"""Endings of the keys that hold sigmas."""
 
 
 def _to_digits(value: float) -> float:
@@ -379,15 +394,15 @@ def _to_digits(value: float) -> float:
 
 
 def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
-    """Readings with as many digits as files state: each to a millionth of its sigma, the sigmas to eight digits.
+    """Round readings for files: each to a millionth of its sigma, the sigmas to eight digits.
 
-    What comes after says nothing, and it depends on the processor: on the order in which its linear algebra sums.
+    Further digits carry no information and differ between processors, with the order in which linear algebra sums.
 
     Parameters
     ----------
     readings : Mapping[str, Any]
-        Nested; the sigma of ``x`` is ``x_sigma_noise`` or ``x_sigma`` beside it, the first that is there. Other numbers
-        stay as they are.
+        Nested readings; the sigma of ``x`` is ``x_sigma_noise`` or ``x_sigma`` beside it, the first that is there.
+        Other numbers are not rounded.
     """
     out: dict[str, Any] = {}
     for key, value in readings.items():
@@ -406,7 +421,7 @@ def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _fit(fits: FitStates | None, spot: int) -> dict[str, float | None]:
-    """How good the fit of a spot is; None where no shape was fitted or no fit was judged."""
+    """Return the goodness of fit of a spot; its numbers are None where no shape was fitted or no fit was tested."""
     known = fits is not None and math.isfinite(fits.whole[0, spot])
     return {key: _to_digits(float(getattr(fits, of)[0, spot])) if known else None for key, of in _FIT.items()}
 
@@ -418,7 +433,7 @@ _FIT = {
     "core_chi_square_sigma_noise": "core_sigma",
     "sigma_widened": "widening",
 }
-"""Key of a spot in files -> the number of its fit."""
+"""Key of a spot in files -> attribute of its fit."""
 
 
 def _spot(position: np.ndarray, sigma: np.ndarray) -> dict[str, float]:

@@ -1,6 +1,4 @@
-"""What the report says of image quality, targets, stray light, and bodies that tables of nodes deform or warm, where a
-job asks for them.
-"""
+"""Report sections on image quality, targets, stray light, and deformed or heated bodies, where a job asks for them."""
 
 from __future__ import annotations
 
@@ -38,7 +36,7 @@ FREE = "the pupils are free: `obstruction: ignore`"
 
 
 def quality_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
-    """Wavefront errors, focus and MTF of the line CCDs; None when they were not asked for."""
+    """Return the section on wavefront errors, focus and MTF of the line CCDs; None if they were not asked for."""
     quality = run.quality
     if quality is None:
         return None
@@ -100,7 +98,7 @@ def _quality_rows(name: str, camera: CameraQuality, quality: ImageQuality) -> li
 
 
 def _every_field(quality: ImageQuality) -> Table:
-    """All digits at every field, not only at those that the report shows."""
+    """Return the table with all digits at every field, including those that the report leaves out."""
     places = {quality.fields.index(field): place for place, field in PLACES.items()}
     rows: list[list[Cell]] = []
     for name, camera in quality.cameras.items():
@@ -119,7 +117,7 @@ _DECIMALS = 4
 
 
 def target_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
-    """MTF from images of targets, and these images; None when no targets were asked for."""
+    """Return the section with images of targets and the MTF measured in them; None if no targets were asked for."""
     targets = run.targets
     if targets is None:
         return None
@@ -207,7 +205,7 @@ def _mtf_table(targets: TargetRun, kinds: list[str]) -> Table:
 
 
 def _mtf_rows(name: str, camera: CameraTargets) -> list[list[Cell]]:
-    """All digits of a camera's readings."""
+    """Return table rows with all digits of a camera's MTF readings."""
     rows: list[list[Cell]] = []
     for place, targets in camera.places.items():
         for direction in DIRECTIONS:
@@ -222,7 +220,7 @@ def _mtf_rows(name: str, camera: CameraTargets) -> list[list[Cell]]:
 
 
 def _mtf_cells(key: str, reading: EdgeReading | BarReading) -> tuple[Marked, Marked]:
-    """One measured value and its truth."""
+    """Return the cells of a measured MTF at Nyquist and of its true value."""
     true = Marked(fixed(reading.true_nyquist, _DECIMALS), "", "truth", f"{key}.true")
     found = reading.nyquist
     if found is None:
@@ -233,11 +231,11 @@ def _mtf_cells(key: str, reading: EdgeReading | BarReading) -> tuple[Marked, Mar
 
 
 _STRONGEST = 4
-"""Families listed of each source."""
+"""Number of path families listed for each source."""
 
 
 def stray_section(run: RenderRun) -> Section | None:
-    """Shares and families of the perturbed state; None when no stray light was asked for."""
+    """Return the section on stray light in the perturbed state, amounts and path families; None if not asked for."""
     if run.stray is None:
         return None
     after = run.stray.after
@@ -305,18 +303,18 @@ def stray_section(run: RenderRun) -> Section | None:
 
 
 def _way(way: list[str]) -> str:
-    """Surfaces in order, without ``base/<camera>/monitor/<channel>/`` of prisms, which every step repeats."""
+    """Return surfaces in order, without the ``base/<camera>/monitor/<channel>/`` that all paths of prisms share."""
     prisms = [step for step in way if "/monitor/" in step]
     common = "/".join(prisms[0].split("/")[:4]) + "/" if prisms else ""
     return " \N{RIGHTWARDS ARROW} ".join(step.removeprefix(common) for step in way)
 
 
 _SHOWN_ANGLES = np.arange(0.0, 90.0, 10.0)
-"""Angles of incidence, degrees, at which coatings are shown; those beyond their tables are left out."""
+"""Angles of incidence, in degrees, at which coatings are tabulated; those beyond the coating's table are omitted."""
 
 
 def finish_section(run: RenderRun) -> Section | None:
-    """What the tables are at the monitor's wavelength; None where there are none."""
+    """Return the section on measured scatter and coatings at the monitor's wavelength; None if there are none."""
     measured = None if run.stray is None else run.stray.measured
     if measured is None or not (measured.scatter or measured.coatings):
         return None
@@ -348,17 +346,17 @@ def finish_section(run: RenderRun) -> Section | None:
 
 
 NAMED = 1e-10
-"""Terms smaller than this, metres rms, are left out of the report's table."""
+"""Amplitude, in metres RMS, below which the report's table omits a Zernike term."""
 
 
 def _flat(told: Mapping[str, Any], *keys: str) -> list[Cell]:
-    """Return the numbers of some keys, of vectors one for each axis."""
+    """Return the numbers under some keys as table cells; a vector gives one cell for each axis."""
     found = [told[key] for key in keys]
     return [number for one in found for number in (one if isinstance(one, list) else [one])]
 
 
 def deformation_section(run: JobRun) -> Section | None:
-    """Numbers, terms and maps of all deformed bodies; None where there are none."""
+    """Return the section with numbers, Zernike terms and maps of all deformed bodies; None if there are none."""
     if not run.deformed:
         return None
     from twin.main_job.target_plots import deformation_svg  # what draws takes long to import
@@ -412,7 +410,7 @@ def deformation_section(run: JobRun) -> Section | None:
 
 
 def heat_section(run: JobRun) -> Section | None:
-    """Numbers of all bodies that tables of temperatures warm; None where there are none."""
+    """Return the section on bodies whose temperatures come from tables of nodes; None if there are none."""
     if not run.heated:
         return None
     keys = ["nodes", "spacing_mm", "linear_change_k", "linear_gradient_k_per_m"]

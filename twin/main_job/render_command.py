@@ -1,4 +1,4 @@
-"""What ``python -m twin.render`` does with a job that it has read: compute, write the run folder, tell the result."""
+"""The command ``python -m twin.render`` after its job is read: compute, write the run folder, print the result."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from twin.targets.target_measurement import TargetRun
 
 _DASH = "\N{EM DASH}"
 NUMBER = 7
-"""Width of most numbers there."""
+"""Width of most numbers in the terminal's table, in characters."""
 _WIDE = 90
-"""Columns of a terminal from which on the table also has the noise's part of sigma."""
+"""Terminal width, in characters, from which the table also has the noise's part of sigma."""
 
 _ALONG = dict(zip(DIRECTIONS, ("along line", "along track"), strict=True))
-"""How the terminal names the direction in which the MTF is measured."""
+"""Direction of the MTF -> its name in the terminal."""
 
 
 def run_render(resolved: ResolvedJob, session: Session, frames: int | None, seed: int | None, picture: bool) -> Result:
@@ -44,20 +44,20 @@ def run_render(resolved: ResolvedJob, session: Session, frames: int | None, seed
     Parameters
     ----------
     resolved : ResolvedJob
-        The job with all it refers to.
+        The job with all that it refers to.
     session : Session
-        The command at work.
-    frames : int | None
-        Of each state, None for as many as the job says.
-    seed : int | None
-        Of all noise, None for the job's.
+        Session of the running command.
+    frames : int or None
+        Number of frames of each state; None for the job's number.
+    seed : int or None
+        Seed of all noise; None for the job's seed.
     picture : bool
         Also render pictures of the instrument.
 
     Raises
     ------
     InputError
-        The job cannot be: its perturbation, its targets.
+        The job's perturbation or its targets are not possible.
     """
     # a second thread of linear algebra would wait for a core that the second process has
     with SecondProcess(load_drawing) as beside, one_blas_thread():
@@ -68,7 +68,7 @@ def run_render(resolved: ResolvedJob, session: Session, frames: int | None, seed
 
 
 def _numbers(run: JobRun) -> dict[str, Any]:
-    """What ``--json`` prints: contents of the files with the main results, by their kind."""
+    """Return what ``--json`` prints: contents of the files with the main results, by their kind."""
     parts = {"truth": run.truth_dict()}
     if isinstance(run, RenderRun):
         parts["recovered"] = recovered_numbers(run)
@@ -84,7 +84,7 @@ def _numbers(run: JobRun) -> dict[str, Any]:
 
 
 def _print_result(run: JobRun, console: Console) -> None:
-    """The verdict, the result table and what to bear in mind."""
+    """Print the verdict, the result table, remarks and warnings."""
     told = judge(run)
     print_verdict(console, told.verdict)
     after = list(told.more)
@@ -109,7 +109,7 @@ def _print_result(run: JobRun, console: Console) -> None:
 
 
 def _mtf_table(targets: TargetRun) -> Table | None:
-    """MTF at the Nyquist frequency from the knife edges, before -> after (true); None if there are none."""
+    """Return the table of MTF at Nyquist from the knife edges, before -> after (true); None if there are none."""
     title = f"MTF at the Nyquist frequency from the knife edge ({targets.frames} frames)"
     title += "\nbefore -> after, below it the true one"
     table = result_table(title)
@@ -134,7 +134,7 @@ def _mtf_table(targets: TargetRun) -> Table | None:
 
 
 def _head(name: str) -> str:
-    """An estimator's name, broken where it is wider than the numbers below it."""
+    """Return an estimator's name, broken into lines where it is wider than the numbers below it."""
     words = [
         word if len(word) <= NUMBER else f"{word[: NUMBER - 2]}-\n{word[NUMBER - 2 :]}" for word in name.split("_")
     ]
@@ -142,7 +142,7 @@ def _head(name: str) -> str:
 
 
 def _changes(run: JobRun) -> Table:
-    """True changes, and wavefront error and MTF at the middle of the line and at its ends, of what has no monitor."""
+    """Return the table of true changes, wavefront error and MTF of an instrument without a monitor."""
     table = result_table(f"{run.resolved.instrument.name}: what changes, by exact tracing")
     for head in ("", "change"):
         table.add_column(head, justify="right" if head else "left", no_wrap=True)
@@ -164,7 +164,7 @@ def _changes(run: JobRun) -> Table:
 
 
 def _table(run: RenderRun, wide: bool) -> Table:
-    """What every estimator recovered, beside the truth, with sigma and error of the judged one."""
+    """Return the table of every estimator's readings beside the truth, with sigma and error of the judged estimator."""
     title = f"{run.resolved.instrument.name}: recovered from the images ({run.frames} frames, seed {run.seed})"
     if run.series is not None:
         title += f"\nat {moment(float(run.series.times[run.series.shown]))} of the course"

@@ -1,5 +1,6 @@
-"""The files of a run that hold its numbers and images, and the tables that its job names: where the run keeps them, so
-that config.yaml repeats it without them, and what those of nodes were found to be.
+"""Files of a run with its numbers and images, and the tables of nodes and finishes that its job names.
+
+The run folder keeps a copy of each such table, so that its config.yaml repeats the run without the originals.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from twin.uncertainty.uncertainty_numbers import LIMITS
 
 
 def irradiance_file(run: RenderRun) -> bytes:
-    """Contents of irradiance.nc."""
+    """Return the contents of irradiance.nc."""
     return netcdf(irradiance(run))
 
 
@@ -41,9 +42,9 @@ def write_results(run: JobRun, folder: RunFolder) -> None:
     Parameters
     ----------
     run : JobRun
-        What to write.
+        Run to write.
     folder : RunFolder
-        An open run folder.
+        Open run folder.
     """
     # TIFF and netCDF are made in memory: on a full disk NumPy's writer does not say why, and HDF5 crashes the process
     folder.write_text("config.yaml", config_text(run.resolved))
@@ -65,7 +66,7 @@ def write_results(run: JobRun, folder: RunFolder) -> None:
 
 
 def _write_monitor(run: RenderRun, folder: RunFolder) -> None:
-    """What the monitor recorded and what it reads."""
+    """Write the frames, readings and tables of a run's monitor."""
     crosstalk = {name: table.to_dict() for name, table in run.crosstalk.items()}
     for kind, data in (("recovered", recovered_numbers(run)), ("crosstalk", crosstalk)):
         _write_numbers(folder, kind, data)
@@ -85,18 +86,18 @@ def _write_monitor(run: RenderRun, folder: RunFolder) -> None:
 
 
 def _write_numbers(folder: RunFolder, kind: str, data: Mapping[str, Any]) -> None:
-    """``KIND.json`` with its schema and frames."""
+    """Write ``KIND.json`` with its schema and reference frames."""
     folder.write_json(f"{kind}.json", described(kind, data))
 
 
 def _spot_facts(run: RenderRun, channel: Channel, note: str) -> FrameFacts:
-    """What is known of frames of a monitor's area CCD."""
+    """Return the metadata of frames of a monitor's area CCD."""
     camera = f"{channel.camera}, {channel.name} area CCD"
     return FrameFacts(camera, run.experiment.path.pitch, run.experiment.exposure, note=note)
 
 
 def _write_series(run: RenderRun, series: TimeSeries, folder: RunFolder) -> None:
-    """Numbers, expected images, and of each channel the first frame of every time as one page."""
+    """Write a course: numbers, expected images, and for each channel the first frame of every time as one page."""
     _write_numbers(folder, "course", series.to_dict())
     for i, channel in enumerate(run.experiment.path.channels):
         times = tuple(float(time) for time in series.times)
@@ -109,7 +110,9 @@ def _write_series(run: RenderRun, series: TimeSeries, folder: RunFolder) -> None
 
 
 def _write_targets(targets: TargetRun, folder: RunFolder) -> None:
-    """MTF and frames; the faint rings of a pinhole are stretched in its preview, levels of the others are not."""
+    """Write MTF and frames of targets; previews are stretched for a pinhole, to show its faint rings, and linear
+    otherwise.
+    """
     _write_numbers(folder, "mtf", targets.to_dict())
     for stem, name, frames, facts in targets.images():
         for file, content in frame_files(stem, frames, facts, SPOT_STRETCH if name == "pinhole" else None):
@@ -120,7 +123,9 @@ _WAVELENGTH = {"units": "m", "standard_name": "radiation_wavelength", "long_name
 
 
 def irradiance(run: RenderRun) -> GridData:
-    """Expected photons before and after, (state, channel, row, column), with stray light apart where it was traced."""
+    """Return expected photons before and after, (state, channel, row, column); traced stray light is a variable of its
+    own.
+    """
     photons = np.stack([run.photons_before, run.photons_after])
     states = ("state", ["before", "after"], {"long_name": "before the disturbance or after it"})
     images = _images(run, "state", states, photons)
@@ -133,7 +138,7 @@ def irradiance(run: RenderRun) -> GridData:
 
 
 def _images(run: RenderRun, first: str, coordinate: Gridded, photons: np.ndarray) -> GridData:
-    """Expected images (N, C, rows, columns) with the coordinate of their first axis."""
+    """Return expected images (N, C, rows, columns) as grid data with the coordinate of their first axis."""
     path = run.experiment.path
     return GridData(
         {
@@ -160,7 +165,7 @@ def _images(run: RenderRun, first: str, coordinate: Gridded, photons: np.ndarray
 
 
 def table_names(job: JobSpec) -> Mapping[tuple[str, str], str]:
-    """Body and what a table does to it, a key of its perturbation -> name of the table in the run folder."""
+    """Return (body, key of its perturbation) -> name of the table of nodes in the run folder."""
     named = {
         (path, kind): spec.table
         for path, what in job.perturb.items()
@@ -176,13 +181,13 @@ def table_names(job: JobSpec) -> Mapping[tuple[str, str], str]:
 
 
 def finish_tables(job: JobSpec) -> Mapping[tuple[str, str], FinishTableSpec]:
-    """Kind of surface and what is measured of it -> table, of a job's stray light."""
+    """Return (kind of surface, measured quantity) -> table of a finish, for a job's stray light."""
     stray = job.render.stray
     return FrozenMap({} if stray is None or stray.finishes is None else stray.finishes.tables)
 
 
 def finish_names(job: JobSpec) -> Mapping[tuple[str, str], str]:
-    """Kind of surface and what is measured of it -> name of the table in the run folder."""
+    """Return (kind of surface, measured quantity) -> name of the table of a finish in the run folder."""
     tables = finish_tables(job).items()
     return FrozenMap(
         {(kind, what): f"finish/{kind}_{what}{PurePath(t.table).suffix.lower()}" for (kind, what), t in tables}
@@ -190,7 +195,7 @@ def finish_names(job: JobSpec) -> Mapping[tuple[str, str], str]:
 
 
 def config_text(resolved: ResolvedJob) -> str:
-    """Text of the run folder's config.yaml, which names the tables beside it."""
+    """Return the text of the run folder's config.yaml, which names the tables beside it."""
     names, finishes = table_names(resolved.job), finish_names(resolved.job)
     if not names and not finishes:
         return resolved.to_yaml()
@@ -261,7 +266,7 @@ WARMED: Record[HeatedBody] = Record(
 
 
 def table_numbers(run: JobRun) -> dict[str, dict[str, Any]]:
-    """Return the contents of deformation.json and temperature.json, by their kind, of a job that has such tables."""
+    """Return the contents of deformation.json and temperature.json, by kind, of a job that has such tables."""
     names = table_names(run.resolved.job)
     found = {
         "deformation": {path: BENT(face) for path, face in run.deformed.items()},
@@ -275,14 +280,14 @@ def table_numbers(run: JobRun) -> dict[str, dict[str, Any]]:
 
 
 def deformation_warnings(faces: Mapping[str, NodalDeformation], planes: Collection[str] = ()) -> tuple[str, ...]:
-    """What the user should know of the meshes.
+    """Return warnings about the meshes of deformed surfaces.
 
     Parameters
     ----------
     faces : Mapping[str, NodalDeformation]
-        Body -> what its table is.
+        Body -> deformation by its table of nodes.
     planes : Collection[str]
-        Of these, faces of glass in a run with stray light, which takes them as planes.
+        Those of the bodies that are glass faces in a run with stray light, which treats them as planes.
     """
     bent = {path: 1e9 * faces[path].rms(faces[path].change) for path in planes}
     out = [

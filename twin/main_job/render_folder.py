@@ -1,5 +1,6 @@
-"""The run folder of a main job: its data, then what they look like. What each drawing needs is imported when it is
-drawn, and by the process that draws it.
+"""Run folder of a main job: its data files, figures and report.
+
+Each drawing imports what it needs when it is drawn, in the process that draws it.
 """
 
 from __future__ import annotations
@@ -53,23 +54,23 @@ from twin.pictures.scene_file import viewer_markup, viewer_programs, viewer_scri
 
 
 def write_run(run: JobRun, session: Session, picture: bool = False, beside: SecondProcess | None = None) -> str:
-    """Write all files of a run: its data, then what they look like.
+    """Write all files of a run: its data, then figures and report.
 
     Parameters
     ----------
     run : JobRun
-        What was computed.
+        Run to write.
     session : Session
-        With the open run folder.
+        Session with the open run folder.
     picture : bool
         Also render pictures of the instrument.
-    beside : SecondProcess | None
-        The process that helps with the drawing; None for one that begins now.
+    beside : SecondProcess or None
+        Second process that draws figures; None starts one.
 
     Returns
     -------
     str
-        What could not be drawn and why, empty where all was.
+        What could not be drawn and why; empty if all was drawn.
     """
     if beside is None:
         with SecondProcess(load_drawing) as helper:
@@ -105,7 +106,7 @@ def write_run(run: JobRun, session: Session, picture: bool = False, beside: Seco
 
 
 def _pictures(run: JobRun, session: Session) -> str:
-    """Render them; why they are not complete, else nothing."""
+    """Render pictures of the instrument; return why they are incomplete, or an empty string."""
     from twin.pictures.picture import PictureError, write_pictures
 
     write = session.folder.write_with
@@ -121,7 +122,7 @@ _PICTURES = {
     "picture_prisms.png": "The central prism and what is next to it",
     "picture_focal_plane.png": "The detectors of the first camera",
 }
-"""What the rendered pictures show."""
+"""Captions of the rendered pictures."""
 _JPEG_QUALITY = 88
 AGAIN = (
     "The run folder's own config.yaml holds everything that was resolved; with the same versions it gives the same "
@@ -136,19 +137,19 @@ def render_report(
     pictures: Sequence[Path] = (),
     drawn: Mapping[str, Any] | None = None,
 ) -> str:
-    """The page as text.
+    """Return the HTML text of the report.
 
     Parameters
     ----------
     run : JobRun
-        The run.
+        Run to report.
     sections : Sequence[Section]
-        Beside the report's own.
-    scene : bytes | None
-        Contents of scene.glb, for the view that can be turned; None leaves it out.
+        Further sections.
+    scene : bytes or None
+        Contents of scene.glb, for the 3-D view; None omits the view.
     pictures : Sequence[Path]
-        Files in PICTURES that were rendered.
-    drawn : Mapping[str, Any] | None
+        Rendered pictures, named as in ``_PICTURES``.
+    drawn : Mapping[str, Any] or None
         Name -> <svg> element of every figure of ``twin.main_job.render_folder``; None draws them.
     """
     experiment, backend = run.experiment, run.experiment.backend.name
@@ -204,7 +205,7 @@ ARROWS = " Arrows: lines of sight."
 
 
 def _instrument(side: str, pictures: Sequence[Path], viewer: Markup, monitored: bool) -> Section:
-    """The view that can be turned, the drawing that stands in for it, and rendered pictures."""
+    """Return the section with the 3-D view, the drawing shown where it is not available, and rendered pictures."""
     drawing = '<figure id="fallback"><div class="card">{}</div><figcaption>{}</figcaption></figure>'
     markup = viewer + Markup(drawing).format(Markup(side), f"{SIDE}{BEAMS if monitored else ''}{ARROWS}")
     if pictures:
@@ -228,13 +229,13 @@ def _light(drawn: Mapping[str, str], monitored: bool) -> Section:
 
 
 def _again_words(run: JobRun, backend: str, pictures: bool) -> tuple[str, ...]:
-    """Words of the command that makes a run again from its own folder."""
+    """Return the words of the command that repeats a run from its folder."""
     options = ("--seed", str(run.seed), "--frames", str(run.frames), "--backend", backend)
     return (PROGRAM, "config.yaml", *options, *(("--picture",) if pictures else ()))
 
 
 def _picture(place: Path) -> Markup:
-    """A rendered picture for the page, a fifth of the file's size."""
+    """Return a rendered picture for the page, compressed as JPEG to a fifth of its file's size."""
     image = cv2.imread(str(place))
     _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     address = "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")
@@ -246,37 +247,38 @@ if TYPE_CHECKING:
     from twin.uncertainty.monitor_limits import MonitorLimits
 
 LIMITS = "limits"
-"""The figure of what limits the readings."""
+"""Name of the figure of what limits the readings."""
 SUMMARY, SCENE, IRRADIANCE = "summary", "scene", "irradiance"
 """What is no figure of the report: the bytes of summary.png, scene.glb, irradiance.nc."""
 APART = (SUMMARY, SCENE, IRRADIANCE)
 LOADED = (SCENE, IRRADIANCE)
-"""What needs libraries that nothing else of a run needs, trimesh and h5netcdf: drawn after `load_drawing`."""
+"""Drawings that need libraries which nothing else in a run needs, trimesh and h5netcdf: drawn after `load_drawing`."""
 FILES = {IRRADIANCE: "irradiance.nc", SCENE: "scene.glb", SUMMARY: "summary.png"}
-"""Where these are written."""
+"""Drawing -> file that it is written to."""
 
 
 def begin_drawing(beside: SecondProcess, instrument: Instrument, backend: Backend, state: State) -> None:
-    """Let the second process draw what is known before anything is measured, if it does not so already.
+    """Start drawing in the second process what is known before the measurement, unless it has started already.
 
     Parameters
     ----------
     beside : SecondProcess
-        The process.
+        Second process.
     instrument : Instrument
-        Of the run.
+        Instrument of the run.
     backend : Backend
-        Where to trace its light.
+        Backend that traces its light.
     state : State
-        That is shown.
+        State that is shown.
     """
     if SCENE not in beside:
         beside.start(instrument_drawings(instrument, backend, state), LOADED)
 
 
 def instrument_drawings(instrument: Instrument, backend: Backend, state: State) -> dict[str, Callable[[], Any]]:
-    """Name -> what draws it, the longest first, of an instrument and its light in a state: <svg> elements, and the
-    bytes of scene.glb.
+    """Return drawing functions of an instrument and its light in a state, by name, the longest first.
+
+    They give <svg> elements, and the bytes of scene.glb.
     """
     paths = trace_light_paths(instrument, backend, state)
     return _tried_each(
@@ -289,7 +291,7 @@ def instrument_drawings(instrument: Instrument, backend: Backend, state: State) 
 
 
 def drawings(run: JobRun) -> dict[str, Callable[[], Any]]:
-    """The same of what a run has found; what it works out on demand is taken as it is now."""
+    """Return drawing functions of a run's results, by name; values computed on demand are computed now."""
     targets = run.targets
     out = _of_monitor(run) if isinstance(run, RenderRun) else {}
     if targets is not None:
@@ -303,7 +305,7 @@ def drawings(run: JobRun) -> dict[str, Callable[[], Any]]:
 
 
 def limits_drawing(limits: MonitorLimits | None) -> dict[str, Callable[[], Any]]:
-    """The same of what limits the readings, of which nothing is drawn where no prior is stated."""
+    """Return the drawing function of what limits the readings, by name; empty without a prior."""
     if limits is None:
         return {}
     return _tried_each({LIMITS: _drawing("twin.uncertainty.uncertainty_report:limits_svg", limits)})
@@ -314,7 +316,7 @@ def _tried_each(drawing: Mapping[str, Callable[[], Any]]) -> dict[str, Callable[
 
 
 def _of_monitor(run: RenderRun) -> dict[str, Callable[[], Any]]:
-    """Drawings of what the monitor recorded and reads."""
+    """Return drawing functions of the monitor's images and readings, by name."""
     out: dict[str, Callable[[], Any]] = {"motions": _drawing("spot_plots:motion_map_svg", run)}
     out |= {f"spots {name}": _drawing("spot_plots:spots_svg", run, name) for name in run.experiment.instrument.cameras}
     out[IRRADIANCE] = _drawing("render_files:irradiance_file", run)
@@ -330,12 +332,13 @@ def _of_monitor(run: RenderRun) -> dict[str, Callable[[], Any]]:
 
 
 def _drawing(function: str, *given: Any) -> Callable[[], Any]:
-    """A drawing by a function, ``module:name``: what draws takes a second to import, in the process that draws."""
+    """Return a drawing by the function ``module:name``, which the drawing process imports, since that takes a second.
+    """
     return partial(Named(function if "." in function else f"{__package__}.{function}"), *given)
 
 
 def _tried(name: str, draw: Callable[[], Any]) -> Any:
-    """A drawing, or Undrawn: what cannot be drawn must not cost what was computed."""
+    """Return a drawing, or Undrawn with the reason: a failed drawing must not cost the computed results."""
     try:
         return draw()
     except Exception as error:
@@ -343,8 +346,12 @@ def _tried(name: str, draw: Callable[[], Any]) -> Any:
 
 
 def without_failed(drawn: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Drawings with a note in the place of a figure that could not be made; files that could not are left out. And what
-    is missing, a sentence each.
+    """Replace figures that could not be drawn by a note and drop files that could not be.
+
+    Returns
+    -------
+    tuple of (dict, tuple of str)
+        The drawings, and a sentence for each that is missing.
     """
     out, missing = dict(drawn), []
     for name, made in drawn.items():
@@ -360,7 +367,7 @@ def without_failed(drawn: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str,
 
 
 def load_drawing() -> None:
-    """Import what all runs draw with, and let it find its fonts."""
+    """Import the libraries that all runs draw with, and let Matplotlib find its fonts."""
     import h5netcdf
 
     from twin.framework.svg import look, new_figure, to_svg

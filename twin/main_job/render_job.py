@@ -53,25 +53,26 @@ STAGES = (
 )
 
 COURSE = "times of the course"
-"""A long part of jobs with a course."""
+"""Progress label of a long part: the times of a course."""
 
 STRAY = "trace ghosts and stray light"
-"""A long part of jobs that ask for it."""
+"""Progress label of a long part: stray light."""
 
 TARGETS = "render the targets"
-"""Another one."""
+"""Progress label of a long part: images of targets."""
 
 QUALITY = "image quality"
-"""And another."""
+"""Progress label of a long part: image quality."""
 
 _FREE_PUPILS = "obstruction: ignore: image quality and targets are those of free pupils, whatever stands in the beams"
-"""Said where the job asks for it."""
+"""Warning of a job that ignores obstructions."""
 
 MIN_LIGHT = 0.5
 """Share of the nominal light on a CCD below which the user is warned: vignetting, or a spot that leaves the CCD."""
 
 SHARP = 1.0 / 14.0
-"""Wavefront error below which a nominal spot is as good as perfect, waves rms (Marechal: Strehl ratio 0.8)."""
+"""Wavefront error, in waves RMS, below which a nominal spot counts as diffraction limited (Marechal: Strehl ratio 0.8).
+"""
 
 
 def render_job(
@@ -83,35 +84,35 @@ def render_job(
     experiment: MonitorExperiment | None = None,
     placed: Callable[[Instrument, Backend, State], object] | None = None,
 ) -> JobRun:
-    """Run a job. Of a course, the time ``course.detail`` is the single state that most of the result is about.
+    """Run a job. Most of a course's results describe the single time ``course.detail``.
 
-    Of an instrument with a monitor the result is a `RenderRun`; one without is perturbed and traced, and its cameras'
-    images are looked at.
+    An instrument with a monitor gives a `RenderRun`. One without is perturbed and traced, and the images of its cameras
+    are evaluated.
 
     Parameters
     ----------
     resolved : ResolvedJob
-        The job.
+        Job to run.
     backend : Backend
-        Where to trace.
-    frames : int | None
-        Per state; overrides the job's.
-    seed : int | None
-        Of all noise; overrides the job's.
+        Backend that traces rays.
+    frames : int or None
+        Number of frames per state; overrides the job's.
+    seed : int or None
+        Seed of all noise; overrides the job's.
     advance : Advance
-        Told of each of STAGES and of QUALITY when it begins and ends, and of the long parts COURSE, STRAY and TARGETS
-        how many of how many times, paths or places are done.
-    experiment : MonitorExperiment | None
-        The job's instrument where it has been built already; results are the same.
-    placed : Callable[[Instrument, Backend, State], object] | None
-        Told of a monitored instrument and of the state that is shown before the rest is computed, for who draws it
-        meanwhile.
+        Called when each of STAGES and QUALITY begins and ends, and for the long parts COURSE, STRAY and TARGETS with
+        the number of times, paths or places done and their total.
+    experiment : MonitorExperiment or None
+        The job's instrument if it has been built already; results are the same.
+    placed : callable or None
+        Called with a monitored instrument and the state that is shown before the rest is computed, so that they can be
+        drawn meanwhile.
 
     Raises
     ------
     InputError
-        An unknown node, more memory than there is, or a perturbation so large that light misses the mirrors or a spot
-        its CCD.
+        A node is unknown, memory does not suffice, or the perturbation is so large that light misses the mirrors or a
+        spot its CCD.
     """
     count = resolved.frames if frames is None else frames
     number = resolved.job.render.seed if seed is None else seed
@@ -208,17 +209,17 @@ def render_job(
 
 
 def require_one_state(resolved: ResolvedJob) -> None:
-    """Refuse what only a monitor gives in a job of an instrument without one.
+    """Refuse what requires a monitor in a job of an instrument without one.
 
     Parameters
     ----------
     resolved : ResolvedJob
-        The job.
+        Job to check.
 
     Raises
     ------
     InputError
-        a course, stray light or disturbances.
+        The job has a course, stray light or disturbances.
     """
     job = resolved.job
     for asked, key, what in (
@@ -240,12 +241,12 @@ def require_one_state(resolved: ResolvedJob) -> None:
 def _without_monitor(
     resolved: ResolvedJob, backend: Backend, advance: Advance, experiment: MonitorExperiment | None
 ) -> JobRun:
-    """The job of an instrument without a monitor: its state, the truth about it, and the cameras' images.
+    """Run the job of an instrument without a monitor: its state, the true changes, and the cameras' images.
 
     Raises
     ------
     InputError
-        As `render_job`; or the job asks for what only a monitor gives.
+        The job cannot be run (see `render_job`), or it asks for what requires a monitor.
     """
     require_one_state(resolved)
     job = resolved.job
@@ -283,7 +284,7 @@ def _without_monitor(
 def _images(
     experiment: MonitorExperiment, resolved: ResolvedJob, state: State, seed: int, advance: Advance
 ) -> tuple[TargetRun | None, ImageQuality | None]:
-    """Targets and image quality of the cameras, where the job asks for them.
+    """Render targets and compute image quality of the cameras, where the job asks for them.
 
     Raises
     ------
@@ -319,7 +320,7 @@ def _image_warnings(
 
 
 class _Stages:
-    """Tells of each of STAGES when it begins and ends."""
+    """Progress reports when each of STAGES begins and ends."""
 
     def __init__(self, advance: Advance) -> None:
         self._advance, self._now = advance, ""
@@ -337,12 +338,12 @@ class _Stages:
 def _stray(
     experiment: MonitorExperiment, resolved: ResolvedJob, state: State, seed: int, advance: Advance
 ) -> StrayPair:
-    """Stray light before and after the perturbation.
+    """Trace stray light before and after the perturbation.
 
     Raises
     ------
     InputError
-        No light comes back to a CCD, or a table of a finish is not one for this instrument.
+        No light returns to a CCD, or a table of a finish does not suit this instrument.
     """
     assert resolved.job.render.stray is not None
     paths = resolved.job.render.stray.paths
@@ -373,7 +374,7 @@ def _stray_warnings(experiment: MonitorExperiment, stray: StrayPair) -> Iterator
 
 @contextmanager
 def _lost_by_motions(resolved: ResolvedJob, *errors: type[Exception]) -> Iterator[None]:
-    """Tell errors that motions cause at the key of these. Raises InputError."""
+    """Raise InputError at the key ``perturb`` for errors that motions cause."""
     try:
         yield
     except errors as error:
@@ -409,7 +410,7 @@ def _no_spots(experiment: MonitorExperiment, reason: str) -> InputError:
 
 
 def _mounted_facets(experiment: MonitorExperiment) -> str:
-    """How the facets would have to stand for the monitor of an instrument as built to work."""
+    """Return the facet orientations with which the monitor of an instrument as built would work, as text."""
     instrument, smaller = experiment.instrument, "bodies that stand nearer to the drawing"
     try:
         turns = squared_facets(instrument, experiment.backend)
@@ -421,7 +422,7 @@ def _mounted_facets(experiment: MonitorExperiment) -> str:
 
 
 def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotError, focus: SpotFocus) -> InputError:
-    """What is wrong where a spot cannot be measured: the instrument, if already the spots before cannot."""
+    """Return the error of a spot that cannot be measured; it blames the instrument if the spots before fail too."""
     channels, resolved = experiment.path.channels, experiment.resolved
 
     def told(error: SpotError) -> str:
@@ -437,7 +438,7 @@ def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotEr
 
 
 def _blurred(experiment: MonitorExperiment, focus: SpotFocus) -> tuple[str, ...]:
-    """One warning for each camera whose spots are not sharp as designed; it is a camera, but hardly the one meant."""
+    """Return a warning for each camera whose spots are out of focus as designed, which is probably a mistake."""
     out = []
     for name in experiment.instrument.cameras:
         own = [i for i, channel in enumerate(experiment.path.channels) if channel.camera == name]
@@ -458,7 +459,7 @@ def _blurred(experiment: MonitorExperiment, focus: SpotFocus) -> tuple[str, ...]
 def _warnings(
     experiment: MonitorExperiment, nominal: np.ndarray, photons: np.ndarray, before: np.ndarray, after: np.ndarray
 ) -> tuple[str, ...]:
-    """What the user should know before using the numbers."""
+    """Return warnings about saturation and lost light."""
     out = []
     channels = experiment.path.channels
     for name, recorded in (("before", before), ("after", after)):

@@ -1,4 +1,4 @@
-"""Everything one render run finds, and its JSON forms (the contract of truth.json and recovered.json)."""
+"""Results of one render run, and their JSON forms (the contents of truth.json and recovered.json)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ PROGRAM = "twin.render"
 
 @dataclass(frozen=True, eq=False)
 class StrayPair:
-    """Stray light of the nominal and the perturbed instrument, which prisms stand in whose beam, measured finishes."""
+    """Stray light of the nominal and the perturbed instrument, obstruction of beams by prisms, and measured finishes.
+    """
 
     before: StrayLight
     after: StrayLight
@@ -45,7 +46,7 @@ class StrayPair:
     measured: MeasuredFinishes | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Contents of stray.json."""
+        """Return the contents of stray.json."""
         taken = [{"body": o.body, "beam": o.beam, "share": o.share, "used": o.used} for o in self.obstructions]
         out = {"before": self.before.to_dict(), "after": self.after.to_dict(), "obstructions": taken}
         return out if self.measured is None else {**out, "finishes": self.measured.to_dict()}
@@ -53,26 +54,26 @@ class StrayPair:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class JobRun:
-    """What a job does to an instrument, whether it has a monitor or not.
+    """Result of a job, of an instrument with or without a monitor.
 
     Attributes
     ----------
     resolved : ResolvedJob
-        The job with everything it names.
+        Job with everything it names.
     experiment : MonitorExperiment
-        The instrument, with the calibration of its monitor if it has one.
+        Instrument, with the calibration of its monitor if it has one.
     state : State
-        What was perturbed.
+        Perturbed state.
     frames, seed : int
-        Of the exposures.
+        Number of frames of each state, and seed of their noise.
     truth : Truth
-        By exact tracing.
-    warnings : tuple[str, ...]
-        What the user should know.
-    targets : TargetRun | None
+        True changes, by exact tracing.
+    warnings : tuple of str
+        Warnings to the user.
+    targets : TargetRun or None
         Test targets on the line CCDs, None if not asked for.
-    quality : ImageQuality | None
-        Image quality of the nominal and of the perturbed state, None if not asked for.
+    quality : ImageQuality or None
+        Image quality of the nominal and the perturbed state, None if not asked for.
     """
 
     resolved: ResolvedJob
@@ -86,7 +87,7 @@ class JobRun:
     quality: ImageQuality | None = None
 
     def truth_dict(self) -> dict[str, Any]:
-        """Contents of truth.json."""
+        """Return the contents of truth.json."""
         out: dict[str, Any] = {"cameras": {}}
         for group, one, value in self.true_changes():
             held = out if group in (ANGLE_GROUP, GROUND_GROUP) else out["cameras"]
@@ -94,7 +95,7 @@ class JobRun:
         return self._with_nominal(out)
 
     def true_changes(self) -> list[tuple[str, Parameter, float]]:
-        """Camera or group of two cameras, parameter, and how it truly changed, in the parameter's unit."""
+        """Return (camera or group of two cameras, parameter, true change in the parameter's unit) of each parameter."""
         truth = self.truth
         out = [
             (name, one, one.per_si * float(value) + 0.0)
@@ -109,7 +110,7 @@ class JobRun:
         return out
 
     def _with_nominal(self, out: dict[str, Any]) -> dict[str, Any]:
-        """True changes with the nominal principal distances and angle beside them."""
+        """Add the nominal principal distances and angle to the true changes."""
         for name, group in out["cameras"].items():
             group["principal_distance_mm"] = 1e3 * float(self.truth.principal_distance[name])
         if ANGLE_GROUP in out:
@@ -118,38 +119,38 @@ class JobRun:
 
     @property
     def deformed(self) -> Mapping[str, NodalDeformation]:
-        """Body -> what the table of displaced nodes is that deforms it."""
+        """Body -> deformation by its table of displaced nodes."""
         return self.experiment.deformed(self.resolved.job)
 
     @property
     def heated(self) -> Mapping[str, HeatedBody]:
-        """Body -> what the table of temperatures is that warms it."""
+        """Body -> temperature field by its table of nodes."""
         return self.experiment.heated(self.resolved.job)
 
     @property
     def checks(self) -> tuple[SelfCheck, ...]:
-        """What was checked on the way."""
+        """Checks that were made during the run."""
         return ()
 
 
 @shows("experiment", "seed", "before [DN]", "after [DN]")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RenderRun(JobRun):
-    """One job's outcome, of an instrument with a monitor: also what its spots say.
+    """Result of a job of an instrument with a monitor, with the monitor's frames and readings.
 
     Attributes
     ----------
-    photons_before, photons_after : np.ndarray
-        Expected photons per pixel and frame, (C, rows, columns), stray light included.
-    before, after : np.ndarray
-        Grey values, uint16 (C, frames, rows, columns).
+    photons_before, photons_after : (C, rows, columns) ndarray
+        Expected photons per pixel and frame, stray light included.
+    before, after : (C, frames, rows, columns) ndarray of uint16
+        Grey values, DN.
     recovery : Recovery
-        What the images say (one state).
+        Spot positions and estimates from the images (one state).
     crosstalk : Mapping[str, CameraCrosstalk]
         Camera -> response to elementary motions.
-    series : TimeSeries | None
-        All times of the job's course, None if it has none; the rest is then about the time it shows.
-    stray : StrayPair | None
+    series : TimeSeries or None
+        All times of the job's course, None if it has none; the other attributes then describe the time that it shows.
+    stray : StrayPair or None
         Ghosts and stray light, None if not asked for.
     """
 
@@ -163,12 +164,12 @@ class RenderRun(JobRun):
     stray: StrayPair | None = None
 
     def truth_dict(self) -> dict[str, Any]:
-        """Contents of truth.json."""
+        """Return the contents of truth.json."""
         return self._with_nominal(self.reading.table.true())
 
     @cached_property
     def reading(self) -> MonitorReading:
-        """What the images say, beside the truth."""
+        """Reading of the monitor, beside the truth."""
         experiment = self.experiment
         together = None if self.series is None else self.series.smoothed
         return MonitorReading(
@@ -202,21 +203,23 @@ class RenderRun(JobRun):
 
     @property
     def sigma_holds(self) -> bool:
-        """Whether nothing that was measured contradicts the sigmas; of a course at none of its times."""
+        """True if no measurement contradicts the sigmas, at any time of a course."""
         return self.reading.sigma_holds if self.series is None else bool(np.all(self.series.sigma_holds))
 
     @cached_property
     def worst_of_course(self) -> tuple[int, Consistency] | None:
-        """The time of a course whose shifts agree least with the prior, and its consistency (see
-        `MonitorReading.worst_of`). None without a course or a prior.
+        """Index of the time of a course whose shifts agree least with the prior, and its consistency.
+
+        None without a course or a prior; see `MonitorReading.worst_of`.
         """
         series = self.series
         return None if series is None else self.reading.worst_of(series.shift, series.shift_covariance)
 
     @cached_property
     def limits(self) -> MonitorLimits | None:
-        """What limits the readings; None where nothing is stated to move. Of the instrument and its light, not of these
-        images: the same for every seed.
+        """Analysis of what limits the readings; None without a prior.
+
+        It depends on the instrument and its light, not on these images, and is the same for every seed.
         """
         if self.experiment.disturbances is None:
             return None
@@ -224,7 +227,7 @@ class RenderRun(JobRun):
 
     @property
     def checks(self) -> tuple[SelfCheck, ...]:
-        """What was checked of images and readings, and of the balance of stray light."""
+        """Checks of images and readings, and of the energy balance of stray light."""
         out = [*self.experiment.path.checked.told(), *self.reading.checks]
         if self.worst_of_course is not None:
             out.append(stated_check("worst time of the course against the statement", self.worst_of_course[1]))
@@ -236,5 +239,5 @@ class RenderRun(JobRun):
         return tuple(out)
 
     def recovered_dict(self) -> dict[str, Any]:
-        """Contents of recovered.json."""
+        """Return the contents of recovered.json."""
         return self.reading.recovered_dict()

@@ -1,4 +1,4 @@
-"""What the report says of what was set up, and of readings and truth: result, time course, spots, residuals."""
+"""Report sections on set-up, result, time course, spots and residuals of the main job."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from twin.monitor.reading_table import Reading, ReadingTable
 from twin.monitor.time_series import TimeSeries
 
 IN_PAGE = ""
-"""File of what only the page shows."""
+"""File name of artefacts that appear in the page only."""
 _GROUND_TITLE = "Points on the ground, located as if the cameras had not changed: error"
 _ANGLE_TITLE = "Angle between the cameras"
 
@@ -48,21 +48,23 @@ _ANGLE_TITLE = "Angle between the cameras"
 def figure(
     drawn: Mapping[str, str], name: str, caption: str, title: str = "", full: Table | None = None, count: int = 0
 ) -> SvgFigure:
-    """A drawing of the run in the page, the ``count``-th of its kind."""
+    """Return a drawing of the run as a figure of the page, the ``count``-th of its kind."""
     own = name.partition(" ")[0] + f"-{count}" * (" " in name)
     return SvgFigure(own, title, caption, drawn[name], within=IN_PAGE, full=full)
 
 
 def shown_time(run: JobRun) -> str:
-    """``, at 12 min``: the time of a course that a run shows in full; empty without a course."""
+    """Return ``, at 12 min``, the time of a course that a run shows in full; empty without a course."""
     if not isinstance(run, RenderRun):
         return ""
     return "" if run.series is None else f", at {moment(float(run.series.times[run.series.shown]))}"
 
 
 def result_tables(run: JobRun) -> tuple[Table, ...]:
-    """Recovered against true; of a course first the errors over all its times, then one of these times. Without a
-    monitor the true changes alone.
+    """Return the tables of recovered and true changes.
+
+    A course has the errors over all its times first, then the time that is shown; without a monitor there are only true
+    changes.
     """
     if not isinstance(run, RenderRun):
         return (_change_table(run),)
@@ -72,7 +74,7 @@ def result_tables(run: JobRun) -> tuple[Table, ...]:
 
 
 def _change_table(run: JobRun) -> Table:
-    """True changes of the cameras, of the angle between two, and on the ground."""
+    """Return the table of true changes of the cameras, of the angle between two, and on the ground."""
     rows: list[list[Cell]] = []
     bands: dict[int, str] = {}
     for group, one, value in run.true_changes():
@@ -96,8 +98,9 @@ def _change_table(run: JobRun) -> Table:
 
 
 def part_title(run: RenderRun, reading: Reading, nominal: bool = True) -> str:
-    """What a reading and those beside it are about: a camera, the angle of two (``nominal``: and what it is), or points
-    on the ground.
+    """Return the heading of a reading's group: a camera, the angle between two, or points on the ground.
+
+    The angle's heading has its nominal value if ``nominal`` is set.
     """
     if reading.group == GROUND_GROUP:
         return _GROUND_TITLE
@@ -111,7 +114,9 @@ def _label(reading: Reading) -> Marked:
 
 
 def _all_digits(run: RenderRun, name: str, found: ReadingTable, over: bool) -> Table:
-    """A row for each change: truth, and of each estimator value (over times its error), sigma and that of the noise."""
+    """Return a table with a row for each change: truth, and each estimator's value (or RMS error), sigma and noise
+    sigma.
+    """
     heads = ["camera", "parameter", "unit", "true rms" if over else "true"]
     heads += _value_and_sigma(run, " error rms" if over else "")
     rows: list[list[Cell]] = []
@@ -125,7 +130,7 @@ def _all_digits(run: RenderRun, name: str, found: ReadingTable, over: bool) -> T
 
 
 def _value_and_sigma(run: RenderRun, label: str) -> list[str]:
-    """Value, total sigma and noise sigma of each estimator."""
+    """Return column heads for value, total sigma and noise sigma of each estimator."""
     said = (label, " sigma", " sigma noise")
     return [f"{estimator.title}{what}" for estimator in run.estimators.values() for what in said]
 
@@ -210,7 +215,7 @@ def _range(values: np.ndarray, places: int) -> str:
 
 
 def _worst(run: RenderRun, series: TimeSeries) -> str:
-    """The camera that the judged estimator reads worst in Δα, by how much, when, and how much truly happened."""
+    """Return a sentence with the largest error of the judged estimator in alpha: camera, size, time, true change."""
     own = [row for row in series.readings.of(run.judged) if row.parameter.key == "d_alpha_arcsec"]
     worst = max(own, key=lambda row: float(np.max(np.abs(row.error))))
     k = int(np.argmax(np.abs(worst.error)))
@@ -223,16 +228,16 @@ def _worst(run: RenderRun, series: TimeSeries) -> str:
 
 
 def course_sections(run: RenderRun, drawn: Mapping[str, str], shown: Table) -> tuple[Section, ...]:
-    """Figures of a course, and its one time that the other sections show.
+    """Return the sections with figures of a course and with the time that the other sections show.
 
     Parameters
     ----------
     run : RenderRun
-        With a course.
+        Run with a course.
     drawn : Mapping[str, str]
         Name -> <svg> element of its figures.
     shown : Table
-        Table of that time.
+        Table of the time that is shown.
     """
     series = run.series
     assert series is not None
@@ -278,7 +283,7 @@ def course_sections(run: RenderRun, drawn: Mapping[str, str], shown: Table) -> t
 
 
 def _every_time(run: RenderRun) -> Table:
-    """Every reading of every time, with all digits."""
+    """Return the table of every reading at every time, with all digits."""
     assert run.series is not None
     rows: list[list[Cell]] = []
     for same in run.series.readings.by_change():
@@ -292,7 +297,8 @@ def _every_time(run: RenderRun) -> Table:
 
 
 def spot_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
-    """Images of the spots, their measured positions and shifts; figures as ``spots NAME`` of each camera."""
+    """Return the section with images of the spots (figures ``spots NAME`` of each camera), their positions and shifts.
+    """
     figures: list[Artefact] = []
     for k, name in enumerate(run.experiment.instrument.cameras):
         caption = f"Camera {name}: mean of {run.frames} frames."
@@ -343,8 +349,9 @@ def _with_sigma(value: float, sigma: float, sign: bool = False) -> str:
 
 
 def residual_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
-    """Residuals of all estimators, and what the crosstalk table explains of the judged one's; what is left over is
-    noise, and judged by it alone.
+    """Return the section with residuals of all estimators and the part of them that the crosstalk table explains.
+
+    The unexplained part of the judged estimator's residual is compared with the noise alone.
     """
     title = run.estimators[run.judged].title
     rows: list[list[Cell]] = []
@@ -400,7 +407,7 @@ ZERO_CELSIUS = 273.15
 
 
 def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
-    """What was set up, and what the estimators assume."""
+    """Return the facts about set-up and assumptions, as pairs of title and text."""
     resolved, instrument = run.resolved, run.experiment.instrument
     spec, stated = resolved.instrument, run.experiment.stated is not None
     own = ("Instrument", f"{spec.name}: {spec.description}" if spec.description else spec.name)
@@ -455,12 +462,14 @@ def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
 
 
 def _all(values: list[float]) -> str:
-    """Different values among those of all channels: ``50``, or ``34, 24``."""
+    """Return the distinct values among those of all channels, as text: ``50``, or ``34, 24``."""
     return ", ".join(dict.fromkeys(plain(value) for value in values))
 
 
 def _fields(degrees: list[float]) -> str:
-    """Different field places: ``±1.22``, or ``±1.22, 1.25`` where one end of the line has more than the other."""
+    """Return distinct field angles, as text: ``±1.22``, or ``±1.22, 1.25`` where only one end of the line has the
+    second.
+    """
     ends: dict[str, set[bool]] = {}
     for field in degrees:
         ends.setdefault(plain(abs(field)), set()).add(field > 0.0)
@@ -469,7 +478,7 @@ def _fields(degrees: list[float]) -> str:
 
 
 def setup_section(run: JobRun) -> Section:
-    """The cameras, and cause by cause what is stated to move."""
+    """Return the section with the cameras and with the prior on disturbances, cause by cause."""
     spec, instrument = run.resolved.instrument, run.experiment.instrument
     rows: list[list[Cell]] = []
     for name, model in instrument.cameras.items():
@@ -495,7 +504,7 @@ def _stated(run: JobRun) -> Table:
     full: list[list[Cell]] = []
 
     def listed(name: str, when: str, why: str) -> list[Component]:
-        """Add the components of a cause to the table with all digits."""
+        """Add the components of a cause to the table with all digits, and return them."""
         own = [c for c in motions.components if c.cause == name]
         full.extend([name, c.body, c.what, c.sigma / c.unit_size, shown_unit(c.unit), when, why] for c in own)
         return own
@@ -536,7 +545,9 @@ def _stated(run: JobRun) -> Table:
 
 
 def done_table(run: JobRun) -> Table:
-    """What the job does to each node, at the time that is shown; not what follows from it for other bodies."""
+    """Return the table of what the job does to each body at the time shown, without the effects on bodies that it
+    carries.
+    """
     job = run.resolved.job
     shown = _shown(run)
     motions, fields = motions_of(job, shown), job.fields(shown)
@@ -563,12 +574,12 @@ def done_table(run: JobRun) -> Table:
 
 
 def _shown(run: JobRun) -> int | None:
-    """Number of the time of a course that is shown; None without one."""
+    """Return the index of the time of a course that is shown; None without one."""
     return run.series.shown if isinstance(run, RenderRun) and run.series is not None else None
 
 
 def _heated(run: JobRun) -> int:
-    """How many bodies have another temperature than nominal, faces of prisms not counted."""
+    """Return the number of bodies at another temperature than nominal, faces of prisms not counted."""
     job = run.resolved.job
     time = _shown(run)
     fields = run.experiment.thermal.fields(run.experiment.fields(job, time))

@@ -1,4 +1,4 @@
-"""Figures of a series over times: temperatures, true changes and what every estimator reads."""
+"""Figures of a course: temperatures, true changes and the readings of every estimator over time."""
 
 from __future__ import annotations
 
@@ -19,36 +19,38 @@ from twin.monitor.reading_table import Reading
 from twin.monitor.time_series import TimeSeries
 
 COLOURS = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.ORANGE, svg.SKY, svg.PURPLE, svg.INK, svg.GREY)
-"""Colours of the nodes; after the last one they repeat with the next line style."""
+"""Colours of the nodes; after the last, they repeat with the next line style."""
 STYLES = ("-", "--", ":")
-"""Line styles: of the first nodes, and of nodes whose colour has been used before."""
+"""Line styles: the first for the first nodes, the others for nodes whose colour is already in use."""
 _BESIDE = 0.12
-"""Distance of the marks of two estimators at one time, part of the distance of two times."""
+"""Distance between the marks of two estimators at one time, as a share of the time step."""
 UNITS = ((2.0 * 86400.0, 86400.0, "d"), (6.0 * 3600.0, 3600.0, "h"), (180.0, 60.0, "min"), (0.0, 1.0, "s"))
-"""From how many seconds on a course is drawn in a unit, the unit in seconds, and its name."""
+"""Time units: shortest course, in seconds, that is drawn in the unit; the unit in seconds; its name."""
 
 
 def time_unit(times: np.ndarray) -> tuple[float, str]:
-    """A unit that suits a course's length, in seconds, and its name.
+    """Return a unit that suits a course's length, in seconds, and its name.
 
     Parameters
     ----------
-    times : np.ndarray
-        Of the course, seconds, in order.
+    times : (T,) ndarray
+        Times of the course, in seconds, ascending.
     """
     span = float(times[-1] - times[0])
     return next((size, unit) for least, size, unit in UNITS if span >= least)
 
 
 def _time_axis(series: TimeSeries) -> tuple[np.ndarray, str]:
-    """Times of a course in a unit that suits its length, and the axis label."""
+    """Return the times of a course in a unit that suits its length, and the axis label."""
     size, unit = time_unit(series.times)
     return series.times / size, f"time [{unit}]"
 
 
 def temperatures_svg(series: TimeSeries) -> str:
-    """Temperatures that were given, change at the origin and gradient along each axis of every node of the course, and
-    below them its motions, rotation and shift.
+    """Draw the temperatures and motions of a course that the job prescribes.
+
+    Panels show the change at the origin and the gradient along each axis of every node, and below them rotation and
+    shift.
     """
     with svg.look("temperatures"):
         time, label = _time_axis(series)
@@ -91,27 +93,28 @@ def temperatures_svg(series: TimeSeries) -> str:
 
 
 def parameters_svg(series: TimeSeries, names: dict[str, str]) -> str:
-    """True parameters as lines, recovered ones as marks, camera by camera, and the angle between two cameras.
+    """Draw true parameters as lines and readings as marks, camera by camera, and the angle between two cameras.
 
     Parameters
     ----------
     series : TimeSeries
-        The course.
-    names : dict[str, str]
-        Estimator -> its name for readers.
+        Course to draw.
+    names : dict of str to str
+        Estimator -> its title.
     """
     time, _ = _time_axis(series)
     return _changes_svg(series, "course", 1.5, lambda axes, same: _panel(axes, series, time, same, names))
 
 
 def smoothed_svg(series: TimeSeries) -> str:
-    """Errors of the smoothed changes with their total sigma, at the times of the course and between them: the band
-    closes at each measurement and opens between two. Errors are known at the times of the course.
+    """Draw errors of the smoothed changes with their total sigma, at the times of the course and between them.
+
+    The band narrows at each measurement and widens between two. Errors are known at the times of the course only.
 
     Parameters
     ----------
     series : TimeSeries
-        With smoothed changes.
+        Course with smoothed changes.
     """
     together = series.smoothed
     assert together is not None
@@ -137,8 +140,8 @@ def smoothed_svg(series: TimeSeries) -> str:
 def _changes_svg(
     series: TimeSeries, name: str, height: float, panel: Callable[[Axes, list[Reading]], None], ground: bool = False
 ) -> str:
-    """Draw a panel for each change: cameras side by side, below them the angle between two and, with ``ground``, the
-    height there.
+    """Draw a panel for each change: cameras side by side, below them their angle and, with ``ground``, the height
+    error.
     """
     with svg.look(name):
         groups: dict[str, list[list[Reading]]] = {}

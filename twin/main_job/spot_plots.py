@@ -1,6 +1,4 @@
-"""Figures of the spots and of what the estimators leave over, and ``summary.png``: a run in one picture, its spots
-before and after and the recovered parameters.
-"""
+"""Figures of spots, residuals and motions, and ``summary.png``, which shows spots and recovered parameters of a run."""
 
 from __future__ import annotations
 
@@ -30,23 +28,23 @@ STRETCH = 150.0
 """The asinh stretch is linear up to this fraction (1/STRETCH) of the peak."""
 _LEGEND: dict[str, Any] = {"frameon": True, "facecolor": "black", "edgecolor": "none", "framealpha": 0.7}
 _LEAST_CORE = 7.0
-"""Half-width of the core's window, pixels, when the spot moves less."""
+"""Smallest half-width of the window on the core, in pixels."""
 
 
 def mean_images(run: RenderRun) -> tuple[np.ndarray, np.ndarray]:
-    """Mean frame of every channel before and after, DN, (C, rows, columns)."""
+    """Return the mean frame of every channel before and after, in DN, each (C, rows, columns)."""
     return mean_of(run.before), mean_of(run.after)
 
 
 def stretch(images: np.ndarray) -> Normalize:
-    """Common asinh stretch from the background to the peak."""
+    """Return the common asinh stretch of images from the background to the peak."""
     low, high = float(np.percentile(images, 5)), float(images.max())
     high = max(high, low + 1.0)
     return AsinhNorm(linear_width=(high - low) / STRETCH, vmin=low, vmax=high)
 
 
 def cross(axes: Axes, at: np.ndarray, colour: str, size: float, label: str | None = None) -> None:
-    """A cross with an open middle, so that the core stays visible; data coordinates are pixels."""
+    """Draw a cross with an open middle, so that the core stays visible; data coordinates are pixels."""
     (row, column), inner = at, 0.3 * size
     xs, ys = [], []
     for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
@@ -56,14 +54,14 @@ def cross(axes: Axes, at: np.ndarray, colour: str, size: float, label: str | Non
 
 
 def core_window(before: np.ndarray, after: np.ndarray, radius: float) -> tuple[float, float, float]:
-    """Centre (row, column) and half-width of a square that holds both centres, pixels."""
+    """Return the centre (row, column) and half-width of a square that contains both spot centres, in pixels."""
     centre = 0.5 * (before + after)
     half = max(_LEAST_CORE, 0.5 * float(np.max(np.abs(after - before))) + 0.75 * radius)
     return float(centre[0]), float(centre[1]), half
 
 
 def airy_radius(run: RenderRun) -> float:
-    """Radius of the first dark ring that the return face's aperture gives, pixels."""
+    """Return the radius of the first dark ring that the return face's aperture gives, in pixels."""
     path = run.experiment.path
     camera = next(iter(run.experiment.instrument.cameras.values()))
     focal = float(camera.first_order.principal_distance[0])
@@ -71,7 +69,7 @@ def airy_radius(run: RenderRun) -> float:
 
 
 def spots_svg(run: RenderRun, camera: str) -> str:
-    """One camera's spots, a row per channel."""
+    """Draw the spots of one camera, a row for each channel."""
     with svg.look(f"spots-{camera}"):
         return svg.to_svg(_draw(run, camera))
 
@@ -136,7 +134,7 @@ def _draw(run: RenderRun, camera: str) -> Figure:
 
 
 def _dn_ticks(norm: Normalize) -> list[float]:
-    """Round numbers, one or two a decade, inside the stretch."""
+    """Return round numbers within the stretch, at most three per decade."""
     assert norm.vmin is not None
     assert norm.vmax is not None
     found = [float(m * 10**k) for k in range(1, 8) for m in (1, 2, 5)]
@@ -151,19 +149,19 @@ _MARKS = (
 
 
 def marks(names: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Estimator -> marker and colour: told apart by shape as well as by colour, while there are at most eight.
+    """Return estimator -> marker and colour, which differ in shape and colour for up to eight estimators.
 
     Parameters
     ----------
     names : Iterable[str]
-        Of the estimators in a figure; each has its mark whatever others are there.
+        Estimators in a figure; the mark of an estimator does not depend on the others.
     """
     every = dict(zip(ESTIMATORS, cycle(_MARKS), strict=False))
     return {name: every[name] for name in names}
 
 
 def residuals_svg(run: RenderRun) -> str:
-    """Residuals of all estimators in sigma, a panel for each camera, the angle and the ground."""
+    """Draw the residuals of all estimators in sigma, a panel for each camera, the angle and the ground."""
     names = {name: estimator.title for name, estimator in run.estimators.items()}
     panels: dict[str, dict[str, dict[str, float | None]]] = {}
     for same in run.reading.table.by_change():
@@ -214,17 +212,17 @@ def _panel(axes: Axes, title: str, panel: dict[str, dict[str, float | None]], na
 
 
 ROW = 0.168
-"""Height of a row, inches."""
+"""Height of a row, in inches."""
 _DECADES = 3
-"""Decades of the logarithmic part of the colour scale, below the largest number."""
+"""Number of decades in the logarithmic part of the colour scale, below the largest number."""
 _MOST_LEVEL = 4
-"""Names of columns that have room beside one another."""
+"""Largest number of column names that fit side by side."""
 _STRONG = 0.55
 """Depth of a colour from which the number in it is white."""
 
 
 def motion_map_svg(run: RenderRun) -> str:
-    """Micrometres on the area CCD per unit of motion: a row for each motion, a panel for each camera."""
+    """Draw the spot shifts, in micrometres per unit of motion: a row for each motion, a panel for each camera."""
     pitch = 1e6 * run.experiment.path.pitch
     tables = list(run.crosstalk.items())
     largest = max(float(np.abs(table.spot_shift).max()) for _, table in tables) * pitch
@@ -268,13 +266,13 @@ WIDTH, DPI = 14.0, 100
 NOTE, LONGEST_NOTE = 0.85, 150
 """Height of a note's line, in lines of the table, and characters that the width holds."""
 FIRST = 0.22
-"""Where the column of the truth ends, part of the width."""
+"""Right edge of the column of true values, as a share of the width."""
 REACH = 2.2
-"""Half-width of the pictures in Airy radii around both centres."""
+"""Half-width of the pictures around both centres, in Airy radii."""
 
 
 def summary_png(run: RenderRun) -> bytes:
-    """The picture as PNG."""
+    """Return the summary picture as PNG."""
     with svg.look("summary"):
         return svg.to_png(_drawn_summary(run), DPI)
 
@@ -316,14 +314,14 @@ def _drawn_summary(run: RenderRun) -> Figure:
 
 
 def _notes(run: RenderRun) -> list[str]:
-    """Lines below the table: on what sigma rests, and what the marks say."""
+    """Return the lines below the table: the basis of sigma, and the meaning of the marks."""
     limit = f" {sentence(limited(run))}" if limited(run) else ""
     texts = f"{assumed(run.reading)}.", f"± is one σ; ● within {FAR:g} σ of the truth, ▲ beyond.{limit}"
     return [line for text in texts for line in wrap(text, LONGEST_NOTE)]
 
 
 def _scale_bar(axes: Axes, run: RenderRun, column: float, row: float, half: float) -> None:
-    """Ten pixels, and how many micrometres they are."""
+    """Draw a bar of ten pixels, labelled with its length in micrometres."""
     y, x = row + 0.86 * half, column + 0.9 * half
     axes.plot([x - 10.0, x], [y, y], color="white", lw=2.5, solid_capstyle="butt")
     text = f"10 px = {1e7 * run.experiment.path.pitch:.4g} µm"
@@ -331,7 +329,7 @@ def _scale_bar(axes: Axes, run: RenderRun, column: float, row: float, half: floa
 
 
 def _table(figure: Figure, table: Table, top: float, run: RenderRun, notes: Sequence[str]) -> None:
-    """Recovered against true, drawn as text on a grid of lines, with notes below."""
+    """Draw recovered and true changes as text on a grid of lines, with notes below."""
     axes = figure.add_axes((0.0, 0.0, 1.0, top), xlim=(0.0, 1.0))
     axes.set_axis_off()
     count = 1 + len(table.bands) + len(table.rows)

@@ -1,6 +1,4 @@
-"""What the estimators must make of a run's motions by the crosstalk table; what its sigmas rest on, whether its shifts
-agree with that, and which body limits what it reads.
-"""
+"""Systematic errors of the estimators by the crosstalk table, and the basis, consistency and limits of the sigmas."""
 
 from __future__ import annotations
 
@@ -29,30 +27,30 @@ from twin.monitor.time_series import SmoothedCourse
 from twin.uncertainty.monitor_limits import short_text, unit_text
 
 _FAMILY = 4
-"""The first motions of a crosstalk table are the family that the estimators of paper 001 assume."""
+"""Number of first motions of a crosstalk table that form the family which the estimators of paper 001 assume."""
 SHOWN = 1e-3
-"""Least amount of a motion, in its table unit, that is spoken of."""
+"""Smallest amount of a motion, in its table unit, that is reported."""
 
 
 HEAT = "temperatures (expansion, bending, change of index)"
-"""How the effects of temperatures are called; a table of motions of single bodies holds only their carried motions."""
+"""Name of the effects of temperatures; a table of motions of single bodies holds only the motions that they carry."""
 
 
 @dataclass(frozen=True, eq=False)
 class Systematics:
-    """What the crosstalk tables make of a run's motions, for one camera.
+    """Systematic errors of one camera's readings that the crosstalk tables predict from a run's motions.
 
     Attributes
     ----------
-    bias : dict[str, np.ndarray]
-        Estimator -> (P,) reading minus truth, to first order, of every reading of the camera, in its unit.
-    outside : tuple[str, ...]
+    bias : dict of str to (P,) ndarray
+        Estimator -> reading minus truth, to first order, of every reading of the camera, in its unit.
+    outside : tuple of str
         Motions of this camera outside the family, as text with amounts.
-    parts : dict[str, np.ndarray]
-        Motion, as text with its amount -> its share of the judged estimator's bias, (P,); also motions of other cameras
-        where that estimator takes all spots together.
-    uncovered : tuple[str, ...]
-        What was moved but is in no row of the table.
+    parts : dict of str to (P,) ndarray
+        Motion, as text with its amount -> its contribution to the judged estimator's bias; motions of other cameras are
+        included where that estimator uses all spots together.
+    uncovered : tuple of str
+        Bodies and effects that were perturbed but are in no row of the table.
     """
 
     bias: dict[str, np.ndarray]
@@ -79,7 +77,7 @@ def systematics(run: RenderRun, camera: str) -> Systematics:
 
 
 def _parts(run: RenderRun, camera: str, amounts: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Error that each motion contributes, for motions that the judged estimator does not read as they are."""
+    """Return the error that each motion contributes, for motions outside the judged estimator's model."""
     names = list(run.crosstalk)
     k = names.index(camera)
     gain = rows_of(run.reading.cameras[camera]) @ run.gains[run.judged][4 * k : 4 * k + 4]
@@ -109,7 +107,9 @@ def _told(motion: ElementaryMotion, amount: float) -> str:
 
 
 def _amount(run: RenderRun, elementary: ElementaryMotion) -> float:
-    """How much of an elementary motion the run's state holds, in its table unit; pivots converted to first order."""
+    """Return the amount of an elementary motion in the run's state, in table units, with pivots converted to first
+    order.
+    """
     motion = run.state.get(elementary.body)
     if motion is None:
         return 0.0
@@ -121,14 +121,14 @@ def _amount(run: RenderRun, elementary: ElementaryMotion) -> float:
 
 
 def _shift_at(run: RenderRun, body: str, motion: Motion, pivot: str) -> np.ndarray:
-    """The shift, metres, that makes the same rotation and scale about another pivot the same motion to first order."""
+    """Return the shift, in metres, that with another pivot gives the same motion to first order."""
     pivots = next(b for b in run.experiment.instrument.assembly.tree.bodies if b.path == body).pivots
     arm = np.array(pivots[motion.pivot]) - np.array(pivots[pivot])
     return np.asarray(np.array(motion.shift) - np.cross(motion.rotate, arm) - motion.scale * arm)
 
 
 def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str, ...]:
-    """Bodies that moved, reach this camera and have no row in the table."""
+    """Return the bodies that moved, affect this camera and have no row in the table."""
     own = f"{BASE}/{camera}"
     bodies = {motion.body for motion in table.motions}
     out = []
@@ -155,23 +155,26 @@ def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str
 
 
 def joined(names: Sequence[str]) -> str:
-    """``a; b; c`` without repetitions."""
+    """Return ``a; b; c`` without repetitions."""
     return "; ".join(dict.fromkeys(names))
 
 
 BLIND = 4.0
-"""Sigmas by which a reading is wrong from which on it is told that no spot says so. Of what is drawn from the statement
-itself a motion does as much in one of 20 000 runs."""
+"""Error of a reading, in sigmas, from which a warning says that the spots do not show it.
+
+A motion drawn from the prior itself causes as much in one of 20 000 runs.
+"""
 
 
 def perturbed_unseen(run: RenderRun) -> tuple[str, ...]:
-    """A warning for each perturbed body by which readings are wrong while the spots do not show it: what the
-    perturbation of that body alone does to spots and cameras, traced, against what would be read of it.
+    """Return a warning for each perturbed body that falsifies readings without showing in the spots.
+
+    The effect of that body's perturbation alone on spots and cameras is traced and compared with the reading of it.
 
     Parameters
     ----------
     run : RenderRun
-        Of a state, or of the time of a course that is shown.
+        Run of a state, or of a course, whose shown time is used.
     """
     job, noise = run.resolved.job, run.recovery.shift_covariance[0]
     shown = None if run.series is None else run.series.shown
@@ -213,20 +216,21 @@ def perturbed_unseen(run: RenderRun) -> tuple[str, ...]:
 
 
 def _sigmas(rows: np.ndarray, stated: Disturbances | None, noise: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """(Q,) of the readings by an estimator."""
+    """Return (Q,) sigmas of the readings by an estimator."""
     if stated is not None:
         return split(rows, stated, noise, gain).sigma
     return np.sqrt(np.einsum("qd,de,qe->q", rows @ gain, noise, rows @ gain))
 
 
 _NOISE_ALONE = "No disturbances are stated: σ is that of the noise of the images alone"
-"""Without a sentence's end."""
+"""Sentence, without a full stop, for runs without a prior."""
 NOISE = "the noise of the images"
-"""How the part of the variance is called that more frames lower."""
+"""Name of the part of the variance that more frames lower."""
 
 
 def assumed(reading: MonitorReading) -> str:
-    """What the sigmas assume, and whether the measured shifts agree with it; a sentence without its end."""
+    """Return the basis of the sigmas and whether the measured shifts agree with it, as a sentence without a full stop.
+    """
     stated, found = reading.disturbances, reading.consistency
     if stated is None or found is None:
         return _NOISE_ALONE
@@ -239,7 +243,7 @@ def assumed(reading: MonitorReading) -> str:
 
 
 def _from_statement(reading: MonitorReading) -> str:
-    """How much of the sigmas is from the statement: the least and the largest share of the posterior's variances."""
+    """Return how much of the posterior's variances rests on the prior, from the least to the largest share, as text."""
     shares = [share for own in reading.from_statement.values() for share in own.values() if share is not None]
     if not shares:
         return ""
@@ -248,8 +252,9 @@ def _from_statement(reading: MonitorReading) -> str:
 
 
 def contradiction(run: RenderRun) -> tuple[str, ...]:
-    """A warning where the shifts of a course contradict the prior at the worst of its times. That of a single state is
-    one of the doubts of its reading.
+    """Return a warning where the shifts of a course contradict the prior at the worst of its times.
+
+    For a single state this is among the doubts of its reading.
     """
     if run.worst_of_course is None or run.series is None:
         return ()
@@ -259,8 +264,8 @@ def contradiction(run: RenderRun) -> tuple[str, ...]:
 
 
 def doubted(run: RenderRun) -> tuple[str, ...]:
-    """Warnings where spots are not as calibrated, and of readings that are not linear; of a course at the worst of its
-    times.
+    """Return warnings of spots that differ from their calibration and of nonlinear readings, at the worst time of a
+    course.
     """
     if run.series is None:
         return (*run.reading.doubts, *run.reading.notes)
@@ -268,20 +273,20 @@ def doubted(run: RenderRun) -> tuple[str, ...]:
 
 
 def course_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
-    """Whether all measurements of a course agree with what is stated to move, and how it goes on in time; sentences.
+    """Return sentences on the agreement of all measurements of a course with the prior and its time laws.
 
     Parameters
     ----------
     together : SmoothedCourse
-        The course.
-    times : np.ndarray
-        Of its measurements, seconds.
+        Smoothed course.
+    times : (T,) ndarray
+        Times of its measurements, in seconds.
     """
     return " ".join((_series_agrees(together, times), *_jumps_told(together)))
 
 
 def _jumps_told(together: SmoothedCourse) -> tuple[str, ...]:
-    """What jumped, or that nothing did, where something may; sentences."""
+    """Return sentences on detected jumps, or that there are none; empty where the prior has no jumps."""
     if together.jumps is None:
         return ()
     if not together.jumps:
@@ -309,28 +314,28 @@ def _series_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
 
 
 def combination(reading: MonitorReading, group: str, key: str) -> np.ndarray:
-    """(4 x cameras,) what a change is made of: its unit per SI of all cameras' parameters, to first order.
+    """Return the row that forms a change from all cameras' parameters, (4 x cameras,), its unit per SI, to first order.
 
     Parameters
     ----------
     reading : MonitorReading
-        Of the instrument.
+        Reading of the instrument.
     group : str
-        Whose change: a camera, or the group of what two read together.
+        Camera of the change, or the group of a quantity of two cameras.
     key : str
-        Of the change.
+        Key of the change.
     """
     found = quantities(reading.cameras, reading.ground)
     return next(quantity.row for quantity in found if (quantity.group, quantity.key) == (group, key))
 
 
 def limits(reading: MonitorReading, one: Reading) -> tuple[str, float]:
-    """What leaves most of the variance of a change's error, and its share: a body without the base, or NOISE.
+    """Return the largest source of a change's error variance (a body, or NOISE) and its share.
 
     Parameters
     ----------
     reading : MonitorReading
-        Of the instrument, under stated disturbances.
+        Reading of the instrument, with a prior.
     one : Reading
         The change, as the judged estimator reads it.
     """
@@ -346,5 +351,5 @@ def limits(reading: MonitorReading, one: Reading) -> tuple[str, float]:
 
 
 def share_text(share: float) -> str:
-    """A share in per cent, for sentences."""
+    """Return a share in per cent, as text for sentences."""
     return f"{plain(round(100.0 * share), 3)} %"

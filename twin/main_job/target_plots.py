@@ -1,4 +1,4 @@
-"""Figures of targets, of their MTF, of the pupils with their shadows, and of surfaces that tables of nodes deform."""
+"""Figures of targets, their MTF, pupils with their shadows, and surfaces deformed by tables of nodes."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from twin.targets.target_measurement import NYQUIST, BarReading, CameraTargets, 
 COLOURS = {"before": BLUE, "after": VERMILION}
 MARKS = {"before": "o", "after": "D"}
 BAND = 2.0
-"""Half width of the band about zero, sigma."""
+"""Half-width of the band about zero, in sigma."""
 _LEAST_SPAN = 4.0
-"""Half height of the panels of differences at least, thousandths."""
+"""Smallest half-height of the panels of differences, in thousandths."""
 EVERY = 2
-"""Every how many-th frequency gets a dot."""
+"""Step between the frequencies that have a dot."""
 _IMAGE_NAMES = {
     "knife_edge_along": "knife edge, along line,\nmiddle 40 px",
     "knife_edge_track": "knife edge, along track,\nmiddle 40 px",
@@ -48,17 +48,18 @@ _IMAGE_NAMES = {
     "star": "star",
     "pinhole": "pinhole, asinh stretch,\nmiddle 24 px",
 }
-"""Titles of the images shown, with the direction of their MTF. Other targets have their own names; uniform fields are
-not shown.
+"""Titles of the images, with the direction of their MTF.
+
+Other targets have their own names; uniform fields are not shown.
 """
 _CROPS = {"knife_edge_along": 40, "knife_edge_track": 40, "pinhole": 24}
-"""Side of what is shown, pixels; the others are shown whole."""
+"""Side of the part that is shown, in pixels; images without an entry are shown whole."""
 STRETCH = 100.0
 """The pinhole's stretch is linear up to this fraction (1/STRETCH) of the peak."""
 
 
 def curves_svg(name: str, camera: CameraTargets) -> str:
-    """Measured and true MTF, a row for each direction and a column for each place."""
+    """Draw measured and true MTF, a row for each direction and a column for each place."""
     with look(f"mtf-{name}"):
         figure = new_figure(8.4)
         heights = (3.0, 1.2) * len(DIRECTIONS)
@@ -111,7 +112,7 @@ def _curve(axes: Axes, when: str, edge: EdgeReading) -> None:
 
 
 def _difference(axes: Axes, when: str, edge: EdgeReading) -> None:
-    """Measured less true, thousandths."""
+    """Draw measured minus true MTF, in thousandths."""
     found = edge.measured
     if found is None:
         return
@@ -137,7 +138,7 @@ def _norm(target: str, image: np.ndarray) -> Normalize:
 
 
 def images_svg(name: str, camera: CameraTargets) -> str:
-    """Mean images, a row for each target, and before and after side by side for each place."""
+    """Draw mean images, a row for each target, with before and after side by side for each place."""
     columns = [(place, when) for place in camera.places for when in COLOURS]
     names = [name for name in next(iter(camera.places.values())).before.frames if name in {*_IMAGE_NAMES, *TARGETS}]
     with look(f"targets-{name}"):
@@ -164,7 +165,8 @@ _RIM = np.exp(2j * np.pi * np.arange(181) / 180)
 
 
 def pupils_svg(quality: ImageQuality) -> str:
-    """A row for each camera, a column for each place on its line: nominal shadows filled, perturbed ones outlined."""
+    """Draw pupils, a row for each camera and a column for each place: nominal shadows filled, perturbed ones outlined.
+    """
     where = {place: quality.fields.index(field) for place, field in PLACES.items()}
     with look("pupils"):
         figure = new_figure(0.6 + 2.9 * len(quality.cameras))
@@ -197,11 +199,11 @@ def _draw(axes: Axes, states: list[PupilOutline]) -> None:
 
 
 _PIXELS = 220
-"""Of a map of a deformed surface along its longer side."""
+"""Number of pixels of a map of a deformed surface along its longer side."""
 
 
 def deformation_svg(faces: Mapping[str, NodalDeformation]) -> str:
-    """Maps of the change of sag at the nodes, a row for each body: change, after Zernike terms, after the grid."""
+    """Draw maps of the change of sag at the nodes, a row for each body: change, after Zernike terms, after the grid."""
     with look("deformation"):
         figure = new_figure(3.3 * len(faces))
         rows = figure.subplots(len(faces), 3, squeeze=False)
@@ -211,7 +213,7 @@ def deformation_svg(faces: Mapping[str, NodalDeformation]) -> str:
 
 
 def _deformation(figure: Figure, axes: Any, path: str, face: NodalDeformation) -> None:
-    """Each node colours its own cell of the aperture."""
+    """Draw the maps of one body; each node colours its cell of the aperture."""
     inside = face.weight > 0.0
     places = face.places[inside]
     low, high = places.min(axis=0), places.max(axis=0)

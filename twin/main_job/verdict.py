@@ -1,4 +1,4 @@
-"""What a run found, in sentences computed from its numbers, and the readings that mislead, as warnings."""
+"""Verdict of a run in sentences computed from its numbers, and warnings of readings that mislead."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ from twin.monitor.reading_table import Reading
 from twin.monitor.time_series import TimeSeries
 
 FALSE_ALARM = 1e-3
-"""Chance that noise and disturbances as stated make any warning of a misreading in a run."""
+"""Probability that noise and disturbances of the prior cause any warning of a misreading in a run."""
 _EXPLAINED = 0.2
-"""Share of an error that may be left over where it is called explained to first order."""
+"""Largest unexplained share of an error that counts as explained to first order."""
 _SOFTER = 0.05
-"""Relative loss of MTF at Nyquist from which it is spoken of."""
+"""Relative loss of MTF at Nyquist from which it is reported."""
 MOST_FRAMES = 10_000
-"""More frames than that are no advice."""
+"""Largest number of frames that is recommended."""
 _DIMMED = 0.5
-"""Share of its nominal light below which a spot counts as dimmed, as for the warning about it."""
+"""Share of its nominal light below which a spot counts as dimmed, the limit of the warning about it."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """A run in two sentences at most, what follows them, and all its warnings, those of misreadings last."""
+    """Verdict of a run in at most two sentences, the text that follows, and all warnings, those of misreadings last."""
 
     verdict: str
     more: tuple[str, ...]
@@ -57,8 +57,7 @@ class Judgement:
 
 
 def readings(run: RenderRun, estimator: str) -> tuple[Reading, ...]:
-    """All readings of an estimator: those of each camera, then the angle and the errors on the ground; over a course
-    root mean squares.
+    """Return all readings of an estimator: of each camera, the angle and the ground errors; over a course, RMS values.
     """
     return run.series.readings.rms.of(estimator) if run.series else run.reading.table.of(estimator)
 
@@ -88,7 +87,7 @@ def judge(run: JobRun) -> Judgement:
 
 
 def _changed(run: JobRun) -> tuple[str, str]:
-    """What the perturbation of an instrument without a monitor does, to its geometry and to its images."""
+    """Return what the perturbation does to geometry and images of an instrument without a monitor, as two texts."""
     moved = any(map(_moves, run.state.values()))
     cameras = len(run.truth.cameras) > 1
     parts = [
@@ -123,7 +122,7 @@ def _changed(run: JobRun) -> tuple[str, str]:
 
 
 def recovered_numbers(run: RenderRun) -> dict[str, Any]:
-    """Contents of recovered.json: what was read, the verdict and the warnings."""
+    """Return the contents of recovered.json: readings, verdict and warnings."""
     told = judge(run)
     return {**stated(run.recovered_dict()), "verdict": told.verdict, "warnings": list(told.warnings)}
 
@@ -134,7 +133,7 @@ def _moves(motion: Motion) -> bool:
 
 
 def _hidden(run: RenderRun, found: tuple[Reading, ...]) -> str:
-    """The least changes that can be told from none, of the parameters of the cameras."""
+    """Return the smallest detectable changes of the cameras' parameters, as text."""
     sigmas = {p: [r.sigma for r in found if r.parameter == p] for p in parameters.CAMERA_PARAMETERS.values()}
     parts = [f"{p.symbol} {significant(FAR * max(own), 2, floor=0.0)} {p.unit}" for p, own in sigmas.items() if own]
     who = (
@@ -152,7 +151,7 @@ def _told(run: RenderRun) -> str:
 
 
 def _within(run: RenderRun, found: tuple[Reading, ...], of: str, how: str = "") -> str:
-    """``all 12 readings ... are within 3 σ of the truth``, and what σ is of."""
+    """Return ``all 12 readings ... are within 3 σ of the truth``, with the basis of σ."""
     stated = run.experiment.disturbances
     basis = "noise alone" if stated is None else f"noise and disturbances {stated.name}"
     return f"all {len(found)} readings of the {_told(run)} are within {FAR:g} σ of {of} ({how}σ: {basis})"
@@ -173,7 +172,7 @@ def _nothing(run: RenderRun, found: tuple[Reading, ...], off: list[Reading]) -> 
 
 
 def _chance(ratio: float, count: int) -> float:
-    """Probability that the largest of ``count`` normal numbers is as far out."""
+    """Return the probability that the largest of ``count`` normal numbers is as far out."""
     return float(-np.expm1(count * np.log1p(-2.0 * ndtr(-abs(ratio)))))
 
 
@@ -182,7 +181,7 @@ def _are(what: list[Reading]) -> str:
 
 
 def _changes(found: tuple[Reading, ...]) -> list[Reading]:
-    """Without the errors on the ground, which follow from them."""
+    """Return the readings without the errors on the ground, which follow from them."""
     return [r for r in found if r.group != GROUND_GROUP]
 
 
@@ -212,22 +211,22 @@ def _recovered(run: RenderRun, found: tuple[Reading, ...]) -> tuple[str, ...]:
 
 
 def _frames(run: RenderRun, found: tuple[Reading, ...]) -> str:
-    """Whether more frames help: they do against the noise alone."""
+    """Return whether more frames help, as text; they lower only the noise."""
     if any(r.noise**2 > 0.5 * r.sigma**2 for r in _changes(found)):
         return "; more frames or more light would reveal smaller changes"
     return "; more frames do not lower this limit"
 
 
 def _needed(run: RenderRun, clearest: Reading) -> str:
-    """How many frames would show a change, where any number does: they lower the noise and nothing else."""
+    """Return the number of frames that would reveal a change, as text; empty if none would."""
     allowed = (clearest.true / FAR) ** 2 - (clearest.sigma**2 - clearest.noise**2)
     need = math.ceil(run.frames * clearest.noise**2 / allowed) if allowed > 0.0 else math.inf
     return f"about {need} frames would reveal the clearest change" if need <= MOST_FRAMES else ""
 
 
 def limited(run: RenderRun) -> str:
-    """Which body limits what a pair is for, the angle; of other instruments the reading that is farthest off. Empty
-    where nothing is stated.
+    """Return the body that limits the angle of a pair, or else the reading with the largest error; empty without a
+    prior.
     """
     if _noise_only(run):
         return ""
@@ -264,14 +263,17 @@ def _score(found: tuple[Reading, ...], off: list[Reading], how: str = "") -> str
 
 
 def _unknown(run: RenderRun) -> str:
-    """Why an estimator misreads a motion."""
+    """Return why an estimator misreads a motion, as text."""
     if run.estimators[run.judged].stated:
         return "larger than the prior expects"
     return f"outside the family of the {_told(run)}"
 
 
 def _cause(run: RenderRun, worst: Reading, count: int) -> str:
-    """What makes an error, as far as the crosstalk table knows, and where to look; ``count``: of all readings."""
+    """Return the cause of an error, as far as the crosstalk table explains it, and where to look.
+
+    ``count`` is the number of all readings.
+    """
     cameras = list(run.crosstalk)
     found = {name: systematics(run, name) for name in cameras}
     # a change of one camera, or what the angle and the ground are made of, per unit of the results
@@ -311,11 +313,11 @@ def _cause(run: RenderRun, worst: Reading, count: int) -> str:
 
 
 NAMED = 4
-"""Motions that a sentence names at most."""
+"""Largest number of motions that a sentence names."""
 
 
 def _largest(parts: Mapping[str, float]) -> str:
-    """The motions with the largest parts."""
+    """Return the motions with the largest contributions, as text."""
     return joined(sorted(parts, key=lambda text: -abs(parts[text]))[:NAMED])
 
 
@@ -341,8 +343,9 @@ def _series_verdict(
 
 
 def _series_contradicted(run: RenderRun) -> str:
-    """Return what leads the verdict of a course that contradicts its prior, with the largest error of its filtered and
-    smoothed changes; empty where it does not.
+    """Return the lead of the verdict for a course that contradicts its prior; empty where it does not.
+
+    It has the largest error of the filtered and smoothed changes.
     """
     series = run.series
     if series is None or series.smoothed is None or series.smoothed.consistency.agrees:
@@ -358,7 +361,7 @@ def _series_contradicted(run: RenderRun) -> str:
 
 
 def _dimmed(run: RenderRun) -> str:
-    """Spots that lost more than half of their light, of the state that is shown."""
+    """Return a sentence on spots that lost more than half of their light in the state shown."""
     share = run.photons_after.sum(axis=(1, 2)) / run.photons_before.sum(axis=(1, 2))
     lost = [(c.key, s) for c, s in zip(run.experiment.path.channels, share, strict=True) if s < _DIMMED]
     if not lost:
@@ -368,7 +371,7 @@ def _dimmed(run: RenderRun) -> str:
 
 
 def sharpness_lost(quality: ImageQuality) -> tuple[float, str, str]:
-    """Largest relative loss of MTF at Nyquist on the lines, where it is, and its values before and after."""
+    """Return the largest relative loss of MTF at Nyquist on the lines, its place, and the values before and after."""
     lost = [
         (1.0 - float(mtf[1, k] / mtf[0, k]), name, direction, field, float(mtf[0, k]), float(mtf[1, k]))
         for name, camera in quality.cameras.items()
@@ -384,7 +387,7 @@ def sharpness_lost(quality: ImageQuality) -> tuple[float, str, str]:
 
 
 def _blurred(run: RenderRun) -> str:
-    """What the perturbation does to the cameras' own images, where it matters."""
+    """Return a sentence on the loss of sharpness in the cameras' images, where it matters."""
     if run.quality is None:
         return ""
     share, where, change = sharpness_lost(run.quality)
@@ -392,13 +395,15 @@ def _blurred(run: RenderRun) -> str:
 
 
 def alarm_limit(count: int) -> float:
-    """Sigmas that a normal error exceeds in any of ``count`` readings with a chance of FALSE_ALARM at most."""
+    """Return the sigmas that a normal error exceeds in any of ``count`` readings with at most FALSE_ALARM probability.
+    """
     return -float(ndtri(0.5 * FALSE_ALARM / count))
 
 
 def _unstated(run: RenderRun, found: tuple[Reading, ...], told: tuple[str, ...]) -> tuple[str, ...]:
-    """A warning where readings are wrong beyond chance in a job that moves more than it states: in a measurement of
-    such an instrument nobody would know. Bodies that are told already are left out.
+    """Return a warning where readings are wrong beyond chance because the job moves more than its prior expects.
+
+    In a real measurement this would go unnoticed. Bodies that have a warning already are omitted.
     """
     limit = alarm_limit(len(found))
     off = [r for r in found if abs(r.ratio) > limit]
@@ -419,7 +424,8 @@ def _unstated(run: RenderRun, found: tuple[Reading, ...], told: tuple[str, ...])
 
 
 def _misreadings(run: RenderRun) -> tuple[str, ...]:
-    """A warning for every change whose reading is wrong by more than the change, and by more than chance can do."""
+    """Return a warning for every change whose reading is wrong by more than the change, and by more than chance allows.
+    """
     changes: dict[tuple[str, str], list[Reading]] = {}
     for reading in (one for estimator in run.estimators for one in readings(run, estimator)):
         changes.setdefault((reading.group, reading.parameter.key), []).append(reading)
