@@ -191,31 +191,29 @@ def export(
         "image": image_sigma,
         "height": height_sigma,
     }
-    options_text = [
-        word for name, sigma in sigmas.items() if sigma is not None for word in (f"--{name}-sigma", str(sigma))
-    ]
-    options_text += [] if band is None else ["--band", band]
-    options_text += [] if control is None else ["--control", str(control), "--correction", correction.value]
+    extra = [word for name, sigma in sigmas.items() if sigma is not None for word in (f"--{name}-sigma", str(sigma))]
+    extra += [] if band is None else ["--band", band]
+    extra += [] if control is None else ["--control", str(control), "--correction", correction.value]
 
     def resolve() -> tuple[Exportable, tuple[float, float] | None, CameraUncertainty | None, ControlPoints | None]:
         from twin.orbit.export.export_run import read_control, read_exportable
         from twin.orbit.export.ground_accuracy import CameraUncertainty
         from twin.orbit.export.quality_run import read_polynomial_source
 
-        given_sigmas = {name: _sigma(name, sigma) for name, sigma in sigmas.items() if sigma is not None}
-        uncertainty = CameraUncertainty.of(**given_sigmas) if given_sigmas else None
+        values = {name: _sigma(name, sigma) for name, sigma in sigmas.items() if sigma is not None}
+        uncertainty = CameraUncertainty.of(**values) if values else None
         points = None if control is None else read_control(control, correction.value)
         read = read_polynomial_source(source, band) or read_exportable(source, options.seed, band)
         return read, _ground(lowest, highest), uncertainty, points
 
-    def work(arguments: tuple[Any, ...], session: Session) -> Result:
+    def work(parsed: tuple[Any, ...], session: Session) -> Result:
         from scenes.yaml.errors import InputError, Issue
         from twin.framework.procedure import BenchError
         from twin.orbit.export import export_report, quality_run
         from twin.orbit.export.export_run import SceneSource, run_export
         from twin.orbit.export.quality_run import PolynomialSource, run_polynomial_export, with_quality
 
-        read, heights, uncertainty, points = arguments
+        read, heights, uncertainty, points = parsed
         contents: dict[str, bytes]
         if isinstance(read, PolynomialSource):
             alone = run_polynomial_export(read, uncertainty, points)
@@ -235,7 +233,7 @@ def export(
             session.folder.write_bytes(name, content)
         ends = () if heights is None else ("--lowest", f"{heights[0]!r} m", "--highest", f"{heights[1]!r} m")
         name = session.backend.name
-        words = (*ends, *(["--truth"] if truth else []), *options_text, "--seed", str(drawn))
+        words = (*ends, *(["--truth"] if truth else []), *extra, "--seed", str(drawn))
         again = (PROGRAM, "export", str(source), *words, *(() if name == "llvm" else ("--backend", name)))
         inputs = (source,) if control is None else (source, control)
         facts = {"config": read.config, "seed": drawn, "again": again, "given": inputs}

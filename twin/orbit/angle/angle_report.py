@@ -123,11 +123,8 @@ def _facts(run: AngleRun) -> tuple[tuple[str, str], ...]:
         camera, tracker, gps = setup.camera, setup.test.errors.star_tracker, setup.test.errors.gps
         name, described = camera.name, camera.description
         particular: tuple[tuple[str, str], ...] = (
-            ("Passes", ", ".join(pass_angles.name for pass_angles in run.passes)),
-            (
-                "Moment, from the epoch",
-                ", ".join(f"{pass_angles.name} {pass_angles.time:.4g} s" for pass_angles in run.passes),
-            ),
+            ("Passes", ", ".join(result.name for result in run.passes)),
+            ("Moment, from the epoch", ", ".join(f"{result.name} {result.time:.4g} s" for result in run.passes)),
             ("Noise of the attitude, 1σ", ", ".join(format_quantity(v, ANGLE) for v in tracker.noise)),
             ("Noise of the orbit, 1σ", ", ".join(format_quantity(v, LENGTH) for v in gps.noise)),
         )
@@ -166,23 +163,23 @@ def _facts(run: AngleRun) -> tuple[tuple[str, str], ...]:
     )
 
 
-def _named_pairs(pass_angles: PassAngles) -> Iterable[tuple[str, tuple[str, str]]]:
-    return zip(greek_names(pass_angles.pairs), pass_angles.pairs.values(), strict=True)
+def _named_pairs(result: PassAngles) -> Iterable[tuple[str, tuple[str, str]]]:
+    return zip(greek_names(result.pairs), result.pairs.values(), strict=True)
 
 
 def _methods(run: AngleRun) -> Table:
     flight = run.flight if isinstance(run, SimulatedAngleRun) else None
     truth = () if flight is None else tuple(values_of(a) for a in (flight.dihedral, flight.look, flight.along_track))
     rows: list[tuple[Cell, ...]] = []
-    for pass_angles in run.passes:
+    for result in run.passes:
         estimate, along, resection, lab = (
-            pass_angles.estimate,
-            pass_angles.estimate.along,
-            pass_angles.estimate.resection_angles,
-            pass_angles.laboratory,
+            result.estimate,
+            result.estimate.along,
+            result.estimate.resection_angles,
+            result.laboratory,
         )
         laboratory = tuple(values_of(angles) for angles in (lab.dihedral, lab.look, lab.along_track))
-        for k, name in enumerate(greek_names(pass_angles.pairs)):
+        for k, name in enumerate(greek_names(result.pairs)):
             # the sigma along the track holds only for looks mostly along the track
             mostly = abs(laboratory[2][k]) > 0.99 * laboratory[1][k]
             sighted = "lines of sight in the tls planes"
@@ -198,7 +195,7 @@ def _methods(run: AngleRun) -> Table:
             for method, kind, value, sigma, which in kinds:
                 differences = (float((value[k] - side[which][k]) / ARCSEC) for side in (laboratory, truth) if side)
                 spread = None if sigma is None else float(sigma[k] / ARCSEC)
-                rows.append((pass_angles.name, name, method, kind, float(np.degrees(value[k])), spread, *differences))
+                rows.append((result.name, name, method, kind, float(np.degrees(value[k])), spread, *differences))
     heads = ("pass", "", "method", "angle", "deg", "σ [arcsec]", "− laboratory [arcsec]", "− truth [arcsec]")
     width = len(heads) - (not truth)
     return Table(
@@ -215,12 +212,12 @@ def _methods(run: AngleRun) -> Table:
 
 def _planes(run: AngleRun) -> Section:
     rows: list[tuple[Cell, ...]] = []
-    for pass_angles in run.passes:
-        for line, fit in zip(pass_angles.measurement.strips, pass_angles.estimate.planes["tls"], strict=True):
+    for result in run.passes:
+        for line, fit in zip(result.measurement.strips, result.estimate.planes["tls"], strict=True):
             freedom, rms = len(fit.residual) - 2, float(np.sqrt(np.mean(fit.residual**2)))
             p_value = float(chi2.sf(fit.chi_square, freedom)) if freedom > 0 else None
             ratio = fit.chi_square / max(freedom, 1)
-            rows.append((pass_angles.name, line, len(fit.residual), *pass_angles.span[line], rms, ratio, p_value))
+            rows.append((result.name, line, len(fit.residual), *result.span[line], rms, ratio, p_value))
     table = Table(
         "planes",
         "Planes of the lines",
@@ -493,10 +490,10 @@ def _histogram_of_passes(axes: Axes, scatter: Scatter) -> None:
     axes.plot(position, bell, color=svg.VERMILION, lw=1.2, label="by propagation")
 
 
-def _far_points(pass_angles: PassAngles) -> list[tuple[str, int, float]]:
+def _far_points(result: PassAngles) -> list[tuple[str, int, float]]:
     """Return points that lie improbably far from their plane: line, index in it, distance in sigmas."""
     points = []
-    for line, fit in zip(pass_angles.measurement.strips, pass_angles.estimate.planes["tls"], strict=True):
+    for line, fit in zip(result.measurement.strips, result.estimate.planes["tls"], strict=True):
         sigma = np.sqrt(np.einsum("i,nij,j->n", fit.normal, fit.strip.covariance, fit.normal))
         distance = np.abs(fit.residual) / sigma
         limit = np.sqrt(chi2.isf(_FALSE_ALARM / len(distance), 1))
@@ -518,28 +515,24 @@ def _warnings(run: AngleRun) -> tuple[str, ...]:
                 "the points share a shift that is neither in the sigmas nor visible in the residuals; see the table of "
                 "effects"
             )
-    for pass_angles in run.passes:
-        folded = [
-            n
-            for n, f in zip(greek_names(pass_angles.pairs), pass_angles.estimate.angles["tls"].folded, strict=True)
-            if f
-        ]
+    for result in run.passes:
+        folded = [n for n, f in zip(greek_names(result.pairs), result.estimate.angles["tls"].folded, strict=True) if f]
         if folded:
             warnings.append(
-                f"{pass_angles.name}: the planes of {listed(folded)} are parallel within their noise, where the "
+                f"{result.name}: the planes of {listed(folded)} are parallel within their noise, where the "
                 "unsigned dihedral angle is biased; use the signed angle along the track"
             )
-        far = _far_points(pass_angles)
+        far = _far_points(result)
         if far:
             line, number, distance = max(far, key=lambda point: point[2])
             warnings.append(
-                f"{pass_angles.name}: {len(far)} points lie improbably far from their planes, the farthest "
-                f"{pass_angles.ids[line][number]} of {line}, {distance:.0f} σ; `angle` rejects none: check them, or "
+                f"{result.name}: {len(far)} points lie improbably far from their planes, the farthest "
+                f"{result.ids[line][number]} of {line}, {distance:.0f} σ; `angle` rejects none: check them, or "
                 "use the screening of `calibrate`"
             )
-        if pass_angles.estimate.resection.p_value < UNLIKELY:
+        if result.estimate.resection.p_value < UNLIKELY:
             warnings.append(
-                f"{pass_angles.name}: the resection does not fit (p = {pass_angles.estimate.resection.p_value:.1g}); "
+                f"{result.name}: the resection does not fit (p = {result.estimate.resection.p_value:.1g}); "
                 "principal distances may have changed, or lines rotated about the flight direction or the vertical"
             )
     return tuple(warnings)

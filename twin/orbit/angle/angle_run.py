@@ -369,7 +369,7 @@ def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Ad
         first, third = Scatter.of(planes, flight.dihedral), Scatter.of(alongs, flight.along_track)
         second = Scatter.of(resections, flight.along_track)
         common = reduce_to_station(measurement, estimate.resection)
-        pass_angles = PassAngles(
+        result = PassAngles(
             "pass 1",
             flight.spec.time,
             flight.before_launch,
@@ -382,7 +382,7 @@ def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Ad
         return SimulatedAngleRun(
             setup=setup,
             seed=seed,
-            passes=(pass_angles,),
+            passes=(result,),
             flight=flight,
             frames=frame_rows(flight, common),
             effects=effect_rows(flight),
@@ -543,8 +543,8 @@ def _with_sigmas(names: Iterable[str], angles: PlaneAngles | AlongTrackAngles | 
     return _degrees(names, angles.values) | _by_angle([f"{n}_arcsec_sigma" for n in names], angles.sigma / ARCSEC)
 
 
-def _plane_p_values(pass_angles: PassAngles) -> dict[str, float]:
-    fits = zip(pass_angles.measurement.strips, pass_angles.estimate.planes["tls"], strict=True)
+def _plane_p_values(result: PassAngles) -> dict[str, float]:
+    fits = zip(result.measurement.strips, result.estimate.planes["tls"], strict=True)
     return {line: float(chi2.sf(fit.chi_square, len(fit.residual) - 2)) for line, fit in fits}
 
 

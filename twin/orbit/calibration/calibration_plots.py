@@ -166,26 +166,26 @@ def _correlation_figure(run: CalibrationRun) -> Figure:
 
 def _residual_figure(run: CalibrationRun) -> Figure:
     """Draw the residuals of the first field's control points in the images of the lines, in pixels."""
-    field_pass = run.campaign.passes[0]
+    flight = run.campaign.passes[0]
     adjustment = run.together
     offset = [
         adjustment.value(n) if n in adjustment.names else 0.0
-        for n in (f"{field_pass.name} offset {axis}" for axis in OFFSET)
+        for n in (f"{flight.name} offset {axis}" for axis in OFFSET)
     ]
     figure = svg.new_figure(3.9)
-    shown = tuple(field_pass.control.rays)
+    shown = tuple(flight.control.rays)
     panels = figure.subplots(1, len(shown), sharex=True, squeeze=False)[0]
     for axes, line in zip(panels, shown, strict=True):
-        rays, pitch = field_pass.control.rays[line], field_pass.data.pitch[line]
+        rays, pitch = flight.control.rays[line], flight.data.pitch[line]
         residual = misclosure(
             adjustment.cameras[line],
             rays,
-            adjustment.ground[field_pass.name][rays.point],
-            adjustment.bias(field_pass.name),
-            field_pass.control.axes @ np.array(offset),
+            adjustment.ground[flight.name][rays.point],
+            adjustment.bias(flight.name),
+            flight.control.axes @ np.array(offset),
         )
         residual = residual / pitch
-        images = field_pass.control_images[line]
+        images = flight.control_images[line]
         arrows = axes.quiver(
             images.pixel,
             images.line / 1e3,
@@ -212,16 +212,16 @@ def _check_figure(run: CalibrationRun) -> Figure:
 
     Arrows show the error in plan, colours the error in height.
     """
-    field_pass = run.campaign.passes[0]
-    _, lat, _ = (float(v) for v in field_pass.data.earth.geodetic(field_pass.check_ground.mean(axis=0)))
-    lon, latitude, _ = field_pass.data.earth.geodetic(field_pass.check_ground)
+    flight = run.campaign.passes[0]
+    _, lat, _ = (float(v) for v in flight.data.earth.geodetic(flight.check_ground.mean(axis=0)))
+    lon, latitude, _ = flight.data.earth.geodetic(flight.check_ground)
     east = (lon - lon.mean()) * 6.378e3 * np.cos(lat)
     north = (latitude - latitude.mean()) * 6.357e3
     figure = svg.new_figure(5.2)
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     cases = (
-        ("laboratory's camera", run.before[field_pass.name]),
-        ("its own parameters", list(run.schemes.values())[-1][field_pass.name]),
+        ("laboratory's camera", run.before[flight.name]),
+        ("its own parameters", list(run.schemes.values())[-1][flight.name]),
     )
     for axes, (title, errors) in zip(panels, cases, strict=True):
         size = float(f"{np.sqrt(np.nanmean(np.sum(errors.error[:, :2] ** 2, axis=1))):.1g}")

@@ -143,7 +143,7 @@ def _measured_facts(setup: MeasuredCalibrationSetup, run: CalibrationRun) -> tup
     if conventions.quaternion is not None and conventions.body_axes is not None:
         turns = conventions.quaternion.turns.replace("_", " ")
         quaternion = f"scalar {conventions.quaternion.scalar}, {turns}, body {', '.join(conventions.body_axes)}"
-    paths = {field_pass.measured.interpolation for field_pass in run.campaign.passes}
+    paths = {flight.measured.interpolation for flight in run.campaign.passes}
     joined = {"spline": "cubic splines", "lagrange": "Lagrange polynomials of ten readings"}
     light = "none" if not any_effect(run.campaign.effects) else f"{'' if test.effects.corrected else 'not '}corrected"
     held = " and ".join(run.together.gauge.held)
@@ -192,14 +192,14 @@ def _measured_warnings(run: CalibrationRun) -> list[str]:
                 f"{name}: image points scatter more than their sigmas predict, by factors of {factors}; their sigmas "
                 "were multiplied by these factors"
             )
-    for field_pass in run.campaign.passes:
-        places = np.concatenate([field_pass.control_ground, field_pass.check_ground])
-        if twice := duplicates(np.concatenate([field_pass.control_ids, field_pass.check_ids]), places):
-            warnings.append(f"{field_pass.name}: {twice}")
-        fit = intersection_fit(run.campaign, field_pass, run.fields[field_pass.name].adjustment)
+    for flight in run.campaign.passes:
+        places = np.concatenate([flight.control_ground, flight.check_ground])
+        if twice := duplicates(np.concatenate([flight.control_ids, flight.check_ids]), places):
+            warnings.append(f"{flight.name}: {twice}")
+        fit = intersection_fit(run.campaign, flight, run.fields[flight.name].adjustment)
         if fit.degrees_of_freedom >= _FEW and fit.p_value < _LEAST_CHANCE:
             warnings.append(
-                f"{field_pass.name}: rays of the check points do not intersect within their sigmas (p = "
+                f"{flight.name}: rays of the check points do not intersect within their sigmas (p = "
                 f"{fit.p_value:.1g}): the sigmas of image points or attitude are too small, or the attitude has slow "
                 "errors"
             )

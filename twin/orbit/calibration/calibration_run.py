@@ -303,8 +303,8 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
     together = simultaneous(campaign, rates)
     advance("calibration", 2, parts)
     fields = {}
-    for k, field_pass in enumerate(campaign.passes):
-        fields[field_pass.name] = FieldResult(calibrated_alone(campaign, field_pass), *third_differences(field_pass))
+    for k, flight in enumerate(campaign.passes):
+        fields[flight.name] = FieldResult(calibrated_alone(campaign, flight), *third_differences(flight))
         advance("calibration", 3 + k, parts)
     first = campaign.spec.schemes[0][0]
     control = next(p.control for p in campaign.passes if p.name == first)
@@ -384,21 +384,19 @@ def true_values(campaign: Campaign, names: tuple[str, ...]) -> np.ndarray:
         for line, camera in campaign.truth.items()
         for name, value in zip(INTERIOR, camera.interior, strict=True)
     }
-    for field_pass in campaign.passes:
-        values |= {f"{field_pass.name} {name}": v for name, v in zip(BIAS, field_pass.bias, strict=True)}
-        values |= {
-            f"{field_pass.name} offset {name}": v for name, v in zip(OFFSET, field_pass.truth.offset, strict=True)
-        }
-    rates = [(field_pass.truth.bias_at(1.0) - field_pass.truth.bias_at(-1.0)) / 2.0 for field_pass in campaign.passes]
+    for flight in campaign.passes:
+        values |= {f"{flight.name} {name}": v for name, v in zip(BIAS, flight.bias, strict=True)}
+        values |= {f"{flight.name} offset {name}": v for name, v in zip(OFFSET, flight.truth.offset, strict=True)}
+    rates = [(flight.truth.bias_at(1.0) - flight.truth.bias_at(-1.0)) / 2.0 for flight in campaign.passes]
     values |= dict(zip(RATE, np.mean(rates, axis=0), strict=True))
-    for field_pass, rate in zip(campaign.passes, rates, strict=True):
-        values |= {f"{field_pass.name} {name}": v for name, v in zip(RATE, rate, strict=True)}
+    for flight, rate in zip(campaign.passes, rates, strict=True):
+        values |= {f"{flight.name} {name}": v for name, v in zip(RATE, rate, strict=True)}
     return np.array([values[name] for name in names])
 
 
-def third_differences(field_pass: FieldPass) -> tuple[ThirdDifference | None, ThirdDifference | None]:
+def third_differences(flight: FieldPass) -> tuple[ThirdDifference | None, ThirdDifference | None]:
     """Return the third differences of orbit and attitude of a pass; None for fewer than five evenly spaced readings."""
-    measured, table = field_pass.measured, field_pass.measured.table
+    measured, table = flight.measured, flight.measured.table
     fixes, looks = _even(table.orbit_time), _even(table.attitude_time[measured.covers(table.attitude_time)])
     places = table.position[np.isin(table.orbit_time, fixes)]
     turned = np.swapaxes(measured.orbital_to_itrs(looks), 1, 2) @ measured.body_to_itrs(looks)
@@ -430,7 +428,7 @@ def exported(run: CalibrationRun) -> dict[str, str]:
 
 def files_of(setup: AnyCalibration, campaign: Campaign) -> dict[str, str]:
     """Return the files of a campaign, path -> text; the campaign need not be calibrated."""
-    files = campaign_files([field_pass.measurements for field_pass in campaign.passes], setup.camera.plain())
+    files = campaign_files([flight.measurements for flight in campaign.passes], setup.camera.plain())
     return files | {TEST_FILE: dump_yaml(_test(setup))}
 
 

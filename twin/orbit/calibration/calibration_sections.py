@@ -16,7 +16,7 @@ from analysis.calibration.adjustment import Adjustment
 from analysis.orbit.calibration_parameters import OFFSET, RATE
 from analysis.orbit.three_line_model import BIAS
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.framework.artefact import Cell, OwnDecimals, PngFigure, SvgFigure, Table
+from twin.framework.artefact import Cell, DecimalNumber, PngFigure, SvgFigure, Table
 from twin.framework.report import Section
 from twin.orbit.calibration.calibration_numbers import CHIP_STEP, LATITUDE, MATCHING, SCREENED
 from twin.orbit.calibration.calibration_plots import figure_svg
@@ -162,21 +162,21 @@ def _measured(run: CalibrationRun) -> Section:
     campaign = run.campaign
     rows: Rows = []
     sizes: Rows = []
-    for field_pass in campaign.passes:
-        rejected, alone = campaign.rejected.get(field_pass.name), run.fields[field_pass.name].adjustment
-        fit, errors = intersection_fit(campaign, field_pass, alone), list(run.schemes.values())[-1][field_pass.name]
+    for flight in campaign.passes:
+        rejected, alone = campaign.rejected.get(flight.name), run.fields[flight.name].adjustment
+        fit, errors = intersection_fit(campaign, flight, alone), list(run.schemes.values())[-1][flight.name]
         factors = {} if rejected is None else {line: f"{factor:.2f}" for line, factor in rejected.factors.items()}
         alike = len(set(factors.values())) == 1
         factor = factors.popitem()[1] if alike else ", ".join(f"{line} {v}" for line, v in factors.items())
         lost = (None, None, None) if rejected is None else (len(rejected.points), len(rejected.check_points), factor)
-        points = (int(field_pass.is_control.sum()), field_pass.tie_count, len(field_pass.check_ground))
+        points = (int(flight.is_control.sum()), flight.tie_count, len(flight.check_ground))
         ratio, check = (v.chi_square / max(v.degrees_of_freedom, 1) for v in (alone, fit))
-        rows.append((field_pass.name, *points, *lost, ratio, alone.p_value, check))
-        for line in field_pass.data.sensors:
-            along, across = ground_sample(field_pass, line)
+        rows.append((flight.name, *points, *lost, ratio, alone.p_value, check))
+        for line in flight.data.sensors:
+            along, across = ground_sample(flight, line)
             pixel = float(np.sqrt(along * across))
             both = errors.plan_rms / pixel, errors.height_rms / pixel
-            sizes.append((field_pass.name, line, along, across, *both, errors.count))
+            sizes.append((flight.name, line, along, across, *both, errors.count))
     heads = ("image points rejected", "check rejected", "factor", "χ²/dof", "p", "check χ²/dof")
     tables = (
         Table(
@@ -204,20 +204,20 @@ def _measured(run: CalibrationRun) -> Section:
 
 
 def _limits(run: CalibrationRun) -> str:
-    noise, field_pass = run.campaign.noise, run.campaign.passes[0]
-    ground = field_pass.altitude / float(np.mean([m.interior[0] for m in run.campaign.laboratory.values()]))
-    control = np.trace(field_pass.control_covariance[field_pass.is_control], axis1=1, axis2=2)
+    noise, flight = run.campaign.noise, run.campaign.passes[0]
+    ground = flight.altitude / float(np.mean([m.interior[0] for m in run.campaign.laboratory.values()]))
+    control = np.trace(flight.control_covariance[flight.is_control], axis1=1, axis2=2)
     # white noise of the readings by their spline, in metres on the ground, beside that of the image
     parts = {
         "image points": noise.image * ground,
-        "readings of the attitude": noise.attitude * field_pass.altitude,
-        "slow errors of the attitude": noise.slow_attitude * field_pass.altitude,
+        "readings of the attitude": noise.attitude * flight.altitude,
+        "slow errors of the attitude": noise.slow_attitude * flight.altitude,
         "readings of the orbit": noise.station,
         "control points": float(np.sqrt(np.mean(control / 3.0))),
     }
     texts = ", ".join(f"{name} {value:.2g} m" for name, value in sorted(parts.items(), key=lambda v: -v[1]) if value)
     return (
-        f"Error budget on the ground at nadir (1σ) of a single ray to a single point of {field_pass.name}: {texts}. "
+        f"Error budget on the ground at nadir (1σ) of a single ray to a single point of {flight.name}: {texts}. "
         "The largest of these limits the result. More points reduce it, except for slow errors of the attitude."
     )
 
@@ -451,13 +451,11 @@ def _parameters(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
 
 def _fields(run: CalibrationRun) -> Section:
     rows: Rows = []
-    for field_pass in run.campaign.passes:
-        alone = run.fields[field_pass.name].adjustment
-        bias = alone.bias(field_pass.name) / ARCSEC
-        errors = [] if field_pass.known_truth is None else (bias - field_pass.bias / ARCSEC).tolist()
-        rows.append(
-            (field_pass.name, float(np.degrees(field_pass.latitude)), *map(float, bias), *errors, alone.p_value)
-        )
+    for flight in run.campaign.passes:
+        alone = run.fields[flight.name].adjustment
+        bias = alone.bias(flight.name) / ARCSEC
+        errors = [] if flight.known_truth is None else (bias - flight.bias / ARCSEC).tolist()
+        rows.append((flight.name, float(np.degrees(flight.latitude)), *map(float, bias), *errors, alone.p_value))
     truth = ("Δ roll", "Δ pitch", "Δ yaw") if run.truth is not None else ()
     table = Table(
         "fields",
@@ -604,7 +602,7 @@ def _datum(run: CalibrationRun) -> Section:
         scale, unit = (1e3, "ms") if row.late else (1.0, "m")
         warned = "never" if row.warned is None else f"{scale * row.warned:.3g} {unit}"
         sizes = f"{sure} {sigmas:.1f} σ", f"{scale * row.size / max(sigmas, 1e-9):.3g} {unit}", warned
-        moved = [OwnDecimals(v / ARCSEC, 2) for v in row.bias]
+        moved = [DecimalNumber(v / ARCSEC, 2) for v in row.bias]
         others = (*map(float, row.offset), row.fit, row.p_value, *astuple(row.after))
         rows.append((where, *moved, f"{name} {1e6 * change:+.1f} µm", *sizes, *others))
     table = Table(

@@ -936,11 +936,11 @@ def _numbered(images: Mapping[str, ImagePoints], chosen: np.ndarray, count: int)
     return FrozenMap(images_by_line)
 
 
-def _with_ties(field_pass: FieldPass, noise: Noise) -> FieldPass:
+def _with_ties(flight: FieldPass, noise: Noise) -> FieldPass:
     """Return the pass with first coordinates of its tie points, intersected with the laboratory's camera."""
-    tie = ~field_pass.is_control
+    tie = ~flight.is_control
     if not np.any(tie):
-        return field_pass
-    rays = field_pass.data.rays(field_pass.control_images)
-    ground = intersect(rays, field_pass.data.models, noise, count=len(tie)).ground
-    return replace(field_pass, control_ground=np.where(tie[:, None], ground, field_pass.control_ground))
+        return flight
+    rays = flight.data.rays(flight.control_images)
+    ground = intersect(rays, flight.data.models, noise, count=len(tie)).ground
+    return replace(flight, control_ground=np.where(tie[:, None], ground, flight.control_ground))

@@ -77,16 +77,14 @@ def _rate_priors(campaign: Campaign, passes: Sequence[FieldPass], common: Sequen
         return tuple(common)
     common_rates = {next(iter(p.weights)): (p.value, p.sigma) for p in common}
     priors = []
-    for field_pass in passes:
+    for flight in passes:
         for name, scatter in zip(RATE, np.maximum(sigma, _LEAST_RATE).tolist(), strict=True):
             value, error = common_rates.get(name, (0.0, 0.0))
-            priors.append(
-                Prior({f"{field_pass.name} {name}": 1.0}, value, float(np.hypot(scatter, error)), "bias rate")
-            )
+            priors.append(Prior({f"{flight.name} {name}": 1.0}, value, float(np.hypot(scatter, error)), "bias rate"))
     return tuple(priors)
 
 
-def calibrated_alone(campaign: Campaign, field_pass: FieldPass) -> Adjustment:
+def calibrated_alone(campaign: Campaign, flight: FieldPass) -> Adjustment:
     """Calibrate one field by itself, with paper 003's twelve unknowns less the gauge.
 
     A rate of the attitude is added where the attitude drifts.
@@ -95,7 +93,7 @@ def calibrated_alone(campaign: Campaign, field_pass: FieldPass) -> Adjustment:
     ----------
     campaign : Campaign
         Campaign with the laboratory's camera and the noise.
-    field_pass : FieldPass
+    flight : FieldPass
         Pass over the field.
 
     Raises
@@ -103,9 +101,9 @@ def calibrated_alone(campaign: Campaign, field_pass: FieldPass) -> Adjustment:
     CalibrationError
         The adjustment cannot be solved.
     """
-    rates = _rate_priors(campaign, [field_pass])
+    rates = _rate_priors(campaign, [flight])
     return adjust(
-        [field_pass.control],
+        [flight.control],
         campaign.laboratory,
         campaign.noise,
         unknowns=Unknowns(rate="field" if rates else "none"),
@@ -304,14 +302,14 @@ def rate_priors(campaign: Campaign, fits: tuple[LatitudeFit, ...]) -> tuple[Prio
     )
 
 
-def _sine_rate(field_pass: FieldPass, reference: float) -> float:
+def _sine_rate(flight: FieldPass, reference: float) -> float:
     """Return the rate of sin(latitude - reference) at a pass's middle, from the measured orbit, in 1/s."""
-    path, middle, step = field_pass.measured, field_pass.middle, np.array([-1.0, 1.0])
+    path, middle, step = flight.measured, flight.middle, np.array([-1.0, 1.0])
     covered = path.covers(middle + step)[:, None]
     # where readings end within a second, extrapolated by the velocity
     on = path.position(middle) + step[:, None] * path.velocity(middle)
     ends = np.where(covered, path.position(middle + np.where(covered[:, 0], step, 0.0)), on)
-    latitude = field_pass.data.earth.geodetic(ends)[1]
+    latitude = flight.data.earth.geodetic(ends)[1]
     return float(np.diff(np.sin(latitude - reference))[0] / 2.0)
 
 

@@ -369,8 +369,8 @@ def fly_fields(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: A
     measured, readings, pictures, truths = zip(*flown, strict=True)
     campaign = campaign_of(spec, payload, measured, spec.images is None)
     passes = tuple(
-        replace(field_pass, known_truth=truth, readings=reading)
-        for field_pass, truth, reading in zip(campaign.passes, truths, readings, strict=True)
+        replace(flight, known_truth=truth, readings=reading)
+        for flight, truth, reading in zip(campaign.passes, truths, readings, strict=True)
     )
     images = tuple(images for images in pictures if images is not None)
     truth = FrozenMap({k: line_model(changed, k) for k in LINES})
@@ -399,16 +399,14 @@ def _pass(
     pictures, drift = stream(seed, _PICTURES), _sample_drift(spec, seed)
     readings = _sample_readings(spec, drift, seed)
     cameras = line_cameras(drifted_payload(changed, drift))
-    random_places, random_image, random_ground, random_season, random_errors = (
-        np.random.default_rng(s) for s in seed.spawn(5)
-    )
+    rng_place, rng_image, rng_ground, rng_season, rng_data = (np.random.default_rng(s) for s in seed.spawn(5))
     trajectory = _trajectory(name, field, spec, earth, seed)
     errors = spec.errors
-    rotation = np.array(errors.star_tracker.bias) + np.array(errors.season) * random_season.standard_normal(3)
+    rotation = np.array(errors.star_tracker.bias) + np.array(errors.season) * rng_season.standard_normal(3)
     tracker = errors.star_tracker.model_copy(update={"bias": tuple(rotation.tolist())})
     terms = TERMS if errors.switched_on else ("attitude_bias",)
     measured = trajectory.with_errors(
-        errors.model_copy(update={"star_tracker": tracker}), int(random_errors.integers(2**31)), terms
+        errors.model_copy(update={"star_tracker": tracker}), int(rng_data.integers(2**31)), terms
     )
     platform = PlatformTable.sampled(measured, errors.gps.interval, errors.star_tracker.interval)
     effects = light_effects(spec.effects)
@@ -420,9 +418,7 @@ def _pass(
     images = None
     if imager is None:
         assert spec.points is not None
-        points = _simulated_points(
-            field, spec, spec.points, sensors, pass_info, (random_places, random_image, random_ground)
-        )
+        points = _simulated_points(field, spec, spec.points, sensors, pass_info, (rng_place, rng_image, rng_ground))
     else:
         points, images = imager.measured(field, sensors, pass_info, effects, pictures)
     ties: Mapping[str, ImagePoints] = {}
@@ -450,8 +446,8 @@ def _pass(
         drift,
     )
     datum = errors.datum if errors.switched_on else (0.0, 0.0, 0.0)
-    measurements = _measurements_of(name, platform, times, points, ties, datum)
-    return measurements, readings, images, truth
+    measured_pass = _measurements_of(name, platform, times, points, ties, datum)
+    return measured_pass, readings, images, truth
 
 
 def _measurements_of(

@@ -184,11 +184,11 @@ def light_rows(campaign: Campaign, sigma: Mapping[str, float]) -> tuple[LightRow
     base = simultaneous(clean)
     rows = []
     for left in cases:
-        case, adjustment = clean, base
+        case, fit = clean, base
         if left:
             removed = replace(campaign.effects, **dict.fromkeys(left, False))
             case = clean.without_effects(removed if len(left) < len(on) else NO_EFFECTS)
-            adjustment = simultaneous(case)
+            fit = simultaneous(case)
         moved = {
             line: np.sqrt(
                 np.mean(
@@ -204,11 +204,9 @@ def light_rows(campaign: Campaign, sigma: Mapping[str, float]) -> tuple[LightRow
             )
             for line in campaign.lines
         }
-        shift = dict(zip(adjustment.names, (adjustment.values - base.values).tolist(), strict=True))
+        shift = dict(zip(fit.names, (fit.values - base.values).tolist(), strict=True))
         rows.append(
-            LightRow(
-                left, moved, FieldErrors.mean(laboratory_errors(case)), _after(case), shift, sigma, adjustment.p_value
-            )
+            LightRow(left, moved, FieldErrors.mean(laboratory_errors(case)), _after(case), shift, sigma, fit.p_value)
         )
     return tuple(rows)
 
@@ -234,8 +232,8 @@ def datum_rows(campaign: Campaign) -> tuple[DatumRow, ...]:
     for east, north, up in shifts:
         late = 0.0 if any((east, north, up)) else _TRIAL_TIME
         wrong = right.later(late) if late else right.shifted((east, north, up))
-        adjustment = simultaneous(wrong)
-        change = dict(zip(adjustment.names, adjustment.values - base.values, strict=True))
+        fit = simultaneous(wrong)
+        change = dict(zip(fit.names, fit.values - base.values, strict=True))
         names = [p.name for p in campaign.passes]
         rows.append(
             DatumRow(
@@ -243,8 +241,8 @@ def datum_rows(campaign: Campaign) -> tuple[DatumRow, ...]:
                 np.array([np.mean([change[f"{n} {axis}"] for n in names]) for axis in BIAS]),
                 {n: float(change[n]) for n in campaign.inner},
                 np.array([np.mean([change.get(f"{n} offset {axis}", 0.0) for n in names]) for axis in OFFSET]),
-                adjustment.chi_square - base.chi_square,
-                adjustment.p_value,
+                fit.chi_square - base.chi_square,
+                fit.p_value,
                 _after(wrong),
                 late,
                 {n: base.sigma[n] for n in campaign.inner},
@@ -288,15 +286,15 @@ def _expected(campaign: Campaign) -> dict[str, tuple[float, float]]:
     inner = campaign.inner
     start = dict(zip(inner, np.ravel([campaign.laboratory[line].interior for line in campaign.lines]), strict=True))
     expected = {name: (start[name], launch.interior) for name in inner}
-    for field_pass in campaign.passes:
+    for flight in campaign.passes:
         # the season's part is expected, too
         spread = np.hypot(launch.bias, np.array(errors.season))
         expected |= {
-            f"{field_pass.name} {axis}": (0.0, s) for axis, s in zip(BIAS, spread.tolist(), strict=True) if s > 0.0
+            f"{flight.name} {axis}": (0.0, s) for axis, s in zip(BIAS, spread.tolist(), strict=True) if s > 0.0
         }
         if errors.switched_on:
             drift = zip(OFFSET, errors.gps.drift, strict=True)
-            expected |= {f"{field_pass.name} offset {axis}": (0.0, s) for axis, s in drift if s > 0.0}
+            expected |= {f"{flight.name} offset {axis}": (0.0, s) for axis, s in drift if s > 0.0}
     return expected
 
 
@@ -338,25 +336,25 @@ class AttitudeDrift:
     assumed: DetectedDrift | None
 
     @classmethod
-    def of(cls, campaign: Campaign, adjustment: Adjustment) -> Self:
+    def of(cls, campaign: Campaign, fit: Adjustment) -> Self:
         """Return the drift test of an adjustment of all fields."""
         seconds = float(np.mean([p.seconds_apart for p in campaign.passes]))
         effect = detectable = undetected = None
         rate_p_value = None
-        if adjustment.rates is not None and seconds > 0.0:
-            assert isinstance(adjustment.rates.terms, Rates)
-            sigma = np.array([adjustment.sigma[n] for n in adjustment.names])
-            change = np.linalg.norm(adjustment.rates.bias, axis=1) * ARCSEC / seconds
-            effect = {n: float(c / s) for n, c, s in zip(adjustment.names, change, sigma, strict=True) if s > 0.0}
+        if fit.rates is not None and seconds > 0.0:
+            assert isinstance(fit.rates.terms, Rates)
+            sigma = np.array([fit.sigma[n] for n in fit.names])
+            change = np.linalg.norm(fit.rates.bias, axis=1) * ARCSEC / seconds
+            effect = {n: float(c / s) for n, c, s in zip(fit.names, change, sigma, strict=True) if s > 0.0}
             # detectable size of each rate alone in a test of all rates together
-            power = np.sqrt(chi2.isf(FALSE_ALARM, max(adjustment.rates.degrees_of_freedom, 1)))
-            alone = adjustment.rates.sigma_alone.reshape(-1, 3)
+            power = np.sqrt(chi2.isf(FALSE_ALARM, max(fit.rates.degrees_of_freedom, 1)))
+            alone = fit.rates.sigma_alone.reshape(-1, 3)
             detectable = power * np.sqrt(1.0 / np.mean(alone**-2.0, axis=0) / len(alone)) * seconds
             limit = np.where(np.isfinite(alone), alone, 0.0).ravel() * power
-            wrong = np.abs(adjustment.rates.bias) * limit
+            wrong = np.abs(fit.rates.bias) * limit
             undetected = float(np.max(wrong[sigma > 0.0] / sigma[sigma > 0.0][:, None], initial=0.0))
-            rate_p_value = adjustment.rates.p_value
-        course, drifts = adjustment.slow_variations.p_value, campaign.drifts
+            rate_p_value = fit.rates.p_value
+        course, drifts = fit.slow_variations.p_value, campaign.drifts
         if drifts is not None:
             rate_p_value, course = drifts.rate_p_value, drifts.course_p_value
         return cls(seconds, effect, detectable, undetected, rate_p_value, course, drifts)

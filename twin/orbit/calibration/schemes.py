@@ -176,11 +176,9 @@ def evaluate_schemes(
     results = {}
     for k, scheme in enumerate((*campaign.spec.schemes, None)):
         errors = {}
-        for field_pass in campaign.passes:
-            names = scheme or (field_pass.name,)
-            errors[field_pass.name] = test(
-                field_pass, *mean_parameters(campaign, [alone[name] for name in names], names)
-            )
+        for flight in campaign.passes:
+            names = scheme or (flight.name,)
+            errors[flight.name] = test(flight, *mean_parameters(campaign, [alone[name] for name in names], names))
         results[str(k + 1)] = FrozenMap(errors)
     return FrozenMap(results)
 
@@ -188,7 +186,7 @@ def evaluate_schemes(
 def scheme_errors(campaign: Campaign, alone: Mapping[str, Adjustment]) -> FrozenMap[str, FrozenMap[str, CheckErrors]]:
     """Return the errors at check points, scheme -> field; arguments as in `evaluate_schemes`."""
     return evaluate_schemes(
-        campaign, alone, lambda field_pass, cameras, bias: check_point_errors(campaign, field_pass, cameras, bias)
+        campaign, alone, lambda flight, cameras, bias: check_point_errors(campaign, flight, cameras, bias)
     )
 
 
@@ -200,10 +198,10 @@ def laboratory_errors(campaign: Campaign) -> FrozenMap[str, CheckErrors]:
 
 
 def check_point_errors(
-    campaign: Campaign, field_pass: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray
+    campaign: Campaign, flight: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray
 ) -> CheckErrors:
     """Return the errors at a field's check points, intersected with these cameras and this attitude bias (3,)."""
-    return check_errors(intersect(field_pass.check, cameras, campaign.noise, bias=bias).ground, field_pass.check_ground)
+    return check_errors(intersect(flight.check, cameras, campaign.noise, bias=bias).ground, flight.check_ground)
 
 
 def repeat_campaigns(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance) -> Repeats | None:
@@ -336,16 +334,16 @@ def adjust_strips(campaign: Campaign, advance: Advance) -> Strips | None:
     parts, done = (len(spec.schemes) + 2) * len(campaign.passes), itertools.count(1)
     calibrated, strips = {}, {}
 
-    def in_strip(field_pass: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray) -> CheckErrors:
+    def in_strip(flight: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray) -> CheckErrors:
         # strips of the last scheme, with each field's own parameters, replace the others
-        strips[field_pass.name] = strip = adjust_pass_strip(campaign, field_pass, cameras, bias)
+        strips[flight.name] = strip = adjust_pass_strip(campaign, flight, cameras, bias)
         advance("strips", next(done), parts)
-        return strip_check_errors(campaign, field_pass, strip, cameras, bias)
+        return strip_check_errors(campaign, flight, strip, cameras, bias)
 
     with one_blas_thread():
-        for field_pass in campaign.passes:
-            field, gauge = field_with_ties(campaign, field_pass), gauge_of(campaign)
-            calibrated[field_pass.name] = adjust([field], campaign.laboratory, campaign.noise, gauge=gauge)
+        for flight in campaign.passes:
+            field, gauge = field_with_ties(campaign, flight), gauge_of(campaign)
+            calibrated[flight.name] = adjust([field], campaign.laboratory, campaign.noise, gauge=gauge)
             advance("strips", next(done), parts)
         schemes = evaluate_schemes(campaign, calibrated, in_strip)
     return Strips(
@@ -356,13 +354,11 @@ def adjust_strips(campaign: Campaign, advance: Advance) -> Strips | None:
     )
 
 
-def field_with_ties(campaign: Campaign, field_pass: FieldPass) -> CalibrationField:
+def field_with_ties(campaign: Campaign, flight: FieldPass) -> CalibrationField:
     """Return the control and tie points of a pass; points measured in images already contain both."""
-    if not field_pass.ties:
-        return field_pass.control
-    return with_points(
-        field_pass.control, field_pass.ties, intersect(field_pass.ties, campaign.laboratory, campaign.noise).ground
-    )
+    if not flight.ties:
+        return flight.control
+    return with_points(flight.control, flight.ties, intersect(flight.ties, campaign.laboratory, campaign.noise).ground)
 
 
 def with_points(field: CalibrationField, rays: Mapping[str, Rays], ground: np.ndarray) -> CalibrationField:
@@ -385,7 +381,7 @@ def with_points(field: CalibrationField, rays: Mapping[str, Rays], ground: np.nd
 
 
 def adjust_pass_strip(
-    campaign: Campaign, field_pass: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray
+    campaign: Campaign, flight: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray
 ) -> StripAdjustment:
     """Adjust one pass on its tie points; with points measured in images, on all those that the calibration uses.
 
@@ -394,19 +390,15 @@ def adjust_pass_strip(
     CalibrationError
         The strip cannot be adjusted.
     """
-    return adjust_strip(field_pass.ties or field_pass.control.rays, cameras, campaign.noise, bias=bias)
+    return adjust_strip(flight.ties or flight.control.rays, cameras, campaign.noise, bias=bias)
 
 
 def strip_check_errors(
-    campaign: Campaign,
-    field_pass: FieldPass,
-    strip: StripAdjustment,
-    cameras: Mapping[str, LineModel],
-    bias: np.ndarray,
+    campaign: Campaign, flight: FieldPass, strip: StripAdjustment, cameras: Mapping[str, LineModel], bias: np.ndarray
 ) -> CheckErrors:
     """Return the errors at a field's check points, intersected with the strip's adjusted attitude and orbit."""
-    rays = {line: strip.corrected(row) for line, row in field_pass.check.items()}
-    return check_errors(intersect(rays, cameras, campaign.noise, bias=bias).ground, field_pass.check_ground)
+    rays = {line: strip.corrected(row) for line, row in flight.check.items()}
+    return check_errors(intersect(rays, cameras, campaign.noise, bias=bias).ground, flight.check_ground)
 
 
 FACTORS = (0.0, 0.5, 1.0, 2.0, 4.0)
@@ -551,9 +543,9 @@ def with_monitor(campaign: Campaign) -> Treatment:
     The readings are observations where a field is calibrated, and correct the cameras where it is tested.
     """
 
-    def drifted(field_pass: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray) -> CheckErrors:
-        corrected = {line: camera.drifted(field_pass.readings[line]) for line, camera in cameras.items()}
-        return check_point_errors(campaign, field_pass, corrected, bias)
+    def drifted(flight: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray) -> CheckErrors:
+        corrected = {line: camera.drifted(flight.readings[line]) for line, camera in cameras.items()}
+        return check_point_errors(campaign, flight, corrected, bias)
 
     alone = {p.name: adjust_field_with_readings(campaign, p) for p in campaign.passes}
     return _treatment(campaign, adjust_with_readings(campaign), evaluate_schemes(campaign, alone, drifted))
@@ -562,38 +554,32 @@ def with_monitor(campaign: Campaign) -> Treatment:
 def adjust_with_readings(campaign: Campaign) -> Adjustment:
     """Adjust all fields at once, with every camera's drift in every field as unknowns that the readings observe."""
     return simultaneous(
-        campaign,
-        drift=True,
-        monitor=tuple(p for field_pass in campaign.passes for p in _reading_priors(campaign, field_pass)),
+        campaign, drift=True, monitor=tuple(p for flight in campaign.passes for p in _reading_priors(campaign, flight))
     )
 
 
-def adjust_field_with_readings(campaign: Campaign, field_pass: FieldPass) -> Adjustment:
+def adjust_field_with_readings(campaign: Campaign, flight: FieldPass) -> Adjustment:
     """Adjust one field with its readings; the interior orientation is that of the cameras without their drift."""
     return adjust(
-        [field_pass.control],
+        [flight.control],
         campaign.laboratory,
         campaign.noise,
         unknowns=Unknowns(drift=True),
-        priors=_reading_priors(campaign, field_pass),
+        priors=_reading_priors(campaign, flight),
         gauge=gauge_of(campaign),
     )
 
 
 def height_per_arcsec(campaign: Campaign) -> float:
     """Return the mean height error, in metres, of the first field for 1 arcsec of d_alpha of the forward line."""
-    field_pass, cameras = campaign.passes[0], dict(campaign.truth)
+    flight, cameras = campaign.passes[0], dict(campaign.truth)
     ground = [
-        intersect(field_pass.check, {**cameras, "forward": turned}, campaign.noise, bias=field_pass.bias).ground
+        intersect(flight.check, {**cameras, "forward": turned}, campaign.noise, bias=flight.bias).ground
         for turned in (cameras["forward"], cameras["forward"].drifted(np.array([ARCSEC, 0.0, 0.0, 0.0])))
     ]
     return float(np.nanmean(check_errors(ground[1], ground[0]).error[:, 2]))
 
 
-def _reading_priors(campaign: Campaign, field_pass: FieldPass) -> list[Prior]:
+def _reading_priors(campaign: Campaign, flight: FieldPass) -> list[Prior]:
     sigma = reading_sigma(campaign.simulated)
-    return [
-        p
-        for line, reading in field_pass.readings.items()
-        for p in monitor_priors(field_pass.name, line, reading, sigma)
-    ]
+    return [p for line, reading in flight.readings.items() for p in monitor_priors(flight.name, line, reading, sigma)]

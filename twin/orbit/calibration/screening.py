@@ -53,7 +53,7 @@ _SLOPE_POINTS = 500
 _Accepted = dict[str, dict[str, np.ndarray]]
 
 
-def mislabelled_points(campaign: Campaign, field_pass: FieldPass) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def mislabelled_points(campaign: Campaign, flight: FieldPass) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return which image points of a pass show another place than the ground point of their name.
 
     Errors of camera and platform move the image points of a line alike, slightly rotated and scaled: a straight line in
@@ -66,14 +66,14 @@ def mislabelled_points(campaign: Campaign, field_pass: FieldPass) -> tuple[dict[
     wrong_check : (m,) ndarray of bool
         Check points that at least one line shows elsewhere.
     """
-    wrong, wrong_check, still = {}, np.zeros(len(field_pass.check_ground), bool), np.zeros(3)
-    for name, rays in field_pass.control.rays.items():
-        control = field_pass.is_control[rays.point]
+    wrong, wrong_check, still = {}, np.zeros(len(flight.check_ground), bool), np.zeros(3)
+    for name, rays in flight.control.rays.items():
+        control = flight.is_control[rays.point]
         wrong[name] = np.zeros(len(control), bool)
         if control.sum() < _LEAST_OF_LINE:
             continue
         control_rays, model = rays.taken(control), campaign.laboratory[name]
-        miss = misclosure(model, control_rays, field_pass.control.ground[control_rays.point], still, still)
+        miss = misclosure(model, control_rays, flight.control.ground[control_rays.point], still, still)
         sample = np.unique(np.linspace(0, len(miss) - 1, min(_SLOPE_POINTS, len(miss))).round().astype(int))
         fits = [siegelslopes(miss[sample, k], control_rays.image[sample, 1]) for k in (0, 1)]
 
@@ -83,9 +83,9 @@ def mislabelled_points(campaign: Campaign, field_pass: FieldPass) -> tuple[dict[
         scatter = np.sqrt(robust_variance(size(control_rays, miss) ** 2))
         limit = max(_FAR_SCATTERS * scatter, _FAR_SIGMAS * campaign.noise.image)
         wrong[name][control] = size(control_rays, miss) > limit
-        if name in field_pass.check:
-            check = field_pass.check[name]
-            away = misclosure(model, check, field_pass.check_ground[check.point], still, still)
+        if name in flight.check:
+            check = flight.check[name]
+            away = misclosure(model, check, flight.check_ground[check.point], still, still)
             wrong_check[check.point[size(check, away) > limit]] = True
     return wrong, wrong_check
 
@@ -109,12 +109,12 @@ def require_correct_names(campaign: Campaign) -> None:
 def _without_mislabelled(campaign: Campaign) -> tuple[Campaign, dict[str, Rejected]]:
     """Return the campaign without mislabelled points, and these points by field."""
     passes, gross = [], {}
-    for field_pass in campaign.passes:
-        wrong, wrong_check = mislabelled_points(campaign, field_pass)
-        accepted = {name: ~mask for name, mask in wrong.items()}
-        gross[field_pass.name] = _rejected(field_pass, accepted, ~wrong_check, {})
-        passes.append(_reduced(field_pass, accepted, np.ones(len(field_pass.control_ground), bool), ~wrong_check))
-    if not any(field_pass.points or field_pass.check_points for field_pass in gross.values()):
+    for flight in campaign.passes:
+        wrong, wrong_check = mislabelled_points(campaign, flight)
+        good = {name: ~mask for name, mask in wrong.items()}
+        gross[flight.name] = _rejected(flight, good, ~wrong_check, {})
+        passes.append(_reduced(flight, good, np.ones(len(flight.control_ground), bool), ~wrong_check))
+    if not any(flight.points or flight.check_points for flight in gross.values()):
         return campaign, gross
     return _with_light(campaign, tuple(passes)), gross
 
@@ -136,52 +136,52 @@ def screen_campaign(campaign: Campaign) -> Campaign:
     gross: dict[str, Rejected] = {}
     if campaign.images is None:  # points matched by this program have the right names
         campaign, gross = _without_mislabelled(campaign)
-    adjustment, accepted = _robust(campaign)
+    adjustment, good = _robust(campaign)
     total: dict[tuple[str, str], float] = {(p.name, line): 1.0 for p in campaign.passes for line in p.control_images}
     for _ in range(_ROUNDS):
-        factors = _factors(adjustment, accepted)
+        factors = _factors(adjustment, good)
         if not factors:
             break
         for key, factor in factors.items():
             total[key] *= factor
         campaign = _rescaled(campaign, factors)
-        adjustment, accepted = _robust(campaign)
+        adjustment, good = _robust(campaign)
     passes, rejected, judged = [], {}, []
-    for k, field_pass in enumerate(campaign.passes):
-        reduced, keep_check = _without(campaign, field_pass, accepted[field_pass.name], adjustment)
+    for k, flight in enumerate(campaign.passes):
+        reduced, keep_check = _without(campaign, flight, good[flight.name], adjustment)
         passes.append(reduced)
-        factors_of_pass = FrozenMap({line: total[field_pass.name, line] for line in field_pass.control_images})
-        rejected[field_pass.name] = _rejected(field_pass, accepted[field_pass.name], keep_check, factors_of_pass)
+        scales = FrozenMap({line: total[flight.name, line] for line in flight.control_images})
+        rejected[flight.name] = _rejected(flight, good[flight.name], keep_check, scales)
         if campaign.images is None:
-            rejected[field_pass.name] = rejected[field_pass.name].after(gross[field_pass.name])
+            rejected[flight.name] = rejected[flight.name].after(gross[flight.name])
         else:
             shown = campaign.images[k]
-            judged.append(replace(shown, screening=_counted(field_pass, shown, accepted[field_pass.name], keep_check)))
+            judged.append(replace(shown, screening=_counted(flight, shown, good[flight.name], keep_check)))
     images = None if campaign.images is None else tuple(judged)
     return _with_light(replace(campaign, images=images, rejected=FrozenMap(rejected)), tuple(passes))
 
 
 def _robust(campaign: Campaign) -> tuple[Adjustment, _Accepted]:
     """Return the adjustment with robust weights, and masks of the accepted image points, field -> line."""
-    adjustment = simultaneous(campaign, robust="igg")
-    accepted: _Accepted = {}
-    for name, lines in adjustment.residual.items():
-        accepted[name] = {}
+    fit = simultaneous(campaign, robust="igg")
+    good: _Accepted = {}
+    for name, lines in fit.residual.items():
+        good[name] = {}
         for line, residual in lines.items():
             far = np.linalg.norm(residual, axis=1) > REJECT
-            accepted[name][line] = (adjustment.weight[name][line] > 0.0) & ~far
-    return adjustment, accepted
+            good[name][line] = (fit.weight[name][line] > 0.0) & ~far
+    return fit, good
 
 
-def _factors(adjustment: Adjustment, accepted: _Accepted) -> dict[tuple[str, str], float]:
+def _factors(fit: Adjustment, good: _Accepted) -> dict[tuple[str, str], float]:
     """Return factors on image sigmas by (field, line), from the median of the accepted standardised residuals.
 
     A line has a factor of its own where its residuals stand out from the sigmas and from all other lines; all others
     share one factor. The result is empty where no factor is needed.
     """
     squares = {
-        (name, line): np.sum(residual**2, axis=1)[accepted[name][line]]
-        for name, lines in adjustment.residual.items()
+        (name, line): np.sum(residual**2, axis=1)[good[name][line]]
+        for name, lines in fit.residual.items()
         for line, residual in lines.items()
     }
     separate: dict[tuple[str, str], float] = {}
@@ -203,10 +203,10 @@ def _factors(adjustment: Adjustment, accepted: _Accepted) -> dict[tuple[str, str
 def _rescaled(campaign: Campaign, factors: Mapping[tuple[str, str], float]) -> Campaign:
     """Return the campaign with the sigmas of image points multiplied by the factor of their pass and line."""
 
-    def rescaled(field_pass: FieldPass, images: Mapping[str, ImagePoints]) -> FrozenMap[str, ImagePoints]:
+    def rescaled(flight: FieldPass, images: Mapping[str, ImagePoints]) -> FrozenMap[str, ImagePoints]:
         return FrozenMap(
             {
-                line: replace(row, covariance=row.covariance * factors.get((field_pass.name, line), 1.0) ** 2)
+                line: replace(row, covariance=row.covariance * factors.get((flight.name, line), 1.0) ** 2)
                 for line, row in images.items()
             }
         )
@@ -224,52 +224,44 @@ def _rescaled(campaign: Campaign, factors: Mapping[tuple[str, str], float]) -> C
 
 
 def _without(
-    campaign: Campaign, field_pass: FieldPass, accepted: dict[str, np.ndarray], adjustment: Adjustment
+    campaign: Campaign, flight: FieldPass, good: dict[str, np.ndarray], fit: Adjustment
 ) -> tuple[FieldPass, np.ndarray]:
     """Return a pass without rejected points, and the mask of accepted check points.
 
     Rejected are image points, tie points that only one line still sees, and check points whose rays do not intersect.
     """
-    count = len(field_pass.control_ground)
+    count = len(flight.control_ground)
     seen = np.zeros(count, int)
-    for name, row in field_pass.control_images.items():
-        np.add.at(seen, row.point[accepted[name]], 1)
-    retained = np.where(field_pass.is_control, seen > 0, seen > 1)
-    keep = np.ones(len(field_pass.check_ground), bool)
-    if field_pass.check:
-        intersection = intersect(
-            field_pass.check,
-            adjustment.cameras_of(field_pass.name),
-            campaign.noise,
-            bias=adjustment.bias(field_pass.name),
-        )
+    for name, row in flight.control_images.items():
+        np.add.at(seen, row.point[good[name]], 1)
+    remain = np.where(flight.is_control, seen > 0, seen > 1)
+    keep = np.ones(len(flight.check_ground), bool)
+    if flight.check:
+        intersection = intersect(flight.check, fit.cameras_of(flight.name), campaign.noise, bias=fit.bias(flight.name))
         # two conditions per ray, less three coordinates
         keep = intersection.chi_square <= statistics.limit_of(_FALSE_ALARM, 2 * intersection.rays - 3)
-    return _reduced(field_pass, accepted, retained, keep), keep
+    return _reduced(flight, good, remain, keep), keep
 
 
-def _reduced(
-    field_pass: FieldPass, accepted: dict[str, np.ndarray], retained: np.ndarray, accepted_checks: np.ndarray
-) -> FieldPass:
+def _reduced(flight: FieldPass, good: dict[str, np.ndarray], remain: np.ndarray, good_checks: np.ndarray) -> FieldPass:
     """Return a pass with the selected image points (masks by line), ground points (n,) and check points (m,) alone."""
     images = {
-        name: _renumbered(row.taken(accepted[name] & retained[row.point]), retained)
-        for name, row in field_pass.control_images.items()
+        name: _renumbered(row.taken(good[name] & remain[row.point]), remain)
+        for name, row in flight.control_images.items()
     }
     check = {
-        name: _renumbered(row.taken(accepted_checks[row.point]), accepted_checks)
-        for name, row in field_pass.check_images.items()
+        name: _renumbered(row.taken(good_checks[row.point]), good_checks) for name, row in flight.check_images.items()
     }
     return replace(
-        field_pass,
+        flight,
         control_images=FrozenMap(images),
-        control_ground=field_pass.control_ground[retained],
-        control_covariance=field_pass.control_covariance[retained],
-        is_control=field_pass.is_control[retained],
-        control_ids=field_pass.control_ids[retained],
+        control_ground=flight.control_ground[remain],
+        control_covariance=flight.control_covariance[remain],
+        is_control=flight.is_control[remain],
+        control_ids=flight.control_ids[remain],
         check_images=FrozenMap(check),
-        check_ground=field_pass.check_ground[accepted_checks],
-        check_ids=field_pass.check_ids[accepted_checks],
+        check_ground=flight.check_ground[good_checks],
+        check_ids=flight.check_ids[good_checks],
     )
 
 
@@ -279,27 +271,23 @@ def _renumbered(row: ImagePoints, retained: np.ndarray) -> ImagePoints:
 
 
 def _rejected(
-    field_pass: FieldPass, accepted: dict[str, np.ndarray], check: np.ndarray, factors: Mapping[str, float]
+    flight: FieldPass, good: dict[str, np.ndarray], check: np.ndarray, factors: Mapping[str, float]
 ) -> Rejected:
     """Return the names of the rejected points and the counts before and after."""
     points = [
-        (str(field_pass.control_ids[point]), name)
-        for name, row in field_pass.control_images.items()
-        for point in row.point[~accepted[name]].tolist()
+        (str(flight.control_ids[point]), name)
+        for name, row in flight.control_images.items()
+        for point in row.point[~good[name]].tolist()
     ]
-    entered = sum(len(row.point) for row in field_pass.control_images.values())
-    rejected_checks = tuple(str(name) for name in field_pass.check_ids[~check])
-    return Rejected(
-        entered, entered - len(points), tuple(points), len(check), int(check.sum()), rejected_checks, factors
-    )
+    entered = sum(len(row.point) for row in flight.control_images.values())
+    checks = tuple(str(name) for name in flight.check_ids[~check])
+    return Rejected(entered, entered - len(points), tuple(points), len(check), int(check.sum()), checks, factors)
 
 
-def _counted(
-    field_pass: FieldPass, shown: FieldImages, accepted_by_line: dict[str, np.ndarray], check: np.ndarray
-) -> Screening:
+def _counted(flight: FieldPass, shown: FieldImages, good: dict[str, np.ndarray], check: np.ndarray) -> Screening:
     entered = left = wrong_entered = wrong_left = right_lost = 0
-    for name, row in field_pass.control_images.items():
-        wrong, stays = shown.wrong[name][row.point], accepted_by_line[name]
+    for name, row in flight.control_images.items():
+        wrong, stays = shown.wrong[name][row.point], good[name]
         entered, left = entered + len(wrong), left + int(stays.sum())
         wrong_entered, wrong_left = wrong_entered + int(wrong.sum()), wrong_left + int((wrong & stays).sum())
         right_lost += int((~wrong & ~stays).sum())
@@ -334,7 +322,7 @@ class IntersectionFit:
         return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
 
-def intersection_fit(campaign: Campaign, field_pass: FieldPass, adjustment: Adjustment) -> IntersectionFit:
+def intersection_fit(campaign: Campaign, flight: FieldPass, adjustment: Adjustment) -> IntersectionFit:
     """Intersect a pass's check points with the cameras and the bias of an adjustment, and return the fit.
 
     Raises
@@ -343,20 +331,20 @@ def intersection_fit(campaign: Campaign, field_pass: FieldPass, adjustment: Adju
         The check points cannot be intersected.
     """
     intersection = intersect(
-        field_pass.check, adjustment.cameras_of(field_pass.name), campaign.noise, bias=adjustment.bias(field_pass.name)
+        flight.check, adjustment.cameras_of(flight.name), campaign.noise, bias=adjustment.bias(flight.name)
     )
     seen = intersection.rays > 1
     return IntersectionFit(float(np.sum(intersection.chi_square[seen])), int(np.sum(2 * intersection.rays[seen] - 3)))
 
 
-def ground_sample(field_pass: FieldPass, line: str) -> tuple[float, float]:
+def ground_sample(flight: FieldPass, line: str) -> tuple[float, float]:
     """Return the ground sample distance of the middle of a line's image along and across the track, in metres."""
-    sensor = field_pass.data.sensors[line]
-    row = field_pass.control_images.get(line)
+    sensor = flight.data.sensors[line]
+    row = flight.control_images.get(line)
     middle = 0.5 * (sensor.lines - 1) if row is None or not len(row.line) else float(np.mean(row.line))
     pixel = 0.5 * (sensor.camera.pixels - 1)
     step = 0.5 if 0.0 <= middle - 0.5 and middle + 0.5 <= sensor.lines - 1 else 0.25
     places = np.array([[middle - step, pixel], [middle + step, pixel], [middle, pixel - step], [middle, pixel + step]])
-    ground = sensor.ground(places[:, 0], places[:, 1], field_pass.data.height)
+    ground = sensor.ground(places[:, 0], places[:, 1], flight.data.height)
     along, across = (float(np.linalg.norm(ground[k + 1] - ground[k])) / (2.0 * step) for k in (0, 2))
     return along, across

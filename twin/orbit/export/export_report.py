@@ -152,18 +152,14 @@ def control_section(control: Mapping[str, ControlledPolynomial]) -> Section:
     """Return the section with corrections and residuals of every line."""
     rows: list[tuple[Cell, ...]] = []
     points: list[tuple[Cell, ...]] = []
-    for name, controlled in control.items():
-        correction = controlled.correction
+    for name, line in control.items():
+        correction = line.correction
         at = correction.at(*correction.middle)[0]
         sigma = np.sqrt(np.diagonal(correction.covariance_at(*correction.middle)[0]))
         middle = np.stack([at, sigma], axis=-1).ravel().tolist()
         rows.append((name, *middle, correction.chi_square, correction.freedom))
-        residuals = np.stack([correction.residual, residual_sigma(correction)], axis=-1).reshape(
-            len(controlled.names), -1
-        )
-        for point, numbers, used in zip(
-            controlled.names.tolist(), residuals.tolist(), correction.used.tolist(), strict=True
-        ):
+        residuals = np.stack([correction.residual, residual_sigma(correction)], axis=-1).reshape(len(line.names), -1)
+        for point, numbers, used in zip(line.names.tolist(), residuals.tolist(), correction.used.tolist(), strict=True):
             points.append((name, str(point), *numbers, "used" if used else "rejected"))
     heads = ("line [px]", "sigma [px]", "sample [px]", "sigma [px] ")
     table = Table(

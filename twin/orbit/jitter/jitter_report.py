@@ -31,13 +31,9 @@ _FIT = 1.3
 def jitter_report(run: JitterRun) -> Report:
     """Return the report of a search for jitter."""
     sections = []
-    for name, pass_jitter in run.passes.items():
+    for name, jitter in run.passes.items():
         suffix, head = ("", "") if len(run.passes) == 1 else (f"-{name.lower()}", f" of {name}")
-        sections += [
-            _spectrum(pass_jitter, suffix, head),
-            _blind(pass_jitter, suffix, head),
-            _course(pass_jitter, suffix, head),
-        ]
+        sections += [_spectrum(jitter, suffix, head), _blind(jitter, suffix, head), _course(jitter, suffix, head)]
     search = run.setup.test.search
     facts = (
         ("Camera", run.setup.camera.name),
@@ -53,11 +49,10 @@ def jitter_report(run: JitterRun) -> Report:
 
 def _verdict(run: JitterRun) -> tuple[str, tuple[str, ...]]:
     search = run.setup.test.search
-    oscillations = [line for pass_jitter in run.passes.values() for line in pass_jitter.oscillations]
+    oscillations = [line for jitter in run.passes.values() for line in jitter.oscillations]
     if not oscillations:
         least = min(
-            float(np.median(pass_jitter.result.detectable[~pass_jitter.result.before.blind]))
-            for pass_jitter in run.passes.values()
+            float(np.median(jitter.result.detectable[~jitter.result.before.blind])) for jitter in run.passes.values()
         )
         return answer(
             f"No oscillation was detected, at a false-alarm rate of {search.false_alarm:g} over all frequencies",
@@ -95,10 +90,10 @@ def _summary(run: JitterRun) -> Table:
     heads += [head for axis in axes for head in (f"{axis} [arcsec]", f"σ {axis}", f"{axis} [px]")]
     heads += ["p", *(("true [Hz]", *(f"true {axis}" for axis in axes)) if run.simulated else ())]
     rows: list[tuple[Cell, ...]] = []
-    for name, pass_jitter in run.passes.items():
-        for line in pass_jitter.oscillations:
+    for name, jitter in run.passes.items():
+        for line in jitter.oscillations:
             sizes = np.stack([*(v / ARCSEC for v in line.amplitude), line.pixels], axis=-1).ravel()
-            cells = (name, *line.frequency, *sizes.tolist(), float(pass_jitter.result.lines.chance[line.number]))
+            cells = (name, *line.frequency, *sizes.tolist(), float(jitter.result.lines.chance[line.number]))
             truth: tuple[Cell, ...] = (None,) * (1 + len(axes)) if run.simulated else ()
             if line.truth is not None:
                 truth = (line.truth[0], *(line.truth[1] / ARCSEC).tolist())
@@ -114,13 +109,13 @@ def _summary(run: JitterRun) -> Table:
     )
 
 
-def _spectrum(pass_jitter: PassJitter, suffix: str, head: str) -> Section:
-    result, sights, axes = pass_jitter.result, pass_jitter.sights, pass_jitter.setup.test.search.axes
+def _spectrum(jitter: PassJitter, suffix: str, head: str) -> Section:
+    result, sights, axes = jitter.result, jitter.sights, jitter.setup.test.search.axes
     text = (
         f"{sights.points} points were seen by two or more of {', '.join(sights.lines)}, over "
         f"{sights.observations.span:.3g} s. {result.used.mean():.1%} of the observations were used; the others were "
         "rejected as wrong matches. The remaining noise is that of the points' covariances times "
-        f"{_factors(pass_jitter)}; its highest power has p = {significant(pass_jitter.next_p_value, 2)}. Aliases of "
+        f"{_factors(jitter)}; its highest power has p = {significant(jitter.next_p_value, 2)}. Aliases of "
         f"the detected oscillations were searched up to {result.beyond:.4g} Hz.",
     )
     before, after = result.before, result.after
@@ -139,16 +134,16 @@ def _spectrum(pass_jitter: PassJitter, suffix: str, head: str) -> Section:
             f"disparity{suffix}",
             "Disparities over time",
             "Image position in the second line less that in the first, without parts that are smooth over the strip.",
-            svg.drawn("jitter-disparity", _disparity_figure, pass_jitter),
+            svg.drawn("jitter-disparity", _disparity_figure, jitter),
         ),
         SvgFigure(
             f"spectrum{suffix}",
             "Amplitudes by frequency",
             "Fitted at every frequency; an oscillation above the dashed line would be detected.",
-            svg.drawn("jitter-spectrum", _spectrum_figure, pass_jitter),
+            svg.drawn("jitter-spectrum", _spectrum_figure, jitter),
         ),
     ]
-    if shown := transfers(pass_jitter):
+    if shown := transfers(jitter):
         directions = [
             word.replace("_", " the " if word == "along_track" else " ") for word in next(iter(shown.values()))
         ]
@@ -167,19 +162,19 @@ def _spectrum(pass_jitter: PassJitter, suffix: str, head: str) -> Section:
     return Section(f"Spectrum{head}", text, (*parts, full))
 
 
-def _factors(pass_jitter: PassJitter) -> str:
-    return ", ".join(f"{factor:.2g} in {line}" for line, factor in pass_jitter.noise_factors.items())
+def _factors(jitter: PassJitter) -> str:
+    return ", ".join(f"{factor:.2g} in {line}" for line, factor in jitter.noise_factors.items())
 
 
-def _blind(pass_jitter: PassJitter, suffix: str, head: str) -> Section:
+def _blind(jitter: PassJitter, suffix: str, head: str) -> Section:
     table = MULTIPLE.table(
         f"blind{suffix}",
         "Frequencies at which a pair of lines alone is blind",
         "A whole number of periods lies between their sightings. Response: of all lines together, of the worst axis, "
         "relative to its maximum.",
-        [MULTIPLE(of) | {"blind": "blind" if of.blind else "observed"} for of in blind_multiples(pass_jitter)],
+        [MULTIPLE(of) | {"blind": "blind" if of.blind else "observed"} for of in blind_multiples(jitter)],
     )
-    intervals = ", ".join(f"{a:.3g} to {b:.3g} Hz" for a, b in pass_jitter.result.before.intervals())
+    intervals = ", ".join(f"{a:.3g} to {b:.3g} Hz" for a, b in jitter.result.before.intervals())
     text = (
         f"All lines together are blind at {intervals}; no oscillation is sought there."
         if intervals
@@ -188,15 +183,15 @@ def _blind(pass_jitter: PassJitter, suffix: str, head: str) -> Section:
     return Section(f"Blind frequencies{head}", text, (table,))
 
 
-def _course(pass_jitter: PassJitter, suffix: str, head: str) -> Section:
-    first, last = pass_jitter.sights.observations.ends
+def _course(jitter: PassJitter, suffix: str, head: str) -> Section:
+    first, last = jitter.sights.observations.ends
     seconds = np.arange(first, last, max(_COURSE, (last - first) / _ROWS))
     heads, columns = ["time [s]"], [seconds]
-    sources = [("", pass_jitter.result.lines.course(seconds))]
-    if pass_jitter.course is not None:
-        sources.append((" spline", pass_jitter.course.at(seconds)))
+    sources = [("", jitter.result.lines.course(seconds))]
+    if jitter.course is not None:
+        sources.append((" spline", jitter.course.at(seconds)))
     for word, (value, spread) in sources:
-        for k, axis in enumerate(pass_jitter.setup.test.search.axes):
+        for k, axis in enumerate(jitter.setup.test.search.axes):
             heads += [f"{axis}{word} [arcsec]", f"σ {axis}{word}"]
             columns += [value[:, k] / ARCSEC, np.sqrt(np.maximum(spread[:, k, k], 0.0)) / ARCSEC]
     rows = csv_table([heads, *np.stack(columns, axis=-1).tolist()]).decode()
@@ -205,14 +200,14 @@ def _course(pass_jitter: PassJitter, suffix: str, head: str) -> Section:
         f"course{suffix}",
         "Attitude over time",
         "Fast part of the attitude, without its mean and without blind frequencies.",
-        svg.drawn("jitter-course", _course_figure, pass_jitter),
+        svg.drawn("jitter-course", _course_figure, jitter),
     )
     return Section(f"Attitude over time{head}", (), (figure, full))
 
 
-def _panels(pass_jitter: PassJitter, least: float, each: float, label: str) -> tuple[Figure, list[Axes]]:
+def _panels(jitter: PassJitter, least: float, each: float, label: str) -> tuple[Figure, list[Axes]]:
     """Return a figure with a panel for each axis of the body, below each other."""
-    names = pass_jitter.setup.test.search.axes
+    names = jitter.setup.test.search.axes
     figure = svg.new_figure(least + each * len(names))
     panels = list(np.atleast_1d(figure.subplots(len(names), 1, sharex=True)))
     for axes, name in zip(panels, names, strict=True):
@@ -222,11 +217,9 @@ def _panels(pass_jitter: PassJitter, least: float, each: float, label: str) -> t
     return figure, panels
 
 
-def _disparity_figure(pass_jitter: PassJitter) -> Figure:
+def _disparity_figure(jitter: PassJitter) -> Figure:
     """Draw the disparities over time of the pair of neighbouring lines with the longest gap."""
-    pair, (seconds, moved) = max(
-        pass_jitter.sights.pairs.items(), key=lambda item: abs(pass_jitter.sights.gaps[item[0]][1])
-    )
+    pair, (seconds, moved) = max(jitter.sights.pairs.items(), key=lambda item: abs(jitter.sights.gaps[item[0]][1]))
     figure = svg.new_figure(4.0)
     panels = figure.subplots(2, 1, sharex=True)
     step = max(len(seconds) // _MOST, 1)
@@ -240,10 +233,10 @@ def _disparity_figure(pass_jitter: PassJitter) -> Figure:
     return figure
 
 
-def _spectrum_figure(pass_jitter: PassJitter) -> Figure:
+def _spectrum_figure(jitter: PassJitter) -> Figure:
     """Draw the amplitude over frequency, before and after the detected oscillations are removed."""
-    result = pass_jitter.result
-    figure, panels = _panels(pass_jitter, 2.0, 2.0, "frequency [Hz]; shaded: blind")
+    result = jitter.result
+    figure, panels = _panels(jitter, 2.0, 2.0, "frequency [Hz]; shaded: blind")
     for k, axes in enumerate(panels):
         for which, colour, label in ((result.before, svg.SKY, "observed"), (result.after, svg.BLUE, "remaining")):
             shown = np.where(which.blind, np.nan, which.amplitude[:, k] / ARCSEC)
@@ -258,25 +251,21 @@ def _spectrum_figure(pass_jitter: PassJitter) -> Figure:
     return figure
 
 
-def _course_figure(pass_jitter: PassJitter) -> Figure:
+def _course_figure(jitter: PassJitter) -> Figure:
     """Draw the attitude over time from the oscillations and from the spline."""
-    seconds = np.linspace(*pass_jitter.sights.observations.ends, 1200)
-    figure, panels = _panels(pass_jitter, 1.5, 1.7, "time [s]")
-    curves = [(pass_jitter.result.lines.course(seconds), svg.BLUE, svg.SKY, "detected oscillations, with σ")]
-    if pass_jitter.course is not None:
-        curves.insert(0, (pass_jitter.course.at(seconds), svg.GREEN, svg.LIGHT, "spline, with σ"))
+    seconds = np.linspace(*jitter.sights.observations.ends, 1200)
+    figure, panels = _panels(jitter, 1.5, 1.7, "time [s]")
+    curves = [(jitter.result.lines.course(seconds), svg.BLUE, svg.SKY, "detected oscillations, with σ")]
+    if jitter.course is not None:
+        curves.insert(0, (jitter.course.at(seconds), svg.GREEN, svg.LIGHT, "spline, with σ"))
     for k, axes in enumerate(panels):
         for (value, spread), colour, shade, label in curves:
             middle, sigma = value[:, k] / ARCSEC, np.sqrt(spread[:, k, k]) / ARCSEC
             axes.fill_between(seconds, middle - sigma, middle + sigma, lw=0, color=shade, alpha=0.6)
             axes.plot(seconds, middle, color=colour, lw=1.0, label=label)
-        if pass_jitter.truth is not None:
+        if jitter.truth is not None:
             axes.plot(
-                seconds,
-                pass_jitter.truth(seconds)[:, pass_jitter.columns[k]] / ARCSEC,
-                color=svg.INK,
-                lw=0.5,
-                label="true",
+                seconds, jitter.truth(seconds)[:, jitter.columns[k]] / ARCSEC, color=svg.INK, lw=0.5, label="true"
             )
     panels[0].legend(loc="best")
     return figure
@@ -284,14 +273,14 @@ def _course_figure(pass_jitter: PassJitter) -> Figure:
 
 def _warnings(run: JitterRun) -> tuple[str, ...]:
     warnings = []
-    for name, pass_jitter in run.passes.items():
-        if pass_jitter.result.used.mean() < 1.0 - _MOST_WRONG:
-            share = 1.0 - pass_jitter.result.used.mean()
+    for name, jitter in run.passes.items():
+        if jitter.result.used.mean() < 1.0 - _MOST_WRONG:
+            share = 1.0 - jitter.result.used.mean()
             warnings.append(f"{share:.0%} of the observations of {name} were rejected as wrong matches")
-        if max(pass_jitter.noise_factors.values()) > _FIT:
+        if max(jitter.noise_factors.values()) > _FIT:
             warnings.append(
-                f"the remaining noise in {name} is that of the points' covariances times {_factors(pass_jitter)}: "
+                f"the remaining noise in {name} is that of the points' covariances times {_factors(jitter)}: "
                 "jitter in a band, or covariances that are too small"
             )
-        warnings += [f"{name}: {text}" for line in pass_jitter.oscillations for text in _doubts(line)]
+        warnings += [f"{name}: {text}" for line in jitter.oscillations for text in _doubts(line)]
     return tuple(warnings)

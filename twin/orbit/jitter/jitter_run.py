@@ -99,30 +99,30 @@ class Oscillation:
 
     Attributes
     ----------
-    pass_jitter : PassJitter
+    jitter : PassJitter
         Pass in which it was detected.
     number : int
         Index among the detected oscillations, the strongest first.
     """
 
-    pass_jitter: PassJitter
+    jitter: PassJitter
     number: int
 
     @property
     def amplitude(self) -> tuple[np.ndarray, np.ndarray]:
         """Amplitudes (A,) about the axes, in radians, and their standard deviations."""
-        lines = self.pass_jitter.result.lines
+        lines = self.jitter.result.lines
         return lines.amplitude[self.number], lines.amplitude_sigma[self.number]
 
     @property
     def phase(self) -> np.ndarray:
         """Phases (A,) at the epoch, in radians."""
-        return np.asarray(self.pass_jitter.result.lines.phase[self.number])
+        return np.asarray(self.jitter.result.lines.phase[self.number])
 
     @property
     def pixels(self) -> np.ndarray:
         """Amplitudes (A,) in angles of a pixel."""
-        return np.asarray(self.amplitude[0] / self.pass_jitter.sights.pixel)
+        return np.asarray(self.amplitude[0] / self.jitter.sights.pixel)
 
     @property
     def truth(self) -> tuple[float, np.ndarray] | None:
@@ -130,31 +130,33 @@ class Oscillation:
 
         None if none lies within a resolution element, or for measurements.
         """
-        test, jitter = self.pass_jitter.setup.test, self.pass_jitter.truth
-        if jitter is None or not isinstance(test, OrbitJitterSpec) or test.attitude.jitter is None:
+        test, true_jitter = self.jitter.setup.test, self.jitter.truth
+        if true_jitter is None or not isinstance(test, OrbitJitterSpec) or test.attitude.jitter is None:
             return None
-        distance = np.abs(jitter.frequency[: len(test.attitude.jitter.lines)] - self.frequency[0])
-        if not len(distance) or distance.min() > 1.0 / self.pass_jitter.sights.observations.span:
+        distance = np.abs(true_jitter.frequency[: len(test.attitude.jitter.lines)] - self.frequency[0])
+        if not len(distance) or distance.min() > 1.0 / self.jitter.sights.observations.span:
             return None
         k = int(np.argmin(distance))
-        return float(jitter.frequency[k]), np.hypot(jitter.sine[k], jitter.cosine[k])[self.pass_jitter.columns]
+        return float(true_jitter.frequency[k]), np.hypot(true_jitter.sine[k], true_jitter.cosine[k])[
+            self.jitter.columns
+        ]
 
     @property
     def frequency(self) -> tuple[float, float]:
         """Frequency in hertz, and its standard deviation."""
-        lines = self.pass_jitter.result.lines
+        lines = self.jitter.result.lines
         return float(lines.frequency[self.number]), float(lines.frequency_sigma[self.number])
 
     @property
     def in_search(self) -> bool:
         """True if the frequency lies within the search."""
-        search = self.pass_jitter.setup.test.search
+        search = self.jitter.setup.test.search
         return bool(search.lowest <= self.frequency[0] <= search.highest)
 
     @property
     def aliases(self) -> tuple[float, ...]:
         """Other frequencies, in hertz, that explain the observations equally well."""
-        return self.pass_jitter.result.lines.aliases[self.number]
+        return self.jitter.result.lines.aliases[self.number]
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,10 +239,8 @@ def fly_strip(setup: JitterSetup, seed: int) -> tuple[PassMeasurements, Jitter |
         trajectory = Trajectory.flown(propagate(spec.orbit, earth), spec.attitude, root)
     except ValueError as error:
         raise BenchError(str(error), ("orbit",), "an orbit that the satellite can fly") from error
-    random_points, random_noise, random_wrong, random_errors = (
-        np.random.default_rng(stream(root, k)) for k in range(4)
-    )
-    measured = trajectory.with_errors(spec.errors, int(random_errors.integers(2**31)))
+    rng_point, rng_noise, rng_wrong, rng_error = (np.random.default_rng(stream(root, k)) for k in range(4))
+    measured = trajectory.with_errors(spec.errors, int(rng_error.integers(2**31)))
     platform = PlatformTable.sampled(measured, spec.errors.gps.interval, spec.errors.star_tracker.interval)
     count = max(int((trajectory.last - trajectory.first) / spec.line_time) - 1, 1)
     times = LineTimes.even(trajectory.first + 0.5 * spec.line_time, spec.line_time, count)
@@ -249,15 +249,15 @@ def fly_strip(setup: JitterSetup, seed: int) -> tuple[PassMeasurements, Jitter |
     sensors = {name: Sensor.of_lines(cameras[name], trajectory, earth, times, effects) for name in names}
     many = int(np.ceil(_SPARE * wanted.count))
     first = sensors[names[0]]
-    offset = wanted.duration * (random_points.uniform(size=many) - 0.5)
+    delay = wanted.duration * (rng_point.uniform(size=many) - 0.5)
     if wanted.rows is not None:
-        spread = wanted.row_spread * np.clip(random_points.standard_normal(many), -3.0, 3.0)
-        offset = np.clip(
-            wanted.rows * np.rint(offset / wanted.rows) + spread, *(0.5 * wanted.duration * np.array([-1, 1]))
+        spread = wanted.row_spread * np.clip(rng_point.standard_normal(many), -3.0, 3.0)
+        delay = np.clip(
+            wanted.rows * np.rint(delay / wanted.rows) + spread, *(0.5 * wanted.duration * np.array([-1, 1]))
         )
-    seconds = spec.time + offset
-    pixel = random_points.uniform(0.0, first.camera.pixels - 1.0, many)
-    height = wanted.height + wanted.relief * random_points.uniform(-1.0, 1.0, many)
+    seconds = spec.time + delay
+    pixel = rng_point.uniform(0.0, first.camera.pixels - 1.0, many)
+    height = wanted.height + wanted.relief * rng_point.uniform(-1.0, 1.0, many)
     points = first.ground((seconds - first.first_line_time) / first.line_time, pixel, height)
     seen = {name: np.stack(sensor.image(points), axis=-1) for name, sensor in sensors.items()}
     noise = {name: wanted.line_noise.get(name, wanted.noise) for name in names}
@@ -267,32 +267,28 @@ def fly_strip(setup: JitterSetup, seed: int) -> tuple[PassMeasurements, Jitter |
         last = np.array([count, sensors[name].camera.pixels]) - 1.0 - edge
         with np.errstate(invalid="ignore"):
             inside &= np.all((at > edge) & (at < last), axis=1)
-    selected = np.flatnonzero(inside)[: wanted.count]
-    if len(selected) < wanted.count:
-        problem = f"{len(selected)} of {wanted.count} points are seen by all of {', '.join(names)}"
+    used = np.flatnonzero(inside)[: wanted.count]
+    if len(used) < wanted.count:
+        problem = f"{len(used)} of {wanted.count} points are seen by all of {', '.join(names)}"
         raise BenchError(problem, ("points", "duration"), "a shorter strip within the orbit, or other `lines`")
     images = {}
     for name, at in seen.items():
-        noise_px = noise[name] * random_noise.standard_normal((len(selected), 2))
-        bad = random_wrong.uniform(size=len(selected)) < wanted.wrong
-        noise_px[bad] += random_wrong.uniform(-_WRONG, _WRONG, (len(selected), 2))[bad]
-        position = at[selected] + noise_px
-        images[name] = ImagePoints.of(
-            np.arange(len(selected)), position[:, 0], position[:, 1], wanted.noise**2 * np.eye(2)
-        )
-    ids = np.array([f"t{k}" for k in range(len(selected))], object)
-    ground = GroundPoints.of(ids, np.full((len(selected), 3), np.nan), np.zeros((3, 3)), "tie")
-    measurements = PassMeasurements(
-        spec.name, platform, FrozenMap(dict.fromkeys(names, times)), ground, FrozenMap(images)
-    )
-    return measurements, trajectory.jitter if isinstance(trajectory.jitter, Jitter) else None
+        noise_px = noise[name] * rng_noise.standard_normal((len(used), 2))
+        bad = rng_wrong.uniform(size=len(used)) < wanted.wrong
+        noise_px[bad] += rng_wrong.uniform(-_WRONG, _WRONG, (len(used), 2))[bad]
+        position = at[used] + noise_px
+        images[name] = ImagePoints.of(np.arange(len(used)), position[:, 0], position[:, 1], wanted.noise**2 * np.eye(2))
+    ids = np.array([f"t{k}" for k in range(len(used))], object)
+    ground = GroundPoints.of(ids, np.full((len(used), 3), np.nan), np.zeros((3, 3)), "tie")
+    strip = PassMeasurements(spec.name, platform, FrozenMap(dict.fromkeys(names, times)), ground, FrozenMap(images))
+    return strip, trajectory.jitter if isinstance(trajectory.jitter, Jitter) else None
 
 
 def exported(run: JitterRun) -> dict[str, str]:
     """Return a folder of measurements with a test file that reads them back, path -> text."""
     spec = run.setup.test
     plain = spec.plain()
-    files = campaign_files([pass_jitter.measurements for pass_jitter in run.passes.values()], run.setup.camera.plain())
+    files = campaign_files([jitter.measurements for jitter in run.passes.values()], run.setup.camera.plain())
     test = {
         "name": spec.name,
         "description": spec.description,
@@ -336,11 +332,11 @@ class BlindMultiple:
     blind: bool
 
 
-def blind_multiples(pass_jitter: PassJitter) -> list[BlindMultiple]:
+def blind_multiples(jitter: PassJitter) -> list[BlindMultiple]:
     """Return the frequencies of the search at which a pair of lines by itself is blind."""
-    before, multiples = pass_jitter.result.before, []
+    before, multiples = jitter.result.before, []
     share = np.min(before.response / np.max(before.response, axis=0), axis=1)
-    for (first, second), (_, gap, _) in pass_jitter.sights.gaps.items():
+    for (first, second), (_, gap, _) in jitter.sights.gaps.items():
         for order in range(1, int(before.frequency[-1] * abs(gap)) + 1):
             frequency = order / abs(gap)
             if frequency < before.frequency[0]:
@@ -352,44 +348,40 @@ def blind_multiples(pass_jitter: PassJitter) -> list[BlindMultiple]:
     return multiples
 
 
-def transfers(pass_jitter: PassJitter) -> dict[str, dict[str, float]]:
+def transfers(jitter: PassJitter) -> dict[str, dict[str, float]]:
     """Return the transfer at Nyquist of all detected oscillations together, by line and direction.
 
     It is the root mean square over the phases, along the line (by roll) and along the track (by pitch), for lines whose
     file describes how they collect light.
     """
     directions, by_line = {"roll": "along_line", "pitch": "along_track"}, {}
-    swings = [(line.frequency[0], pass_jitter.by_axis(line.pixels)) for line in pass_jitter.oscillations]
-    for name in pass_jitter.sights.lines:
-        image = pass_jitter.setup.camera.image_of(name)
+    swings = [(line.frequency[0], jitter.by_axis(line.pixels)) for line in jitter.oscillations]
+    for name in jitter.sights.lines:
+        image = jitter.setup.camera.image_of(name)
         if image is None:
             continue
-        light = Collection.of(image.tdi, pass_jitter.measurements.line_times[name].line_time)
+        light = Collection.of(image.tdi, jitter.measurements.line_times[name].line_time)
         by_line[name] = {
             directions[axis]: float(light.mtf(0.5, Motion.of([(f, swing[axis]) for f, swing in swings])))
-            for axis in pass_jitter.setup.test.search.axes
+            for axis in jitter.setup.test.search.axes
             if axis in directions
         }
     return by_line
 
 
 def _true_amplitudes(of: Oscillation) -> dict[str, float] | None:
-    return None if of.truth is None else of.pass_jitter.by_axis(of.truth[1])
+    return None if of.truth is None else of.jitter.by_axis(of.truth[1])
 
 
 LINE: Record[Oscillation] = Record(
     "A detected oscillation.",
     Quantity("frequency_hz", lambda of: of.frequency[0], "frequency"),
     Quantity("frequency_hz_sigma", lambda of: of.frequency[1], "standard deviation"),
-    Quantity("amplitude_arcsec", lambda of: of.pass_jitter.by_axis(of.amplitude[0]), "axis -> half of peak to peak"),
-    Quantity(
-        "amplitude_arcsec_sigma", lambda of: of.pass_jitter.by_axis(of.amplitude[1]), "axis -> standard deviation"
-    ),
-    Quantity("amplitude_px", lambda of: of.pass_jitter.by_axis(of.pixels), "axis -> amplitude in pixels"),
-    Quantity(
-        "phase_deg", lambda of: of.pass_jitter.by_axis(of.phase), "axis -> p of sin(2 pi f t + p), t from the epoch"
-    ),
-    Quantity("p_value", lambda of: of.pass_jitter.result.lines.chance[of.number], "by noise alone, at any frequency"),
+    Quantity("amplitude_arcsec", lambda of: of.jitter.by_axis(of.amplitude[0]), "axis -> half of peak to peak"),
+    Quantity("amplitude_arcsec_sigma", lambda of: of.jitter.by_axis(of.amplitude[1]), "axis -> standard deviation"),
+    Quantity("amplitude_px", lambda of: of.jitter.by_axis(of.pixels), "axis -> amplitude in pixels"),
+    Quantity("phase_deg", lambda of: of.jitter.by_axis(of.phase), "axis -> p of sin(2 pi f t + p), t from the epoch"),
+    Quantity("p_value", lambda of: of.jitter.result.lines.chance[of.number], "by noise alone, at any frequency"),
     Quantity("in_search", lambda of: of.in_search, "true if the frequency lies within the search"),
     Quantity("aliases_hz", lambda of: list(of.aliases), "other frequencies that explain the observations as well"),
     Quantity("true_frequency_hz", lambda of: of.truth and of.truth[0], "true frequency", where_known=True),
@@ -407,13 +399,13 @@ MULTIPLE: Record[BlindMultiple] = Record(
 )
 
 
-def _gaps(pass_jitter: PassJitter) -> dict[str, float]:
-    return {f"{first} to {second}": gap for (first, second), (_, gap, _) in pass_jitter.sights.gaps.items()}
+def _gaps(jitter: PassJitter) -> dict[str, float]:
+    return {f"{first} to {second}": gap for (first, second), (_, gap, _) in jitter.sights.gaps.items()}
 
 
-def _detectable(pass_jitter: PassJitter) -> dict[str, float]:
+def _detectable(jitter: PassJitter) -> dict[str, float]:
     """Return the median detectable amplitude over the searched frequencies by axis, in radians."""
-    return pass_jitter.by_axis(np.median(pass_jitter.result.detectable[~pass_jitter.result.before.blind], axis=0))
+    return jitter.by_axis(np.median(jitter.result.detectable[~jitter.result.before.blind], axis=0))
 
 
 PASS: Record[PassJitter] = Record(

@@ -221,9 +221,9 @@ def _loop_figure(run: LoopRun) -> Figure:
     left.plot(circle.real, circle.imag, color=svg.LIGHT, lw=1.0)
     left.plot([-1.0], [0.0], "x", color=svg.INK, ms=7)
     drawn: dict[tuple[float, int], list[str]] = {}
-    for name, analysis in run.loops.items():
-        if analysis.loop_gain:
-            drawn.setdefault((analysis.loop_gain, analysis.corrector.spec.delay), []).append(name)
+    for name, loop in run.loops.items():
+        if loop.loop_gain:
+            drawn.setdefault((loop.loop_gain, loop.corrector.spec.delay), []).append(name)
     for k, ((gain, delay), names) in enumerate(drawn.items()):
         colour, at = _COLOURS[k % len(_COLOURS)], open_loop(gain, delay, frequency)
         left.plot(at.real, at.imag, color=colour, lw=1.2, label=f"gain {gain:.3g}, delay {delay}")
@@ -592,7 +592,7 @@ def _images(run: LoopRun) -> tuple[Section, ...]:
 
 
 def _loops(run: LoopRun) -> Section:
-    rows = {name: numbers.CORRECTION((run, name, analysis)) for name, analysis in run.loops.items()}
+    rows = {name: numbers.CORRECTION((run, name, loop)) for name, loop in run.loops.items()}
     for row in rows.values():
         row["mechanism"] = row["mechanism"] or "on the ground"
     table = numbers.CORRECTION.table(
@@ -667,19 +667,19 @@ def _worse_warnings(run: LoopRun) -> Iterator[str]:
 
 def _loop_warnings(run: LoopRun) -> tuple[str, ...]:
     warnings = [*coarse_warnings(run.setup)]
-    for name, analysis in run.loops.items():
-        if analysis.ends:
-            first = moment(float(run.closed.course.times[analysis.ends[0]]))
+    for name, loop in run.loops.items():
+        if loop.ends:
+            first = moment(float(run.closed.course.times[loop.ends[0]]))
             warnings.append(
-                f"{name} reaches the end of its range at {len(analysis.ends)} of the readings, first at {first}"
+                f"{name} reaches the end of its range at {len(loop.ends)} of the readings, first at {first}"
             )
-        if analysis.cycle is not None and analysis.cycle.steps > 1:
+        if loop.cycle is not None and loop.cycle.steps > 1:
             warnings.append(
-                f"{name} can oscillate by {analysis.cycle.steps} steps without any drift (limit cycle): a smaller "
+                f"{name} can oscillate by {loop.cycle.steps} steps without any drift (limit cycle): a smaller "
                 "gain, a shorter delay or a dead band prevents it"
             )
     for label, course in (("closed", run.closed.course), ("open", run.open.course)):
-        warnings += [f"with the loop {label} {jump_text(analysis)}" for analysis in course.jumps]
+        warnings += [f"with the loop {label} {jump_text(loop)}" for loop in course.jumps]
         warnings += numbers.PASS.warnings((run, run.closed if label == "closed" else run.open))
         if course.evidence is not None:
             spots = [channel.key for channel in run.model.experiment.path.channels]
