@@ -13,8 +13,8 @@ from twin.orbit.export.ground_accuracy import (
     TOGETHER,
     AccuracyMap,
     CameraUncertainty,
-    intersected_accuracy,
     accuracy_maps,
+    intersected_accuracy,
     single_accuracy,
 )
 from twin.orbit.flight.earth import east_north_up

@@ -312,7 +312,9 @@ def course_of(loop_setup: MonitorSetup, model: LoopModel, still: bool = False, *
     own = tuple(replace(one, spec=one.spec.model_copy(update=changed.get(one.name, {}))) for one in model.correctors)
     loop = LoopModel(model.experiment, model.prior, own)
     states = closed_loop.drifting_states(loop_setup.test, model.experiment, 3)
-    return closed_loop.simulate_course(loop, loop_setup.test, states, closed_loop.reader(loop, loop_setup.test, 7), still)
+    return closed_loop.simulate_course(
+        loop, loop_setup.test, states, closed_loop.reader(loop, loop_setup.test, 7), still
+    )
 
 
 @pytest.fixture(scope="module")

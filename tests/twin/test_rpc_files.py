@@ -52,7 +52,7 @@ def ground_points(sensor, count: int, seed: int) -> tuple[np.ndarray, np.ndarray
 def test_what_is_written_comes_back(tmp_path: Path, model: RationalPolynomial, bias) -> None:
     stated = replace(model, bias_m=bias[0], random_m=bias[1])
     (tmp_path / "a_RPC.TXT").write_text(stated.text())
-    (tmp_path / "a.tif").write_bytes(tiff(np.zeros((1, 32, 32), np.uint16), FrameFacts(place=stated)))
+    (tmp_path / "a.tif").write_bytes(tiff(np.zeros((1, 32, 32), np.uint16), FrameFacts(georeference=stated)))
     for name in ("a_RPC.TXT", "a.tif"):
         found = read_rpc(tmp_path / name)
         assert np.array_equal(parts(found), parts(stated)), name
@@ -118,6 +118,8 @@ def test_err_bias_and_err_rand(sensor, model: RationalPolynomial) -> None:
     quiet = corrected_polynomial(model, polynomial_correction(model, itrs, none, place + 0.2 * noise, spread, "shift"))
     assert quiet.bias_m == pytest.approx(0.2 * np.hypot(*size) / np.sqrt(40.0), rel=0.02)
     assert quiet.random_m == 0.0
-    rough = corrected_polynomial(model, polynomial_correction(model, itrs, none, place + noise, spread, "shift", screened=False))
+    rough = corrected_polynomial(
+        model, polynomial_correction(model, itrs, none, place + noise, spread, "shift", screened=False)
+    )
     assert rough.bias_m == pytest.approx(quiet.bias_m, rel=1e-6)
     assert rough.random_m == pytest.approx(np.sqrt(1.0 - 0.04) * np.hypot(*size), rel=0.25)  # 40 points: 11 %

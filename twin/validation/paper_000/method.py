@@ -31,7 +31,13 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.setup import AngleSetup
 from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, Measurement, angle_camera, fly
-from twin.orbit.angle.angle_run import reduce_to_station, effect_rows, resect_measurement, line_of_sight_angles, values_of
+from twin.orbit.angle.angle_run import (
+    effect_rows,
+    line_of_sight_angles,
+    reduce_to_station,
+    resect_measurement,
+    values_of,
+)
 from twin.orbit.flight.light_effects import NO_EFFECTS, SPEED_OF_LIGHT, standard_refractivity
 from twin.orbit.flight.line_camera import dihedral_angle
 from twin.validation.check import CheckResult, mean_of
@@ -527,7 +533,9 @@ def _height(context: Context, flight: AnglePass) -> Iterator[CheckResult]:
 
 def _outlook(context: Context, passes: Passes) -> Iterator[CheckResult]:
     flight = passes.flight
-    along = np.array([line_of_sight_angles(m, s)[1].values for m, s in zip(passes.measured, passes.sections, strict=True)])
+    along = np.array(
+        [line_of_sight_angles(m, s)[1].values for m, s in zip(passes.measured, passes.sections, strict=True)]
+    )
     names = list(flight.pairs)
     for name in ("high_resolution", "multispectral"):
         true = flight.along_track[name]
