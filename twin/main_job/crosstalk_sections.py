@@ -22,7 +22,7 @@ from twin.framework.artefact import (
     Text,
     fixed,
     plain,
-    shown_unit,
+    unit_for_reports,
     significant,
 )
 from twin.framework.report import Section
@@ -81,7 +81,7 @@ def _motions(run: RenderRun) -> Table:
     rows: list[list[Cell]] = []
     for name, table in run.crosstalk.items():
         for k, motion in enumerate(table.motions):
-            row: list[Cell] = [name, motion.label, motion.body, shown_unit(motion.unit)]
+            row: list[Cell] = [name, motion.label, motion.body, unit_for_reports(motion.unit)]
             moved = dict(zip(table.coordinates, table.spot_shift[:, k], strict=True))
             row += [float(moved[place]) * pitch if place in moved else None for place in places]
             row += [float(true) for true in table.true[:, k]]
@@ -116,7 +116,7 @@ def _crosstalk(run: RenderRun, camera: int) -> Table:
         bands[len(rows)] = body.removeprefix(f"{BASE}/")
         for k in members:
             motion = table.motions[k]
-            row: list[Cell] = [_short(motion.label), Marked(shown_unit(motion.unit), "", "number")]
+            row: list[Cell] = [_short(motion.label), Marked(unit_for_reports(motion.unit), "", "number")]
             for p, floor in enumerate(floors):
                 true = float(table.true[p, k])
                 row.append(Marked(significant(true), "", "truth start"))
@@ -135,9 +135,7 @@ def _crosstalk(run: RenderRun, camera: int) -> Table:
 
 
 def _columns(run: RenderRun, table: CameraCrosstalk, parameter: int) -> list[tuple[str, str]]:
-    """Return (heading, estimator) of one parameter; the two printed sets share a column where they are the same
-    formula.
-    """
+    """Return (heading, estimator) of one parameter; the two printed sets share a column where their formulas agree."""
     single, joint = (table.readings[e][parameter] for e in ("paper_single", "paper_joint"))
     same = np.allclose(single, joint, rtol=1e-9, atol=0.0)
     columns = []
@@ -160,15 +158,12 @@ def _short(label: str) -> str:
 
 
 def is_wrong(reading: float, true: float, floor: float = SAME) -> bool:
-    """Return True if a reading departs from the truth by more than ``WRONG`` times the truth and by more than
-    ``floor``.
-    """
+    """Return True if a reading differs from the truth by more than ``WRONG`` of it and more than ``floor``."""
     return abs(reading - true) > max(WRONG * abs(true), floor)
 
 
 def formula_section(run: RenderRun) -> Section:
-    """Return the section with the factors of the printed formulas, two columns for each camera, and their explanation.
-    """
+    """Return the section with the factors of the printed formulas, two columns for each camera, and their explanation."""
     about = (
         "Each printed formula is fed with the spot shifts that the exact trace gives for the one motion it was derived "
         "for. A factor of 1 is a correct formula."

@@ -88,8 +88,7 @@ class MonitorReading:
 
     @cached_property
     def gains(self) -> dict[str, np.ndarray]:
-        """Gain of each estimator at this measurement: (4 x cameras, 2 x spots) parameters (rad, m) per pixel of shift.
-        """
+        """Gain of each estimator at this measurement: (4 x cameras, 2 x spots) parameters (rad, m) per pixel of shift."""
         return estimator_gains(self.cameras, self.disturbances, self.recovery.shift_covariance[0])
 
     @cached_property
@@ -129,8 +128,8 @@ class MonitorReading:
 
     @cached_property
     def unseen(self) -> tuple[str, ...]:
-        """A warning for each stated body whose motions have next to no derivative in the spots and yet make sigma;
-        sentences without their end.
+        """Warnings of bodies of the prior whose motions hardly move the spots but contribute to sigma, without full
+        stops.
         """
         stated, noise = self.disturbances, self.recovery.shift_covariance[0]
         if stated is None or not np.any(noise):
@@ -155,8 +154,7 @@ class MonitorReading:
 
     @cached_property
     def from_statement(self) -> dict[str, dict[str, float | None]]:
-        """Group -> key -> share of the posterior's variance that stays without image noise, so that it rests on the
-        prior alone.
+        """Group -> key -> share of the posterior's variance that remains without image noise and so rests on the prior.
 
         None for a quantity that no motion of the prior changes. Empty without a prior and without noise.
         """
@@ -210,10 +208,9 @@ class MonitorReading:
         return {b: np.stack([c for (body, _, _), c in columns.items() if body == b], axis=1) for b in bodies}
 
     def worst_of(self, shifts: np.ndarray, covariance: np.ndarray) -> tuple[int, Consistency] | None:
-        """Return the state of a series whose shifts agree least with the prior, and its consistency; None without a
-        prior.
+        """Return the state of a series whose shifts agree least with the prior, and its consistency.
 
-        The limit is that of the largest value of all times, at the same false-alarm rate.
+        The limit is that of the largest value of all times, at the same false-alarm rate. None without a prior.
 
         Parameters
         ----------
@@ -278,9 +275,7 @@ class MonitorReading:
         }
 
     def _stated(self, found: Consistency | None) -> dict[str, Any]:
-        """Return the name of the prior and the test of the shifts against it; its numbers are None without prior or
-        noise.
-        """
+        """Return the prior's name and the test of the shifts against it, whose numbers are None without prior or noise."""
         name = None if self.disturbances is None else self.disturbances.name
         numbers = {key: None if found is None else of(found) for key, of in _STATED.items()}
         suspects = [
@@ -369,7 +364,7 @@ def worst_checks(readings: Iterable[MonitorReading]) -> tuple[SelfCheck, ...]:
 
 
 SHARE, OFF = 3, 1
-"""Decimals of shares, and of how far linear readings are off in sigmas: noise does not move them but by chance."""
+"""Decimals of shares, and of linearity errors in sigmas: rounding errors seldom change numbers rounded so."""
 STATED = 6
 """Decimals of a reading in files, counted in units of its sigma."""
 _STATED: Mapping[str, Callable[[Consistency], Any]] = {

@@ -110,9 +110,7 @@ def _write_series(run: RenderRun, series: TimeSeries, folder: RunFolder) -> None
 
 
 def _write_targets(targets: TargetRun, folder: RunFolder) -> None:
-    """Write MTF and frames of targets; previews are stretched for a pinhole, to show its faint rings, and linear
-    otherwise.
-    """
+    """Write MTF and frames of targets; previews of a pinhole are stretched to show its faint rings, others are not."""
     _write_numbers(folder, "mtf", targets.to_dict())
     for stem, name, frames, facts in targets.images():
         for file, content in frame_files(stem, frames, facts, SPOT_STRETCH if name == "pinhole" else None):
@@ -123,9 +121,7 @@ _WAVELENGTH = {"units": "m", "standard_name": "radiation_wavelength", "long_name
 
 
 def irradiance(run: RenderRun) -> GridData:
-    """Return expected photons before and after, (state, channel, row, column); traced stray light is a variable of its
-    own.
-    """
+    """Return expected photons before and after, (state, channel, row, column), and traced stray light apart."""
     photons = np.stack([run.photons_before, run.photons_after])
     states = ("state", ["before", "after"], {"long_name": "before the disturbance or after it"})
     images = _images(run, "state", states, photons)

@@ -249,7 +249,7 @@ if TYPE_CHECKING:
 LIMITS = "limits"
 """Name of the figure of what limits the readings."""
 SUMMARY, SCENE, IRRADIANCE = "summary", "scene", "irradiance"
-"""What is no figure of the report: the bytes of summary.png, scene.glb, irradiance.nc."""
+"""Drawings that are files of bytes, not figures of the report: summary.png, scene.glb, irradiance.nc."""
 APART = (SUMMARY, SCENE, IRRADIANCE)
 LOADED = (SCENE, IRRADIANCE)
 """Drawings that need libraries which nothing else in a run needs, trimesh and h5netcdf: drawn after `load_drawing`."""
@@ -332,8 +332,7 @@ def _of_monitor(run: RenderRun) -> dict[str, Callable[[], Any]]:
 
 
 def _drawing(function: str, *given: Any) -> Callable[[], Any]:
-    """Return a drawing by the function ``module:name``, which the drawing process imports, since that takes a second.
-    """
+    """Return a drawing by the function ``module:name``, which the drawing process imports, since that takes a second."""
     return partial(Named(function if "." in function else f"{__package__}.{function}"), *given)
 
 

@@ -31,7 +31,7 @@ from twin.framework.artefact import (
     residual,
     residual_cell,
     residual_text,
-    shown_unit,
+    unit_for_reports,
 )
 from twin.framework.report import Section
 from twin.main_job.render_results import JobRun, RenderRun
@@ -114,9 +114,7 @@ def _label(reading: Reading) -> Marked:
 
 
 def _all_digits(run: RenderRun, name: str, found: ReadingTable, over: bool) -> Table:
-    """Return a table with a row for each change: truth, and each estimator's value (or RMS error), sigma and noise
-    sigma.
-    """
+    """Return a table of all changes: truth, and each estimator's value (or RMS error), sigma and noise sigma."""
     heads = ["camera", "parameter", "unit", "true rms" if over else "true"]
     heads += _value_and_sigma(run, " error rms" if over else "")
     rows: list[list[Cell]] = []
@@ -297,8 +295,7 @@ def _every_time(run: RenderRun) -> Table:
 
 
 def spot_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
-    """Return the section with images of the spots (figures ``spots NAME`` of each camera), their positions and shifts.
-    """
+    """Return the section with images of the spots (figures ``spots NAME`` of each camera), their positions and shifts."""
     figures: list[Artefact] = []
     for k, name in enumerate(run.experiment.instrument.cameras):
         caption = f"Camera {name}: mean of {run.frames} frames."
@@ -467,9 +464,7 @@ def _all(values: list[float]) -> str:
 
 
 def _fields(degrees: list[float]) -> str:
-    """Return distinct field angles, as text: ``±1.22``, or ``±1.22, 1.25`` where only one end of the line has the
-    second.
-    """
+    """Return distinct field angles, as text: ``±1.22``, or ``±1.22, 1.25`` where only one end has the second."""
     ends: dict[str, set[bool]] = {}
     for field in degrees:
         ends.setdefault(plain(abs(field)), set()).add(field > 0.0)
@@ -506,7 +501,7 @@ def _stated(run: JobRun) -> Table:
     def listed(name: str, when: str, why: str) -> list[Component]:
         """Add the components of a cause to the table with all digits, and return them."""
         own = [c for c in motions.components if c.cause == name]
-        full.extend([name, c.body, c.what, c.sigma / c.unit_size, shown_unit(c.unit), when, why] for c in own)
+        full.extend([name, c.body, c.what, c.sigma / c.unit_size, unit_for_reports(c.unit), when, why] for c in own)
         return own
 
     for name, cause in spec.causes.items():
@@ -515,7 +510,7 @@ def _stated(run: JobRun) -> Table:
         sizes: dict[tuple[str, str], list[str]] = {}
         for c in own:
             if c.body == bodies[0]:
-                size = f"{plain(c.sigma / c.unit_size)} {shown_unit(c.unit)}"
+                size = f"{plain(c.sigma / c.unit_size)} {unit_for_reports(c.unit)}"
                 sizes.setdefault((c.kind, size), []).append(c.what.removeprefix(c.kind).strip())
         what = []
         for (kind, size), axes in sizes.items():
@@ -545,9 +540,7 @@ def _stated(run: JobRun) -> Table:
 
 
 def done_table(run: JobRun) -> Table:
-    """Return the table of what the job does to each body at the time shown, without the effects on bodies that it
-    carries.
-    """
+    """Return the table of what the job does to each body at the time shown, without the bodies that it carries."""
     job = run.resolved.job
     shown = _shown(run)
     motions, fields = motions_of(job, shown), job.fields(shown)

@@ -140,9 +140,7 @@ def smoothed_svg(series: TimeSeries) -> str:
 def _changes_svg(
     series: TimeSeries, name: str, height: float, panel: Callable[[Axes, list[Reading]], None], ground: bool = False
 ) -> str:
-    """Draw a panel for each change: cameras side by side, below them their angle and, with ``ground``, the height
-    error.
-    """
+    """Draw a panel for each change: cameras side by side, below them their angle and, with ``ground``, the height."""
     with svg.look(name):
         groups: dict[str, list[list[Reading]]] = {}
         for same in series.readings.by_change():

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 
 from analysis.monitor.estimators import ESTIMATORS
 from twin.framework import svg
-from twin.framework.artefact import FAR, SAME, Marked, Table, residual, shown_unit, significant, tick_text
+from twin.framework.artefact import FAR, SAME, Marked, Table, residual, unit_for_reports, significant, tick_text
 from twin.framework.frame_store import mean_of
 from twin.framework.report import sentence
 from twin.main_job.render_results import RenderRun
@@ -242,7 +242,7 @@ def motion_map_svg(run: RenderRun) -> str:
 
 
 def _labels(table: CameraCrosstalk) -> list[str]:
-    return [f"{motion.label}, 1 {shown_unit(motion.unit)}" for motion in table.motions]
+    return [f"{motion.label}, 1 {unit_for_reports(motion.unit)}" for motion in table.motions]
 
 
 def _motion_panel(axes: Axes, values: np.ndarray, names: Sequence[str], norm: SymLogNorm) -> None:
@@ -262,9 +262,9 @@ def _motion_panel(axes: Axes, values: np.ndarray, names: Sequence[str], norm: Sy
 
 
 WIDTH, DPI = 14.0, 100
-"""Inches and dots per inch: 1400 px wide."""
+"""Width of the picture in inches, and dots per inch: 1400 px wide."""
 NOTE, LONGEST_NOTE = 0.85, 150
-"""Height of a note's line, in lines of the table, and characters that the width holds."""
+"""Height of a note's line, in rows of the table, and number of characters that fit in the width."""
 FIRST = 0.22
 """Right edge of the column of true values, as a share of the width."""
 REACH = 2.2

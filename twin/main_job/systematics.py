@@ -16,7 +16,7 @@ from optics.geometry.tree import Motion
 from scenes.models.job_state import motions_of
 from scenes.specs.course import moment
 from scenes.specs.instrument import BASE, CENTRAL_PRISM
-from twin.framework.artefact import plain, shown_unit, significant
+from twin.framework.artefact import plain, unit_for_reports, significant
 from twin.main_job.monitor_reading import MonitorReading, contradicted
 from twin.main_job.render_results import RenderRun
 from twin.monitor.crosstalk import CameraCrosstalk
@@ -103,13 +103,11 @@ def _parts(run: RenderRun, camera: str, amounts: dict[str, np.ndarray]) -> dict[
 
 
 def _told(motion: ElementaryMotion, amount: float) -> str:
-    return f"{motion.label}, {plain(float(amount), 4)} {shown_unit(motion.unit)}"
+    return f"{motion.label}, {plain(float(amount), 4)} {unit_for_reports(motion.unit)}"
 
 
 def _amount(run: RenderRun, elementary: ElementaryMotion) -> float:
-    """Return the amount of an elementary motion in the run's state, in table units, with pivots converted to first
-    order.
-    """
+    """Return the amount of an elementary motion in the run's state, in table units, to first order in the pivots."""
     motion = run.state.get(elementary.body)
     if motion is None:
         return 0.0
@@ -229,8 +227,7 @@ NOISE = "the noise of the images"
 
 
 def assumed(reading: MonitorReading) -> str:
-    """Return the basis of the sigmas and whether the measured shifts agree with it, as a sentence without a full stop.
-    """
+    """Return the basis of the sigmas and whether the measured shifts agree with it, as a sentence without a full stop."""
     stated, found = reading.disturbances, reading.consistency
     if stated is None or found is None:
         return _NOISE_ALONE
@@ -264,9 +261,7 @@ def contradiction(run: RenderRun) -> tuple[str, ...]:
 
 
 def doubted(run: RenderRun) -> tuple[str, ...]:
-    """Return warnings of spots that differ from their calibration and of nonlinear readings, at the worst time of a
-    course.
-    """
+    """Return warnings of spots unlike their calibration and of nonlinear readings, for a course at its worst time."""
     if run.series is None:
         return (*run.reading.doubts, *run.reading.notes)
     return run.series.doubts(["/".join(channel) for channel in run.reading.channels])
