@@ -66,7 +66,7 @@ def fit_spot(
     Parameters
     ----------
     image : (H, W) or (B, H, W) array_like
-        Grey values as recorded, one spot in each image.
+        Grey values as recorded, one spot in each image of at least 24 x 24 px.
     noise : NoiseModel
         Noise of the detector.
     frames : int
@@ -88,7 +88,7 @@ def fit_spot(
     Raises
     ------
     ValueError
-        Images that are not real and finite, a spot that is saturated, missing or too close to the edge of the image, a
+        Images that are too small, not real or not finite, a spot that is saturated, missing or too close to the edge of the image, a
         fit that does not converge, or another method.
 
     Notes
