@@ -88,8 +88,8 @@ def fit_spot(
     Raises
     ------
     ValueError
-        Images that are too small, not real or not finite, a spot that is saturated, missing or too close to the edge of the image, a
-        fit that does not converge, or another method.
+        Images that are too small, not real or not finite; a spot that is saturated, missing or too close to the edge;
+        a fit that does not converge; or another method.
 
     Notes
     -----
