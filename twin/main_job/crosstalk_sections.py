@@ -22,8 +22,8 @@ from twin.framework.artefact import (
     Text,
     fixed,
     plain,
-    unit_for_reports,
     significant,
+    unit_for_reports,
 )
 from twin.framework.report import Section
 from twin.main_job.render_results import RenderRun

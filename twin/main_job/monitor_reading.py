@@ -128,7 +128,7 @@ class MonitorReading:
 
     @cached_property
     def unseen(self) -> tuple[str, ...]:
-        """Warnings of bodies of the prior whose motions hardly move the spots but contribute to sigma, without full
+        """Warnings of bodies whose motions in the prior hardly move the spots but contribute to sigma, without full
         stops.
         """
         stated, noise = self.disturbances, self.recovery.shift_covariance[0]

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 
 from analysis.monitor.estimators import ESTIMATORS
 from twin.framework import svg
-from twin.framework.artefact import FAR, SAME, Marked, Table, residual, unit_for_reports, significant, tick_text
+from twin.framework.artefact import FAR, SAME, Marked, Table, residual, significant, tick_text, unit_for_reports
 from twin.framework.frame_store import mean_of
 from twin.framework.report import sentence
 from twin.main_job.render_results import RenderRun

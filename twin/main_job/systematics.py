@@ -16,7 +16,7 @@ from optics.geometry.tree import Motion
 from scenes.models.job_state import motions_of
 from scenes.specs.course import moment
 from scenes.specs.instrument import BASE, CENTRAL_PRISM
-from twin.framework.artefact import plain, unit_for_reports, significant
+from twin.framework.artefact import plain, significant, unit_for_reports
 from twin.main_job.monitor_reading import MonitorReading, contradicted
 from twin.main_job.render_results import RenderRun
 from twin.monitor.crosstalk import CameraCrosstalk

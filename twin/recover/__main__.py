@@ -1,4 +1,4 @@
-"""``python -m twin.recover``: measured frames of a monitor, and what they say."""
+"""Command ``python -m twin.recover``: recover changes of the cameras from measured frames of a monitor."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def main(
     ],
     options: cli.Options,
 ) -> None:
-    """Recover what moved from measured frames of a monitor's area CCDs, before and after: the centroids and estimators
-    of `python -m twin.render`, with total sigmas and without a truth.
+    """Recover what moved from measured frames of a monitor's area CCDs.
 
-    The measurement's file names the instrument and the frames:
+    The centroids and estimators are those of `python -m twin.render`, with total sigmas and without a truth. The
+    measurement's file names the instrument and the frames, taken before and after:
 
         instrument: gf7_pair
 
@@ -38,12 +38,13 @@ def main(
     A folder holds CAMERA_CHANNEL_before.tiff and CAMERA_CHANNEL_after.tiff, as twin.render writes them; or the files
     are named for each channel, in a CSV table, or as a series with times. TIFF (also packed), FITS and PNG are read.
 
-    Without a model of the instrument its geometry will do: then the shape of the spots is learnt from the frames
-    before, and nothing is known of what disturbances do.
+    An instrument without a model can be described by its geometry alone: then the shape of the spots is learnt from the
+    frames before, and there is no prior on disturbances.
 
-    Frames are searched for what is no spot: hot, dead and flickering pixels, bad columns, cosmic rays, frames without
-    light, saturation, uneven background, reflections, movement between frames. What is found is left out or fitted,
-    told with its cost in sigma, or refused by name. Clean frames give what twin.render gives, to the last digit.
+    Frames are searched for artefacts: hot, dead and flickering pixels, bad columns, cosmic rays, frames without light,
+    saturation, uneven background, reflections, movement between frames. Each artefact is excluded or fitted and
+    reported with its effect on sigma, or the frames are refused with the reason. Clean frames give exactly the numbers
+    of twin.render.
 
     The run folder gets recovered.json, report.html, config.yaml, and figures and tables in artefacts/.
 

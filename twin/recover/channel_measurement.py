@@ -1,4 +1,4 @@
-"""One channel of a measurement: its frames searched for defects, its spot measured in every state."""
+"""Measurement of one channel: its frames are searched for artefacts and its spot is located in every state."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from analysis.spots.frame_screening import (
     FramesError,
     ScreenedFrames,
     noise_ratio,
-    screen_frames,
     observed_noise,
+    screen_frames,
     subtracted_level,
 )
 from analysis.spots.learnt_template import (
@@ -34,11 +34,11 @@ from analysis.spots.spot_template import SpotTemplate
 from analysis.spots.static_defects import Examined, examine, outlier_pixels, refit, repaired_centroid
 from scenes.specs.monitor_frames import MeasurementSpec
 from scenes.yaml.errors import Issue
-from twin.framework.frame_store import let_go, mean_of
+from twin.framework.frame_store import mean_of, release_memory
 from twin.recover.measured_frames import ChannelFrames, StateFrames, cannot_measure
 
 _DEAREST = 4.0
-"""Times that sigma may grow by what is missing, before a spot counts as lost."""
+"""Factor by which missing pixels may increase sigma before a spot counts as lost."""
 _REMEDIES = (
     ("(saturation", "frames with less light or a shorter exposure"),
     (
@@ -56,28 +56,28 @@ _REMEDIES = (
 
 @dataclass(frozen=True, eq=False)
 class SpotResult:
-    """One channel in one state.
+    """Measured spot of one channel in one state.
 
     Attributes
     ----------
     frames : StateFrames
-        As recorded.
-    mean : np.ndarray
-        (H, W) DN that was measured.
-    used : np.ndarray
-        (H, W) pixels that were used.
-    residual : np.ndarray | None
-        (H, W) mean over the fitted shape, in standard deviations; None where no shape was fitted.
-    findings : tuple[Finding, ...]
-        What was found in the frames and what became of it.
+        Frames as recorded.
+    mean : (H, W) ndarray
+        Mean image that was measured, DN.
+    used : (H, W) ndarray of bool
+        Pixels that were used.
+    residual : (H, W) ndarray or None
+        Mean minus fitted shape, in standard deviations; None where no shape was fitted.
+    findings : tuple of Finding
+        Artefacts of the frames and how each was treated.
     cost : float
-        Sigma of the place over what it would be without what was found, minus 1.
-    core : tuple[float, int] | None
+        Relative increase of the position's sigma by the artefacts.
+    core : tuple of (float, int) or None
         Reduced chi-square of the spot's core, and its number of pixels; None where no shape was fitted.
     fits : bool
-        Whether the core has the calibrated shape.
-    noise_ratio : float | None
-        Noise of the frames over the stated one; None where they agree.
+        True if the core has the calibrated shape.
+    noise_ratio : float or None
+        Ratio of the frames' noise to the specified noise; None where they agree.
     """
 
     frames: StateFrames
@@ -92,22 +92,22 @@ class SpotResult:
 
     @property
     def clean(self) -> bool:
-        """Whether nothing was corrected."""
+        """True if nothing was corrected."""
         return not any(finding.corrects for finding in self.findings)
 
 
 @dataclass(frozen=True, eq=False)
 class ChannelResult:
-    """One channel.
+    """Measured spots of one channel in all states.
 
     Attributes
     ----------
     channel : ChannelFrames
-        Its frames and what is known of its CCD.
+        Frames and CCD of the channel.
     before : SpotResult
-        In the nominal state.
-    after : tuple[SpotResult, ...]
-        In each of the others.
+        Spot in the nominal state.
+    after : tuple of SpotResult
+        Spots in the other states.
     """
 
     channel: ChannelFrames
@@ -115,7 +115,7 @@ class ChannelResult:
     after: tuple[SpotResult, ...]
 
     def states(self) -> tuple[tuple[str, SpotResult], ...]:
-        """Name and result of each: before, after, or after with its number."""
+        """Return name and result of each state; the name is before, after, or after with its number."""
         many = len(self.after) > 1
         return (
             ("before", self.before),
@@ -124,21 +124,21 @@ class ChannelResult:
 
 
 def remedy(reason: str) -> str:
-    """What to do where a spot cannot be measured for that reason."""
+    """Return what to do where a spot cannot be measured for a reason."""
     return next((remedy for word, remedy in _REMEDIES if word in reason), "other frames of this channel")
 
 
 class ChannelMeasurement:
-    """The work on one channel: search its frames, then measure its spots.
+    """Measurement of one channel: search its frames for artefacts, then locate its spots.
 
     Parameters
     ----------
-    test
-        The measurement.
-    channel
-        Its frames.
-    shape
-        Of its spot on the whole CCD; None to learn it from the frames before.
+    test : MeasurementSpec
+        Measurement.
+    channel : ChannelFrames
+        Frames of the channel.
+    shape : SpotTemplate or None
+        Shape of its spot on the whole CCD; None learns it from the frames before.
     """
 
     def __init__(self, test: MeasurementSpec, channel: ChannelFrames, shape: SpotTemplate | None) -> None:
@@ -163,7 +163,7 @@ class ChannelMeasurement:
 
     @property
     def plain(self) -> bool:
-        """Whether the main job could measure these frames as they are."""
+        """True if the main job could measure these frames without any correction."""
         channel = self.channel
         whole = all(state.shape == channel.ccd and not any(state.offset) for state in channel.states)
         same = len({len(state.frames) for state in channel.after}) == 1
@@ -181,7 +181,7 @@ class ChannelMeasurement:
         return self._templates[state.shape]
 
     def search(self) -> list[Issue]:
-        """Compare frames with each other, and images with the shape of the spot; what is refused."""
+        """Compare frames with each other and images with the shape of the spot; return the issues of refused frames."""
         issues: list[Issue] = []
         try:
             self._show_level()
@@ -209,10 +209,10 @@ class ChannelMeasurement:
         return issues
 
     def _show_level(self) -> None:
-        """Let the detector have the lowest level of its frames, where that was subtracted. Raises FramesError."""
+        """Lower the detector's dark level where a level was subtracted from the frames. Raises FramesError."""
         channel = self.channel
         below = max(
-            subtracted_level(state.frames, channel.raw_noise, state.bad_part(channel.bad), let_go)
+            subtracted_level(state.frames, channel.raw_noise, state.bad_part(channel.bad), release_memory)
             for state in channel.states
         )
         if below == 0.0:
@@ -233,14 +233,14 @@ class ChannelMeasurement:
         self._level = (Finding("subtracted level", text, corrects=False),)
 
     def _show_noise(self) -> None:
-        """From here on the detector has the noise of its noisiest frames, where that is more than stated."""
+        """Set the detector's noise to that of its noisiest frames, where that exceeds the specified noise."""
         channel = self.channel
         shown = []
         for state in channel.states:
             bad = state.bad_part(channel.bad)
-            ratio = noise_ratio(state.frames, channel.raw_noise, bad, released=let_go)
+            ratio = noise_ratio(state.frames, channel.raw_noise, bad, released=release_memory)
             self._noise_ratios.append(ratio)
-            shown.append(observed_noise(state.frames, channel.raw_noise, ratio, bad, let_go).dark_noise_e)
+            shown.append(observed_noise(state.frames, channel.raw_noise, ratio, bad, release_memory).dark_noise_e)
         most = max(shown)
         if most > channel.raw_noise.dark_noise_e:
             raw, corrected = (replace(one, dark_noise_e=most) for one in (channel.raw_noise, channel.noise))
@@ -248,7 +248,7 @@ class ChannelMeasurement:
             self._noisy = True
 
     def _lost(self, state: StateFrames, error: SpotError, burnt: str = "") -> Issue:
-        """Why a spot cannot be measured; where pixels are saturated, that comes first."""
+        """Return the issue of a spot that cannot be measured; saturated pixels are named first."""
         reason = "; ".join(error.reasons.values())
         if burnt:
             reason = f"too much of the spot is missing (saturation: {burnt}): {reason}"
@@ -265,7 +265,7 @@ class ChannelMeasurement:
             counts, still = np.full(state.shape, float(len(values))), np.zeros((2, 2))
             screened = ScreenedFrames(np.asarray(mean, np.float64), counts, ~bad, len(values), len(values), still, ())
         else:
-            screened = screen_frames(state.frames, channel.raw_noise, bad, let_go)
+            screened = screen_frames(state.frames, channel.raw_noise, bad, release_memory)
         if channel.correction is None:
             return screened
         known = channel.correction
@@ -281,7 +281,7 @@ class ChannelMeasurement:
         return replace(screened, mean=part.corrected(screened.mean), good=good, findings=(*screened.findings, *told))
 
     def _learn(self, screened: ScreenedFrames) -> tuple[ScreenedFrames, LearntTemplate]:
-        """The shape of the spot before, without the pixels that no shape could have."""
+        """Return frames without outlier pixels, and the shape of the spot that is learnt from them."""
         if self._searches:
             lone = outlier_pixels(screened, self.channel.noise)
             if np.any(lone):
@@ -291,7 +291,7 @@ class ChannelMeasurement:
         return screened, learn_template(screened, self.channel.noise)
 
     def _examine(self, number: int, state: StateFrames) -> Examined | None:
-        """None where nothing is searched for."""
+        """Search a state's mean image for artefacts; return None where no search is asked for."""
         screened, test = self._screened[number], self._test
         fitted = test.vibration == "fitted"
         if not self._searches and not fitted and np.all(screened.good):
@@ -301,7 +301,7 @@ class ChannelMeasurement:
         return examine(screened, self.channel.noise, template, fitted, own, searched, state.offset, learnt)
 
     def measure(self) -> list[Issue]:
-        """Measure the spot in every state; what is refused."""
+        """Measure the spot in every state; return the issues of states in which it cannot be measured."""
         issues: list[Issue] = []
         static = np.zeros(self.channel.ccd, dtype=bool)
         for state, examined in zip(self.channel.states, self._examined, strict=True):
@@ -341,14 +341,14 @@ class ChannelMeasurement:
         return self._on_ccd(widened(positions, np.array(self._widened[-1:])), state)
 
     def _widening(self, number: int) -> float:
-        """Factor of sigma of a spot by how well its core fits; 1 where no shape was fitted."""
+        """Return the factor of a spot's sigma by the fit of its core; 1 where no shape was fitted."""
         examined, first = self._examined[number], self._examined[0] if self._learnt else None
         if examined is None or (self._learnt and number == 0):
             return 1.0
         return examined.fit.core_widening(None if first is None else first.fit)
 
     def _as_fitted(self, positions: SpotPositions, number: int, state: StateFrames) -> FittedSpot:
-        """What the noise of a learnt shape rests on."""
+        """Return the data of a fit from which the noise of a learnt shape is computed."""
         examined, screened = self._examined[number], self._screened[number]
         counts, jitter = screened.counts, screened.jitter / float(np.median(screened.counts))
         others, smear = np.zeros((0, 3)), np.zeros((2, 2))
@@ -357,12 +357,12 @@ class ChannelMeasurement:
         return FittedSpot(positions, counts, jitter, others, smear, state.offset)
 
     def shift_covariance(self, number: int) -> np.ndarray:
-        """(1, 2, 2) px^2 of after - before, by noise.
+        """Return the (1, 2, 2) noise covariance of after - before, in px^2.
 
         Parameters
         ----------
         number : int
-            Of the state after, from 1 on.
+            Index of the state after, from 1.
         """
         if self._shifts:
             # its noise is worked out with that of the learnt shape, and not from the positions
@@ -371,9 +371,11 @@ class ChannelMeasurement:
         return spread + self._doubt(number)
 
     def _doubt(self, number: int) -> np.ndarray:
-        """(2, 2) px^2, what a reflection of the frames before may do to a centroid that knows no shape: it is in the
-        image before, and is put into that after with the accuracy of the learnt shape only. So far as the shift is not
-        that of the shape itself it is doubted.
+        """Return the (2, 2) covariance, in px^2, of a centroid's error by a reflection in the frames before.
+
+        Such a centroid knows no shape. The reflection is in the image before, and is added to the image after only with
+        the accuracy of the learnt shape. The difference between the shift and that of the shape itself is counted as an
+        error.
         """
         first, second = self._examined[0], self._examined[number]
         if not self._learnt or first is None or second is None or not np.any(second.fit.others[:, 2] < 0.0):
@@ -384,12 +386,12 @@ class ChannelMeasurement:
         return np.outer(own - by_shape - moved, own - by_shape - moved)
 
     def noise_parts(self, number: int) -> tuple[NoiseParts, NoiseParts]:
-        """Noise of the spot before and after, for the covariance of a series of shifts.
+        """Return the noise of the spot before and after, for the covariance of a series of shifts.
 
         Parameters
         ----------
         number : int
-            Of the state after, from 1 on.
+            Index of the state after, from 1.
         """
         if self._shifts:
             return self._shifts[number - 1].parts
@@ -402,7 +404,7 @@ class ChannelMeasurement:
         return self._centroid(screened.mean[None], screened.frames, self.channel.noise, state)
 
     def _repaired(self, examined: Examined, state: StateFrames) -> tuple[SpotPositions, float]:
-        """By a centroid that knows no shape, and what the corrections cost it."""
+        """Return positions by a centroid that uses no shape, and the relative increase of sigma by corrections."""
         screened, noise, template = examined.screened, self.channel.noise, self._template(state)
 
         def measure(image: np.ndarray, own: NoiseModel) -> SpotPositions:
@@ -415,7 +417,7 @@ class ChannelMeasurement:
         return measure_spots(mean, frames, calibration, self._test.analysis.centroid)
 
     def _on_ccd(self, positions: SpotPositions, state: StateFrames) -> SpotPositions:
-        """In pixels of the CCD."""
+        """Return positions in pixels of the whole CCD."""
         if state.shape == self.channel.ccd:
             return positions
         assert positions.gain_maps is not None
@@ -428,9 +430,10 @@ class ChannelMeasurement:
         return replace(positions, row=row, column=column, gain_maps=gain, light_dn=light)
 
     def _noisier(self, number: int, fit: ScreenedFit) -> float:
-        """By which factor the variance in a spot's core is more than stated, where frames have more noise beside the
-        spot: as their differences show it there, but not by more than beside it, since in the light all that flickers
-        and moves is in them, too.
+        """Return the factor by which the variance in a spot's core exceeds the specified one, where frames are noisier.
+
+        It is taken from differences of frames in the core, but is at most that beside the spot: in the light, flicker
+        and movement add to the differences.
         """
         ratio = self._noise_ratios[number]
         if ratio is None or ratio <= 1.0:
@@ -438,11 +441,11 @@ class ChannelMeasurement:
         frames = self.channel.states[number].frames
         light = fit.level - float(fit.level.min())
         core = light > CORE_SHARE * light.max()
-        found = noise_ratio(frames, self.channel.raw_noise, ~fit.used, core, let_go)
+        found = noise_ratio(frames, self.channel.raw_noise, ~fit.used, core, release_memory)
         return 1.0 if found is None else min(max(found, 1.0), ratio) ** 2
 
     def result(self) -> ChannelResult:
-        """What was found."""
+        """Return the result of the channel."""
         spots = []
         # of a learnt shape the frames before have been fitted, too, for they were searched
         first = self._examined[0] if self._learnt else None

@@ -1,4 +1,4 @@
-"""The files of a measurement, read: frames of every channel in every state, and whether they are what is said."""
+"""Files of a measurement: reading the frames of every channel in every state, and checks of them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.monitor_frames import AFTER, BEFORE, MeasurementSetup, MeasurementSpec, per_channel
 from scenes.yaml.errors import InputError, Issue, KeyPath
 from scenes.yaml.spec import Spec
-from twin.framework.frame_store import IN_MEMORY, PART, frame_room, let_go
+from twin.framework.frame_store import IN_MEMORY, PART, allocate_frames, release_memory
 from twin.framework.memory import Lowered, require_memory
 
 _OTHER_FILES = "frames that were recorded one by one, each named once: the right files of before and after"
@@ -33,17 +33,17 @@ _GREY, _MAPS = 2.0, 77.0
 
 
 def repeated_frames(test: Spec, channels: Sequence[ChannelFrames]) -> list[Issue]:
-    """What is said of frames that stand twice in a measurement, to the last pixel; one issue for each two states.
+    """Return issues of frames that occur twice, identical to the last pixel, one for each pair of states.
 
-    Noise is another one in every frame, so that two are never alike: one of them is a copy, and shift and sigma would
-    be those of frames against themselves. Frames of one grey value alone hold no noise, and are not looked at.
+    Noise differs in every frame, so that one of two identical frames is a copy, and shift and sigma would be those of
+    frames against themselves. Frames of a single grey value have no noise and are not compared.
 
     Parameters
     ----------
     test : Spec
-        The measurement.
+        Measurement.
     channels : Sequence[ChannelFrames]
-        As they were read.
+        Frames as they were read.
     """
     seen: dict[bytes, tuple[StateFrames, int]] = {}
     told: set[tuple[int, int]] = set()
@@ -71,7 +71,7 @@ def _digests(state: StateFrames) -> Iterator[tuple[int, bytes]]:
         if values.min() < values.max():
             shape = f"{values.shape}".encode()
             yield number, hashlib.blake2b(values.tobytes() + shape, digest_size=16).digest()
-    let_go(state.frames)
+    release_memory(state.frames)
 
 
 def _files(state: StateFrames) -> str:
@@ -79,16 +79,16 @@ def _files(state: StateFrames) -> str:
 
 
 def order_warnings(channels: Sequence[ChannelFrames], times: Sequence[float] | None) -> tuple[str, ...]:
-    """Warnings where files say themselves that they were recorded in another order than the measurement takes them for.
+    """Return warnings where the files' metadata contradict the order in which the measurement uses them.
 
-    Told only of channels of which every file says when it was recorded, or what it is of.
+    Only channels are checked whose files all have a recording time, or all a note of their state.
 
     Parameters
     ----------
     channels : Sequence[ChannelFrames]
-        As they were read.
-    times : Sequence[float] | None
-        Of a series, seconds; None for a single state after.
+        Frames as they were read.
+    times : Sequence[float] or None
+        Times of a series, in seconds; None for a single state after.
     """
     out = []
     swapped = [channel.name for channel in channels if _swapped(channel)]
@@ -109,7 +109,7 @@ def order_warnings(channels: Sequence[ChannelFrames], times: Sequence[float] | N
 
 
 def _recorded(state: StateFrames) -> tuple[datetime, ...]:
-    """Recording times of all files; empty if one file gives none."""
+    """Return the recording times of all files; empty if one file has none."""
     found = [time for time, _ in state.origin if time is not None]
     return tuple(found) if found and len(found) == len(state.origin) else ()
 
@@ -123,7 +123,7 @@ def _swapped(channel: ChannelFrames) -> bool:
 
 
 def _not_ascending(channel: ChannelFrames) -> int:
-    """Number of the first time that was recorded before the one before it; 0 for none."""
+    """Return the index of the first time that was recorded before its predecessor; 0 if there is none."""
     every = [_recorded(state) for state in channel.after]
     if not all(every):
         return 0
@@ -133,7 +133,7 @@ def _not_ascending(channel: ChannelFrames) -> int:
 Shape = tuple[int, int]
 
 _MOST_GREY = 2.0**32
-"""Largest grey value, either sign: of a converter of 32 bits, beyond any that there is."""
+"""Largest magnitude of a grey value: that of a converter of 32 bits, more than any has."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,16 +142,16 @@ class StateFrames:
 
     Attributes
     ----------
-    files : tuple[str, ...]
-        They are from, by their paths.
-    frames : np.ndarray
-        (N, H, W) grey values as recorded.
-    offset : Shape
-        Row and column of the CCD at which they begin.
+    files : tuple of str
+        Paths of the files.
+    frames : (N, H, W) ndarray
+        Grey values as recorded, DN.
+    offset : (int, int)
+        Row and column of the CCD at which the frames begin.
     key : KeyPath
-        Where they stand in the measurement's file.
-    origin : tuple[tuple[datetime | None, str], ...]
-        Of each file when it was recorded, and the note in it, as far as it says so.
+        Key of the frames in the measurement's file.
+    origin : tuple of (datetime or None, str)
+        Recording time and note of each file, as far as it has them.
     """
 
     files: tuple[str, ...]
@@ -162,43 +162,43 @@ class StateFrames:
 
     @property
     def shape(self) -> Shape:
-        """Rows and columns."""
+        """Rows and columns of a frame."""
         return self.frames.shape[1], self.frames.shape[2]
 
     def of_ccd(self, whole: np.ndarray) -> np.ndarray:
-        """The part of a map of the whole CCD, (rows, columns), that the frames show."""
+        """Return the part of a map of the whole CCD, (rows, columns), that the frames show."""
         (row, column), (height, width) = self.offset, self.shape
         return whole[row : row + height, column : column + width]
 
     def bad_part(self, bad: np.ndarray | None) -> np.ndarray | None:
-        """The part of a map of bad pixels of the whole CCD that the frames show; None for no map."""
+        """Return the part of a map of bad pixels of the whole CCD that the frames show; None without a map."""
         return None if bad is None else self.of_ccd(bad)
 
 
 @dataclass(frozen=True, eq=False)
 class ChannelFrames:
-    """All frames of one channel.
+    """Frames of one channel in all states, with its CCD.
 
     Attributes
     ----------
     name : str
-        ``CAMERA/CHANNEL``.
-    ccd : Shape
+        Name as ``CAMERA/CHANNEL``.
+    ccd : (int, int)
         Rows and columns of its CCD.
     before : StateFrames
-        Of the nominal state.
-    after : tuple[StateFrames, ...]
-        Of each state to be measured.
-    bad : np.ndarray | None
-        (rows, columns) of the CCD: pixels of the bad-pixel map; None for none.
-    correction : PixelCorrection | None
-        Of its pixels by dark and flat frames; None without.
-    transfer : PhotonTransfer | None
+        Frames of the nominal state.
+    after : tuple of StateFrames
+        Frames of each state to be measured.
+    bad : (rows, columns) ndarray of bool, or None
+        Pixels of the bad-pixel map; None without a map.
+    correction : PixelCorrection or None
+        Correction of its pixels by dark and flat frames; None without them.
+    transfer : PhotonTransfer or None
         Measured photon transfer; None where the data sheet's is used.
     noise : NoiseModel
-        Of the detector, as the corrected frames have it.
+        Noise model of the corrected frames.
     raw_noise : NoiseModel
-        As the frames as recorded have it.
+        Noise model of the frames as recorded.
     """
 
     name: str
@@ -213,7 +213,7 @@ class ChannelFrames:
 
     @property
     def states(self) -> tuple[StateFrames, ...]:
-        """Before, then all after."""
+        """The state before, then all states after."""
         return (self.before, *self.after)
 
 
@@ -225,18 +225,18 @@ def read_measurement(
     Parameters
     ----------
     setup : MeasurementSetup
-        The measurement.
+        Measurement.
     noise : NoiseModel
-        Of the CCDs by their data sheet.
-    ccd : Shape | None
-        Rows and columns of the instrument's CCDs; None to take those of the frames before.
-    advance : Callable[[int], None]
-        Told how many channels are read.
+        Noise model of the CCDs by their data sheet.
+    ccd : (int, int) or None
+        Rows and columns of the instrument's CCDs; None takes them from the frames before.
+    advance : callable
+        Called with the number of channels read.
 
     Raises
     ------
     InputError
-        Files that cannot be read or do not fit; one issue for each channel.
+        Files cannot be read or do not fit; one issue for each channel.
     """
     _require_memory(setup.test)
     out: list[ChannelFrames] = []
@@ -253,8 +253,9 @@ def read_measurement(
 
 
 def _require_memory(test: MeasurementSpec) -> None:
-    """See whether the frames that are kept, and the maps of every state, fit into the memory, by the headers of one
-    file of each channel and state. One that cannot be read is told in its place.
+    """Check that the frames kept in memory and the maps of every state fit, by the header of one file per state.
+
+    Files that cannot be read are skipped here and reported when they are read. Raises InputError.
     """
     assert not isinstance(test.frames, str)
     if test.times is None:
@@ -330,7 +331,7 @@ def _state(test: Spec, files: tuple[str, ...], offset: Shape, key: KeyPath) -> S
 
 
 def _stacked(test: Spec, files: tuple[str, ...], key: KeyPath) -> np.ndarray:
-    """Frames of all files one after the other, (N, H, W), in a file of no name where they are many."""
+    """Return frames of all files in order, (N, H, W), in an unnamed temporary file where they are many."""
     images = [_opened(test, file, key) for file in files]
     room: np.ndarray | None = None
     count = held = 0
@@ -338,39 +339,41 @@ def _stacked(test: Spec, files: tuple[str, ...], key: KeyPath) -> np.ndarray:
         for page in _pages(test, file, image, key):
             if room is None:
                 shape, kind = page.shape, page.dtype
-                room = frame_room((sum(len(one.header.pages) for one in images), *shape), kind)
+                room = allocate_frames((sum(len(one.header.pages) for one in images), *shape), kind)
             if page.shape != shape:
                 sizes = (" x ".join(map(str, size)) for size in (shape, page.shape))
                 text = f"{files[0]} and {file} have frames of different sizes, {' and '.join(sizes)}"
                 raise _told(test, key, text, "frames of one size in one state")
             if np.result_type(kind, page.dtype) != kind:
                 kind = np.result_type(kind, page.dtype)
-                wider = frame_room(room.shape, kind)
+                wider = allocate_frames(room.shape, kind)
                 wider[:count] = room[:count]
                 room = wider
             room[count] = page
             count, held = count + 1, held + page.nbytes
             if held > PART:
-                let_go(room)
+                release_memory(room)
                 held = 0
     assert room is not None  # a file without pages is none
-    let_go(room)
+    release_memory(room)
     return room
 
 
 def _opened(test: Spec, file: str, key: KeyPath) -> ImageFile:
-    """The image of a file, whose header is read; raw frames alone."""
+    """Open an image file and read its header; only raw frames are allowed."""
     with _readable(test, file, key):
         image = ImageFile.open(Path(file), choose="")
         if image.header.orientation:
-            raise ImageError(f"{file} is stored turned or mirrored ({image.header.orientation}): save it as it was read out")
+            raise ImageError(
+                f"{file} is stored turned or mirrored ({image.header.orientation}): save it as it was read out"
+            )
         if image.header.coded:
             raise ImageError(f"{file}: {image.header.coded}, which is not linear in light: give raw frames")
         return image
 
 
 def _pages(test: Spec, file: str, image: ImageFile, key: KeyPath) -> Iterator[np.ndarray]:
-    """Frames of a file, whose grey values a converter could give."""
+    """Yield the frames of a file, and check that a converter could give their grey values."""
     largest = 0.0
     with _readable(test, file, key):
         for page in image.pages():
@@ -383,7 +386,7 @@ def _pages(test: Spec, file: str, image: ImageFile, key: KeyPath) -> Iterator[np
 
 @contextmanager
 def _readable(test: Spec, file: str, key: KeyPath) -> Iterator[None]:
-    """What is wrong with a file told at its place in the measurement."""
+    """Raise errors of a file as InputError at its key in the measurement."""
     try:
         yield
     except ImageError as error:
@@ -405,7 +408,7 @@ def _check_place(test: Spec, state: StateFrames, ccd: Shape) -> None:
 
 
 def _check_part(test: Spec, state: StateFrames, known: bool, others: str, key: str) -> None:
-    """See whether it is stated which part of the CCD the frames of a state show. Raises InputError."""
+    """Check that the part of the CCD that the frames of a state show is specified. Raises InputError."""
     if not known:
         text = f"{state.files[0]}: frames of {state.shape[0]} x {state.shape[1]} pixels are not of the size of {others}"
         remedy = f"{key}: [ROW, COLUMN] of the CCD at which they begin, one size for all frames of a series"
@@ -413,7 +416,7 @@ def _check_part(test: Spec, state: StateFrames, known: bool, others: str, key: s
 
 
 def _check_values(test: Spec, state: StateFrames, detector: DetectorSpec) -> None:
-    """See whether the converter can give the grey values of frames that are whole numbers. Raises InputError."""
+    """Check that the converter can give the grey values of frames of integers. Raises InputError."""
     largest, bits, different = 0, 0, False
     for frame in state.frames:
         values = frame[np.isfinite(frame)]
@@ -430,11 +433,11 @@ def _check_values(test: Spec, state: StateFrames, detector: DetectorSpec) -> Non
             text += f"; the converter of {detector.name} with {detector.bit_depth} bits gives 0 to {most} in steps of 1"
             remedy = f"frames divided by {step}: they are aligned to the left" if step > 1 else "the right `detector`"
             raise _told(test, state.key, text, remedy)
-    let_go(state.frames)
+    release_memory(state.frames)
 
 
 def _maps(test: MeasurementSpec, what: str, name: str, ccd: Shape, before: StateFrames) -> np.ndarray | None:
-    """Dark or flat frames of a channel, of the whole CCD or of the part that the frames before show."""
+    """Return dark or flat frames of a channel, of the whole CCD or of the part that the frames before show."""
     given: Any = getattr(test, what)
     files = per_channel(given, name)
     if not files:
@@ -448,7 +451,7 @@ def _maps(test: MeasurementSpec, what: str, name: str, ccd: Shape, before: State
 
 
 def _placed(correction: PixelCorrection, ccd: Shape, before: StateFrames) -> PixelCorrection:
-    """On the whole CCD; pixels that were not calibrated are bad."""
+    """Return a pixel correction on the whole CCD, where pixels that were not calibrated are bad."""
     dark, response, bad = np.zeros(ccd), np.ones(ccd), np.ones(ccd, dtype=bool)
     before.of_ccd(dark)[...] = correction.dark
     before.of_ccd(response)[...] = correction.response
@@ -469,18 +472,18 @@ def _bad(test: MeasurementSpec, name: str, ccd: Shape, before: StateFrames) -> n
 
 
 def cannot_measure(test: Spec, state: StateFrames, channel: str, reason: str, remedy: str) -> Issue:
-    """What is said of frames in which no spot can be measured.
+    """Return the issue of frames in which no spot can be measured.
 
     Parameters
     ----------
     test : Spec
-        The measurement.
+        Measurement.
     state : StateFrames
-        The frames.
+        Frames of the state.
     channel : str
-        whose.
+        Name of the channel.
     reason : str
-        Why not.
+        Reason why the spot cannot be measured.
     remedy : str
         What to do about it.
     """

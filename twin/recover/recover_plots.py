@@ -1,4 +1,4 @@
-"""Figures of measured spots: frames with their centres, what the fit leaves over, changes over time."""
+"""Figures of measured spots: mean frames with spot centres, fit residuals, changes over time."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from twin.recover.channel_measurement import SpotResult
 from twin.recover.recover_run import RecoverRun, state_name
 
 LIMIT = 5.0
-"""Limit of the colour scale of residuals, sigmas."""
+"""Limit of the colour scale of residuals, in sigmas."""
 
 
 def _panels(run: RecoverRun, camera: str) -> list[tuple[str, list[tuple[str, SpotResult, np.ndarray]]]]:
-    """Channel -> before and the last state after, with the centre on the CCD."""
+    """Return each channel with its state before and its last state after, and the spot centres on the CCD."""
     out = []
     for i, result in enumerate(run.channels):
         name, channel = result.channel.name.split("/")
@@ -36,7 +36,7 @@ def _panels(run: RecoverRun, camera: str) -> list[tuple[str, list[tuple[str, Spo
 
 
 def _extent(spot: SpotResult) -> tuple[float, float, float, float]:
-    """Extent of an image on the CCD."""
+    """Return the extent of an image on the CCD, as Matplotlib's ``extent``."""
     (row, column), (height, width) = spot.frames.offset, spot.mean.shape
     return column - 0.5, column + width - 0.5, row + height - 0.5, row - 0.5
 
@@ -48,7 +48,7 @@ def _mark_unused(axes: Axes, spot: SpotResult) -> None:
 
 
 def spots_svg(run: RecoverRun, camera: str) -> str:
-    """Mean frames of one camera, a row per channel."""
+    """Draw the mean frames of one camera, a row for each channel."""
     with svg.look(f"measured-{camera}"):
         panels = _panels(run, camera)
         norm = stretch(np.concatenate([spot.mean.ravel() for _, states in panels for _, spot, _ in states]))
@@ -66,7 +66,7 @@ def spots_svg(run: RecoverRun, camera: str) -> str:
 
 
 def residuals_svg(run: RecoverRun, camera: str) -> str:
-    """Residuals of one camera's spots in standard deviations, a row per channel."""
+    """Draw the fit residuals of one camera's spots in standard deviations, a row for each channel."""
     with svg.look(f"left-{camera}"):
         panels = _panels(run, camera)
         figure, grid = _grid(len(panels))
@@ -110,13 +110,13 @@ class Line:
     Attributes
     ----------
     camera : str
-        Whose; empty for what is of both.
+        Name of the camera; empty for a change of both.
     name : str
-        With its unit.
-    marks : np.ndarray
-        (3, T) times in seconds, values and their standard deviations, each time by itself.
-    band : np.ndarray | None
-        (3, F) the same of all times together, also between them; None where nothing is known of that.
+        Name of the change with its unit.
+    marks : (3, T) ndarray
+        Times in seconds, values and standard deviations, estimated from each time alone.
+    band : (3, F) ndarray or None
+        Times, values and standard deviations from all times together, also between them; None without a prior.
     """
 
     camera: str
@@ -126,12 +126,12 @@ class Line:
 
 
 def changes_svg(lines: Sequence[Line]) -> str:
-    """Changes over time, camera by camera beside each other, and below them what is of both.
+    """Draw changes over time, cameras side by side, and below them the changes of both together.
 
     Parameters
     ----------
     lines : Sequence[Line]
-        Of every change.
+        All changes.
     """
     with svg.look("measured-series"):
         size, unit = time_unit(lines[0].marks[0])

@@ -1,4 +1,4 @@
-"""What a measurement gave, as numbers, as a table in the terminal and as a report."""
+"""Verdict and report of a measurement."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _name(run: RecoverRun) -> str:
 
 
 def _corrected(run: RecoverRun) -> tuple[int, int, SpotResult | None, str]:
-    """Number of corrected sets of frames, of how many, the one whose correction costs most, and its name."""
+    """Return the number of corrected sets of frames, the number of all, the most costly one and its name."""
     every = [
         (result.channel.name, state_name(run.times, k), spot)
         for result in run.channels
@@ -41,7 +41,7 @@ def _corrected(run: RecoverRun) -> tuple[int, int, SpotResult | None, str]:
 
 
 def _verdict(run: RecoverRun) -> tuple[str, tuple[str, ...]]:
-    """The verdict, and the sentences that follow it."""
+    """Return the verdict and the sentences that follow it."""
     reading = run.last
     found = reading.table.of(reading.judged)
     title = reading.estimators[reading.judged].title
@@ -84,7 +84,7 @@ def _verdict(run: RecoverRun) -> tuple[str, tuple[str, ...]]:
 
 
 def recover_report(run: RecoverRun) -> Report:
-    """Report of the command."""
+    """Return the report of the command."""
     reading = run.last
     verdict, more = _verdict(run)
     facts = [
@@ -124,7 +124,7 @@ def _frames_text(run: RecoverRun) -> str:
 
 
 def _summary(run: RecoverRun) -> Table:
-    """What every estimator reads, with sigma of the judged one."""
+    """Return the table of every estimator's readings, with sigma of the judged estimator."""
     reading = run.last
     heads = ["camera", "change", *(one.title for one in reading.estimators.values()), "σ", "σ of noise", "in σ"]
     rows: list[list[Cell]] = []
@@ -140,7 +140,7 @@ def _summary(run: RecoverRun) -> Table:
 
 
 def _spots(run: RecoverRun) -> Section:
-    """What was found in the frames, the spots, the figures."""
+    """Return the section with artefacts, spot positions and figures."""
     heads = ["channel", "state", "frames", "row [px]", "column [px]", "σ [px]", "found and corrected", "cost in σ [%]"]
     rows: list[list[Cell]] = []
     for i, result in enumerate(run.channels):
@@ -197,7 +197,7 @@ def _of(run: RecoverRun, camera: str) -> list[ChannelResult]:
 
 
 def _estimators(run: RecoverRun) -> Section:
-    """All readings with their sigmas."""
+    """Return the section with all readings and their sigmas."""
     reading = run.last
     heads = ["camera", "change", "unit"]
     for estimator in reading.estimators.values():
@@ -245,7 +245,7 @@ def _series(run: RecoverRun) -> Section:
 
 
 def _drawn(run: RecoverRun) -> list[Line]:
-    """What the figure of a series shows: changes of the cameras and of their angle."""
+    """Return the changes of the cameras and of their angle that the figure of a series shows."""
     assert run.times is not None
     out = []
     every = [reading.table.of(reading.judged) for reading in run.readings]

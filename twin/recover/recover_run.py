@@ -1,4 +1,4 @@
-"""A measurement of a monitor: read, searched for defects, measured, and read by the estimators of the main job."""
+"""Recovery from a monitor's measured frames: read, search for artefacts, locate the spots, estimate the changes."""
 
 from __future__ import annotations
 
@@ -48,22 +48,22 @@ CALIBRATE, READ, MEASURE = "calibrate", "read the frames", "search and measure t
 @shows()
 @dataclass(frozen=True, eq=False)
 class RecoverRun:
-    """What a measurement gave.
+    """Result of a measurement.
 
     Attributes
     ----------
     setup : MeasurementSetup
-        The measurement.
-    readings : tuple[MonitorReading, ...]
-        Of each state after.
-    channels : tuple[ChannelResult, ...]
-        In the order of the spots.
+        Measurement.
+    readings : tuple of MonitorReading
+        Reading of each state after.
+    channels : tuple of ChannelResult
+        Results of the channels, in the order of the spots.
     pitch : float
-        Of the CCDs' pixels, metres.
-    smoothed : SmoothedCourse | None
-        All times of a series read together; None for a single state, and where nothing is stated to move.
-    warnings : tuple[str, ...]
-        What the user should know.
+        Pixel pitch of the CCDs, in metres.
+    smoothed : SmoothedCourse or None
+        Estimate from all times of a series; None for a single state, and without a prior.
+    warnings : tuple of str
+        Warnings to the user.
     """
 
     setup: MeasurementSetup
@@ -75,17 +75,17 @@ class RecoverRun:
 
     @property
     def times(self) -> tuple[float, ...] | None:
-        """Times of the states after, seconds; None for a single state."""
+        """Times of the states after, in seconds; None for a single state."""
         return self.setup.test.times
 
     @property
     def last(self) -> MonitorReading:
-        """The latest state's."""
+        """Reading of the latest state."""
         return self.readings[-1]
 
     @cached_property
     def worst(self) -> tuple[int, Consistency] | None:
-        """The state whose shifts agree least with the prior, and its consistency; None without a prior."""
+        """Index of the state whose shifts agree least with the prior, and its consistency; None without a prior."""
         found = [reading.recovery for reading in self.readings]
         if len(found) == 1:
             return None if self.last.consistency is None else (0, self.last.consistency)
@@ -95,7 +95,7 @@ class RecoverRun:
 
     @property
     def all_warnings(self) -> tuple[str, ...]:
-        """Warnings of the measurement, and what contradicts the prior."""
+        """Warnings of the measurement, and of contradictions of the prior."""
         worst, when, rate = self.worst, "", f"{FALSE_ALARM:g}"
         if worst is None:
             return self.warnings
@@ -110,7 +110,7 @@ class RecoverRun:
 
 @dataclass(frozen=True, eq=False)
 class _Bench:
-    """What is known of the instrument: calibrated cameras, shapes of the spots where they are modelled, what moves."""
+    """Calibration of the instrument: cameras, spot shapes where they are modelled, and the prior on disturbances."""
 
     cameras: Mapping[str, CameraCalibration]
     noise: NoiseModel
@@ -123,7 +123,7 @@ class _Bench:
 
     @property
     def motions(self) -> Mapping[str, MotionModel] | None:
-        """Estimator -> the motions by which it reads; None where no instrument is modelled."""
+        """Estimator -> motions by which it reads; None without a model of the instrument."""
         return None if self.experiment is None else self.experiment.motion_models
 
     def crosstalk(self, recovery: Recovery) -> Mapping[str, CameraCrosstalk]:
@@ -139,25 +139,25 @@ def run_recover(
     advance: Advance = silent,
     experiment: MonitorExperiment | None = None,
 ) -> RecoverRun:
-    """Measure the spots and read what they say.
+    """Measure the spots and estimate the changes.
 
     Parameters
     ----------
     setup : MeasurementSetup
-        The measurement.
+        Measurement.
     backend : Backend
-        Where the instrument is traced.
+        Backend that traces the instrument.
     seed : int
-        Of nothing; nothing is drawn.
+        Not used, since nothing is drawn at random.
     advance : Advance
-        Told what is being done.
-    experiment : MonitorExperiment | None
-        The instrument where it has been built already; results are the same.
+        Called with the progress.
+    experiment : MonitorExperiment or None
+        Instrument if it has been built already; results are the same.
 
     Raises
     ------
     InputError
-        Files that cannot be read, or spots that cannot be measured, by name.
+        Files cannot be read, or spots cannot be measured; each is named.
     """
     advance(CALIBRATE, 0, 1)
     bench = _modelled(setup, backend, experiment) if setup.model is not None else _formulas(setup)
@@ -210,7 +210,7 @@ def _modelled(setup: MeasurementSetup, backend: Backend, experiment: MonitorExpe
 
 
 def _formulas(setup: MeasurementSetup) -> _Bench:
-    """By the geometry alone: Jacobians are those of the corrected formulas."""
+    """Return the calibration by the geometry alone, with the Jacobians of the corrected formulas."""
     cameras = {}
     for name, given in (setup.test.geometry or {}).items():
         geometry = MonitorGeometry(
@@ -234,7 +234,7 @@ def _formulas(setup: MeasurementSetup) -> _Bench:
 def _measured(
     setup: MeasurementSetup, bench: _Bench, channels: Sequence[ChannelFrames], advance: Advance
 ) -> tuple[tuple[ChannelResult, ...], list[Recovery], SmoothedCourse | None]:
-    """All spots, what they say of each state, and of a series together."""
+    """Return the results of all channels, the recovery of each state, and the smoothed series."""
     test = setup.test
     found: list[ChannelMeasurement] = []
     issues: list[Issue] = []
@@ -267,7 +267,7 @@ def _measured(
 def _plain(
     setup: MeasurementSetup, bench: _Bench, calibration: MonitorCalibration, channels: Sequence[ChannelFrames]
 ) -> tuple[list[Recovery], SmoothedCourse | None]:
-    """Recover the states in the same way, and in the same portions, as the main job does."""
+    """Recover clean states in the way, and in the portions, of the main job."""
     states, count = len(channels[0].after), len(channels[0].after[0].frames)
     centroid = setup.test.analysis.centroid
 
@@ -297,7 +297,7 @@ def _plain(
 def _corrected(
     setup: MeasurementSetup, bench: _Bench, found: Sequence[ChannelMeasurement]
 ) -> tuple[list[Recovery], SmoothedCourse | None]:
-    """Recover states whose spots have been measured channel by channel."""
+    """Recover states whose spots were measured channel by channel."""
     calibration = bench.calibration
     if calibration is None:
         template = found[0].shape
@@ -318,7 +318,7 @@ def _corrected(
 
 
 def _smoother(setup: MeasurementSetup, bench: _Bench) -> CourseSmoother | None:
-    """Smoother of a series whose prior has time laws; None for a single state or without a prior."""
+    """Return the smoother of a series whose prior has time laws; None for a single state or without a prior."""
     times = setup.test.times
     if times is None or bench.disturbances is None:
         return None
@@ -327,12 +327,12 @@ def _smoother(setup: MeasurementSetup, bench: _Bench) -> CourseSmoother | None:
 
 
 def _together(each: Sequence[NoiseParts]) -> NoiseParts:
-    """Noise of spots that are each on a CCD of its own."""
+    """Return the joint noise of spots on different CCDs."""
     return NoiseParts(np.concatenate([one.temporal for one in each]), np.concatenate([one.pattern for one in each]))
 
 
 def _joined(positions: Sequence[SpotPositions]) -> SpotPositions:
-    """Spots together, without their maps, which may be of different size."""
+    """Return all spots together, without their maps, which may differ in size."""
     names = ["row", "column", "temporal_covariance", "fixed_covariance", "flux", "background", "converged"]
     names.append("reduced_chi_square")
     values: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in positions]) for name in names}
@@ -340,7 +340,7 @@ def _joined(positions: Sequence[SpotPositions]) -> SpotPositions:
 
 
 def _spot_issues(setup: MeasurementSetup, channels: Sequence[ChannelFrames], error: SpotError) -> list[Issue]:
-    """Issues of spots that are numbered state by state."""
+    """Return issues of spots that are numbered state by state."""
     out = []
     for number, reason in error.reasons.items():
         channel = channels[number % len(channels)]
@@ -352,14 +352,14 @@ def _spot_issues(setup: MeasurementSetup, channels: Sequence[ChannelFrames], err
 
 
 def state_name(times: Sequence[float] | None, number: int) -> str:
-    """How a reader knows a state: of a series by its time.
+    """Return the name of a state for readers; in a series it has the time.
 
     Parameters
     ----------
-    times : Sequence[float] | None
-        Of a series, seconds; None for a single state after.
+    times : Sequence[float] or None
+        Times of a series, in seconds; None for a single state after.
     number : int
-        0 for the nominal state, from 1 on those after it.
+        0 for the nominal state, from 1 for those after it.
     """
     if number == 0:
         return "before"
@@ -372,8 +372,9 @@ def _worst(
     suspect: Callable[[SpotResult], tuple[float, ...] | None],
     first: int = 0,
 ) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """The worst state of each channel with suspect spots: its place, and the numbers that make it suspect. `suspect`
-    gives these numbers, largest for the worst, or None.
+    """Yield the worst state of each channel that has suspect spots: its name, and the numbers that make it suspect.
+
+    ``suspect`` returns these numbers, largest for the worst, or None.
     """
     for result in results:
         judged = (
@@ -387,9 +388,7 @@ def _worst(
 
 
 def _of_readings(readings: Sequence[MonitorReading], times: Sequence[float] | None) -> tuple[str, ...]:
-    """Why sigma does not hold, beside what was found in the frames, and what was worked out anew; of a series the
-    first state of each.
-    """
+    """Return doubts and notes of the readings that the frames did not give yet; for a series the first state of each."""
     told: dict[str, list[str]] = {}
     for k, reading in enumerate(readings):
         for text in (*reading.doubts, *reading.notes):
@@ -401,8 +400,9 @@ def _of_readings(readings: Sequence[MonitorReading], times: Sequence[float] | No
 
 
 def _unlike(results: Sequence[ChannelResult], times: Sequence[float] | None, first: int = 0) -> tuple[str, ...]:
-    """Spots whose core is not as calibrated; of a series the worst of each channel; `first` is the number of the first
-    state after that there is.
+    """Return warnings of spots whose core does not have the calibrated shape, for a series the worst of each channel.
+
+    ``first`` is the index of the first state after in the results.
     """
     return tuple(
         f"{where}: the spot does not have the calibrated shape, reduced chi-square of its"
@@ -413,9 +413,7 @@ def _unlike(results: Sequence[ChannelResult], times: Sequence[float] | None, fir
 
 
 def _coarse(channels: Sequence[ChannelFrames], setup: MeasurementSetup) -> tuple[str, ...]:
-    """Warnings of CCDs whose noise, from the data sheet or measured, is too small for the steps of their grey
-    values.
-    """
+    """Return warnings of CCDs whose noise, specified or measured, is too small for the steps of their grey values."""
     if setup.test.photon_transfer == "stated":
         return told_of_steps(channels[0].raw_noise, f"area CCD {setup.detector.name}")
     whose = f"area CCD {setup.detector.name}, as measured,"
@@ -423,7 +421,7 @@ def _coarse(channels: Sequence[ChannelFrames], setup: MeasurementSetup) -> tuple
 
 
 def _why(ratio: float) -> str:
-    """What may be the cause of another noise than stated, and what becomes of it."""
+    """Return possible causes of noise other than specified, and its consequences, as text."""
     if ratio > 1.0:
         return (
             "another gain or read-out, or interference; σ of noise and the search for defects take what is more for"
@@ -438,7 +436,10 @@ def _why(ratio: float) -> str:
 def _noisy(
     results: Sequence[ChannelResult], times: Sequence[float] | None, source: str, first: int = 0
 ) -> tuple[str, ...]:
-    """Frames that have another noise than is stated; of a series the worst of each channel; `first` as there."""
+    """Return warnings of frames with noise other than specified, for a series the worst of each channel.
+
+    ``first`` is the index of the first state after in the results.
+    """
 
     def apart(spot: SpotResult) -> tuple[float, ...] | None:
         return None if spot.noise_ratio is None else (abs(math.log(spot.noise_ratio)), spot.noise_ratio)
@@ -451,9 +452,7 @@ def _noisy(
 
 
 def recover_numbers(run: RecoverRun) -> dict[str, Any]:
-    """Contents of recovered.json: as the main job's, of the last state; then what was found in the frames, and of a
-    series all states.
-    """
+    """Return the contents of recovered.json: the main job's keys for the last state, the artefacts, and all states."""
     out: dict[str, Any] = {**stated(run.last.recovered_dict())}
     out["warnings"] = list(run.all_warnings)
     out["channels"] = {

@@ -1,4 +1,4 @@
-"""``python -m twin.uncertainty``: what limits an instrument's monitor."""
+"""Command ``python -m twin.uncertainty``: what limits the readings of an instrument's monitor."""
 
 from __future__ import annotations
 
@@ -48,10 +48,11 @@ def main(
         ),
     ] = 0,
 ) -> None:
-    """Say what limits the readings of an instrument's monitor under its stated disturbances: standard deviations of
-    every parameter, the intersection angle and points on the ground before and after a measurement, by every estimator;
-    whose motions make up what is left; which motions the spots see least; and what more frames, a test field or a
-    second monitor would take away.
+    """Analyse what limits the readings of an instrument's monitor under its prior on disturbances.
+
+    The report has standard deviations of every parameter, the intersection angle and points on the ground before and
+    after a measurement, for every estimator; the motions that make up the remaining variance; the motions that the
+    spots observe least; and the effect of more frames, a test field or a second monitor.
 
         python -m twin.uncertainty gf7_pair
 
@@ -59,8 +60,8 @@ def main(
 
         python -m twin.uncertainty monitor_pair --states 500
 
-    With --states that many states are drawn from the disturbances, rendered, exposed and recovered (about 0.1 s each),
-    and the share of intervals of 68 and 95 % that hold the truth is compared with what chance allows.
+    With --states, that many states are drawn from the prior, rendered, exposed and recovered (about 0.1 s each), and
+    the share of 68 and 95 % intervals that contain the truth is compared with what chance allows.
 
     The run folder gets report.html, uncertainty.json, config.yaml, and figures and tables in artefacts/.
 

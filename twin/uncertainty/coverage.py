@@ -1,5 +1,6 @@
-"""What the command `python -m twin.uncertainty` works out: what limits a monitor, and whether the stated sigmas hold in
-random states of the stated disturbances, which are rendered, exposed, recovered and compared with the truth.
+"""Computation of ``python -m twin.uncertainty``: limits of a monitor, and coverage of its sigmas in random states.
+
+Random states are drawn from the prior on disturbances, rendered, exposed, recovered and compared with the truth.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ from twin.sensors.area_detector import coarse_warnings
 from twin.uncertainty.monitor_limits import MonitorLimits, expected_covariance, find_limits, unseen_texts
 
 LEVELS = (0.68, 0.95)
-"""Levels of the intervals whose coverage is counted."""
+"""Confidence levels of the intervals whose coverage is counted."""
 HALF_WIDTHS = tuple(float(np.sqrt(2.0 * gammaincinv(0.5, level))) for level in LEVELS)
-"""Half widths of the intervals in standard deviations of a normal error."""
+"""Half-widths of the intervals, in standard deviations of a normal error."""
 FALSE = 1e-2
-"""Chance that any of all counts falls out of its limits though every sigma is right."""
+"""Probability that any of all counts is outside its limits although every sigma is right."""
 CHUNK, _PIXELS = 32, 10_000_000
 """States, and pixels of their images, that are rendered at once, some 2 GB; the numbers do not depend on it."""
 STATES = "random states"
@@ -44,30 +45,31 @@ _DRAWN, _DETECTOR, _BEFORE, _AFTER = 9, 10, 11, 12
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """N measured states.
+    """Errors and sigmas of N measured random states, with the coverage of their intervals.
 
     Attributes
     ----------
-    quantities : tuple[Quantity, ...]
-        Q of them.
+    quantities : tuple of Quantity
+        The Q quantities.
     drawn : int
-        How many states were drawn; those in which a spot leaves its CCD, or comes too near its edge, are not measured.
-    truth : np.ndarray
-        (N, Q).
-    errors : Mapping[str, np.ndarray]
-        Estimator -> (N, Q) reading minus truth.
-    sigmas : Mapping[str, np.ndarray]
-        Estimator -> (N, Q) total standard deviations.
-    expected : Mapping[str, np.ndarray]
-        Estimator -> (levels, Q) share of intervals that should hold the truth: the levels themselves where all states
-        are measured. The measured ones of others move the spots less than is stated, which makes errors that go with
-        the spots smaller; of the posterior none do.
-    chi_square : np.ndarray
-        (N,) predictive chi-square of the shifts.
+        Number of states that were drawn; those in which a spot leaves its CCD, or is too near its edge, are not
+        measured.
+    truth : (N, Q) ndarray
+        True values.
+    errors : Mapping[str, (N, Q) ndarray]
+        Estimator -> reading minus truth.
+    sigmas : Mapping[str, (N, Q) ndarray]
+        Estimator -> total standard deviations.
+    expected : Mapping[str, (levels, Q) ndarray]
+        Estimator -> expected share of intervals that contain the truth: the levels themselves where all states are
+        measured. Otherwise the measured states move the spots less than the prior says, which reduces errors that are
+        correlated with the spots; errors of the posterior are not.
+    chi_square : (N,) ndarray
+        Predictive chi-square of the shifts.
     alarms : int
-        In how many states it was beyond its limit.
+        Number of states whose chi-square exceeds its limit.
     doubted : int
-        In how many the spots were not as calibrated, or the readings not linear and not worked out anew.
+        Number of states in which spots differ from their calibration, or readings are not linear and not relinearised.
     """
 
     quantities: tuple[Quantity, ...]
@@ -82,44 +84,46 @@ class Coverage:
 
     @property
     def measured(self) -> int:
-        """N."""
+        """Number N of measured states."""
         return len(self.truth)
 
     def rms(self, estimator: str) -> np.ndarray:
-        """(Q,) of the errors."""
+        """Return the (Q,) RMS errors."""
         return np.asarray(np.sqrt(np.mean(self.errors[estimator] ** 2, axis=0)))
 
     def ratio(self, estimator: str) -> np.ndarray:
-        """(Q,) rms of error over sigma; 1 where the sigmas are right."""
+        """Return the (Q,) RMS of error over sigma; 1 where the sigmas are right."""
         return np.asarray(np.sqrt(np.mean((self.errors[estimator] / self.sigmas[estimator]) ** 2, axis=0)))
 
     def held(self, estimator: str, level: int) -> np.ndarray:
-        """(Q,) number of states whose interval holds the truth.
+        """Return the (Q,) number of states whose interval contains the truth.
 
         Parameters
         ----------
         estimator : str
-            Its name.
+            Name of the estimator.
         level : int
-            Number in ``LEVELS``.
+            Index in ``LEVELS``.
         """
         inside = np.abs(self.errors[estimator]) <= HALF_WIDTHS[level] * self.sigmas[estimator]
         return np.asarray(np.sum(inside, axis=0))
 
     @property
     def counts(self) -> int:
-        """How many coverages there are."""
+        """Number of counts of coverage."""
         return len(self.errors) * len(self.quantities) * len(LEVELS)
 
     def limits(self, estimator: str, level: int) -> np.ndarray:
-        """(2, Q) smallest and largest count that agree with what is expected, ``FALSE`` for all counts together.
+        """Return the (2, Q) smallest and largest counts that agree with the expected coverage.
+
+        The probability that any count is outside by chance is ``FALSE`` for all counts together.
 
         Parameters
         ----------
         estimator : str
-            Its name.
+            Name of the estimator.
         level : int
-            Number in ``LEVELS``.
+            Index in ``LEVELS``.
         """
         from scipy.stats import binom  # takes long, and only a report of random states needs it
 
@@ -128,19 +132,19 @@ class Coverage:
 
     @property
     def alarm_limit(self) -> int:
-        """Largest number of alarms that agrees with their false-alarm rate, at a chance of ``FALSE``."""
+        """Largest number of alarms that agrees with their false-alarm rate; it is exceeded with probability ``FALSE``."""
         from scipy.stats import binom
 
         return int(binom.ppf(1.0 - FALSE, self.measured, FALSE_ALARM))
 
     @property
     def sigma_holds(self) -> bool:
-        """Return whether no count is beyond its limits and sigma is doubted in no state."""
+        """True if no count is outside its limits and sigma is doubted in no state."""
         return not self.outliers and self.alarms <= self.alarm_limit and not self.doubted
 
     @property
     def outliers(self) -> tuple[tuple[str, str, str, float, int], ...]:
-        """Estimator, group and key of a quantity, level and count of all counts beyond their limits."""
+        """Counts outside their limits: estimator, group and key of the quantity, level, and count of each."""
         out = []
         for name in self.errors:
             for k, level in enumerate(LEVELS):
@@ -159,22 +163,24 @@ def run_states(
     seed: int,
     advance: Advance = silent,
 ) -> Coverage:
-    """Draw, render, expose and recover states; every state has detectors and a nominal measurement of its own.
+    """Draw, render, expose and recover random states.
+
+    Every state has its detectors and its nominal measurement.
 
     Parameters
     ----------
     experiment : MonitorExperiment
-        The instrument, with stated disturbances.
-    quantities : tuple[Quantity, ...]
-        Whose errors are wanted.
+        Instrument, with a prior on disturbances.
+    quantities : tuple of Quantity
+        Quantities whose errors are computed.
     count : int
-        How many states are drawn.
+        Number of states to draw.
     frames : int
-        Of each measurement.
+        Number of frames of each measurement.
     seed : int
-        Of all that is drawn.
+        Seed of all random numbers.
     advance : Advance
-        Told how many states are done.
+        Called with the number of states done.
     """
     stated, disturbances = experiment.stated, experiment.disturbances
     assert stated is not None
@@ -241,8 +247,10 @@ def run_states(
 def _exposed(
     experiment: MonitorExperiment, photons: np.ndarray, frames: int, seed: int, numbers: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Frames of the nominal state and of states of these numbers, (S, C, frames, rows, columns), each pair by detectors
-    of its own: with one detector for all, what its pattern does to the nominal spots would be the same error in all.
+    """Return frames of the nominal state and of numbered states, each (S, C, frames, rows, columns).
+
+    Each pair has detectors of its own: with one detector for all, the effect of its pattern on the nominal spots would
+    be the same error in all states.
     """
     detector, channels = experiment.detector, len(experiment.path.channels)
     before = np.empty((*photons.shape[:2], frames, *photons.shape[2:]), np.uint16)
@@ -261,8 +269,10 @@ def _exposed(
 
 
 def _chances(found: Recovery, experiment: MonitorExperiment, quantities: tuple[Quantity, ...]) -> dict[str, np.ndarray]:
-    """Estimator -> (levels, N, Q) chance that an interval holds the truth, given the shifts: against the posterior,
-    whose errors do not go with them, the reading is off by (gain - posterior's gain) times the shifts.
+    """Return estimator -> (levels, N, Q) probability that an interval contains the truth, given the shifts.
+
+    Errors of the posterior are independent of the shifts; relative to it, a reading is off by (gain - posterior's gain)
+    times the shifts.
     """
     stated, noise = experiment.disturbances, found.shift_covariance
     assert stated is not None
@@ -282,27 +292,27 @@ def _chances(found: Recovery, experiment: MonitorExperiment, quantities: tuple[Q
 
 
 _SPREAD = "what is stated to move"
-"""A part of the work."""
+"""Progress label of the analysis of the prior."""
 
 
 @dataclass(frozen=True, eq=False)
 class UncertaintyRun:
-    """What was found.
+    """Result of the command.
 
     Attributes
     ----------
     resolved : ResolvedJob
-        The job with everything it names.
+        Job with everything it names.
     limits : MonitorLimits
-        Of its instrument under its disturbances.
+        Limits of its instrument under its prior on disturbances.
     seed : int
-        Of the random states.
-    coverage : Coverage | None
-        Of the random states, None if none were asked for.
-    warnings : tuple[str, ...]
-        Blurred cameras, coarse grey values, and stated motions that no spot sees.
+        Seed of the random states.
+    coverage : Coverage or None
+        Coverage in the random states, None if none were asked for.
+    warnings : tuple of str
+        Warnings of blurred cameras, coarse grey values, and motions of the prior that no spot shows.
     images : ImageChecks
-        What the checks of its images found.
+        Checks of its images.
     """
 
     resolved: ResolvedJob
@@ -316,25 +326,25 @@ class UncertaintyRun:
 def run_uncertainty(
     resolved: ResolvedJob, backend: Backend, seed: int = 0, advance: Advance = silent, states: int = 0
 ) -> UncertaintyRun:
-    """Work out what limits the readings of a job's instrument; what the job does to it is not looked at.
+    """Analyse what limits the readings of a job's instrument; the job's perturbation is ignored.
 
     Parameters
     ----------
     resolved : ResolvedJob
-        The job.
+        Job that names the instrument and the prior.
     backend : Backend
-        Where to trace.
+        Backend that traces rays.
     seed : int
-        Of the random states.
+        Seed of the random states.
     advance : Advance
-        Told what is being done.
+        Called with the progress.
     states : int
-        How many random states are drawn, rendered and recovered.
+        Number of random states to draw, render and recover.
 
     Raises
     ------
     InputError
-        Nothing is stated to move, or what is stated cannot be.
+        There is no prior on disturbances, or its disturbances are not possible.
     """
     if resolved.disturbances is None:
         raise InputError(

@@ -1,4 +1,4 @@
-"""What limits the readings of an instrument under its stated disturbances, what would help, and how reports say it."""
+"""Limits of a monitor's readings under a prior on disturbances, the benefit of further measurements, and texts on them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from scenes.models.disturbances import states_of
 from scenes.models.instrument_model import MisplacedError
 from scenes.specs.instrument import BASE
 from scenes.yaml.errors import InputError
-from twin.framework.artefact import shown_unit, significant
+from twin.framework.artefact import significant, unit_for_reports
 from twin.monitor.crosstalk import estimator_gains
 from twin.monitor.monitor_derivative import disturbances_of
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -37,37 +37,40 @@ from twin.monitor.observation import LOST, Observing, observe
 from twin.monitor.truth import half_fields
 
 BEST = "posterior"
-"""The estimator of the least variance: what it leaves only another measurement takes away."""
+"""Estimator of the least variance: only another measurement reduces the error that it leaves."""
 LINES = 10
-"""Motions that are named, the rest is summed."""
+"""Number of motions that are listed; the others are summed."""
 FIELD = 0.1 * ARCSEC
-"""Standard deviation with which a test field fixes a direction of a camera: a quarter of a metre on the ground from
-500 km, what control points of that accuracy give."""
+"""Standard deviation, in radians, with which a test field fixes a direction of a camera.
+
+It is a quarter of a metre on the ground from 500 km, the result of control points of that accuracy.
+"""
 DAY = 86400.0
 _MORE_FRAMES = 4
 _UNMOVED = 1e-8
-"""Standard deviation before any measurement, arcsec, um or m, up to which a quantity is taken as one that nothing
-stated changes: what rounding makes of a trace is 1e-10."""
+"""Standard deviation before any measurement, in arcsec, um or m, up to which a quantity counts as unchanged by the
+prior.
+
+Rounding errors of a trace are 1e-10.
+"""
 _DRAWS = 100_000
 _STATES = 6
 _PIXELS = 1 << 21  # of the images of these states that are worked on at once
-"""States over which the covariance of a shift is averaged, and pixels of their images that are processed at once. The
-covariance varies by some per cent between states.
-"""
+"""Number of pixels of the images of these states that are processed at once."""
 
 
 @dataclass(frozen=True, eq=False)
 class Remedy:
-    """Something that could be done.
+    """Further measurement that would improve the readings.
 
     Attributes
     ----------
     name : str
-        Short, small letters and _.
+        Short name in lower case with underscores.
     what : str
-        In words.
-    sigma : np.ndarray
-        (Q,) standard deviations of the posterior that it would leave.
+        Description.
+    sigma : (Q,) ndarray
+        Standard deviations of the posterior that it would leave.
     """
 
     name: str
@@ -77,30 +80,30 @@ class Remedy:
 
 @dataclass(frozen=True, eq=False)
 class MonitorLimits:
-    """What limits an instrument's readings.
+    """Analysis of what limits an instrument's readings.
 
     Attributes
     ----------
     instrument : str
-        Its name.
+        Name of the instrument.
     stated : Disturbances
-        What moves.
-    quantities : tuple[Quantity, ...]
-        Q of them.
-    noise : np.ndarray
-        (D, D) of the shifts of the spots, px^2.
+        Prior on the disturbances.
+    quantities : tuple of Quantity
+        The Q quantities.
+    noise : (D, D) ndarray
+        Noise covariance of the spot shifts, px^2.
     frames : int
-        Of each state.
+        Number of frames of each state.
     splits : Mapping[str, Split]
-        Estimator -> the variances of all quantities.
-    least_seen : tuple[LeastSeen, ...]
-        Of every quantity.
-    remedies : tuple[Remedy, ...]
-        What would help.
+        Estimator -> variances of all quantities by motion.
+    least_seen : tuple of LeastObservable
+        Least observable combination of motions for every quantity.
+    remedies : tuple of Remedy
+        Further measurements.
     outside : float
-        Chance that a spot leaves its CCD, or comes too near its edge, so that nothing is measured.
+        Probability that a spot leaves its CCD, or is too near its edge, so that nothing is measured.
     without : str
-        Why there is no remedy by a second monitor; empty where there is one, or nobody asked.
+        Reason why there is no result for a second monitor; empty where there is one, or none was asked for.
     """
 
     instrument: str
@@ -116,18 +119,19 @@ class MonitorLimits:
 
     @cached_property
     def rows(self) -> np.ndarray:
-        """(Q, 4 K) of the quantities."""
+        """Rows that form the quantities from the cameras' parameters, (Q, 4 K)."""
         return np.stack([quantity.row for quantity in self.quantities])
 
     def lines(self, estimator: str, quantity: int) -> list[tuple[str, float]]:
-        """Label and share of the variance of an estimate's error, largest first, noise apart.
+        """Return label and share of each motion in the variance of an estimate's error, largest first, without the
+        noise.
 
         Parameters
         ----------
         estimator : str
-            Its name, or empty for the variance before a measurement.
+            Name of the estimator, or empty for the variance before a measurement.
         quantity : int
-            Its number.
+            Index of the quantity.
         """
         split = self.splits[estimator or BEST]
         total = (split.sigma if estimator else split.sigma_before)[quantity] ** 2
@@ -136,28 +140,28 @@ class MonitorLimits:
 
     @cached_property
     def _by_label(self) -> Mapping[str, dict[str, np.ndarray]]:
-        """Estimator, or empty for before a measurement -> label -> (Q,) its share of the variances."""
+        """Estimator, or empty for before a measurement -> label -> (Q,) contribution to the variances."""
         shares = {"": self.splits[BEST].before, **{name: split.after for name, split in self.splits.items()}}
         return {name: Split.by(share, self.stated.labels) for name, share in shares.items()}
 
     @cached_property
     def gain(self) -> np.ndarray:
-        """(4 K, D) of the posterior."""
+        """Gain of the posterior, (4 K, D)."""
         return self.stated.best_gain(self.noise)
 
     @cached_property
     def elasticities(self) -> tuple[Elasticity, ...]:
-        """How every quantity's sigma follows each stated number."""
+        """Sensitivity of every quantity's sigma to each number of the prior."""
         return elasticities(self.rows, self.stated, self.noise, self.gain)
 
     @cached_property
     def heavy_tail(self) -> HeavyTail:
-        """What a statement with heavy tails would leave."""
+        """Errors of the posterior under a prior with heavy tails."""
         return heavy_tails(self.rows, self.stated, self.noise, self.gain)
 
     @cached_property
     def from_statement(self) -> np.ndarray:
-        """(Q,) shares of the posterior's variances that no spot constrains, however little noise it has."""
+        """Shares of the posterior's variances that remain without image noise and so rest on the prior, (Q,)."""
         left, alone = (
             limits.posterior_sigma(self.rows, self.stated, noise) for noise in (self.noise, 0.0 * self.noise)
         )
@@ -165,7 +169,7 @@ class MonitorLimits:
 
     @cached_property
     def known(self) -> Mapping[str, np.ndarray]:
-        """Label -> (Q,) what would be left if that motion were known, of all that the posterior's first lines name."""
+        """Label -> (Q,) sigmas if that motion were known, for the motions listed first under the posterior."""
         names = {name for q in range(len(self.quantities)) for name, _ in self.lines(BEST, q)[:LINES]}
         # in the order of the statement: a set has none
         labels = [label for label in dict.fromkeys(self.stated.labels) if label in names]
@@ -174,17 +178,18 @@ class MonitorLimits:
 
 
 def expected_covariance(experiment: MonitorExperiment, frames: int) -> np.ndarray:
-    """(D, D) px^2 of the shifts between two measurements of so many frames each, without drawing any noise.
+    """Return the expected (D, D) noise covariance, in px^2, of the shifts between two measurements, without random
+    draws.
 
-    The pattern of the pixels' response cancels where a spot stays on its pixels. It is therefore worked out for some
-    states of the stated disturbances, and the mean is taken; for none where their spots leave the CCDs.
+    The pattern of the pixels' response cancels where a spot stays on its pixels. It is therefore computed for some
+    states of the prior and averaged; where their spots leave the CCDs, no such state is used.
 
     Parameters
     ----------
     experiment : MonitorExperiment
-        The instrument.
+        Instrument.
     frames : int
-        Of each.
+        Number of frames of each measurement.
     """
     centroid, calibration = experiment.resolved.job.analysis.centroid, experiment.calibration
     nominal = experiment.expected_frames(experiment.nominal_photons)
@@ -209,24 +214,23 @@ def expected_covariance(experiment: MonitorExperiment, frames: int) -> np.ndarra
 def find_limits(
     experiment: MonitorExperiment, noise: np.ndarray, frames: int, second_monitor: bool = False
 ) -> MonitorLimits | None:
-    """What limits the readings of all quantities that what is stated changes; None where nothing is stated to move, or
-    nothing that changes a camera.
+    """Return what limits the readings of all quantities that the prior changes; None if it changes no camera.
 
     Parameters
     ----------
     experiment : MonitorExperiment
-        The instrument.
-    noise : np.ndarray
-        (D, D) of the shifts, px^2.
+        Instrument.
+    noise : (D, D) ndarray
+        Noise covariance of the shifts, px^2.
     frames : int
-        Of each state.
+        Number of frames of each state.
     second_monitor : bool
-        Whether a second one is built to say what it would give; it takes a second or two.
+        Also build a second monitor to compute its benefit, which takes a second or two.
 
     Raises
     ------
     InputError
-        What is stated cannot be.
+        The disturbances of the prior are not possible.
     """
     stated = experiment.disturbances
     if stated is None:
@@ -275,12 +279,14 @@ def _left(rows: np.ndarray, stated: Disturbances, noise: np.ndarray) -> np.ndarr
 
 
 def _own(stated: Disturbances) -> list[bool]:
-    """Whether a second monitor has a body of its own: its prisms; cameras and central prism are the same."""
+    """Return for each motion True if a second monitor has its own body: prisms are doubled, cameras and central prism
+    shared.
+    """
     return ["/monitor/" in body for body in stated.bodies]
 
 
 def _second_monitor(experiment: MonitorExperiment) -> Disturbances:
-    """Disturbances of a second monitor for the same motions, with its sub-aperture on the other side of every pupil."""
+    """Return the disturbances of a second monitor for the same motions, mirrored to the other side of every pupil."""
     resolved = experiment.resolved
     mirrored = {name: mounted.mirrored for name, mounted in resolved.instrument.cameras.items()}
     instrument = resolved.instrument.model_copy(update={"cameras": mirrored})
@@ -290,7 +296,7 @@ def _second_monitor(experiment: MonitorExperiment) -> Disturbances:
 
 
 def _outside(experiment: MonitorExperiment, stated: Disturbances, noise: np.ndarray) -> float:
-    """Chance that a spot is beyond its CCD, or too near its edge; from draws of the shifts, always the same ones."""
+    """Return the probability that a spot is beyond its CCD or too near its edge, from a fixed set of random shifts."""
     half = 0.5 * (np.array(experiment.path.shape) - 1) - EDGE_PX
     middle = experiment.path.coarse_trace([{}]).place[:, 0]
     root = np.linalg.cholesky(stated.spot_covariance + noise)
@@ -300,12 +306,12 @@ def _outside(experiment: MonitorExperiment, stated: Disturbances, noise: np.ndar
 
 
 def quantity_text(quantity: Quantity) -> str:
-    """With its unit: ``forward Δα [arcsec]``."""
+    """Return the name of a quantity with its unit: ``forward Δα [arcsec]``."""
     return f"{short_text(quantity)} [{unit_text(quantity)}]"
 
 
 def short_text(quantity: Quantity) -> str:
-    """Without its unit: ``forward Δα``, ``intersection angle``, ``height``."""
+    """Return the name of a quantity without its unit: ``forward Δα``, ``intersection angle``, ``height``."""
     name = quantity.parameter.symbol
     if quantity.group == ANGLE_GROUP:
         return "intersection angle"
@@ -315,25 +321,25 @@ def short_text(quantity: Quantity) -> str:
 
 
 def unit_text(quantity: Quantity) -> str:
-    """Unit of a quantity."""
+    """Return the unit of a quantity."""
     return quantity.parameter.unit
 
 
 def unseen_texts(
     stated: Disturbances, noise: np.ndarray, quantities: Sequence[Quantity], gain: np.ndarray
 ) -> tuple[str, ...]:
-    """A warning for each stated body whose motions have next to no derivative in the spots and yet make sigma.
+    """Return a warning for each body whose motions in the prior hardly move the spots but contribute to sigma.
 
     Parameters
     ----------
     stated : Disturbances
-        What moves.
-    noise : np.ndarray
-        (D, D) of the shifts, px^2.
+        Prior on the disturbances.
+    noise : (D, D) ndarray
+        Noise covariance of the shifts, px^2.
     quantities : Sequence[Quantity]
-        Q of them.
-    gain : np.ndarray
-        (4 K, D) of the estimator that is judged by.
+        The Q quantities.
+    gain : (4 K, D) ndarray
+        Gain of the judged estimator.
     """
     rows = np.stack([quantity.row for quantity in quantities])
     out = []
@@ -348,12 +354,12 @@ def unseen_texts(
 
 
 def body_text(body: str) -> str:
-    """A body, or a motion of it, without the base that all stand on."""
+    """Return the name of a body, or of its motion, without the base."""
     return body.removeprefix(f"{BASE}/")
 
 
 def part_of(body: str) -> str:
-    """What a body is, whichever camera's it is: ``M2``, ``prism_180``, ``camera``, ``central_prism``."""
+    """Return the kind of a body, whichever camera it belongs to: ``M2``, ``prism_180``, ``camera``, ``central_prism``."""
     below = body.split("/")[1:]
     if not below:
         return "base"
@@ -363,22 +369,22 @@ def part_of(body: str) -> str:
 
 
 def combination_text(limits: MonitorLimits, number: int, most: int = 4) -> str:
-    """The motions that hide best, in words.
+    """Return the least observable combination of motions for a quantity, as text.
 
     Parameters
     ----------
     limits : MonitorLimits
-        Of an instrument.
+        Limits of an instrument.
     number : int
-        Of the quantity.
+        Index of the quantity.
     most : int
-        Motions that are named.
+        Largest number of motions to name.
     """
     seen, quantity, stated = limits.least_seen[number], limits.quantities[number], limits.stated
     order = sorted(range(len(seen.amounts)), key=lambda k: -abs(seen.amounts[k]))[:most]
     named = [
         f"{body_text(stated.labels[k])} {significant(seen.amounts[k] * stated.sigmas[k], 2, sign=True)} "
-        f"{shown_unit(stated.units[k])}"
+        f"{unit_for_reports(stated.units[k])}"
         for k in order
         if seen.amounts[k]
     ]
@@ -387,6 +393,6 @@ def combination_text(limits: MonitorLimits, number: int, most: int = 4) -> str:
 
 
 def _moved(seen: LeastObservable) -> str:
-    """How far spots move with a combination, beside their noise."""
+    """Return how far a combination moves the spots, and their noise, as text."""
     moved, noise = float(abs(seen.spots).max()), float(seen.noise.max())
     return f"{moved:.1g} px (noise {noise:.1g} px)"

@@ -1,4 +1,4 @@
-"""Numbers of what limits the readings, as uncertainty.json has them."""
+"""Records of the contents of uncertainty.json."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from twin.uncertainty.coverage import FALSE, Coverage, UncertaintyRun
 from twin.uncertainty.monitor_limits import BEST, LINES, MonitorLimits, Remedy
 
 SEEN = 8
-"""Motions that are named of a combination."""
+"""Number of motions that are listed for a combination."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Limited:
-    """One quantity of an instrument: before the measurement, or as an estimator leaves it."""
+    """Limits of one quantity before the measurement, or after it by an estimator."""
 
     limits: MonitorLimits
     q: int
@@ -50,7 +50,7 @@ class _Limited:
 
     @property
     def motions(self) -> list[tuple[str, float, str]]:
-        """Label, amount and unit of the motions that hide best."""
+        """Label, amount and unit of the motions in the least observable combination."""
         amounts, stated = self.limits.least_seen[self.q].amounts, self.limits.stated
         order = np.argsort(-np.abs(amounts), kind="stable")[:SEEN]
         return [(stated.labels[k], float(amounts[k] * stated.sigmas[k]), stated.units[k]) for k in order]
@@ -60,7 +60,7 @@ class _Limited:
 
     @property
     def followed(self) -> list[tuple[Elasticity, int]]:
-        """The stated numbers that make most of the variance, with the quantity's number."""
+        """Numbers of the prior with the largest elasticities, each with the quantity's index."""
         found = sorted(self.limits.elasticities, key=lambda one: -float(one.elasticity[self.q]))[:LINES]
         return [(one, self.q) for one in found]
 
@@ -163,7 +163,7 @@ LIMITS: Record[MonitorLimits] = Record(
 
 @dataclass(frozen=True, eq=False)
 class _Counted:
-    """One quantity as an estimator reads it in random states."""
+    """Errors of one quantity by one estimator in random states."""
 
     coverage: Coverage
     q: int
@@ -228,14 +228,14 @@ STATES: Record[Coverage] = Record(
 def _by_quantity(
     quantities: Sequence[limits.Quantity], values: Sequence[Any] | np.ndarray
 ) -> dict[str, dict[str, Any]]:
-    """Group -> key -> value.
+    """Return values by quantity, as group -> key -> value.
 
     Parameters
     ----------
     quantities : Sequence[limits.Quantity]
-        Q of them.
-    values : Sequence[Any] | np.ndarray
-        Q of them.
+        The Q quantities.
+    values : sequence
+        The Q values.
     """
     out: dict[str, dict[str, Any]] = {}
     for quantity, value in zip(quantities, values, strict=True):
@@ -244,12 +244,13 @@ def _by_quantity(
 
 
 def uncertainty_numbers(run: UncertaintyRun) -> dict[str, Any]:
-    """Contents of uncertainty.json of the command: those of the main job's, and ``states``, what random states gave.
+    """Return the contents of uncertainty.json: the numbers of the main job's file, and ``states`` with the random
+    states.
 
     Parameters
     ----------
     run : UncertaintyRun
-        Of the command.
+        Run of the command.
     """
     out = LIMITS(run.limits)
     if run.coverage is not None:

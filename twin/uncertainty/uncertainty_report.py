@@ -1,4 +1,4 @@
-"""The report of what limits a monitor's readings with its figure, and the section of it in the main job's report."""
+"""Report of what limits a monitor's readings, with its figure, and the section on it in the main job's report."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Split
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from twin.framework import svg
-from twin.framework.artefact import Cell, SvgFigure, Table, shown_unit, significant
+from twin.framework.artefact import Cell, SvgFigure, Table, significant, unit_for_reports
 from twin.framework.provenance import checks_in
 from twin.framework.report import Report, Section, answer, sentence
 from twin.uncertainty.coverage import FALSE, HALF_WIDTHS, LEVELS, Coverage, UncertaintyRun
@@ -35,26 +35,26 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FEW = 3
-"""Motions that are named of each quantity where the rest of a report is about something else."""
+"""Number of motions listed for each quantity in a report with another main subject."""
 RARE = 1e-3
-"""Chance that a spot leaves its CCD of which a reader need not know."""
+"""Probability that a spot leaves its CCD below which it is not reported."""
 
 
 def limits_section(
     limits: MonitorLimits | None, lines: int = FEW, folded: int = 3, figure: str | None = None
 ) -> Section:
-    """What limits the readings: the figure and the tables.
+    """Return the section on what limits the readings, with figure and tables.
 
     Parameters
     ----------
-    limits : MonitorLimits | None
-        Of the instrument, None where nothing is stated to move.
+    limits : MonitorLimits or None
+        Limits of the instrument, None without a prior.
     lines : int
-        Motions that are named of each quantity.
+        Number of motions listed for each quantity.
     folded : int
-        How many of its three tables a reader has to ask for.
-    figure : str | None
-        As of ``limits_svg`` where it has been drawn already.
+        Number of its tables that are folded.
+    figure : str or None
+        Result of ``limits_svg`` where it has been drawn already.
     """
     title = "What limits the readings"
     if limits is None:
@@ -80,7 +80,7 @@ def limits_section(
 
 
 def uncertainty_report(run: UncertaintyRun) -> Report:
-    """Report of the command."""
+    """Return the report of the command."""
     limits, coverage = run.limits, run.coverage
     sections = [limits_section(limits, LINES, 0), _statement(limits), _before(limits)]
     if coverage is not None:
@@ -124,7 +124,7 @@ def uncertainty_report(run: UncertaintyRun) -> Report:
 
 
 def _headline(limits: MonitorLimits) -> int:
-    """Number of the quantity that an answer begins with: height, else the angle, else the first parameter."""
+    """Return the index of the main quantity: the height, else the angle, else the first parameter."""
     keys = [(q.group, q.key) for q in limits.quantities]
     for wanted in ((GROUND_GROUP, "height_m"), (ANGLE_GROUP, "change_arcsec")):
         if wanted in keys:
@@ -133,7 +133,7 @@ def _headline(limits: MonitorLimits) -> int:
 
 
 def _verdict(limits: MonitorLimits) -> tuple[str, ...]:
-    """Statements: what is left of the headline quantity, what makes it up, and what would help most."""
+    """Return sentences on the main quantity: remaining sigma, what causes it, and what would reduce it most."""
     q = _headline(limits)
     quantity, split = limits.quantities[q], limits.splits[BEST]
     unit, name = unit_text(quantity), short_text(quantity)
@@ -165,7 +165,7 @@ def _lost(limits: MonitorLimits) -> str:
 
 
 def _sigmas(limits: MonitorLimits) -> Table:
-    """Standard deviations before and after."""
+    """Return the table of standard deviations before and after the measurement."""
     heads = ("quantity", "before", *limits.splits, "of it noise")
     rows: list[Sequence[Cell]] = []
     for q, quantity in enumerate(limits.quantities):
@@ -180,7 +180,7 @@ def _sigmas(limits: MonitorLimits) -> Table:
 
 
 def _ledger(limits: MonitorLimits, lines: int) -> Table:
-    """The posterior's variance by motions."""
+    """Return the table of the posterior's variance by motions."""
     split = limits.splits[BEST]
     rows: list[Sequence[Cell]] = []
     for q, quantity in enumerate(limits.quantities):
@@ -207,7 +207,7 @@ def _ledger(limits: MonitorLimits, lines: int) -> Table:
 
 
 def _before(limits: MonitorLimits) -> Section:
-    """The variance before a measurement by motions, and after it by the other estimators."""
+    """Return the section on the variance by motions before a measurement, and after it by the other estimators."""
     rows: list[Sequence[Cell]] = []
     for q, quantity in enumerate(limits.quantities):
         for name in ("", *(name for name in limits.splits if name != BEST)):
@@ -229,12 +229,12 @@ def _before(limits: MonitorLimits) -> Section:
 
 
 def _statement(limits: MonitorLimits) -> Section:
-    """What rests on the stated numbers: how sigmas follow them, and what they leave with heavy tails."""
+    """Return the section on the sigmas' dependence on the prior: elasticities, and errors under heavy tails."""
     rows: list[Sequence[Cell]] = []
     for q, quantity in enumerate(limits.quantities):
         found = sorted(limits.elasticities, key=lambda one: -float(one.elasticity[q]))[:FEW]
         for one in found:
-            size = f"{significant(one.size, 3)} {shown_unit(one.unit)}"
+            size = f"{significant(one.size, 3)} {unit_for_reports(one.unit)}"
             told = (float(one.elasticity[q]), float(one.doubled[q]), float(one.told[q]))
             rows.append((quantity_text(quantity), one.number.replace("_", " "), size, *told))
     numbers = Table(
@@ -270,7 +270,7 @@ def _statement(limits: MonitorLimits) -> Section:
     unit = unit_text(limits.quantities[q])
     text = (
         f"The sigmas are as good as the stated numbers. The {short_text(limits.quantities[q])} follows "
-        f"{most.number.replace('_', ' ')}, {significant(most.size, 3)} {shown_unit(most.unit)}, with an elasticity of "
+        f"{most.number.replace('_', ' ')}, {significant(most.size, 3)} {unit_for_reports(most.unit)}, with an elasticity of "
         f"{float(most.elasticity[q]):.2f}: if it is twice as large, {significant(float(most.doubled[q]), 2)} {unit} "
         f"are left in place of {significant(float(split.sigma[q]), 2)} {unit}."
     )
@@ -278,7 +278,7 @@ def _statement(limits: MonitorLimits) -> Section:
 
 
 def _remedies(limits: MonitorLimits) -> Table:
-    """What further measurements would leave."""
+    """Return the table of what further measurements would leave."""
     heads = ["quantity", "before", "now", *(remedy.what for remedy in limits.remedies)]
     rows: list[Sequence[Cell]] = []
     for q, quantity in enumerate(limits.quantities):
@@ -301,7 +301,7 @@ def _remedies(limits: MonitorLimits) -> Table:
 
 
 def _hidden(limits: MonitorLimits) -> Table:
-    """The least-seen combinations."""
+    """Return the table of the least observable combinations of motions."""
     rows = [(quantity_text(q), combination_text(limits, k)) for k, q in enumerate(limits.quantities)]
     caption = (
         "Of all motions that change a quantity by the standard deviation that the posterior leaves, the most likely "
@@ -311,7 +311,7 @@ def _hidden(limits: MonitorLimits) -> Table:
 
 
 def _holds(coverage: Coverage) -> str:
-    """Whether the sigmas hold."""
+    """Return a sentence on the coverage of the sigmas."""
     n, counts = coverage.measured, coverage.counts
     if coverage.outliers:
         return f"in {n} random states {len(coverage.outliers)} of {counts} coverages are out of their limits"
@@ -319,7 +319,7 @@ def _holds(coverage: Coverage) -> str:
 
 
 def _states(coverage: Coverage) -> Section:
-    """What random states gave."""
+    """Return the section on the random states."""
     n, lost = coverage.measured, coverage.drawn - coverage.measured
     rows: list[Sequence[Cell]] = []
     for k, quantity in enumerate(coverage.quantities):
@@ -361,8 +361,10 @@ MARKS = "os^vDP*X"
 
 
 def limits_svg(limits: MonitorLimits) -> str:
-    """Left, of every quantity the standard deviations of all estimators over that before the measurement; right, the
-    variance that the posterior leaves by bodies.
+    """Draw what the measurement removes and what remains.
+
+    Left: standard deviation of every quantity by each estimator, over that before the measurement. Right: the variance
+    that the posterior leaves, by bodies.
     """
     with svg.look("limits"):
         return svg.to_svg(_figure(limits))
@@ -391,7 +393,7 @@ def _figure(limits: MonitorLimits) -> Figure:
 
 
 def _reduced(axes: Axes, limits: MonitorLimits) -> None:
-    """Ratios of standard deviations, with both in their units for the posterior."""
+    """Draw the ratios of standard deviations, with both values in their units for the posterior."""
     y = np.arange(len(limits.quantities))
     before = limits.splits[BEST].sigma_before
     for k, (name, split) in enumerate(limits.splits.items()):
@@ -420,7 +422,7 @@ def _reduced(axes: Axes, limits: MonitorLimits) -> None:
 
 
 def _by_body(axes: Axes, limits: MonitorLimits) -> None:
-    """Stacked shares of the posterior's variance, bodies of both cameras together; negative ones to the left."""
+    """Draw stacked shares of the posterior's variance by kind of body; negative shares go to the left."""
     split = limits.splits[BEST]
     total = split.sigma**2
     parts = {
