@@ -260,7 +260,7 @@ class Camera:
 
     @cached_property
     def paraxial(self) -> Paraxial:
-        """Paraxial data about the axis: focal lengths and pupils, in metres."""
+        """Paraxial focal lengths and pupils about the axis, in metres."""
         return paraxial(self._axial, -float(self.launch[2]), abs(self.surfaces[-1].thickness))
 
     @property
