@@ -163,7 +163,7 @@ def is_wrong(reading: float, true: float, floor: float = SAME) -> bool:
 
 
 def formula_section(run: RenderRun) -> Section:
-    """Return the section with the factors of the printed formulas, two columns for each camera, and their explanation."""
+    """Return the section with the factors of the printed formulas, two columns per camera, and their explanation."""
     about = (
         "Each printed formula is fed with the spot shifts that the exact trace gives for the one motion it was derived "
         "for. A factor of 1 is a correct formula."

@@ -30,7 +30,7 @@ _UP, _DOWN = 1 + RIM // 4, 1 + 3 * RIM // 4  # edge rays at +y and -y of the sto
 
 
 def side_view_svg(instrument: Instrument, paths: LightPaths) -> str:
-    """Draw the instrument in the base's X-Z plane, in metres, with the mirrors cut in the camera's plane of symmetry."""
+    """Draw the instrument in the base's X-Z plane, metres, with the mirrors cut in their plane of symmetry."""
     with svg.look("side-view"):
         spread = np.concatenate([b.vertices.reshape(-1, 3) for b in paths.beams])
         low, high = spread[:, [0, 2]].min(axis=0) - 0.3, spread[:, [0, 2]].max(axis=0) + 0.3 + 0.5 * ARROW
@@ -252,7 +252,7 @@ def footprints_svg(instrument: Instrument, paths: LightPaths) -> str:
 
 
 def _style(colour: str, filled: bool) -> dict[str, Any]:
-    """Return the line style of a footprint: filled at +Y, an outline at -Y, since footprints of both ends may coincide."""
+    """Return the line style of a footprint: filled at +Y, outlined at -Y, since both ends may coincide."""
     return {"fc": colour, "ec": colour, "alpha": 0.5} if filled else {"fill": False, "ec": colour, "lw": 1.4}
 
 

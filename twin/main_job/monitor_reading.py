@@ -88,7 +88,7 @@ class MonitorReading:
 
     @cached_property
     def gains(self) -> dict[str, np.ndarray]:
-        """Gain of each estimator at this measurement: (4 x cameras, 2 x spots) parameters (rad, m) per pixel of shift."""
+        """Gain of each estimator here: (4 x cameras, 2 x spots) parameters (rad, m) per pixel of shift."""
         return estimator_gains(self.cameras, self.disturbances, self.recovery.shift_covariance[0])
 
     @cached_property
@@ -128,9 +128,7 @@ class MonitorReading:
 
     @cached_property
     def unseen(self) -> tuple[str, ...]:
-        """Warnings of bodies whose motions in the prior hardly move the spots but contribute to sigma, without full
-        stops.
-        """
+        """Warnings of bodies whose motions hardly move the spots but contribute to sigma, without full stops."""
         stated, noise = self.disturbances, self.recovery.shift_covariance[0]
         if stated is None or not np.any(noise):
             return ()
@@ -275,7 +273,7 @@ class MonitorReading:
         }
 
     def _stated(self, found: Consistency | None) -> dict[str, Any]:
-        """Return the prior's name and the test of the shifts against it, whose numbers are None without prior or noise."""
+        """Return the prior's name and the test of the shifts against it; numbers are None without prior or noise."""
         name = None if self.disturbances is None else self.disturbances.name
         numbers = {key: None if found is None else of(found) for key, of in _STATED.items()}
         suspects = [

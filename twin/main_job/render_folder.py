@@ -332,7 +332,7 @@ def _of_monitor(run: RenderRun) -> dict[str, Callable[[], Any]]:
 
 
 def _drawing(function: str, *given: Any) -> Callable[[], Any]:
-    """Return a drawing by the function ``module:name``, which the drawing process imports, since that takes a second."""
+    """Return a drawing by the function ``module:name``, which the drawing process imports (this takes a second)."""
     return partial(Named(function if "." in function else f"{__package__}.{function}"), *given)
 
 

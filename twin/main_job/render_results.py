@@ -37,7 +37,7 @@ PROGRAM = "twin.render"
 
 @dataclass(frozen=True, eq=False)
 class StrayPair:
-    """Stray light of the nominal and the perturbed instrument, obstruction of beams by prisms, and measured finishes."""
+    """Stray light of the nominal and the perturbed instrument, obstruction by prisms, and measured finishes."""
 
     before: StrayLight
     after: StrayLight

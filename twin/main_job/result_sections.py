@@ -295,7 +295,7 @@ def _every_time(run: RenderRun) -> Table:
 
 
 def spot_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
-    """Return the section with images of the spots (figures ``spots NAME`` of each camera), their positions and shifts."""
+    """Return the section with images of the spots (figures ``spots NAME``), their positions and shifts."""
     figures: list[Artefact] = []
     for k, name in enumerate(run.experiment.instrument.cameras):
         caption = f"Camera {name}: mean of {run.frames} frames."

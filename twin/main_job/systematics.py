@@ -227,7 +227,7 @@ NOISE = "the noise of the images"
 
 
 def assumed(reading: MonitorReading) -> str:
-    """Return the basis of the sigmas and whether the measured shifts agree with it, as a sentence without a full stop."""
+    """Return the basis of the sigmas and whether the shifts agree with it, as a sentence without a full stop."""
     stated, found = reading.disturbances, reading.consistency
     if stated is None or found is None:
         return _NOISE_ALONE

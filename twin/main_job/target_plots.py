@@ -165,7 +165,7 @@ _RIM = np.exp(2j * np.pi * np.arange(181) / 180)
 
 
 def pupils_svg(quality: ImageQuality) -> str:
-    """Draw pupils, a row for each camera and a column for each place: nominal shadows filled, perturbed ones outlined."""
+    """Draw pupils, a row per camera and a column per place: nominal shadows filled, perturbed ones outlined."""
     where = {place: quality.fields.index(field) for place, field in PLACES.items()}
     with look("pupils"):
         figure = new_figure(0.6 + 2.9 * len(quality.cameras))

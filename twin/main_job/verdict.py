@@ -57,7 +57,7 @@ class Judgement:
 
 
 def readings(run: RenderRun, estimator: str) -> tuple[Reading, ...]:
-    """Return all readings of an estimator: of each camera, the angle and the ground errors; over a course, RMS values."""
+    """Return all readings of an estimator: cameras, angle and ground errors; over a course, RMS values."""
     return run.series.readings.rms.of(estimator) if run.series else run.reading.table.of(estimator)
 
 
@@ -392,7 +392,7 @@ def _blurred(run: RenderRun) -> str:
 
 
 def alarm_limit(count: int) -> float:
-    """Return the sigmas that a normal error exceeds in any of ``count`` readings with at most FALSE_ALARM probability."""
+    """Return the sigmas that any of ``count`` normal errors exceeds with at most FALSE_ALARM probability."""
     return -float(ndtri(0.5 * FALSE_ALARM / count))
 
 
@@ -420,7 +420,7 @@ def _unstated(run: RenderRun, found: tuple[Reading, ...], told: tuple[str, ...])
 
 
 def _misreadings(run: RenderRun) -> tuple[str, ...]:
-    """Return a warning for every change whose reading is wrong by more than the change, and by more than chance allows."""
+    """Return a warning for every reading that is wrong by more than its change, and by more than chance allows."""
     changes: dict[tuple[str, str], list[Reading]] = {}
     for reading in (one for estimator in run.estimators for one in readings(run, estimator)):
         changes.setdefault((reading.group, reading.parameter.key), []).append(reading)

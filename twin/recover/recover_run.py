@@ -388,7 +388,7 @@ def _worst(
 
 
 def _of_readings(readings: Sequence[MonitorReading], times: Sequence[float] | None) -> tuple[str, ...]:
-    """Return doubts and notes of the readings that the frames did not give yet; for a series the first state of each."""
+    """Return doubts and notes of the readings that the frames gave no warning of; for a series the first of each."""
     told: dict[str, list[str]] = {}
     for k, reading in enumerate(readings):
         for text in (*reading.doubts, *reading.notes):

@@ -37,7 +37,7 @@ HALF_WIDTHS = tuple(float(np.sqrt(2.0 * gammaincinv(0.5, level))) for level in L
 FALSE = 1e-2
 """Probability that any of all counts is outside its limits although every sigma is right."""
 CHUNK, _PIXELS = 32, 10_000_000
-"""States, and pixels of their images, that are rendered at once, some 2 GB; the numbers do not depend on it."""
+"""Numbers of states, and of pixels of their images, that are rendered at once (2 GB); results do not depend on them."""
 STATES = "random states"
 _DRAWN, _DETECTOR, _BEFORE, _AFTER = 9, 10, 11, 12
 """Numbers of the random streams of the states, of their detectors and of the noise before and after."""
@@ -132,7 +132,7 @@ class Coverage:
 
     @property
     def alarm_limit(self) -> int:
-        """Largest number of alarms that agrees with their false-alarm rate; it is exceeded with probability ``FALSE``."""
+        """Largest number of alarms that agrees with their false-alarm rate, at a probability of ``FALSE``."""
         from scipy.stats import binom
 
         return int(binom.ppf(1.0 - FALSE, self.measured, FALSE_ALARM))

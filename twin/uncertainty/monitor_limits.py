@@ -1,4 +1,4 @@
-"""Limits of a monitor's readings under a prior on disturbances, the benefit of further measurements, and texts on them."""
+"""Limits of a monitor's readings under a prior on disturbances, and the benefit of further measurements."""
 
 from __future__ import annotations
 
@@ -55,7 +55,9 @@ Rounding errors of a trace are 1e-10.
 """
 _DRAWS = 100_000
 _STATES = 6
-_PIXELS = 1 << 21  # of the images of these states that are worked on at once
+"""Number of states over which the covariance of a shift is averaged; it varies by some per cent between them."""
+"""Number of states over which the covariance of a shift is averaged; it varies by some per cent between states."""
+_PIXELS = 1 << 21
 """Number of pixels of the images of these states that are processed at once."""
 
 
@@ -123,8 +125,7 @@ class MonitorLimits:
         return np.stack([quantity.row for quantity in self.quantities])
 
     def lines(self, estimator: str, quantity: int) -> list[tuple[str, float]]:
-        """Return label and share of each motion in the variance of an estimate's error, largest first, without the
-        noise.
+        """Return label and share of each motion in the variance of an error, largest first, without the noise.
 
         Parameters
         ----------
@@ -178,11 +179,10 @@ class MonitorLimits:
 
 
 def expected_covariance(experiment: MonitorExperiment, frames: int) -> np.ndarray:
-    """Return the expected (D, D) noise covariance, in px^2, of the shifts between two measurements, without random
-    draws.
+    """Return the expected noise covariance (D, D), px^2, of the shifts between two measurements.
 
-    The pattern of the pixels' response cancels where a spot stays on its pixels. It is therefore computed for some
-    states of the prior and averaged; where their spots leave the CCDs, no such state is used.
+    No noise is drawn. The pattern of the pixels' response cancels where a spot stays on its pixels. It is therefore
+    computed for some states of the prior and averaged; where their spots leave the CCDs, no such state is used.
 
     Parameters
     ----------
@@ -279,9 +279,7 @@ def _left(rows: np.ndarray, stated: Disturbances, noise: np.ndarray) -> np.ndarr
 
 
 def _own(stated: Disturbances) -> list[bool]:
-    """Return for each motion True if a second monitor has its own body: prisms are doubled, cameras and central prism
-    shared.
-    """
+    """Return for each motion True if a second monitor has its own such body: prisms, not cameras or central prism."""
     return ["/monitor/" in body for body in stated.bodies]
 
 
@@ -359,7 +357,7 @@ def body_text(body: str) -> str:
 
 
 def part_of(body: str) -> str:
-    """Return the kind of a body, whichever camera it belongs to: ``M2``, ``prism_180``, ``camera``, ``central_prism``."""
+    """Return the kind of a body, for all cameras alike: ``M2``, ``prism_180``, ``camera``, ``central_prism``."""
     below = body.split("/")[1:]
     if not below:
         return "base"

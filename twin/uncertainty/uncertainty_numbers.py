@@ -244,8 +244,7 @@ def _by_quantity(
 
 
 def uncertainty_numbers(run: UncertaintyRun) -> dict[str, Any]:
-    """Return the contents of uncertainty.json: the numbers of the main job's file, and ``states`` with the random
-    states.
+    """Return the contents of uncertainty.json: those of the main job, and ``states`` with the random states.
 
     Parameters
     ----------

@@ -133,7 +133,7 @@ def _headline(limits: MonitorLimits) -> int:
 
 
 def _verdict(limits: MonitorLimits) -> tuple[str, ...]:
-    """Return sentences on the main quantity: remaining sigma, what causes it, and what would reduce it most."""
+    """Return sentences on the main quantity: remaining sigma, its causes, and what would reduce it most."""
     q = _headline(limits)
     quantity, split = limits.quantities[q], limits.splits[BEST]
     unit, name = unit_text(quantity), short_text(quantity)
