@@ -69,7 +69,7 @@ CASES = [(table, share) for share in (0.2, 0.04, 0.4) for table in ("image_point
 def test_exchanged_names_are_found_and_no_others(file: Path, table: str, share: float) -> None:
     """In the images each line has pairs of its own, so that up to three times the share of the points is in one."""
     wrong = swapped(file.parent, share, table)
-    with pytest.raises(FarPointsError, match=r"image points of (Beijing|Anhui) lie elsewhere") as refused:
+    with pytest.raises(FarPointsError, match=r"image points of (Beijing|Anhui) do not lie where") as refused:
         read_back(file)
     named = str(refused.value)
     assert any(f"{point} in" in named for _, point in wrong)
