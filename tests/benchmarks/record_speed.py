@@ -58,15 +58,15 @@ def measure(bench: Workbench, quick: bool) -> Speed:
             for year in years:
                 done = _filled(history, done, DAYS * A_DAY * year)
                 estimate = Operation(history, plan)
-                assert estimate.standing
+                assert estimate.estimator_state
                 clock, spent, more = [], [], []
                 for _ in range(REPEATS):
                     start, begun = time.process_time(), time.perf_counter()
-                    assert history.take(given(f"one{done}", [reading(done)])).new == 1
+                    assert history.ingest(given(f"one{done}", [reading(done)])).new == 1
                     taken = time.process_time()
                     clock.append(time.perf_counter() - begun)
-                    estimate = estimate.again()
-                    assert estimate.standing
+                    estimate = estimate.updated()
+                    assert estimate.estimator_state
                     spent.append(taken - start)
                     more.append(time.process_time() - taken)
                     done += 1
@@ -99,6 +99,6 @@ def _filled(history: History, done: int, count: int) -> int:
     """Add readings up to a count, a month's at once."""
     while done < count:
         upto = min(done + 30 * A_DAY, count)
-        history.take(given(f"month{done}", [reading(k) for k in range(done, upto)]))
+        history.ingest(given(f"month{done}", [reading(k) for k in range(done, upto)]))
         done = upto
     return done

@@ -18,8 +18,15 @@ from tests.twin.operation_records import monitor_entry as own_entry
 from tests.twin.record_bench import START, given, made, pair
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.estimate_snapshot import Scores
-from twin.operate.estimate.operation_model import keep_plan
-from twin.operate.estimate.reported_estimate import Break, Course, Following, FoundJump, Motions, SensorState
+from twin.operate.estimate.operation_model import store_plan
+from twin.operate.estimate.reported_estimate import (
+    Course,
+    DetectedJump,
+    FilterResult,
+    Motions,
+    RequirementStatus,
+    SensorState,
+)
 from twin.operate.record.entries import MICRO, Alarm, Entry
 from twin.operate.record.history import History
 
@@ -71,10 +78,10 @@ def filled(place: Any, count: int = COUNT) -> History:
     """A new record with readings and two alarms, of which one was acknowledged."""
     history = made(place)
     events = [Entry("event", name, time, {}) for time, name in ((START + 5 * DAY, "safe_mode"), (REFOCUS, "refocus"))]
-    history.take(given("passes.csv", [monitor_entry(k) for k in range(count)]))
-    history.take(given("events.csv", events if count > 100 else []))
+    history.ingest(given("passes.csv", [monitor_entry(k) for k in range(count)]))
+    history.ingest(given("events.csv", events if count > 100 else []))
     texts = (f"the height will break its requirement {EVIL}", "a jump of base/forward/M2")
-    for k, (kind, text) in enumerate(zip(("breaks", "jump"), texts, strict=True)):
+    for k, (kind, text) in enumerate(zip(("requirements", "jump"), texts, strict=True)):
         history.raise_alarm(Alarm(kind, "ground height_m", START + (20 - 7 * k) * DAY - 3 * HOUR, text))
     history.acknowledge(2, "A. Nurse", "seen in the images, too")
     return history
@@ -110,11 +117,11 @@ class StandIn:
         sigmas = (0.05 + 0.02 * np.clip(days - 20.0, 0.0, None))[:, None] * np.ones_like(rate)
         return Course(times, self.quantities, values, sigmas, np.zeros((len(times), 8)), np.zeros((len(times), 8, 8)))
 
-    def follow(self) -> Following:
+    def filter_readings(self) -> FilterResult:
         times = [int(entry["time_us"]) for entry in self.history.entries("monitor")]
         newest = times[-1]
         now = self._course([newest])
-        breaks = []
+        requirements = []
         for q, limit, probability in ((0, 0.4, 0.99), (8, 20.0, 0.95)):
             value, sigma = now.values[0, q], now.sigmas[0, q]
             beyond = float(norm.sf((limit - value) / sigma) + norm.cdf((-limit - value) / sigma))
@@ -122,10 +129,10 @@ class StandIn:
             one = self.quantities[q]
             name = f"{one.group} {one.key}"
             holds = beyond <= 1.0 - probability
-            breaks.append(Break(name, one.parameter.unit, limit, probability, beyond, holds, when))
+            requirements.append(RequirementStatus(name, one.parameter.unit, limit, probability, beyond, holds, when))
         chi = np.random.default_rng(3).chisquare(8, len(times))
         chi[-5] = 60.0
-        jump = FoundJump(
+        jump = DetectedJump(
             "base/forward/M2",
             START + 12 * DAY - 3 * HOUR,
             START + 12 * DAY,
@@ -137,7 +144,7 @@ class StandIn:
         )
         stuck = f"40 readings in a row of 293.1 K {EVIL}"
         reason = "its own sigma does not hold"
-        return Following(
+        return FilterResult(
             newest,
             len(times),
             now,
@@ -153,7 +160,7 @@ class StandIn:
             {"forward d_alpha_arcsec": 0.62, "forward d_beta_arcsec": float("nan")},
             1.5,
             False,
-            tuple(breaks),
+            tuple(requirements),
         )
 
     def smoothed(self, times: Any) -> Course:
@@ -182,6 +189,6 @@ def lived(folder: Path, days: float = 80.0) -> tuple[Path, Path]:
     with record_of(folder / "record", setup) as history:
         entries = [own_entry(own, stated, life, k, 3) for k in range(len(life.times))]
         entries.append(Entry("event", "safe_mode", int(life.times[0]) + 30 * DAY + HOUR, {}))
-        history.take(given("all", sorted(entries, key=lambda one: one.time)))
-        keep_plan(setup, folder / "plan.yaml", history)
+        history.ingest(given("all", sorted(entries, key=lambda one: one.time)))
+        store_plan(setup, folder / "plan.yaml", history)
     return folder / "record", folder / "plan.yaml"

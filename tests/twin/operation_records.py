@@ -10,8 +10,8 @@ from scenes.specs.operation import OperationSetup, read_operation
 from scenes.specs.resolved import resolve_with
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.operation_filter import Operation
-from twin.operate.record.entries import MICRO, Entry, Given, digest_of_data, micros
-from twin.operate.record.history import History, initialised
+from twin.operate.record.entries import MICRO, Entry, FileContent, digest_of_data, micros
+from twin.operate.record.history import History, initialise_record
 
 DAY = 86_400.0
 START = micros("2026-03-01T00:00:00Z")
@@ -128,13 +128,13 @@ def entries_of(
     return out
 
 
-def given(name: str, entries: list[Entry]) -> Given:
-    return Given(name, digest_of_data(name), digest_of_data([name, "m"]), entries, {})
+def given(name: str, entries: list[Entry]) -> FileContent:
+    return FileContent(name, digest_of_data(name), digest_of_data([name, "m"]), entries, {})
 
 
 def record_of(folder: Path, plan: OperationSetup) -> History:
     """An empty record of the plan's instrument."""
-    initialised(str(folder), resolve_with("monitor_pair"), True)
+    initialise_record(str(folder), resolve_with("monitor_pair"), True)
     return History(str(folder))
 
 

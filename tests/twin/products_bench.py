@@ -48,7 +48,7 @@ class StandIn:
     noise: np.ndarray
     events: tuple = ()
     jumps: tuple = ()
-    breaks: tuple = ()
+    requirements: tuple = ()
     horizon: float = 30.0 * 86400.0
 
     @property
@@ -71,9 +71,9 @@ class StandIn:
     def quantities(self) -> tuple:
         return quantities(self.experiment.cameras, self.experiment.ground)
 
-    def follow(self) -> Any:
+    def filter_readings(self) -> Any:
         newest, count = int(self.times[-1]), len(self.times)
-        known = {"events": self.events, "jumps": self.jumps, "breaks": self.breaks, "warnings": []}
+        known = {"events": self.events, "jumps": self.jumps, "requirements": self.requirements, "warnings": []}
         return SimpleNamespace(time=newest, readings=count, **known)
 
     def smoothed(self, times: list[int]) -> Estimate:

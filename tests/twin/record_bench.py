@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from scenes.specs.resolved import ResolvedJob, resolve_with
-from twin.operate.record.entries import Entry, Given, digest_of_data, micros
-from twin.operate.record.history import History, initialised
+from twin.operate.record.entries import Entry, FileContent, digest_of_data, micros
+from twin.operate.record.history import History, initialise_record
 
 ROOT = Path(__file__).resolve().parents[2]
 START = micros("2026-01-01T00:00:00Z")
@@ -33,13 +33,13 @@ def pair() -> ResolvedJob:
 
 def made(place: Path | str, simulated: bool = True) -> History:
     """A new record of gf7_pair."""
-    initialised(str(place), pair(), simulated)
+    initialise_record(str(place), pair(), simulated)
     return History(str(place))
 
 
-def given(name: str, entries: list[Entry]) -> Given:
+def given(name: str, entries: list[Entry]) -> FileContent:
     """A file that holds readings."""
-    return Given(name, digest_of_data([one.digest for one in entries]), "", entries, {})
+    return FileContent(name, digest_of_data([one.digest for one in entries]), "", entries, {})
 
 
 def temperatures(first: int, count: int, subject: str = "base") -> list[Entry]:

@@ -23,10 +23,19 @@ from tests.twin.record_bench import MINUTE, START, TELEMETRY, given, made, pair,
 from tests.twin.study_bench import REFUSED as INPUTS
 from twin.operate.__main__ import _record_warnings, app
 from twin.operate.record import FILE, NotARecord, RecordFailed, schema
-from twin.operate.record.entries import Alarm, Entry, Given, digest_of_job, instrument_digest, micros, now, utc_text
-from twin.operate.record.history import History, content_of, initialised
+from twin.operate.record.entries import (
+    Alarm,
+    Entry,
+    FileContent,
+    digest_of_job,
+    instrument_digest,
+    micros,
+    now,
+    utc_text,
+)
+from twin.operate.record.history import History, content_of, initialise_record
 from twin.operate.record.record_tables import tables
-from twin.operate.record.taking import Taking
+from twin.operate.record.taking import Ingest
 from twin.operate.record.telemetry import time_of_name
 
 
@@ -105,7 +114,7 @@ def test_a_record_is_exported_with_units(tmp_path: Path) -> None:
 def test_parquet_has_units_and_meanings(record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     with History(str(record)) as history:
-        history.take(given("t", temperatures(0, 5)))
+        history.ingest(given("t", temperatures(0, 5)))
     assert run("export", record, "--tables", "parquet", "--out", tmp_path / "p").exit_code == 0
     found = parquet.read_table(tmp_path / "p/temperature.parquet")
     assert found.num_rows == 5
@@ -283,14 +292,14 @@ def test_the_time_in_a_folders_name(name: str, utc: str | None) -> None:
 
 def test_an_interruption_says_what_is_kept(record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = written(tmp_path, TELEMETRY, {"t_1.csv": table(0, 3), "t_2.csv": table(3, 2)})
-    take = History.take
+    take = History.ingest
 
-    def interrupted(self: History, given: Given, late: bool = False):
+    def interrupted(self: History, given: FileContent, late: bool = False):
         if given.file.endswith("t_2.csv"):
             raise KeyboardInterrupt
         return take(self, given, late)
 
-    monkeypatch.setattr(History, "take", interrupted)
+    monkeypatch.setattr(History, "ingest", interrupted)
     result = run("ingest", record, file)
     assert (result.exit_code, "the files that were told are in the record" in result.stderr) == (130, True)
     assert status(record)["entries"] == 3
@@ -375,7 +384,7 @@ ATTACKS = INPUTS["attacks"]
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_the_database_refuses_to_replace_rows(attack: str, attached: bool, record: Path) -> None:
     with History(str(record)) as history:
-        history.take(given("a", temperatures(0, 3)))
+        history.ingest(given("a", temperatures(0, 3)))
     base = sqlite3.connect(":memory:" if attached else record / FILE)
     if attached:
         base.execute("ATTACH ? AS record", (str(record / FILE),))
@@ -389,7 +398,7 @@ def test_the_database_refuses_to_replace_rows(attack: str, attached: bool, recor
 def test_the_status_finds_what_was_altered_behind_the_guard(record: Path) -> None:
     """Triggers taken out of the schema, rows altered and removed, and the triggers put back: digests do not agree."""
     with History(str(record)) as history:
-        history.take(given("a", temperatures(0, 700)))
+        history.ingest(given("a", temperatures(0, 700)))
     base = sqlite3.connect(record / FILE)
     guards = base.execute("SELECT * FROM sqlite_master WHERE type = 'trigger'").fetchall()
     base.execute("PRAGMA writable_schema = ON")
@@ -425,44 +434,44 @@ def test_a_guard_that_is_not_there_is_told_by_kind_of_database() -> None:
 @pytest.mark.parametrize("beaten", [1, 2])
 def test_a_writer_that_another_beats_twice_is_told(beaten: int, record: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By a database without a lock; once is tried again."""
-    taken, errors = Taking.take, [IntegrityError("", None, Exception("UNIQUE constraint\nfailed"))] * beaten
+    taken, errors = Ingest.ingest, [IntegrityError("", None, Exception("UNIQUE constraint\nfailed"))] * beaten
 
-    def take(self: Taking, file: Given) -> object:
+    def take(self: Ingest, file: FileContent) -> object:
         if errors:
             raise errors.pop()
         return taken(self, file)
 
-    monkeypatch.setattr(Taking, "take", take)
+    monkeypatch.setattr(Ingest, "ingest", take)
     with History(str(record)) as history:
         file = given("t", temperatures(0, 3))
         if beaten == 2:
             with pytest.raises(RecordFailed, match=r"^UNIQUE constraint failed$"):
-                history.take(file)
-        assert history.take(file).new == 3
+                history.ingest(file)
+        assert history.ingest(file).new == 3
 
 
 def test_a_clock_that_runs_backwards(record: Path) -> None:
     first, second, third = temperatures(0, 3)
     with History(str(record)) as history:
-        taken = history.take(given("t", [second, first, third]))
+        taken = history.ingest(given("t", [second, first, third]))
         assert taken.new == 2
         assert "the clock runs backwards: 2026-01-01T00:00:00Z after 2026-01-01T00:01:00Z" in taken.refused[0][1]
         # another body's clock is another one
-        assert history.take(given("u", [replace(first, subject="base/forward/M1")])).new == 1
+        assert history.ingest(given("u", [replace(first, subject="base/forward/M1")])).new == 1
 
 
 @pytest.mark.second
 def test_a_late_reading_waits_for_who_knows(record: Path) -> None:
     early, late = temperatures(0, 1), temperatures(5, 1)
     with History(str(record)) as history:
-        history.take(given("b", late))
-        refused = history.take(given("a", early))
+        history.ingest(given("b", late))
+        refused = history.ingest(given("a", early))
         assert refused.new == 0
         assert "--late takes it" in refused.refused[0][1]
         assert status(record)["open"] == 1
-        assert history.take(given("a", early)).refused == refused.refused
+        assert history.ingest(given("a", early)).refused == refused.refused
         assert len(status(record)["refused"]) == 1  # told once, however often it is tried
-        assert history.take(given("a", early), late=True).new == 1
+        assert history.ingest(given("a", early), late=True).new == 1
     told = status(record)
     assert (told["entries"], told["open"], [one["taken_since"] for one in told["refused"]]) == (2, 0, [True])
 
@@ -472,11 +481,11 @@ def test_other_numbers_of_a_moment_do_not_replace_those_that_are_there(record: P
     (one,) = temperatures(0, 1)
     other = replace(one, content={**one.content, "values": [299.0]})
     with History(str(record)) as history:
-        history.take(given("a", [one]))
-        assert "has other numbers of base" in history.take(given("b", [other]), late).refused[0][1]
+        history.ingest(given("a", [one]))
+        assert "has other numbers of base" in history.ingest(given("b", [other]), late).refused[0][1]
         assert [content_of(row)["values"] for row in history.entries()] == [[293.0]]
         in_one = [replace(e, time=e.time + MINUTE) for e in (one, other)]
-        assert "another reading of base" in history.take(given("c", in_one), late).refused[0][1]
+        assert "another reading of base" in history.ingest(given("c", in_one), late).refused[0][1]
 
 
 def test_a_time_still_to_come_is_of_a_wrong_clock(tmp_path: Path) -> None:
@@ -484,10 +493,10 @@ def test_a_time_still_to_come_is_of_a_wrong_clock(tmp_path: Path) -> None:
     (one,) = temperatures(0, 1)
     far = [replace(one, time=now() + round((24 + 0.2) * 3600e6))]
     with made(tmp_path / "real", simulated=False) as history:
-        assert history.take(given("b", [replace(one, time=now() + round((24 - 0.2) * 3600e6))])).new == 1
-        assert "is still to come" in history.take(given("a", far)).refused[0][1]
+        assert history.ingest(given("b", [replace(one, time=now() + round((24 - 0.2) * 3600e6))])).new == 1
+        assert "is still to come" in history.ingest(given("a", far)).refused[0][1]
     with made(tmp_path / "simulated") as history:
-        assert history.take(given("a", far)).new == 1
+        assert history.ingest(given("a", far)).new == 1
 
 
 def test_every_transaction_is_on_the_disk_with_its_folder_before_it_is_over(record: Path) -> None:
@@ -544,7 +553,7 @@ def test_a_reading_against_other_reference_images(record: Path, tmp_path: Path) 
         own.append(Entry("monitor", "monitor", START + (k + 1) * MINUTE, {"numbers": {**base, "spots": moved}}))
     shutil.rmtree(record)
     with made(record) as history:
-        done = history.take(given("series", own))
+        done = history.ingest(given("series", own))
     assert done.new == 2
     assert ["are 0.99 sigma from these" in reason for _, reason in done.refused] == [True, True]
 
@@ -622,8 +631,8 @@ def test_times_count_leap_seconds() -> None:
 
 def test_the_database_refuses_to_alter_a_record(record: Path) -> None:
     with History(str(record)) as history:
-        history.take(given("a", [*temperatures(1, 1), *temperatures(0, 1)]))
-        history.keep_plan("plan.yaml", {"window": 60})
+        history.ingest(given("a", [*temperatures(1, 1), *temperatures(0, 1)]))
+        history.store_plan("plan.yaml", {"window": 60})
         history.raise_alarm(Alarm("jump", "base/forward/M2", START, "it jumped"))
         history.acknowledge(1, "Ann", "looked at")
         history.save_checkpoint("a" * 64, 0, START + 2 * MINUTE, 1, b"state")
@@ -649,6 +658,6 @@ def test_a_record_of_another_version_is_left_alone(record: Path) -> None:
     base.execute(f"INSERT INTO record_schema VALUES (9, {later}, '2030-01-01T00:00:00Z', 'x')")
     base.commit()
     base.close()
-    for opened in (lambda: History(str(record)), lambda: initialised(str(record), pair())):
+    for opened in (lambda: History(str(record)), lambda: initialise_record(str(record), pair())):
         with pytest.raises(NotARecord, match=f"is of version {later}, this program knows"):
             opened()

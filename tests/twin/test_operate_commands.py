@@ -19,12 +19,12 @@ from twin.framework.provenance import negative_verdicts
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
 from twin.operate.estimate.operation_filter import Operation
-from twin.operate.estimate.operation_model import keep_plan
+from twin.operate.estimate.operation_model import store_plan
 from twin.operate.estimate.reported_estimate import (
     AGAIN,
-    Break,
-    Following,
-    FoundJump,
+    DetectedJump,
+    FilterResult,
+    RequirementStatus,
     SensorState,
     alarms_of,
     raise_alarms,
@@ -61,7 +61,7 @@ def life(tmp_path_factory: pytest.TempPathFactory) -> Path:
     entries.append(Entry("event", "safe_mode", START + 30 * DAY + DAY // 2, {}))
     entries.sort(key=lambda one: one.time)
     with record_of(folder / "record", plan) as history:
-        assert not history.take(given("all", entries)).refused
+        assert not history.ingest(given("all", entries)).refused
     return folder
 
 
@@ -81,10 +81,10 @@ def said(*words: object) -> Any:
 
 
 @pytest.fixture(scope="module")
-def following(life: Path, tmp_path_factory: pytest.TempPathFactory) -> Following:
+def filter_result(life: Path, tmp_path_factory: pytest.TempPathFactory) -> FilterResult:
     place = Path(shutil.copytree(life / "record", tmp_path_factory.mktemp("followed") / "record"))
     with History(str(place)) as history:
-        return Operation(history, plan_of(life)).follow()
+        return Operation(history, plan_of(life)).filter_readings()
 
 
 # --- without a plan, and with one ------------------------------------------------------------------------
@@ -106,7 +106,7 @@ def test_without_a_plan_there_is_no_estimate(record: Path, life: Path) -> None:
 def test_a_record_without_a_reading_of_the_monitor(life: Path, tmp_path: Path) -> None:
     plan = plan_of(life)
     with record_of(tmp_path / "record", plan) as history:
-        keep_plan(plan, life / "plan.yaml", history)
+        store_plan(plan, life / "plan.yaml", history)
     assert said("status", tmp_path / "record")["estimate"] is None
     (tmp_path / "tm.yaml").write_text(TABLE)
     (tmp_path / "t.csv").write_text("UTC,T\n2026-06-25T06:00:00Z,293.1\n")
@@ -201,7 +201,7 @@ def test_an_estimate_that_fails_does_not_hide_what_was_taken(record: Path, life:
     with History(str(record)) as history:
         content = plan_of(life).plain()
         content["operation"]["window"] = -1  # as of another program
-        history.keep_plan("plan.yaml", content)
+        history.store_plan("plan.yaml", content)
     (tmp_path / "tm.yaml").write_text(TABLE)
     (tmp_path / "t.csv").write_text("UTC,T\n2026-06-25T06:00:00Z,293.1\n")
     done = run("ingest", record, tmp_path / "tm.yaml")
@@ -240,29 +240,29 @@ PLAN = OperationSpec(
 )
 
 
-def told_of(following: Following) -> Iterator[tuple[str, str]]:
-    return ((one.kind, one.text) for one in alarms_of(PLAN, following))
+def told_of(filter_result: FilterResult) -> Iterator[tuple[str, str]]:
+    return ((one.kind, one.text) for one in alarms_of(PLAN, filter_result))
 
 
-def clean(following: Following) -> Following:
+def clean(filter_result: FilterResult) -> FilterResult:
     """With nothing to be told of."""
-    return replace(following, breaks=(), jumps=(), sensors=(), innovations=())
+    return replace(filter_result, requirements=(), jumps=(), sensors=(), innovations=())
 
 
 @pytest.mark.second
-def test_what_contradicts_the_plan_is_in_the_numbers(following: Following) -> None:
-    calm = replace(clean(following), widened=1.0, too_many_jumps=False, bad_readings=((1, "x"), (2, "y")))
+def test_what_contradicts_the_plan_is_in_the_numbers(filter_result: FilterResult) -> None:
+    calm = replace(clean(filter_result), sigma_inflation=1.0, too_many_jumps=False, bad_readings=((1, "x"), (2, "y")))
     good = calm.to_dict()
     assert (good["agrees"], good["warnings"]) == (True, [])
     for change, words in (
         ({"undecided": True}, "the newest reading may be bad: y; until then sigmas count with both"),
         ({"bad_readings": ((1, "x"),) * 3}, "3 readings were taken for bad ones"),
-        ({"too_small": ("heat", "mounts")}, "sensors of several bodies together disagree with heat, mounts"),
+        ({"understated_causes": ("heat", "mounts")}, "sensors of several bodies together disagree with heat, mounts"),
         ({"widened": 1.01}, "all sigmas are 1.01 times as wide"),
     ):
         (text,) = replace(calm, **change).warnings
         assert words in text
-    bad = replace(clean(following), widened=2.5, too_many_jumps=True).to_dict()
+    bad = replace(clean(filter_result), sigma_inflation=2.5, too_many_jumps=True).to_dict()
     assert not bad["agrees"]
     assert [text.partition(";")[0] for text in bad["warnings"]] == [
         "the last or the first readings contradict what is stated",
@@ -271,24 +271,24 @@ def test_what_contradicts_the_plan_is_in_the_numbers(following: Following) -> No
     assert negative_verdicts({"estimate": bad}) == ["estimate.agrees"]
 
 
-def test_what_is_told_of_requirements(following: Following) -> None:
-    one = Break("forward d_f_um", "µm", 20.0, 0.95, 0.12, False, following.time)
-    soon = replace(one, chance_now=0.01, holds_now=True, breaks_us=following.time + 3 * DAY)
+def test_what_is_told_of_requirements(filter_result: FilterResult) -> None:
+    one = RequirementStatus("forward d_f_um", "µm", 20.0, 0.95, 0.12, False, filter_result.time)
+    soon = replace(one, chance_now=0.01, holds_now=True, breaks_us=filter_result.time + 3 * DAY)
     never = replace(soon, breaks_us=None)
-    assert list(told_of(replace(clean(following), breaks=(one, soon, never)))) == [
+    assert list(told_of(replace(clean(filter_result), requirements=(one, soon, never)))) == [
         ("broken", "Δf of forward is beyond 20 µm with a chance of 12 %; 5.0 % is allowed"),
         (
-            "breaks",
+            "requirements",
             "Δf of forward is expected to be beyond 20 µm with a chance above 5.0 % from "
-            f"{utc_text(following.time + 3 * DAY)} on",
+            f"{utc_text(filter_result.time + 3 * DAY)} on",
         ),
     ]
 
 
-def test_a_reading_that_contradicts_what_is_stated(following: Following) -> None:
+def test_a_reading_that_contradicts_what_is_stated(filter_result: FilterResult) -> None:
     """The newest of several; the chance of a false alarm is spent by time, and a jump explains what came with it."""
-    times = [following.time - k * DAY for k in (4, 3, 2, 1)]
-    own = clean(following)
+    times = [filter_result.time - k * DAY for k in (4, 3, 2, 1)]
+    own = clean(filter_result)
     # of eight coordinates 50 is exceeded with a chance of 4e-8; a day's share of 1e-3 in ten years is 2.7e-7
     seen = tuple((time, square, 8) for time, square in zip(times, (90.0, 50.0, 50.0, 8.0), strict=True))
     (found,) = alarms_of(PLAN, replace(own, innovations=seen))
@@ -296,32 +296,34 @@ def test_a_reading_that_contradicts_what_is_stated(following: Following) -> None
     assert "chi-square 50 of 8 coordinates, at most 45.7" in found.text
     assert found.content["degrees_of_freedom"] == 8
     assert list(alarms_of(PLAN, replace(own, innovations=tuple((t, 45.0, 8) for t in times)))) == []
-    jump = FoundJump("base/forward/M1", times[1], times[2], times[3], (), 30.0, 1e-9, {})
+    jump = DetectedJump("base/forward/M1", times[1], times[2], times[3], (), 30.0, 1e-9, {})
     kinds = [kind for kind, _ in told_of(replace(own, innovations=seen[1:], jumps=(jump,)))]
     assert kinds == ["jump"]
     # it explains the reading with which it was told, and not the last one before it
     for after, until, wanted in ((times[1], times[2], ["jump"]), (times[2], times[3], ["jump", "contradiction"])):
-        one = replace(jump, after_us=after, told_us=until)
+        one = replace(jump, after_us=after, detected_us=until)
         alone = tuple((time, 50.0 if time == times[2] else 8.0, 8) for time in times)
         assert [kind for kind, _ in told_of(replace(own, innovations=alone, jumps=(one,)))] == wanted
 
 
-def test_bodies_that_explain_a_jump_nearly_as_well_are_named(following: Following) -> None:
+def test_bodies_that_explain_a_jump_nearly_as_well_are_named(filter_result: FilterResult) -> None:
     """Within a difference of log likelihoods of three, and three of them at most."""
-    (jump,) = following.jumps
+    (jump,) = filter_result.jumps
     many = {f"body{k}": 28.0 + k for k in range(5)}
     for rivals, named in (({"a": 27.1, "b": 26.9}, "a"), ({"b": 26.9}, ""), (many, "body0, body1, body2")):
-        ((_, text),) = told_of(replace(clean(following), jumps=(replace(jump, log_ratio=30.0, rivals=rivals),)))
+        ((_, text),) = told_of(replace(clean(filter_result), jumps=(replace(jump, log_ratio=30.0, rivals=rivals),)))
         assert text.partition("; ")[2] == (f"{named} would explain it nearly as well" if named else "")
 
 
-def test_what_goes_on_is_told_again_a_month_after_somebody_has_seen_it(record: Path, following: Following) -> None:
+def test_what_goes_on_is_told_again_a_month_after_somebody_has_seen_it(
+    record: Path, filter_result: FilterResult
+) -> None:
     def raised(history: History, days: float) -> list[str]:
-        time = following.time + round(days * DAY)
-        one = Break("forward d_f_um", "µm", 20.0, 0.95, 0.12, False, time)
+        time = filter_result.time + round(days * DAY)
+        one = RequirementStatus("forward d_f_um", "µm", 20.0, 0.95, 0.12, False, time)
         seen = ((time - DAY, 5.0, 8), (time, 80.0, 8))
         sensor = SensorState("base/forward", "doubtful", time, time, "3 of the last 10 readings")
-        now = replace(clean(following), time=time, breaks=(one,), innovations=seen, sensors=(sensor,))
+        now = replace(clean(filter_result), time=time, requirements=(one,), innovations=seen, sensors=(sensor,))
         return [alarm.kind for alarm in raise_alarms(history, PLAN, now)]
 
     assert AGAIN == 30 * DAY
@@ -336,13 +338,15 @@ def test_what_goes_on_is_told_again_a_month_after_somebody_has_seen_it(record: P
         assert raised(history, 30) == ["broken", "sensor", "contradiction"]
 
 
-def test_a_jump_whose_time_is_known_better_is_the_same(record: Path, following: Following) -> None:
-    (jump,) = following.jumps
+def test_a_jump_whose_time_is_known_better_is_the_same(record: Path, filter_result: FilterResult) -> None:
+    (jump,) = filter_result.jumps
     with History(str(record)) as history:
-        assert [one.subject for one in raise_alarms(history, PLAN, replace(clean(following), jumps=(jump,)))] == [BODY]
+        assert [one.subject for one in raise_alarms(history, PLAN, replace(clean(filter_result), jumps=(jump,)))] == [
+            BODY
+        ]
         better = replace(jump, after_us=jump.after_us + DAY, until_us=jump.until_us - DAY)
-        assert raise_alarms(history, PLAN, replace(clean(following), jumps=(better,))) == []
+        assert raise_alarms(history, PLAN, replace(clean(filter_result), jumps=(better,))) == []
         other = replace(jump, after_us=jump.until_us, until_us=jump.until_us + DAY)
-        assert len(raise_alarms(history, PLAN, replace(clean(following), jumps=(jump, other)))) == 1
+        assert len(raise_alarms(history, PLAN, replace(clean(filter_result), jumps=(jump, other)))) == 1
         history.acknowledge(1, "Ann", "")
-        assert raise_alarms(history, PLAN, replace(clean(following), jumps=(jump, other))) == []
+        assert raise_alarms(history, PLAN, replace(clean(filter_result), jumps=(jump, other))) == []

@@ -38,10 +38,10 @@ from twin.framework.data_files import TABLE_FORMATS
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
 from twin.operate.estimate.operation_filter import Operation
-from twin.operate.estimate.operation_model import kept_plan, plan_digest, quantity_names, read_plan
+from twin.operate.estimate.operation_model import plan_digest, quantity_names, read_plan, stored_plan
 from twin.operate.record import FILE, RecordFailed
 from twin.operate.record.entries import Alarm
-from twin.operate.record.history import History, initialised
+from twin.operate.record.history import History, initialise_record
 from twin.operate.record.record_tables import tables
 
 FILES, ROWS = 12, 400
@@ -107,7 +107,7 @@ def test_a_full_disk(tmp_path: Path) -> None:
         with made(disk / "record") as history:
             for k in range(20):
                 try:
-                    taken += history.take(given(f"t{k}", temperatures(100 * k, 100))).new
+                    taken += history.ingest(given(f"t{k}", temperatures(100 * k, 100))).new
                 except RecordFailed as error:
                     told.append(str(error))
         assert set(told) == {"database or disk is full"}
@@ -120,7 +120,7 @@ def test_a_full_disk(tmp_path: Path) -> None:
     base.close()
     with History(str(tmp_path / "larger")) as history:
         for k in range(20):
-            history.take(given(f"t{k}", temperatures(100 * k, 100)), late=True)
+            history.ingest(given(f"t{k}", temperatures(100 * k, 100)), late=True)
     assert len(times(tmp_path / "larger")) == 2000
 
 
@@ -169,10 +169,10 @@ def test_the_same_record_on_a_postgresql_server(server: str, tmp_path: Path) -> 
     assert "no record" in invoke(app, "status", server).stderr
     for place in (server, str(tmp_path / "record")):
         with made(place) as history:
-            assert history.take(given("a", temperatures(5, 600))).new == 600
-            assert history.take(given("b", temperatures(0, 10))).refused[0][1].endswith("--late takes it")
-            assert history.take(given("b", temperatures(0, 10)), late=True).new == 5
-            assert history.take(given("c", temperatures(0, 605))).known == 605
+            assert history.ingest(given("a", temperatures(5, 600))).new == 600
+            assert history.ingest(given("b", temperatures(0, 10))).refused[0][1].endswith("--late takes it")
+            assert history.ingest(given("b", temperatures(0, 10)), late=True).new == 5
+            assert history.ingest(given("c", temperatures(0, 605))).known == 605
     with History(server) as one, History(str(tmp_path / "record")) as two:
         kept = [[t for t in tables(history) if t.name != "refused"] for history in (one, two)]
         assert [TABLE_FORMATS["csv"](t) for t in kept[0]] == [TABLE_FORMATS["csv"](t) for t in kept[1]]
@@ -189,7 +189,7 @@ def test_the_same_record_on_a_postgresql_server(server: str, tmp_path: Path) -> 
 @pytest.mark.second
 def test_the_same_estimate_on_a_postgresql_server(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is known now, of the past and ahead: the same bytes, also where it goes on from what was kept."""
-    monkeypatch.setattr("twin.operate.estimate.operation_filter.HEAD", 1)
+    monkeypatch.setattr("twin.operate.estimate.operation_filter.HEAD_READINGS", 1)
     plan = plan_of(tmp_path)
     experiment = MonitorExperiment(plan.model, load_backend())
     stated = experiment.disturbances
@@ -199,12 +199,12 @@ def test_the_same_estimate_on_a_postgresql_server(server: str, tmp_path: Path, m
     entries = [monitor_entry(experiment, stated, life, k, 2) for k in range(len(life.times))]
     found = []
     for place in (database(server, "estimate"), str(tmp_path / "record")):
-        initialised(place, resolve_with("monitor_pair"), True)
+        initialise_record(place, resolve_with("monitor_pair"), True)
         with History(place) as history:
             for name, own in (("a", entries[:12]), ("b", entries[12:])):
-                assert not history.take(given(name, own)).refused
+                assert not history.ingest(given(name, own)).refused
                 estimate = Operation(history, plan)
-                told = estimate.follow().to_dict()
+                told = estimate.filter_readings().to_dict()
             ahead = estimate.forecast(life.times[-1:] + 86_400_000_000).to_dict()
             found.append(json.dumps([told, estimate.smoothed(life.times).to_dict(), ahead]))
     assert json.loads(found[0])[0]["jumps"]
@@ -217,15 +217,15 @@ def test_what_is_derived_on_a_postgresql_server(server: str) -> None:
     """Plans, checkpoints and alarms as in SQLite."""
     url = database(server, "derived")
     with made(url) as history:
-        assert history.take(given("a", temperatures(0, 3))).new == 3
-        assert history.keep_plan("plan.yaml", {"window": 60})
+        assert history.ingest(given("a", temperatures(0, 3))).new == 3
+        assert history.store_plan("plan.yaml", {"window": 60})
         assert history.raise_alarm(Alarm("jump", "base", 0, "it jumped"))
         history.acknowledge(1, "Ann", "seen")
         times = [row["time_us"] for row in history.entries()]
         for k, time_us in enumerate(times):
             assert history.save_checkpoint("a" * 64, k, time_us, 3, b"\0%d" % k)
         assert history.save_checkpoint("a" * 64, 0, times[0], 3, b"other")
-        assert history.take(given("b", temperatures(1, 1, "base/forward"))).new == 1
+        assert history.ingest(given("b", temperatures(1, 1, "base/forward"))).new == 1
         assert [(one.number, one.content) for one in history.checkpoints("a" * 64)] == [(0, b"other")]
         assert history.drop_checkpoints("a" * 64, 0) == 1
         assert history.alarms()[0]["acknowledged"]["by"] == "Ann"
@@ -257,8 +257,8 @@ def record(tmp_path: Path, empty: Path) -> Path:
 def test_entries_after_a_place_in_their_order(record: Path) -> None:
     """Two bodies at the same minutes, the second one taken later."""
     with History(str(record)) as history:
-        history.take(given("a", temperatures(0, 4)))
-        history.take(given("b", temperatures(0, 4, "base/forward")))
+        history.ingest(given("a", temperatures(0, 4)))
+        history.ingest(given("b", temperatures(0, 4, "base/forward")))
 
         def found(**limits: int) -> list[tuple[int, int]]:
             return [((row["time_us"] - START) // MINUTE, row["id"]) for row in history.entries("", **limits)]
@@ -282,7 +282,7 @@ def test_entries_after_a_place_in_their_order(record: Path) -> None:
 
 def test_checkpoints_are_kept_replaced_and_dropped(record: Path) -> None:
     with History(str(record)) as history:
-        history.take(given("a", temperatures(0, 3)))
+        history.ingest(given("a", temperatures(0, 3)))
         for k in (1, 0, 2):
             assert history.save_checkpoint(PLAN_DIGEST, k, START + MINUTE * k, 3, b"%d" % k)
         assert history.save_checkpoint(PLAN_DIGEST, 1, START + MINUTE, 3, b"again \0")
@@ -300,24 +300,24 @@ def test_checkpoints_are_kept_replaced_and_dropped(record: Path) -> None:
 def test_a_reading_drops_what_was_derived_without_it(record: Path) -> None:
     """Whether it is late in its own stream or only comes after those of others."""
     with History(str(record)) as history:
-        history.take(given("a", [*temperatures(0, 1), *temperatures(2, 3)]))
+        history.ingest(given("a", [*temperatures(0, 1), *temperatures(2, 3)]))
         for k in range(5):
             assert history.save_checkpoint(PLAN_DIGEST, k, START + MINUTE * k, 4, b"")
-        history.take(given("b", temperatures(5, 1)))
+        history.ingest(given("b", temperatures(5, 1)))
         assert len(history.checkpoints(PLAN_DIGEST)) == 5
-        history.take(given("c", temperatures(4, 1, "base/forward")))
+        history.ingest(given("c", temperatures(4, 1, "base/forward")))
         assert [one.number for one in history.checkpoints(PLAN_DIGEST)] == [0, 1, 2, 3]
-        assert history.take(given("d", temperatures(1, 1))).new == 0  # it is refused
+        assert history.ingest(given("d", temperatures(1, 1))).new == 0  # it is refused
         assert len(history.checkpoints(PLAN_DIGEST)) == 4
-        assert history.take(given("d", temperatures(1, 1)), late=True).new == 1
+        assert history.ingest(given("d", temperatures(1, 1)), late=True).new == 1
         assert [one.number for one in history.checkpoints(PLAN_DIGEST)] == [0]
 
 
 def test_a_checkpoint_that_a_reading_has_overtaken_is_not_kept(record: Path) -> None:
     """Another process took a reading while the estimate was worked out."""
     with History(str(record)) as history:
-        history.take(given("a", temperatures(0, 3)))
-        history.take(given("b", temperatures(1, 1, "base/forward")))
+        history.ingest(given("a", temperatures(0, 3)))
+        history.ingest(given("b", temperatures(1, 1, "base/forward")))
         assert not history.save_checkpoint(PLAN_DIGEST, 0, START + 2 * MINUTE, 3, b"")
         assert history.save_checkpoint(PLAN_DIGEST, 0, START, 3, b"")
         assert history.save_checkpoint(PLAN_DIGEST, 1, START + 2 * MINUTE, 4, b"")
@@ -355,7 +355,7 @@ def test_the_newest_plan_counts_and_reads_back(record: Path, tmp_path: Path) -> 
     file.write_text("instrument: gf7_pair\ndisturbances: launch\nwindow: 20\n")
     assert "counts" in invoke(app, "init", record, "gf7_pair", "--plan", file).stdout
     with History(str(record)) as history:
-        kept = kept_plan(history)
+        kept = stored_plan(history)
         assert kept == read_plan(file, history)
         assert kept is not None
         assert (kept.operation.window, kept.disturbances.name) == (20, "launch")

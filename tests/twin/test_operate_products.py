@@ -30,12 +30,12 @@ from tests.twin.record_bench import START, given, made, pair
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app as operate
 from twin.operate.estimate.operation_filter import Operation
-from twin.operate.estimate.operation_model import keep_plan
+from twin.operate.estimate.operation_model import store_plan
 from twin.operate.estimated_motions import EstimatedMotions, perturbation, prior_files, state_file
-from twin.operate.products import Mark, Products, _warnings, product_files, validity
-from twin.operate.products import made as products_of
+from twin.operate.products import Products, ValidityLimit, _warnings, product_files, validity
+from twin.operate.products import make_products as products_of
 from twin.operate.record.entries import MICRO, Entry, micros, utc_text
-from twin.operate.record.history import History, initialised
+from twin.operate.record.history import History, initialise_record
 from twin.orbit.export.export_run import ExportSource, read_source
 from twin.orbit.flight.line_camera import corrected_line, traced_line_cameras
 
@@ -72,7 +72,7 @@ def stand_in(amounts: np.ndarray, times: tuple[int, ...] = (START,), **more: obj
 @pytest.fixture(scope="module")
 def history(tmp_path_factory: pytest.TempPathFactory) -> History:
     record = made(tmp_path_factory.mktemp("record") / "record")
-    record.take(given("reading", [Entry("monitor", "monitor", START, {"numbers": {}})]))
+    record.ingest(given("reading", [Entry("monitor", "monitor", START, {"numbers": {}})]))
     return record
 
 
@@ -104,7 +104,7 @@ class Walk:
         return SimpleNamespace(quantities=self.quantities, values=self.slope * away, sigmas=sigmas)
 
 
-FIRST, LAST = Mark(START - 10**12, "first"), Mark(START + 10**13, "last")
+FIRST, LAST = ValidityLimit(START - 10**12, "first"), ValidityLimit(START + 10**13, "last")
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,12 @@ def test_an_estimate_does_not_hold_across_what_is_known_to_have_happened() -> No
     found = validity(still, START, FIRST, LAST)
     assert (found.since, found.until) == (FIRST.time, LAST.time)
     assert (found.since_reason, found.until_reason) == ("first", "last")
-    marks = [Mark(START - MICRO, "before"), Mark(START, "now"), Mark(START + 7, "after"), Mark(START + 9, "later")]
+    marks = [
+        ValidityLimit(START - MICRO, "before"),
+        ValidityLimit(START, "now"),
+        ValidityLimit(START + 7, "after"),
+        ValidityLimit(START + 9, "later"),
+    ]
     found = validity(still, START, FIRST, LAST, marks)
     assert (found.since, found.since_reason, found.until, found.until_reason) == (START, "now", START + 7, "after")
     # a mark far away does not widen what a growing error allows
@@ -171,8 +176,8 @@ def test_two_causes_about_two_points_are_one_motion(tmp_path: Path) -> None:
         *(np.ones((2, 5)), np.ones((8, 5)), np.eye(5), (None,) * 5),
     )
     prior = prior_files(found, stated, experiment().instrument, "p", "reason", "")
-    merged = state_of(prior.table @ amounts, prior.components, experiment().thermal)
-    truth = experiment().sight.truth([own, said, merged])
+    merge_components = state_of(prior.table @ amounts, prior.components, experiment().thermal)
+    truth = experiment().sight.truth([own, said, merge_components])
     changes = truth.vector("forward")
     assert abs(changes[0, 1]) > 1e-6
     np.testing.assert_allclose(changes[1], changes[0], rtol=1e-9, atol=1e-14)
@@ -195,12 +200,12 @@ def test_of_too_many_components_those_that_matter_least_are_left_out() -> None:
     found = EstimatedMotions(components, np.zeros(count), np.diag(amounts**2))
     prior = prior_files(found, stated, experiment().instrument, "p", "reason", "")
     assert len(prior.components) == MOST_JOINT
-    gone = {one.name for one in prior.left_out}
+    gone = {one.name for one in prior.omitted}
     least = np.argsort(amounts)[: count - MOST_JOINT]
     assert gone == {components[k].name for k in least}
     share = amounts**2 / np.sum(amounts**2)
-    assert max(one.share for one in prior.left_out) == pytest.approx(share[least].max(), rel=1e-12)
-    assert {one.name: one.amount for one in prior.left_out} == pytest.approx(
+    assert max(one.share for one in prior.omitted) == pytest.approx(share[least].max(), rel=1e-12)
+    assert {one.name: one.amount for one in prior.omitted} == pytest.approx(
         {components[k].name: amounts[k] for k in least}, rel=1e-9
     )
 
@@ -217,7 +222,11 @@ def problem(history: History, time: int, source: ExportSource | None = None) -> 
 @pytest.mark.second
 def test_times_of_which_nothing_is_known_are_refused(history: History, tmp_path: Path) -> None:
     end = START + 30 * 86400 * MICRO
-    early, late, none = problem(history, START - 1), problem(history, end + 1), problem(made(tmp_path / "none"), START)
+    early, late, none = (
+        problem(history, START - 1),
+        problem(history, end + 1),
+        problem(made(tmp_path / "none"), START),
+    )
     assert "before the first reading" in early.problem
     assert early.allowed == f"a time from {utc_text(START)} to {utc_text(end)}"
     assert "forecast does not go so far" in late.problem
@@ -248,14 +257,14 @@ def test_a_scene_of_another_instrument_is_refused(history: History, tmp_path: Pa
 @pytest.mark.second
 def test_the_version_goes_with_the_record_and_the_plan(tmp_path: Path) -> None:
     record, backend = made(tmp_path / "record"), load_backend()
-    record.take(given("reading", [Entry("monitor", "monitor", START, {"numbers": {}})]))
+    record.ingest(given("reading", [Entry("monitor", "monitor", START, {"numbers": {}})]))
     operation = stand_in(drawn(3))
     first, again, other = (
         products_of(one, record, START, None, backend).version
         for one in (operation, operation, replace(operation, horizon=3600.0))
     )
     assert first == again != other
-    record.take(given("later", [Entry("temperature", "base", START, {"sigma": 1.0, "unit": "K", "values": [293.0]})]))
+    record.ingest(given("later", [Entry("temperature", "base", START, {"sigma": 1.0, "unit": "K", "values": [293.0]})]))
     assert products_of(operation, record, START, None, backend).version not in (first, other)
 
 
@@ -269,7 +278,7 @@ def test_events_jumps_and_requirements_limit_the_span(history: History) -> None:
     base = {
         "events": ((START + hour, "safe_mode", ("settling",)), (START + 1, "heater_set_point", ())),
         "jumps": (SimpleNamespace(body="base/forward/M2", after_us=START + 4 * hour, until_us=START + 5 * hour),),
-        "breaks": (SimpleNamespace(quantity=quantity, breaks_us=START + 9 * hour, holds_now=True),),
+        "requirements": (SimpleNamespace(quantity=quantity, breaks_us=START + 9 * hour, holds_now=True),),
     }
     operation = replace(stand_in(drawn(3), **base), experiment=told)
     spans = []
@@ -278,20 +287,20 @@ def test_events_jumps_and_requirements_limit_the_span(history: History) -> None:
         spans.append(tuple(round((t - START) / hour) for t in (held.since, held.until)))
         assert held.since_reason
     assert spans == [(0, 1), (1, 4), (5, 9), (9, 720)]
-    broken = replace(operation, breaks=(SimpleNamespace(quantity=quantity, breaks_us=None, holds_now=False),))
+    broken = replace(operation, requirements=(SimpleNamespace(quantity=quantity, breaks_us=None, holds_now=False),))
     found = products_of(broken, history, START, None, load_backend())
     assert found.warnings == ("ground height_m does not keep its requirement",)
 
 
 def test_what_limits_products_is_told() -> None:
     """A scene a minute and more from the estimate, a model without polynomials, what a job or a prior does not have."""
-    calm = SimpleNamespace(warnings=["doubt"], breaks=(SimpleNamespace(quantity="q", holds_now=True),))
-    whole = SimpleNamespace(left_out=())
+    calm = SimpleNamespace(warnings=["doubt"], requirements=(SimpleNamespace(quantity="q", holds_now=True),))
+    whole = SimpleNamespace(omitted=())
     assert _warnings(calm, START, START - 60 * MICRO, None, (), whole) == ("doubt",)
     assert _warnings(calm, START, None, None, (), whole) == ("doubt",)
-    broken = SimpleNamespace(warnings=[], breaks=(SimpleNamespace(quantity="q", holds_now=False),))
+    broken = SimpleNamespace(warnings=[], requirements=(SimpleNamespace(quantity="q", holds_now=False),))
     lines = {"a": SimpleNamespace(polynomial=None, refused="too steep"), "b": SimpleNamespace(polynomial=1)}
-    small = SimpleNamespace(left_out=(SimpleNamespace(share=0.001), SimpleNamespace(share=0.02)))
+    small = SimpleNamespace(omitted=(SimpleNamespace(share=0.001), SimpleNamespace(share=0.02)))
     found = _warnings(broken, START, START + 60 * MICRO + 1, SimpleNamespace(lines=lines), (1, 2, 3), small)
     assert found == (
         f"the scene was taken at {utc_text(START + 60 * MICRO + 1)}, and the estimate is for {utc_text(START)}",
@@ -433,14 +442,14 @@ def followed(tmp_path_factory: pytest.TempPathFactory) -> Followed:
     folder = tmp_path_factory.mktemp("followed")
     plan = records.plan_of(folder, "gf7_pair")
     place = folder / "record"
-    initialised(str(place), pair(), True)
+    initialise_record(str(place), pair(), True)
     own = experiment_of(plan)
     assert own.disturbances is not None
     life = records.life_of(own.disturbances, 6.0, 1.0, 3, {})
     with History(str(place)) as record:
-        keep_plan(plan, folder / "plan.yaml", record)
+        store_plan(plan, folder / "plan.yaml", record)
         entries = [records.monitor_entry(own, own.disturbances, life, k, 3) for k in range(len(life.times))]
-        record.take(records.given("readings", entries))
+        record.ingest(records.given("readings", entries))
     return Followed(place, life, int(life.times[-1]))
 
 
@@ -534,18 +543,18 @@ def test_a_state_has_the_temperatures_that_do_what_was_found(tmp_path: Path) -> 
     life = records.life_of(stated, 12.0, 1.0, 4, {})
     acting = life.motions.copy()
     acting[:, heat] *= 2.0
-    initialised(str(tmp_path / "record"), pair(), True)
+    initialise_record(str(tmp_path / "record"), pair(), True)
     with History(str(tmp_path / "record")) as history:
         twice = replace(life, motions=acting)
         readings = [records.monitor_entry(own, stated, twice, k, 4) for k in range(len(life.times))]
-        history.take(records.given("readings", readings))
+        history.ingest(records.given("readings", readings))
         for k in heat:
             kelvin = history.temperature + life.motions[:, k] * components[k].sigma
             warm = [
                 records.temperature_entry(components[k].body, int(time), value, 0.01)
                 for time, value in zip(life.times, kelvin.tolist(), strict=True)
             ]
-            history.take(records.given(components[k].body, warm))
+            history.ingest(records.given(components[k].body, warm))
         operation = Operation(history, plan)
         one = products_of(operation, history, int(life.times[-1]), None, load_backend())
         plain, found = (operation.motions(int(life.times[-1]), acting=which) for which in (False, True))

@@ -22,11 +22,11 @@ from twin.operate import daily_report as daily
 from twin.operate.__main__ import app
 from twin.operate.daily_report import _warnings, daily_report, end_of_day, state_table
 from twin.operate.estimate.operation_filter import Operation
-from twin.operate.estimate.operation_model import kept_plan
+from twin.operate.estimate.operation_model import stored_plan
 from twin.operate.estimate.reported_estimate import percent
-from twin.operate.overview import Overview, coverage, points_of, readings, span_of, spread, trend
+from twin.operate.overview import Overview, coverage, readings, single_readings, span_of, spread, trend
 from twin.operate.record.entries import Alarm, Entry, micros
-from twin.operate.record.history import History, content_of, initialised
+from twin.operate.record.history import History, content_of, initialise_record
 
 
 @pytest.fixture(scope="module")
@@ -132,9 +132,9 @@ def test_the_page_needs_nothing_else_and_runs_nothing_that_a_text_brings(page):
 def test_what_a_reader_has_to_know_is_told_and_nothing_else(age: int, alarms: int, states: str, told: list) -> None:
     """A reading more than a day old, alarms that wait, sensors that fail; beside what the estimate warns of."""
     sensors = [SimpleNamespace(body=f"body{k}", state=state) for k, state in enumerate(states.split())]
-    following = SimpleNamespace(warnings=["doubt"], sensors=sensors)
+    filter_result = SimpleNamespace(warnings=["doubt"], sensors=sensors)
     waiting = [{"text": f"alarm {k}"} for k in range(alarms)]
-    overview = SimpleNamespace(following=following, time=0, open_alarms=lambda: waiting)
+    overview = SimpleNamespace(filter_result=filter_result, time=0, open_alarms=lambda: waiting)
     assert _warnings(overview, age) == ("doubt", *told)
 
 
@@ -189,7 +189,7 @@ def test_a_day_is_a_date_of_utc():
 def test_points_are_what_the_readings_say(history, overview):
     found = readings(history, START, START + 40 * DAY, 1000)
     assert len(found) == COUNT
-    points = points_of(found, overview.quantities)
+    points = single_readings(found, overview.quantities)
     assert points.values[7, 0] == pytest.approx(0.14 + 0.3 * np.sin(4.9))
     assert points.sigmas[7, 0] == 0.3
     names = [(one.group, one.key) for one in overview.quantities]
@@ -206,7 +206,7 @@ def test_of_many_readings_some_are_shown_and_the_newest_is_one(history):
 
 def test_a_trend_has_times_at_both_sides_of_a_jump(history, overview):
     found = trend(history, overview, START, START + 30 * DAY)
-    jump = overview.following.jumps[0]
+    jump = overview.filter_result.jumps[0]
     assert {jump.after_us, jump.until_us} <= set(found.past.times.tolist())
     assert found.past.times[-1] == overview.time == found.future.times[0]
     assert found.future.times[-1] == START + 30 * DAY
@@ -229,7 +229,7 @@ def test_the_past_is_without_what_came_later_and_takes_nothing(tmp_path: Path):
             assert not past.raise_alarm(Alarm("jump", "y", until, "new"))
             assert past.drop_checkpoints("p", 0) == 0
             with pytest.raises(TypeError):
-                past.take(given("more.csv", [monitor_entry(99)]))
+                past.ingest(given("more.csv", [monitor_entry(99)]))
         assert [one.content for one in history.checkpoints("p")] == [b"early", b"late"]
 
 
@@ -271,16 +271,16 @@ def test_the_report_of_a_past_day_is_what_was_known_then(life, tmp_path):
     with History(str(record)) as history:
         end = end_of_day("2026-04-25", 0)
         with History(str(record), end) as past:
-            then = state_table(Overview.of(past, Operation(past, kept_plan(history)))).content()
-        initialised(str(tmp_path / "short"), kept_plan(history).model, True)
+            then = state_table(Overview.of(past, Operation(past, stored_plan(history)))).content()
+        initialise_record(str(tmp_path / "short"), stored_plan(history).model, True)
         with History(str(tmp_path / "short")) as short:
             rows = [one for one in history.entries() if one["time_us"] <= end]
             entries = [
                 Entry(one["kind"], one["subject"], one["time_us"], content_of(one), None, one["origin"] or "")
                 for one in rows
             ]
-            assert not short.take(given("all", entries)).refused
-            assert state_table(Overview.of(short, Operation(short, kept_plan(history)))).content() == then
+            assert not short.ingest(given("all", entries)).refused
+            assert state_table(Overview.of(short, Operation(short, stored_plan(history)))).content() == then
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from twin.operate import simulation_run
 from twin.operate.__main__ import app
 from twin.operate.judged_life import covered, likely_shares
 from twin.operate.record.entries import MICRO, micros
-from twin.operate.record.history import History, content_of, initialised
+from twin.operate.record.history import History, content_of, initialise_record
 from twin.operate.record.telemetry import WITHIN
 from twin.operate.simulate import Life, Simulation, drawn_life, sensed_temperatures
 from twin.operate.simulation_run import take_files
@@ -217,7 +217,7 @@ def test_a_life_is_a_record_as_any_other(made: tuple[Path, Path, Mapping]) -> No
 def test_the_files_of_a_life_make_its_record_again(made: tuple[Path, Path, Mapping], tmp_path: Path) -> None:
     """The readings are those of its files; a second record that takes these holds the same."""
     record, _, told = made
-    initialised(str(tmp_path / "again"), resolve_with("gf7_pair"), simulated=True)
+    initialise_record(str(tmp_path / "again"), resolve_with("gf7_pair"), simulated=True)
     with History(str(tmp_path / "again")) as history:
         assert sum(one.new for one in take_files(history, Path(told["files"]) / "telemetry.yaml")) == told["entries"]
     assert [one["sha256"] for one in entries(tmp_path / "again")] == [one["sha256"] for one in entries(record)]
@@ -322,15 +322,15 @@ def test_a_life_without_a_record_is_its_files_alone(tmp_path: Path) -> None:
 @pytest.mark.second
 def test_readings_that_could_not_be_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On the terminal, in the numbers and in the manifest; a life without any reading is refused."""
-    simulation, words = simulation_run.recorded, (*WORDS[:3], 1, *WORDS[4:8])
+    simulation, words = simulation_run.simulate_record, (*WORDS[:3], 1, *WORDS[4:8])
     found: list = []
     when = micros("2027-01-01T06:00:00Z")
 
-    def recorded(*what: object) -> object:
+    def simulate_record(*what: object) -> object:
         found.append(found[0] if found else simulation(*what))
         return replace(found[0], lost=((when, "it misses"),))
 
-    monkeypatch.setattr(simulation_run, "recorded", recorded)
+    monkeypatch.setattr(simulation_run, "simulate_record", simulate_record)
     done = run("simulate", PLAN, *words, "--out", tmp_path / "files")
     lost = "no reading at 2027-01-01T06:00:00Z: it misses"
     assert f"warning: {lost}" in done.stdout
@@ -344,7 +344,7 @@ def test_readings_that_could_not_be_are_told(tmp_path: Path, monkeypatch: pytest
     told = "1 of what was simulated was refused, the first: no such body"
     assert (done.exit_code, told in " ".join(done.stderr.split())) == (2, True), done.stderr
     monkeypatch.setattr(
-        simulation_run, "recorded", lambda *a: SimpleNamespace(readings=(), lost=((when, "it misses"),))
+        simulation_run, "simulate_record", lambda *a: SimpleNamespace(readings=(), lost=((when, "it misses"),))
     )
     done = run("simulate", PLAN, *words, "--out", tmp_path / "none")
     said = " ".join(done.stderr.split())

@@ -66,7 +66,7 @@ def operated(tmp_path_factory, backend):
     life = life_of(stated, READINGS * EVERY, EVERY, 3, {})
     entries = [monitor_entry(experiment, stated, life, k, 3) for k in range(READINGS)]
     with record_of(folder / "record", plan) as history:
-        history.take(given("all", entries))
+        history.ingest(given("all", entries))
     (folder / "own_lines.yaml").write_text(PAYLOAD)
     (folder / "turned.yaml").write_text(PAYLOAD.replace("26 deg", "20 deg"))
     (folder / "renamed.yaml").write_text(PAYLOAD.replace("backward", "rear"))

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from scenes.specs.operation import ReadingTableSpec
-from twin.operate.record.entries import Refused
+from twin.operate.record.entries import Refusal
 from twin.operate.record.record_tables import TABLES
 from twin.operate.record.telemetry import read_table_file
 
@@ -29,7 +29,7 @@ def test_quaternions_are_normalised_or_refused(tmp_path: Path) -> None:
     text = "\n".join(["time,a,b,c,d", *(f"2026-03-05T00:00:0{k}Z,{row}" for k, row in enumerate(rows))])
     column = {"column": ["a", "b", "c", "d"], "unit": "quaternion", "sigma": "2 arcsec"}
     found = items(tmp_path, text, "attitude", tracker=column)
-    assert [isinstance(one, Refused) for one in found] == 3 * [False] + 4 * [True]
+    assert [isinstance(one, Refusal) for one in found] == 3 * [False] + 4 * [True]
     for one in found[:3]:
         assert sum(v * v for v in one.content["values"]) == pytest.approx(1.0, abs=1e-14)
         assert one.content["sigma"] == pytest.approx(2.0 * 4.84813681e-6, rel=1e-8)
@@ -52,7 +52,7 @@ def test_readings_are_kept_in_si_units(tmp_path: Path) -> None:
     (one,) = items(
         tmp_path, text.replace("21.5", "294.65"), "temperature", base={"column": "t", "unit": "degC", "sigma": "50 mK"}
     )
-    assert isinstance(one, Refused)
+    assert isinstance(one, Refusal)
     assert "the column is in K, it seems" in one.reason
 
 

@@ -39,17 +39,17 @@ from twin.operate.terminal import (
     PlanFile,
     json_and_quiet,
     line,
-    moment_said,
     on_record,
     require_new,
     show_table,
     tell,
     told,
+    utc_option,
 )
 
 if TYPE_CHECKING:
     from twin.operate.record.history import History
-    from twin.operate.record.taking import Taken
+    from twin.operate.record.taking import IngestResult
 
 POLL = 10.0
 """Seconds between two looks at what is watched."""
@@ -100,15 +100,15 @@ def init(
     """
     from scenes.specs.operation import read_operation
     from scenes.specs.resolved import resolve_with
-    from twin.operate.estimate.operation_model import keep_plan, read_plan
-    from twin.operate.record.history import History, initialised
+    from twin.operate.estimate.operation_model import read_plan, store_plan
+    from twin.operate.record.history import History, initialise_record
 
     with told() as errors:
         if plan is not None:  # a mistake in it is told before anything is made
             read_operation(plan)
-        passed = initialised(record, resolve_with(instrument), simulated)
+        passed = initialise_record(record, resolve_with(instrument), simulated)
         with History(record) as history:
-            kept = plan is not None and keep_plan(read_plan(plan, history), plan, history)
+            kept = plan is not None and store_plan(read_plan(plan, history), plan, history)
             what = f"version {', '.join(map(str, passed))}" if passed else "as it was"
             what += "" if plan is None else f"; the plan {plan} counts" if kept else f"; the plan {plan} counted before"
             text = f"record of {history.name} ({history.sha256[:12]}) in {history.url}: {what}"
@@ -172,7 +172,7 @@ def ingest(
 
     listed = call.options.as_json and not watch
     with durable.exit_on_terminate():
-        start = None if moment is None else moment_said("--time", moment)
+        start = None if moment is None else utc_option("--time", moment)
         if page is not None:
             call.planned(None)
         sources = Sources(files, start, _is_stated(instrument, call.history), watch)
@@ -183,7 +183,7 @@ def ingest(
             while True:
                 before = totals["new"]
                 for given in sources.look(call.history):
-                    taken = call.history.take(given, late)
+                    taken = call.history.ingest(given, late)
                     totals.update(taken.counts)
                     first = first or (f"{taken.file}: {taken.refused[0][1]}" if taken.refused else "")
                     if listed:
@@ -250,14 +250,14 @@ def _counted(counts: Mapping[str, int]) -> str:
     return text + (f", {before} refused before" if (before := counts["refused_before"]) else "")
 
 
-def _line(taken: Taken) -> str:
+def _line(taken: IngestResult) -> str:
     lines = [f"{taken.file}: {_counted(taken.counts)}"]
     shown = [f"  refused{'' if line is None else f', line {line}'}: {reason}" for line, reason in taken.refused[:10]]
     more = len(taken.refused) - len(shown)
     return "\n".join([*lines, *shown, *([f"  and {more} more; status shows all"] if more else [])])
 
 
-def _taken(one: Taken) -> dict[str, Any]:
+def _taken(one: IngestResult) -> dict[str, Any]:
     refused = [{"line": line, "reason": reason} for line, reason in one.refused]
     return {"file": one.file, **one.counts, "refused": refused, "before": one.before}
 

@@ -22,7 +22,7 @@ from analysis.statistics import limit_of
 from scenes.models.disturbances import HEAT
 from scenes.yaml.errors import Problem
 from twin.framework import svg
-from twin.framework.artefact import Artefact, Cell, Marked, OwnDecimals, SvgFigure, Table, Text, decimals_for
+from twin.framework.artefact import Artefact, Cell, DecimalNumber, Marked, SvgFigure, Table, Text, decimals_for
 from twin.framework.report import Report, Section, answer
 from twin.operate.estimate.reported_estimate import name_of, percent, with_sigma
 from twin.operate.overview import (
@@ -30,10 +30,10 @@ from twin.operate.overview import (
     DAY,
     Overview,
     Trend,
-    carried_text,
+    best_known_motion,
     day_text,
     group_name,
-    largest_part,
+    line_change_text,
     minute_text,
     trend,
 )
@@ -134,7 +134,7 @@ def _points(axes: Axes, trend: Trend, q: int) -> None:
 def _happened(axes: Axes, overview: Overview, trend: Trend) -> None:
     """Jumps as bands from the reading before to the one after, events as lines."""
     begin, end = int(trend.past.times[0]), int(trend.past.times[-1])
-    jumps = [jump for jump in overview.following.jumps if begin <= jump.until_us and jump.after_us <= end]
+    jumps = [jump for jump in overview.filter_result.jumps if begin <= jump.until_us and jump.after_us <= end]
     for k, jump in enumerate(jumps):
         low, high = dates(np.array([jump.after_us, jump.until_us]))
         axes.axvspan(low, high, color=svg.PURPLE, alpha=0.35, lw=1.0, label=None if k else "jump")
@@ -154,7 +154,7 @@ def _dated(axes: Axes) -> None:
 def innovations_svg(overview: Overview) -> str:
     """What the newest readings departed from their predictions by, chi-square with its limit."""
     with svg.look("operate-innovations"):
-        told = overview.following.innovations
+        told = overview.filter_result.innovations
         times = np.array([one[0] for one in told], np.int64)
         chi = np.array([one[1] for one in told], np.float64)
         degrees = np.array([one[2] for one in told], np.float64)
@@ -199,7 +199,7 @@ def daily_report(history: History, overview: Overview, end: int) -> Report:
     end : int
         Of the day, microseconds of TAI since 2000.
     """
-    told = overview.following
+    told = overview.filter_result
     begin = end - DAY
     last = min(end, overview.time)
     verdict, lead = answer(
@@ -257,7 +257,7 @@ def end_of_day(text: str | None, newest: int) -> int:
 
 def state_table(overview: Overview) -> Table:
     """Every quantity now: value, sigma, requirement, chance, and when it is expected to break."""
-    now = overview.following.now
+    now = overview.filter_result.now
     heads = ("change", "now", "σ", "limit", "beyond it [%]", "allowed [%]", "holds", "expected to break")
     rows: list[list[Cell]] = []
     full: list[list[Cell]] = []
@@ -267,7 +267,7 @@ def state_table(overview: Overview) -> Table:
         if group not in bands.values():
             bands[q] = group
         places = decimals_for(sigma)
-        row: list[Cell] = [quantity.parameter.label, OwnDecimals(value, places), OwnDecimals(sigma, places)]
+        row: list[Cell] = [quantity.parameter.label, DecimalNumber(value, places), DecimalNumber(sigma, places)]
         row += _required_cells(overview, quantity)
         rows.append(row)
         full.append([group, *(str(cell) if isinstance(cell, Marked) else cell for cell in row)])
@@ -300,7 +300,7 @@ def _required_cells(overview: Overview, quantity: Quantity) -> list[Cell]:
 def _changed_section(overview: Overview, begin: int, end: int) -> Section:
     found = [one for one in overview.changed(begin, end) if not one.again]
     lines = tuple(f"{minute_text(one.time)}: {one.text}" for one in found)
-    what = f"Between {minute_text(begin)} and {minute_text(end)} UTC.{'' if lines else ' Nothing happened.'}"
+    what = f"Between {minute_text(begin)} and {minute_text(end)} UTC.{'' if lines else ' Nothing occurrences.'}"
     shown = (Text("changed", "", "", lines[-MOST_SHOWN:], within=""),) if lines else ()
     return Section("What changed", (what,), shown, name="changed")
 
@@ -341,7 +341,7 @@ def _motion_section(overview: Overview) -> Section | None:
         mean, sigma = float(own @ found.mean), math.sqrt(max(float(own @ found.covariance @ own), 0.0))
         places = decimals_for(sigma)
         ratio = abs(mean) / sigma if sigma else 0.0
-        numbers = OwnDecimals(mean, places), OwnDecimals(sigma, places), OwnDecimals(ratio, 1)
+        numbers = DecimalNumber(mean, places), DecimalNumber(sigma, places), DecimalNumber(ratio, 1)
         rows.append((ratio, [f"{name} [{unit}]", *numbers]))
     if not rows:
         return None
@@ -355,15 +355,15 @@ def _motion_section(overview: Overview) -> Section | None:
 
 
 def _prediction_section(overview: Overview) -> Section:
-    told = overview.following
+    told = overview.filter_result
     rows: list[list[Cell]] = []
     for one in overview.coverages:
         if one.count:
             look = "text" if one.holds else "text wrong"
             interval = f"{100.0 * one.low:.1f} to {100.0 * one.high:.1f}"
             words = Marked("yes" if one.holds else "no", look=look, key=f"coverage {one.sigmas}")
-            row: list[Cell] = [f"within {one.sigmas}σ", OwnDecimals(100.0 * one.expected, 2)]
-            rows.append([*row, OwnDecimals(100.0 * one.share, 2), interval, one.count, words])
+            row: list[Cell] = [f"within {one.sigmas}σ", DecimalNumber(100.0 * one.expected, 2)]
+            rows.append([*row, DecimalNumber(100.0 * one.share, 2), interval, one.count, words])
     heads = ("components", "expected [%]", "found [%]", f"interval of {100.0 * CONFIDENCE:.0f} % [%]", "of", "in it")
     caption = (
         "Each reading was predicted from all before it. Its components, made independent and of unit variance, lie "
@@ -386,13 +386,13 @@ def _prediction_section(overview: Overview) -> Section:
 
 
 def _explained(overview: Overview) -> str:
-    known = {name: share for name, share in overview.following.explained.items() if math.isfinite(share)}
+    known = {name: share for name, share in overview.filter_result.explained.items() if math.isfinite(share)}
     if not known:
         return ""
     parts = [
         f"{100.0 * known[one.name]:.0f} % of that of {name_of(one.name, overview.quantities)}"
         for one in overview.quantities
-        if known.get(one.name, 0.0) >= 0.005 and (overview.required(one) or not overview.following.breaks)
+        if known.get(one.name, 0.0) >= 0.005 and (overview.required(one) or not overview.filter_result.requirements)
     ]
     if not parts:
         return "Temperatures explain nothing of the scatter of what is required"
@@ -400,20 +400,20 @@ def _explained(overview: Overview) -> str:
 
 
 def _jump_section(overview: Overview) -> Section | None:
-    told = overview.following
+    told = overview.filter_result
     heads = ("came until", "told", "body", "best known part", "did to the line", "log ratio", "false alarm", "or else")
     digits = ("after", "until", "told", "body", "part", "size", "sigma", "unit", "log ratio", "false alarm", "or else")
     rows: list[list[Cell]] = []
     full: list[list[Cell]] = []
     for jump in sorted(told.jumps, key=lambda one: -one.until_us):
-        label, unit, size, sigma = largest_part(jump)
+        label, unit, size, sigma = best_known_motion(jump)
         part, rivals = label.removeprefix(f"{jump.body} "), sorted(jump.rivals.items(), key=lambda one: -one[1])
         others = ", ".join(f"{body} ({ratio:.1f})" for body, ratio in rivals[:3])
         row: list[Cell] = [Marked(minute_text(jump.until_us), f"after {minute_text(jump.after_us)}", "text")]
-        row += [minute_text(jump.told_us), jump.body]
-        row += [Marked(part, with_sigma(size, sigma, unit), "text"), carried_text(overview, jump) or _NOT]
-        rows.append([*row, OwnDecimals(jump.log_ratio, 1), f"{jump.false_alarm:.1g}", others or _NOT])
-        when = [utc_text(time) for time in (jump.after_us, jump.until_us, jump.told_us)]
+        row += [minute_text(jump.detected_us), jump.body]
+        row += [Marked(part, with_sigma(size, sigma, unit), "text"), line_change_text(overview, jump) or _NOT]
+        rows.append([*row, DecimalNumber(jump.log_ratio, 1), f"{jump.false_alarm:.1g}", others or _NOT])
+        when = [utc_text(time) for time in (jump.after_us, jump.until_us, jump.detected_us)]
         full.append([*when, jump.body, part, size, sigma, unit, jump.log_ratio, jump.false_alarm, others])
     events = [
         f"{minute_text(time)}: {name.replace('_', ' ')}" + (f", which may step {', '.join(causes)}" if causes else "")
@@ -452,7 +452,7 @@ def _sensor_section(overview: Overview) -> Section:
             minute_text(one.last_us),
             one.reason or _NOT,
         ]
-        for one in sorted(overview.following.sensors, key=lambda one: (one.state == "ok", one.body))
+        for one in sorted(overview.filter_result.sensors, key=lambda one: (one.state == "ok", one.body))
     ]
     heads = ("body", "state", "since", "last reading", "why")
     if not rows:
@@ -488,7 +488,7 @@ def _who(ack: Mapping[str, Any]) -> str:
 def _left_out_section(history: History, overview: Overview) -> Section:
     rows: list[list[Cell]] = [
         [minute_text(time), kind, subject, reason]
-        for time, kind, subject, reason in sorted(overview.following.left_out, key=lambda one: -one[0])
+        for time, kind, subject, reason in sorted(overview.filter_result.excluded, key=lambda one: -one[0])
     ]
     refused = [one for one in history.refusals() if not one["taken_since"]]
     artefacts: list[Artefact] = []
@@ -507,7 +507,7 @@ def _left_out_section(history: History, overview: Overview) -> Section:
 
 
 def _warnings(overview: Overview, end: int) -> tuple[str, ...]:
-    out = overview.following.warnings
+    out = overview.filter_result.warnings
     age = (end - overview.time) / DAY
     if age > 1.0:
         out.append(f"the newest reading is {age:.0f} d older than the end of the day")
@@ -515,7 +515,7 @@ def _warnings(overview: Overview, end: int) -> tuple[str, ...]:
     if waiting:
         count = "one alarm waits" if len(waiting) == 1 else f"{len(waiting)} alarms wait"
         out.append(f"{count} for an acknowledgement; the newest: {waiting[0]['text']}")
-    bad = [one for one in overview.following.sensors if one.state != "ok"]
+    bad = [one for one in overview.filter_result.sensors if one.state != "ok"]
     if bad:
         out.append("sensors that are not in order: " + ", ".join(f"{one.body} ({one.state})" for one in bad))
     return tuple(out)

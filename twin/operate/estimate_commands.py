@@ -16,19 +16,19 @@ from twin.operate.terminal import (
     Call,
     NewFolder,
     PlanFile,
+    input_errors,
     line,
-    moment_said,
     on_record,
-    problems_of,
     require_new,
     show_table,
+    utc_option,
 )
 
 if TYPE_CHECKING:
     from analysis.monitor.kalman_filter import DetectionPower
     from twin.framework.report import Report
     from twin.operate.estimate.operation_filter import Operation
-    from twin.operate.estimate.reported_estimate import Course, Following
+    from twin.operate.estimate.reported_estimate import Course, FilterResult
     from twin.operate.record.history import History
 
 STEPS = 4
@@ -56,20 +56,20 @@ def forecast(
     from twin.operate.record.entries import MICRO
 
     operation = call.followed(call.planned(plan))
-    following = operation.follow()
-    start, horizon = following.time, round(operation.plan.operation.horizon * MICRO)
-    end = start + horizon if until is None else moment_said("--until", until)
+    result = operation.filter_readings()
+    start, horizon = result.time, round(operation.plan.operation.horizon * MICRO)
+    end = start + horizon if until is None else utc_option("--until", until)
     if end <= start:
-        raise InputErrorText(f"--until: {until} is not after the newest reading, {following.now.utc[0]}")
+        raise InputErrorText(f"--until: {until} is not after the newest reading, {result.now.utc[0]}")
     course = operation.forecast([start + round((end - start) * k / steps) for k in range(steps + 1)])
-    requirements = [one.to_dict() for one in following.breaks]
-    name, warnings = call.history.name, following.warnings
+    requirements = [one.to_dict() for one in result.requirements]
+    name, warnings = call.history.name, result.warnings
     data = {"record": call.history.url, "instrument": name, **course.to_dict(), "requirements": requirements}
 
     def show(console: Console) -> None:
         print_verdict(console, f"{name}: forecast from {course.utc[0]} to {course.utc[-1]}")
         _show_course(course, console)
-        show_requirements(following, console)
+        show_requirements(result, console)
         for text in warnings:
             line(console, f"warning: {text}")
 
@@ -97,7 +97,7 @@ def alarms(
     if acknowledge is not None:
         if not (by and by.strip()):
             raise InputErrorText("--acknowledge: who has seen the alarm? --by NAME")
-        with problems_of("--acknowledge"):
+        with input_errors("--acknowledge"):
             call.history.acknowledge(acknowledge, by.strip(), note)
     elif by is not None or note:
         raise InputErrorText("--by and --note: which alarm? --acknowledge ID")
@@ -133,7 +133,7 @@ def exclude(
     """
     if not why.strip():
         raise InputErrorText("--why: a decision needs a reason, which the record keeps")
-    with problems_of("ENTRY"):
+    with input_errors("ENTRY"):
         made = call.history.decide(entry, include, why.strip())
     text = "entry {entry}, {kind} of {subject} at {time_utc}, is ".format(**made)
     text += f"{'included' if include else 'excluded'}: {made['why']}"
@@ -167,21 +167,21 @@ def products(
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
     from optics.numerics.backend import load_backend
-    from twin.operate.products import made, product_files, scene_time, summary
+    from twin.operate.products import make_products, product_files, scene_time, summary
     from twin.orbit.export.export_run import read_source
 
     require_new(out)
     source = None if scene is None else read_source(scene)
     if moment is not None:
-        time = moment_said("--time", moment)
+        time = utc_option("--time", moment)
     elif source is not None:
-        with problems_of("--scene"):
+        with input_errors("--scene"):
             time = scene_time(source)
     else:
         raise InputErrorText("of which time? --time UTC, or --scene FILE, which has one")
     operation = call.followed(call.planned(plan))
-    with problems_of():
-        one = made(operation, call.history, time, source, load_backend())
+    with input_errors():
+        one = make_products(operation, call.history, time, source, load_backend())
     files, numbers = product_files(one)
     call.write_new(out, files, "products")
     call.tell(numbers, lambda console: line(console, summary(one)))
@@ -216,7 +216,7 @@ def report(
     first, newest = span_of(call.history)
     if not newest:
         raise InputErrorText("the record has no reading of the monitor; ingest takes some")
-    with problems_of("--day"):
+    with input_errors("--day"):
         end = end_of_day(day, newest)
     if end <= first:
         raise InputErrorText(f"--day: the record has no reading of the monitor before the end of {day}")
@@ -285,7 +285,7 @@ def alarm_line(row: Mapping[str, Any]) -> str:
     return f"alarm {row['id']}, {row['time_utc']}, {row['kind']} ({state}): {row['text']}"
 
 
-def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], console: Console) -> None:
+def show_estimate(result: FilterResult, rows: Sequence[Mapping[str, Any]], console: Console) -> None:
     """The head of the estimate: now, predictions and whether they came true, jumps, sensors, what was left out, alarms.
 
     Parameters
@@ -299,26 +299,32 @@ def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], conso
     """
     from twin.operate.record.entries import utc_text
 
-    scores, count = following.scores, following.readings
-    print_verdict(console, f"estimate at {utc_text(following.time)} from {count} readings of the monitor")
-    _show_course(following.now, console)
-    show_requirements(following, console)
+    scores, count = result.scores, result.readings
+    print_verdict(console, f"estimate at {utc_text(result.time)} from {count} readings of the monitor")
+    _show_course(result.now, console)
+    show_requirements(result, console)
     if scores.components:
         one, two = (100.0 * part / scores.components for part in (scores.within_one, scores.within_two))
         text = f"{one:.1f} % within one sigma (68.3 % expected), {two:.1f} % within two (95.4 %)"
         line(console, f"predictions before the readings came: {text}; mean log score {scores.log_score:.2f}")
-    for text in following.warnings:
+    for text in result.warnings:
         line(console, f"warning: {text}")
-    for jump in following.jumps:
+    for jump in result.jumps:
         line(console, f"jump of {jump.body} {jump.found}")
-    bad = [one for one in following.sensors if one.state != "ok"]
-    if following.sensors:
-        line(console, f"sensors: {len(following.sensors) - len(bad)} of {len(following.sensors)} are as they should be")
+    bad = [one for one in result.sensors if one.state != "ok"]
+    if result.sensors:
+        line(
+            console,
+            f"sensors: {len(result.sensors) - len(bad)} of {len(result.sensors)} are as they should be",
+        )
     for sensor in bad:
         line(console, f"  {sensor.body}: {sensor.state} since {utc_text(sensor.since_us)}: {sensor.reason}")
-    if following.left_out:
-        line(console, f"left out of the estimate: {len(following.left_out)} of the last readings and more; the newest")
-        for time, _, subject, reason in following.left_out[-3:]:
+    if result.excluded:
+        line(
+            console,
+            f"left out of the estimate: {len(result.excluded)} of the last readings and more; the newest",
+        )
+        for time, _, subject, reason in result.excluded[-3:]:
             line(console, f"  {utc_text(time)} {subject}: {reason}")
     waiting = [one for one in rows if one["acknowledged"] is None]
     for alarm in waiting[-10:]:
@@ -347,20 +353,20 @@ def show_power(found: Sequence[DetectionPower], console: Console) -> None:
     show_table(console, heads, sizes, ())
 
 
-def show_requirements(following: Following, console: Console) -> None:
+def show_requirements(result: FilterResult, console: Console) -> None:
     """A row for each requirement."""
     from twin.framework.artefact import plain
     from twin.operate.estimate.reported_estimate import name_of, percent
     from twin.operate.record.entries import utc_text
 
-    if not following.breaks:
+    if not result.requirements:
         return
     rows = []
-    for one in following.breaks:
+    for one in result.requirements:
         later = "now" if not one.holds_now else "not in the horizon"
         rows.append(
             [
-                name_of(one.quantity, following.now.quantities),
+                name_of(one.quantity, result.now.quantities),
                 f"{plain(one.limit)} {one.unit}",
                 percent(one.chance_now),
                 percent(1.0 - one.probability),

@@ -26,9 +26,9 @@ from scenes.specs.job import JobSpec, PerturbationSpec
 from scenes.specs.job_tables import TableTemperatureSpec
 from scenes.yaml.yaml_file import dump_yaml
 
-UNSAID = ("index_gradient",)
+UNSUPPORTED = ("index_gradient",)
 """Kinds of components that `perturb` of a job has no key for."""
-TURNS = ("rotate", "scale")
+PIVOTED = ("rotate", "scale")
 """Kinds whose pivot matters."""
 
 
@@ -80,7 +80,7 @@ class EstimatedMotions:
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class OmittedComponent:
     """A component that a file does not have.
 
     Attributes
@@ -115,7 +115,7 @@ def perturbation(found: EstimatedMotions, thermal: ThermalModel) -> dict[str, Pe
     thermal : ThermalModel
         Of the instrument.
     """
-    said = [k for k, one in enumerate(found.components) if one.kind not in (*HEAT, *UNSAID)]
+    said = [k for k, one in enumerate(found.components) if one.kind not in (*HEAT, *UNSUPPORTED)]
     moves = state_of(found.mean[said], [found.components[k] for k in said], thermal)
     heat: dict[str, Temperature] = {}
     for one, amount in zip(found.components, found.mean.tolist(), strict=True):
@@ -146,7 +146,7 @@ def _perturbed(motion: Motion, heat: Temperature | None) -> PerturbationSpec:
 
 def state_file(
     found: EstimatedMotions, thermal: ThermalModel, instrument: str, disturbances: str, remark: str
-) -> tuple[str, tuple[LeftOut, ...]]:
+) -> tuple[str, tuple[OmittedComponent, ...]]:
     """Text of the job of the estimated state, and what of it a job cannot say.
 
     Parameters
@@ -166,9 +166,9 @@ def state_file(
     plain = {"instrument": instrument, "perturb": _short(job.plain()["perturb"])}
     head = "".join(f"# {line}\n" for line in remark.splitlines())
     left = tuple(
-        LeftOut(one.name, amount, one.unit, one.unit_size)
+        OmittedComponent(one.name, amount, one.unit, one.unit_size)
         for one, amount in zip(found.components, found.mean.tolist(), strict=True)
-        if one.kind in UNSAID and amount
+        if one.kind in UNSUPPORTED and amount
     )
     return head + dump_yaml({**plain, "disturbances": disturbances}), left
 
@@ -182,7 +182,7 @@ def _short(perturb: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, o
     }
 
 
-def merged(found: EstimatedMotions, instrument: Instrument) -> tuple[tuple[Component, ...], Array]:
+def merge_components(found: EstimatedMotions, instrument: Instrument) -> tuple[tuple[Component, ...], Array]:
     """Every component of every body once, and what of them each stated motion is, (J, M).
 
     Parameters
@@ -206,7 +206,7 @@ def merged(found: EstimatedMotions, instrument: Instrument) -> tuple[tuple[Compo
     for k, one in enumerate(found.components):
         own = place(one.body, one.kind, one.axis, one.pivot)
         entries.append((own, k, 1.0))
-        away = _away(bodies[one.body], one, components[own].pivot) if one.kind in TURNS else np.zeros(3)
+        away = _pivot_shift(bodies[one.body], one, components[own].pivot) if one.kind in PIVOTED else np.zeros(3)
         for axis in np.flatnonzero(np.abs(away) > 0.0).tolist():
             shift = place(one.body, "shift", axis, usual_pivot(nodes[one.body]))
             entries.append((shift, k, float(away[axis])))
@@ -216,7 +216,7 @@ def merged(found: EstimatedMotions, instrument: Instrument) -> tuple[tuple[Compo
     return tuple(components), table
 
 
-def _away(body: Body, one: Component, pivot: str) -> Array:
+def _pivot_shift(body: Body, one: Component, pivot: str) -> Array:
     """Shift (3,) that a turn or a growth about its own pivot is beside one about another pivot, per unit."""
     apart = np.array(body.pivots[pivot]) - np.array(body.pivots[one.pivot])
     return np.asarray(np.cross(np.eye(3)[one.axis], apart) if one.kind == "rotate" else apart)
@@ -241,7 +241,7 @@ class Prior:
     files: Mapping[str, str]
     components: tuple[Component, ...]
     table: Array
-    left_out: tuple[LeftOut, ...]
+    omitted: tuple[OmittedComponent, ...]
 
 
 def prior_files(
@@ -267,7 +267,7 @@ def prior_files(
     remark : str
         At its top, lines of comment.
     """
-    components, table = merged(found, instrument)
+    components, table = merge_components(found, instrument)
     covariance = table @ found.covariance @ table.T
     share = largest_shares(found, stated)
     weight = np.array([share[table[j] != 0.0].max(initial=0.0) for j in range(len(components))])
@@ -283,7 +283,9 @@ def prior_files(
         f"What is not known of {instrument.spec.name} at one time of its operation, about the state that is estimated.",
     )
     left = [
-        LeftOut(components[j].name, float(sigma[j]), components[j].unit, components[j].unit_size, float(weight[j]))
+        OmittedComponent(
+            components[j].name, float(sigma[j]), components[j].unit, components[j].unit_size, float(weight[j])
+        )
         for j in gone
     ]
     own = tuple(replace(components[j], sigma=float(sigma[j])) for j in kept)

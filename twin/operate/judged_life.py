@@ -30,13 +30,13 @@ from twin.framework.artefact import Cell, SvgFigure, Table
 from twin.framework.procedure import Advance
 from twin.framework.report import Report, Section, answer
 from twin.operate.estimate.operation_filter import Operation
-from twin.operate.estimate.reported_estimate import Course, Following
-from twin.operate.record.entries import MICRO, Entry, Given, utc_text
-from twin.operate.record.history import History, initialised
+from twin.operate.estimate.reported_estimate import Course, FilterResult
+from twin.operate.record.entries import MICRO, Entry, FileContent, utc_text
+from twin.operate.record.history import History, initialise_record
 from twin.operate.record.telemetry import RESULTS, read_table_file, read_telemetry, tables_of
 
 FOLLOW = "follow the readings"
-WAYS = {
+METHODS = {
     "ground": "calibration on the ground, kept",
     "single": "each reading by itself",
     "filtered": "operation, readings so far",
@@ -82,16 +82,16 @@ class JudgedLife:
     times: NDArray[np.int64]
     quantities: tuple[Quantity, ...]
     true: Array
-    ways: Mapping[str, Estimate | Course]
+    methods: Mapping[str, Estimate | Course]
     horizon: float
     forecast: Estimate
-    came: Array
+    updated: Array
     interrupted: NDArray[np.bool_]
-    following: Following
+    filter_result: FilterResult
 
     def errors(self, way: str) -> Array:
         """(T, Q) of one way, in each quantity's unit."""
-        return self.ways[way].values - self.true
+        return self.methods[way].values - self.true
 
     def number(self, group: str, key: str) -> int:
         """Of a quantity.
@@ -121,9 +121,9 @@ def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance:
         Told of the progress.
     """
     with tempfile.TemporaryDirectory() as place:
-        initialised(place, plan.model, simulated=True)
+        initialise_record(place, plan.model, simulated=True)
         with History(place) as history:
-            steps = Steps(history, files)
+            steps = StepwiseIngest(history, files)
             times = steps.times
             horizon = plan.operation.horizon
             ahead = np.searchsorted(times, times + round(horizon * MICRO))
@@ -133,9 +133,9 @@ def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance:
             advance(FOLLOW, 0, len(times))
             for k, moment in enumerate(times.tolist()):
                 steps.take(moment)
-                operation = Operation(history, plan) if operation is None else operation.again()
-                following = operation.follow()
-                now.append(following.now)
+                operation = Operation(history, plan) if operation is None else operation.updated()
+                filter_result = operation.filter_readings()
+                now.append(filter_result.now)
                 target = times[ahead[k]] if ahead[k] < len(times) else moment + round(horizon * MICRO)
                 later.append(operation.forecast(np.array([target])))
                 advance(FOLLOW, k + 1, len(times))
@@ -146,19 +146,19 @@ def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance:
     single = _single(read_json(files.parent / RESULTS["monitor"])["series"], operation.quantities)
     quantities = operation.quantities
     true = true_changes(truth, quantities, times)
-    came = np.full_like(true, np.nan)
+    updated = np.full_like(true, np.nan)
     there = ahead < len(times)
-    came[there] = true[ahead[there]]
+    updated[there] = true[ahead[there]]
     targets = np.where(there, times[np.minimum(ahead, len(times) - 1)], times)
-    dates = np.array([time for time, *_ in following.events], np.int64)
+    dates = np.array([time for time, *_ in filter_result.events], np.int64)
     interrupted = np.any((dates > times[:, None]) & (dates <= targets[:, None]), axis=1)
     filtered, forecast = (
         Estimate(*(np.concatenate([getattr(one, part) for one in courses]) for part in ("values", "sigmas")))
         for courses in (now, later)
     )
-    ways: dict[str, Estimate | Course] = {"ground": ground, "single": single}
-    ways |= {"filtered": filtered, "smoothed": smoothed}
-    return JudgedLife(times, quantities, true, ways, horizon, forecast, came, interrupted, following)
+    methods: dict[str, Estimate | Course] = {"ground": ground, "single": single}
+    methods |= {"filtered": filtered, "smoothed": smoothed}
+    return JudgedLife(times, quantities, true, methods, horizon, forecast, updated, interrupted, filter_result)
 
 
 def _prior(operation: Operation, times: NDArray[np.int64]) -> Estimate:
@@ -172,7 +172,7 @@ def _prior(operation: Operation, times: NDArray[np.int64]) -> Estimate:
     return Estimate(values, np.sqrt(np.einsum("qi,tij,qj->tq", rows, spread, rows)))
 
 
-class Steps:
+class StepwiseIngest:
     """The files of a life, taken into a record up to one moment after the other.
 
     Parameters
@@ -203,11 +203,11 @@ class Steps:
         for given in self._given:
             own = [one for one in _entries(given) if self._taken < one.time <= until]
             if own:
-                self._history.take(Given(given.file, given.sha256, given.meaning, own, given.frames))
+                self._history.ingest(FileContent(given.file, given.sha256, given.meaning, own, given.frames))
         self._taken = until
 
 
-def _entries(given: Given) -> list[Entry]:
+def _entries(given: FileContent) -> list[Entry]:
     return [one for one in given.items if isinstance(one, Entry)]
 
 
@@ -290,13 +290,13 @@ def judged_numbers(life: JudgedLife) -> dict[str, Any]:
     """
     told: dict[str, dict[str, Any]] = {}
     for number, one in enumerate(life.quantities):
-        own = {way: _told(life.errors(way)[:, number], said.sigmas[:, number]) for way, said in life.ways.items()}
+        own = {way: _error_summary(life.errors(way)[:, number], said.sigmas[:, number]) for way, said in life.methods.items()}
         for name, which in ((FORECAST, ~life.interrupted), ("forecast_over_events", life.interrupted)):
-            error = (life.forecast.values - life.came)[which, number]
-            own[name] = _told(error, life.forecast.sigmas[which, number])
+            error = (life.forecast.values - life.updated)[which, number]
+            own[name] = _error_summary(error, life.forecast.sigmas[which, number])
         told.setdefault(one.group, {})[one.key] = own
-    following = life.following.to_dict()
-    scores = life.following.scores
+    filter_result = life.filter_result.to_dict()
+    scores = life.filter_result.scores
     return {
         "readings": len(life.times),
         "first_utc": utc_text(int(life.times[0])),
@@ -312,13 +312,13 @@ def judged_numbers(life: JudgedLife) -> dict[str, Any]:
             "within_two_limits": list(likely_shares(scores.components, 2.0)),
             "limits_hold_but_for": CHANCE,
         },
-        "explained_by_temperatures": following["explained"],
-        "sensors": following["sensors"],
-        "jumps": following["jumps"],
+        "explained_by_temperatures": filter_result["explained"],
+        "sensors": filter_result["sensors"],
+        "jumps": filter_result["jumps"],
     }
 
 
-def _told(error: Any, sigma: Any) -> dict[str, Any]:
+def _error_summary(error: Any, sigma: Any) -> dict[str, Any]:
     """RMS and coverage of what is known."""
     value = rms(error)
     out: dict[str, Any] = {"rms": value if math.isfinite(value) else None}
@@ -389,7 +389,7 @@ def _sentences(life: JudgedLife, numbers: dict[str, Any], shown: Sequence[tuple[
     told = []
     for group, key in shown[-2:] if len(shown) > 1 else shown:
         one, said = life.quantities[life.number(group, key)], numbers["quantities"][group][key]
-        values = " / ".join(_short(said[way]["rms"]) for way in WAYS)
+        values = " / ".join(_short(said[way]["rms"]) for way in METHODS)
         told.append(f"{group} {one.parameter.symbol} {values} {one.parameter.unit}")
     made = numbers["predictions"]
     low, high = made["within_one_limits"]
@@ -412,14 +412,14 @@ def _sentences(life: JudgedLife, numbers: dict[str, Any], shown: Sequence[tuple[
 
 def _table(life: JudgedLife) -> Table:
     """RMS errors by way, and shares within one and two sigmas."""
-    heads = ("quantity", *("RMS: " + way for way in WAYS), "forecast")
+    heads = ("quantity", *("RMS: " + way for way in METHODS), "forecast")
     heads += tuple(f"{way} within {n} σ [%]" for way in _COVERED for n in (1, 2))
     rows: list[list[Cell]] = []
     quantities = judged_numbers(life)["quantities"]
     for one in life.quantities:
         said = quantities[one.group][one.key]
         row: list[Cell] = [f"{one.group} {one.parameter.label}"]
-        row += [_cell(said[way]["rms"]) for way in (*WAYS, FORECAST)]
+        row += [_cell(said[way]["rms"]) for way in (*METHODS, FORECAST)]
         for way in _COVERED:
             row += [_cell(said[way][key], 100.0) for key in ("within_one", "within_two")]
         rows.append(row)
@@ -447,12 +447,12 @@ def judged_svg(life: JudgedLife, quantities: Sequence[tuple[str, str]]) -> str:
     """
     with svg.look("operation"):
         figure = svg.new_figure(8.4)
-        grid = figure.subplots(len(WAYS), len(quantities), sharex=True, squeeze=False)
+        grid = figure.subplots(len(METHODS), len(quantities), sharex=True, squeeze=False)
         for column, name in enumerate(quantities):
             number = life.number(*name)
             one = life.quantities[number]
             own = "" if one.group in (ANGLE_GROUP, GROUND_GROUP) else f"{one.group} "
-            for row, (way, title) in enumerate(WAYS.items()):
+            for row, (way, title) in enumerate(METHODS.items()):
                 axes = grid[row, column]
                 _panel(axes, life, way, number)
                 size = f"RMS {rms(life.errors(way)[:, number]):.2g} {one.parameter.unit}"
@@ -469,15 +469,15 @@ def judged_svg(life: JudgedLife, quantities: Sequence[tuple[str, str]]) -> str:
 def _panel(axes: Any, life: JudgedLife, way: str, number: int) -> None:
     """Errors of one way with its sigma, when events came, and between which readings jumps that were told."""
     years = (life.times - life.times[0]) / _YEAR
-    error, sigma = life.errors(way)[:, number], life.ways[way].sigmas[:, number]
+    error, sigma = life.errors(way)[:, number], life.methods[way].sigmas[:, number]
     svg.gridded(axes)
     axes.axhline(0.0, color=svg.GREY, lw=0.7)
     for times, colour, name in ((2.0, svg.SHADE, "±2σ"), (1.0, svg.LIGHT, "±σ")):
         if np.any(np.isfinite(sigma)):
             axes.fill_between(years, -times * sigma, times * sigma, color=colour, lw=0.0, label=name)
-    for k, (moment, *_) in enumerate(life.following.events):
+    for k, (moment, *_) in enumerate(life.filter_result.events):
         axes.axvline((moment - life.times[0]) / _YEAR, color=svg.ORANGE, lw=0.9, ls="--", label="" if k else "event")
-    for k, jump in enumerate(life.following.jumps):
+    for k, jump in enumerate(life.filter_result.jumps):
         low, high = ((moment - life.times[0]) / _YEAR for moment in (jump.after_us, jump.until_us))
         axes.axvspan(low, high, color=svg.PURPLE, alpha=0.5, lw=1.0, label="" if k else "jump that was told")
     axes.plot(years, error, color=svg.BLUE, lw=1.1, label="estimate minus truth")

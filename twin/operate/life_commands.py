@@ -128,7 +128,11 @@ def judge(
 
         plan, telemetry, known = given
         done = judged(plan, telemetry, _truth(known), session.advance)
-        facts: dict[str, Any] = {"config": dump_yaml(plan.plain()), "command": "judge", "given": (telemetry, known)}
+        facts: dict[str, Any] = {
+            "config": dump_yaml(plan.plain()),
+            "command": "judge",
+            "input_paths": (telemetry, known),
+        }
         facts["again"] = ("twin.operate", "judge", str(life), *(() if truth is None else ("--truth", str(truth))))
         report = judged_report(done, plan.model.instrument.name)
         return finished(session, "judged", report, judged_numbers(done), program="twin.operate", **facts)

@@ -27,7 +27,7 @@ from scenes.specs.orbit.setup import AnyAdjust
 from scenes.yaml.errors import InputError, Problem, unknown
 from twin.framework.procedure import Advance, silent
 from twin.operate.estimate.operation_filter import Operation
-from twin.operate.estimate.operation_model import kept_plan, read_plan
+from twin.operate.estimate.operation_model import read_plan, stored_plan
 from twin.operate.record import NotARecord, RecordFailed
 from twin.operate.record.entries import micros, utc_text
 from twin.operate.record.history import History
@@ -169,7 +169,7 @@ def _recorded(
 ) -> JointCameraPrior:
     with History(spec.record) as history:
         try:
-            plan = kept_plan(history) if spec.plan is None else read_plan(Path(spec.plan), history)
+            plan = stored_plan(history) if spec.plan is None else read_plan(Path(spec.plan), history)
         except InputError as error:
             raise Problem(str(error), spec.plan, "a plan of the record's instrument", within=("plan",)) from None
         if plan is None:
@@ -185,7 +185,7 @@ def _recorded(
                 found = f"{np.degrees(mounted[line].look):.4g} deg, not {np.degrees(look):.4g} deg"
                 raise Problem(text, found, "the record of the instrument that took the images", within=("record",))
         operation = Operation(history, plan, lambda done, of: advance("follow the record", done, of))
-        operation.follow()
+        operation.filter_readings()
         for line in lines:
             length = plan.model.cameras[mounted[line].camera].focal_length
             stated = setup.camera.lines[line].principal_distance

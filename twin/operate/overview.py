@@ -29,7 +29,7 @@ from twin.operate.record.schema import ENTRY, SOURCE
 
 if TYPE_CHECKING:
     from twin.operate.estimate.operation_filter import Operation
-    from twin.operate.estimate.reported_estimate import Break, Course, Following, FoundJump
+    from twin.operate.estimate.reported_estimate import Course, DetectedJump, FilterResult, RequirementStatus
     from twin.operate.record.history import History
 
 KIND = "monitor"
@@ -156,7 +156,7 @@ def coverage(sigmas: int, within: int, count: int) -> Coverage:
 
 
 @dataclass(frozen=True, eq=False)
-class Points:
+class SingleReadings:
     """What single readings say of the quantities, each by itself.
 
     Attributes
@@ -174,7 +174,7 @@ class Points:
     sigmas: np.ndarray
 
 
-def points_of(entries: Sequence[Mapping[str, Any]], quantities: Sequence[Quantity]) -> Points:
+def single_readings(entries: Sequence[Mapping[str, Any]], quantities: Sequence[Quantity]) -> SingleReadings:
     """Readings of the monitor as points.
 
     Parameters
@@ -194,7 +194,7 @@ def points_of(entries: Sequence[Mapping[str, Any]], quantities: Sequence[Quantit
             if quantity.key in read:
                 values[n, q] = read[quantity.key]
                 sigmas[n, q] = read.get(f"{quantity.key}_sigma", np.nan)
-    return Points(np.array([entry["time_us"] for entry in entries], np.int64), values, sigmas)
+    return SingleReadings(np.array([entry["time_us"] for entry in entries], np.int64), values, sigmas)
 
 
 def spread(begin: int, end: int, count: int) -> np.ndarray:
@@ -203,7 +203,7 @@ def spread(begin: int, end: int, count: int) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Happening:
+class Occurrence:
     """Something that happened at a time.
 
     Attributes
@@ -243,7 +243,7 @@ class Overview:
     """
 
     operation: Operation
-    following: Following
+    filter_result: FilterResult
     alarms: tuple[Mapping[str, Any], ...]
     events: tuple[tuple[int, str, tuple[str, ...]], ...]
     begin: int
@@ -254,12 +254,12 @@ class Overview:
         known = operation.plan.operation.events
         found = ((int(one["time_us"]), str(one["subject"])) for one in history.entries("event"))
         events = tuple((time, name, tuple(known.get(name, ()))) for time, name in found)
-        return cls(operation, operation.follow(), tuple(history.alarms()), events, span_of(history)[0])
+        return cls(operation, operation.filter_readings(), tuple(history.alarms()), events, span_of(history)[0])
 
     @property
     def time(self) -> int:
         """Of the newest entry that was used, microseconds of TAI since 2000."""
-        return self.following.time
+        return self.filter_result.time
 
     @property
     def latest(self) -> int:
@@ -271,9 +271,9 @@ class Overview:
         """What is estimated."""
         return tuple(self.operation.quantities)
 
-    def required(self, quantity: Quantity) -> Break | None:
+    def required(self, quantity: Quantity) -> RequirementStatus | None:
         """The requirement on a quantity with what is known of it; None where nothing is required."""
-        return next((one for one in self.following.breaks if one.quantity == quantity.name), None)
+        return next((one for one in self.filter_result.requirements if one.quantity == quantity.name), None)
 
     @property
     def horizon(self) -> int:
@@ -283,53 +283,53 @@ class Overview:
     @property
     def coverages(self) -> tuple[Coverage, ...]:
         """Whether predictions came true, within 1 and 2 sigma."""
-        scores = self.following.scores
+        scores = self.filter_result.scores
         return (coverage(1, scores.within_one, scores.components), coverage(2, scores.within_two, scores.components))
 
-    def happened(self) -> Iterator[Happening]:
+    def occurrences(self) -> Iterator[Occurrence]:
         """All that happened, in no order: jumps at the end of the interval in which they came."""
-        told = self.following
+        told = self.filter_result
         for jump in told.jumps:
-            label, unit, size, sigma = largest_part(jump)
+            label, unit, size, sigma = best_known_motion(jump)
             text = f"a jump of {jump.body} between {minute_text(jump.after_us)} and {minute_text(jump.until_us)}"
             text += f": {label} {with_sigma(size, sigma, unit)}"
-            yield Happening(jump.told_us, "jump", text)
+            yield Occurrence(jump.detected_us, "jump", text)
         for time, name, _ in self.events:
-            yield Happening(time, "event", f"the event {name.replace('_', ' ')}")
+            yield Occurrence(time, "event", f"the event {name.replace('_', ' ')}")
         for sensor in told.sensors:
             if sensor.state != "ok":
-                yield Happening(sensor.since_us, "sensor", f"the sensor of {sensor.body} is {sensor.state}")
+                yield Occurrence(sensor.since_us, "sensor", f"the sensor of {sensor.body} is {sensor.state}")
         for alarm in self.alarms:
             # one of what is still to come was raised with the newest reading at the latest
-            yield Happening(
+            yield Occurrence(
                 min(int(alarm["time_us"]), self.latest),
                 "alarm",
                 str(alarm["text"]),
                 alarm["kind"] in ("jump", "sensor"),
             )
-        for time, kind, subject, reason in told.left_out:
-            yield Happening(time, "left out", f"{kind} of {subject}: {reason}")
+        for time, kind, subject, reason in told.excluded:
+            yield Occurrence(time, "left out", f"{kind} of {subject}: {reason}")
 
-    def changed(self, begin: int, end: int) -> list[Happening]:
+    def changed(self, begin: int, end: int) -> list[Occurrence]:
         """What happened from a time on and before another one, in the order of time."""
-        found = [one for one in self.happened() if begin <= one.time < end]
+        found = [one for one in self.occurrences() if begin <= one.time < end]
         return sorted(found, key=lambda one: one.time)
 
     def state_sentence(self) -> str:
         """Whether the requirements hold, and which is the least sure."""
-        breaks = self.following.breaks
-        if not breaks:
+        requirements = self.filter_result.requirements
+        if not requirements:
             return "The plan states no requirement"
-        broken = [one for one in breaks if not one.holds_now]
-        worst = max(breaks, key=lambda one: one.chance_now / (1.0 - one.probability))
+        broken = [one for one in requirements if not one.holds_now]
+        worst = max(requirements, key=lambda one: one.chance_now / (1.0 - one.probability))
         which = f"{self._now(worst)}, limit {_limit(worst)} (beyond it with a chance of {percent(worst.chance_now)}; "
         which += f"{percent(1.0 - worst.probability)} is allowed)"
-        if len(breaks) == 1:
+        if len(requirements) == 1:
             return f"The requirement {'does not hold' if broken else 'holds'}: {which}"
         if broken:
             verb, link = ("does", "") if len(broken) == 1 else ("do", "the worst: ")
-            return f"{len(broken)} of {len(breaks)} requirements {verb} not hold: {link}{which}"
-        return f"All {len(breaks)} requirements hold; the least sure: {which}"
+            return f"{len(broken)} of {len(requirements)} requirements {verb} not hold: {link}{which}"
+        return f"All {len(requirements)} requirements hold; the least sure: {which}"
 
     def change_sentence(self, begin: int, end: int, when: str) -> str:
         """What changed in a span, counted by sort.
@@ -353,7 +353,7 @@ class Overview:
 
     def break_sentences(self) -> list[str]:
         """Which requirements are expected to break, the first to break first."""
-        coming = [one for one in self.following.breaks if one.holds_now and one.breaks_us is not None]
+        coming = [one for one in self.filter_result.requirements if one.holds_now and one.breaks_us is not None]
         return [
             f"{_capital(self._name(one))} is expected to break its requirement of {_limit(one)} on "
             f"{day_text(one.breaks_us or 0)}"
@@ -367,7 +367,7 @@ class Overview:
             return "No reading has been predicted yet"
         held = one.holds and two.holds
         return (
-            f"Of {one.count} components of {self.following.scores.readings} readings, each predicted before it came, "
+            f"Of {one.count} components of {self.filter_result.scores.readings} readings, each predicted before it came, "
             f"{100.0 * one.share:.1f} % lay within 1σ and {100.0 * two.share:.1f} % within 2σ, "
             f"{'as' if held else 'other than'} predictions of the right size have it "
             f"({100.0 * one.expected:.1f} and {100.0 * two.expected:.1f} %)"
@@ -378,14 +378,14 @@ class Overview:
         found = [one for one in self.alarms if one["acknowledged"] is None]
         return sorted(found, key=lambda one: -int(one["time_us"]))
 
-    def _name(self, one: Break) -> str:
+    def _name(self, one: RequirementStatus) -> str:
         return name_of(one.quantity, self.quantities)
 
-    def _quantity(self, one: Break) -> Quantity:
+    def _quantity(self, one: RequirementStatus) -> Quantity:
         return next(quantity for quantity in self.quantities if quantity.name == one.quantity)
 
-    def _now(self, one: Break) -> str:
-        quantity, now = self._quantity(one), self.following.now
+    def _now(self, one: RequirementStatus) -> str:
+        quantity, now = self._quantity(one), self.filter_result.now
         q = self.quantities.index(quantity)
         value = with_sigma(float(now.values[0, q]), float(now.sigmas[0, q]), quantity.parameter.unit)
         return f"{self._name(one)} is {value}"
@@ -410,22 +410,22 @@ def _capital(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}"
 
 
-def _limit(one: Break) -> str:
+def _limit(one: RequirementStatus) -> str:
     """The limit with its unit."""
     return f"{one.limit:g} {one.unit}"
 
 
-def largest_part(jump: FoundJump) -> tuple[str, str, float, float]:
+def best_known_motion(jump: DetectedJump) -> tuple[str, str, float, float]:
     """The motion of a jump that is known best: its name, unit, size and sigma."""
     return max(jump.sizes, key=lambda one: abs(one[2]) / one[3] if one[3] > 0.0 else 0.0)
 
 
-def carried_text(overview: Overview, jump: FoundJump) -> str:
+def line_change_text(overview: Overview, jump: DetectedJump) -> str:
     """What a jump did to the line, of what is required; of all where nothing is; empty where nothing is told of it."""
     parts = []
     for quantity in overview.quantities:
-        told = jump.carried.get(quantity.name)
-        if told is not None and (overview.required(quantity) is not None or not overview.following.breaks):
+        told = jump.line_changes.get(quantity.name)
+        if told is not None and (overview.required(quantity) is not None or not overview.filter_result.requirements):
             _, changed, sigma = told
             if abs(changed) + sigma < SAME:  # the body is none of that camera
                 continue
@@ -450,7 +450,7 @@ class Trend:
 
     past: Course
     future: Course | None
-    points: Points
+    points: SingleReadings
 
 
 MOST_POINTS = 600
@@ -474,17 +474,17 @@ def trend(history: History, overview: Overview, begin: int, end: int, count: int
         Times at most, of past and future each.
     """
     operation, now = overview.operation, overview.time
-    edges = [t for jump in overview.following.jumps for t in (jump.after_us, jump.until_us)]
+    edges = [t for jump in overview.filter_result.jumps for t in (jump.after_us, jump.until_us)]
     edges += [t for time, *_ in overview.events for t in (time - 1, time)]
     last = min(end, now)
     own = [t for t in edges if begin <= t <= last]
     past = operation.smoothed(np.unique(np.concatenate([spread(begin, last, count), np.array(own, np.int64)])))
     if past.times[-1] == now:  # as all that is told of now and later
-        current = overview.following.now
+        current = overview.filter_result.now
         parts = ("values", "sigmas", "changes", "covariance")
         joined: dict[str, Any] = {
             part: np.concatenate([getattr(past, part)[:-1], getattr(current, part)]) for part in parts
         }
         past = replace(past, **joined)
     future = operation.forecast(spread(now, end, count)) if end > now else None
-    return Trend(past, future, points_of(readings(history, begin, last, MOST_POINTS), overview.quantities))
+    return Trend(past, future, single_readings(readings(history, begin, last, MOST_POINTS), overview.quantities))

@@ -37,7 +37,7 @@ from twin.framework.procedure import BenchError
 from twin.framework.record import Quantity, Record
 from twin.framework.reference_frames import described
 from twin.operate.estimate.operation_model import plan_digest
-from twin.operate.estimated_motions import EstimatedMotions, LeftOut, Prior, prior_files, state_file
+from twin.operate.estimated_motions import EstimatedMotions, OmittedComponent, Prior, prior_files, state_file
 from twin.operate.record.entries import MICRO, digest_of_data, instrument_digest, micros, utc_text
 from twin.operate.record.schema import ENTRY
 from twin.orbit.export.export_report import LINE, export_files
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from optics.numerics.backend import Backend
     from scenes.models.disturbances import Component
     from twin.operate.estimate.operation_filter import Operation
-    from twin.operate.estimate.reported_estimate import Course, Following
+    from twin.operate.estimate.reported_estimate import Course, FilterResult
     from twin.operate.record.history import History
     from twin.orbit.export.export_run import ExportSource
 
@@ -62,7 +62,7 @@ that does not."""
 
 
 @dataclass(frozen=True)
-class Mark:
+class ValidityLimit:
     """What an estimate does not hold across.
 
     Attributes
@@ -98,9 +98,9 @@ class Validity:
 def validity(
     estimates: Callable[[Sequence[int]], Course],
     time: int,
-    first: Mark,
-    last: Mark,
-    marks: Sequence[Mark] = (),
+    first: ValidityLimit,
+    last: ValidityLimit,
+    marks: Sequence[ValidityLimit] = (),
     beside: Course | None = None,
 ) -> Validity:
     """The span in which the estimate of a time holds.
@@ -124,11 +124,11 @@ def validity(
     high = min((one for one in (last, *marks) if one.time > time), key=lambda one: one.time, default=last)
     here = beside or estimates([time])
     ends = {-1: time - low.time, 1: high.time - time}
-    found = _looked_at(estimates, here, time, {sign: (0, _distances(0, span)) for sign, span in ends.items()})
+    found = _limits_of_validity(estimates, here, time, {sign: (0, _distances(0, span)) for sign, span in ends.items()})
     again = {sign: (good, _distances(good, bad, evenly=True)) for sign, (good, bad, _) in found.items()}
-    found |= _looked_at(estimates, here, time, again)
+    found |= _limits_of_validity(estimates, here, time, again)
     since, until = (
-        Mark(time + sign * found[sign][0], found[sign][2]) if sign in found else mark
+        ValidityLimit(time + sign * found[sign][0], found[sign][2]) if sign in found else mark
         for sign, mark in ((-1, low), (1, high))
     )
     return Validity(since.time, until.time, since.reason, until.reason)
@@ -145,7 +145,7 @@ def _distances(good: int, end: int, evenly: bool = False) -> NDArray[np.int64]:
     return np.unique(np.round(away).astype(np.int64))
 
 
-def _looked_at(
+def _limits_of_validity(
     estimates: Callable[[Sequence[int]], Course],
     here: Course,
     time: int,
@@ -230,14 +230,14 @@ class Products:
     history: History
     time: int
     scene_time: int | None
-    following: Following
+    filter_result: FilterResult
     version: str
     course: Course
     validity: Validity
     changes: Mapping[str, EstimatedChange]
     export: Export | None
     state: str
-    state_left_out: tuple[LeftOut, ...]
+    omitted_from_state: tuple[OmittedComponent, ...]
     prior: Prior
     warnings: tuple[str, ...]
 
@@ -261,7 +261,9 @@ def scene_time(scene: ExportSource) -> int:
     return micros(str(setup.test.orbit.epoch), seconds=setup.test.time)
 
 
-def made(operation: Operation, history: History, time: int, scene: ExportSource | None, backend: Backend) -> Products:
+def make_products(
+    operation: Operation, history: History, time: int, scene: ExportSource | None, backend: Backend
+) -> Products:
     """The products of a time.
 
     Parameters
@@ -286,9 +288,9 @@ def made(operation: Operation, history: History, time: int, scene: ExportSource 
     """
     at = None if scene is None else scene_time(scene)
     if scene is not None:
-        _require_own(scene, history)
-    following = operation.follow()
-    ends = _ends(operation, history, following)
+        _require_same_instrument(scene, history)
+    result = operation.filter_readings()
+    ends = _ends(operation, history, result)
     if not ends[0].time <= time <= ends[1].time:
         early = time < ends[0].time
         text = "nothing is known of a time before the first reading" if early else "the forecast does not go so far"
@@ -299,23 +301,27 @@ def made(operation: Operation, history: History, time: int, scene: ExportSource 
     both = operation.smoothed([time, min(time + 1, ends[1].time)])
     course, beside = _at(both, 0), _at(both, 1)
     far = round(operation.plan.operation.horizon * MICRO)
-    limits = [Mark(time + sign * far, "longer than the plan's horizon nothing is looked at") for sign in (-1, 1)]
-    held = validity(operation.smoothed, time, *ends, [*_marks(following), *limits], beside)
+    limits = [
+        ValidityLimit(time + sign * far, "longer than the plan's horizon nothing is looked at") for sign in (-1, 1)
+    ]
+    held = validity(operation.smoothed, time, *ends, [*_validity_limits(result), *limits], beside)
     motions = operation.motions(time, acting=True)
     disturbances = operation.model.how.stated
     found = EstimatedMotions.in_units(_components(operation), motions.mean, motions.covariance)
     version = _version(operation, history)
-    changes = _changes(operation, course, found, _notes(time, held, following, version))
+    changes = _changes(operation, course, found, _notes(time, held, result, version))
     remark = f"{history.name} as estimated for {utc_text(time)}, version {version}"
-    about = f"posterior of {following.readings} readings up to {utc_text(following.time)}, for {utc_text(time)}"
+    about = f"posterior of {result.readings} readings up to {utc_text(result.time)}, for {utc_text(time)}"
     plan, instrument = operation.plan.operation, operation.experiment.instrument
     state, left = state_file(found, operation.experiment.thermal, plan.instrument, plan.disturbances, remark)
     prior = prior_files(
         found, disturbances, instrument, PRIOR, about, f"{remark}\nWhat is uncertain of the state in {STATE}.yaml"
     )
     export = None if scene is None else _exported(scene, backend, changes)
-    warnings = _warnings(following, time, at, export, left, prior)
-    return Products(history, time, at, following, version, course, held, changes, export, state, left, prior, warnings)
+    warnings = _warnings(result, time, at, export, left, prior)
+    return Products(
+        history, time, at, result, version, course, held, changes, export, state, left, prior, warnings
+    )
 
 
 def _components(operation: Operation) -> list[Component]:
@@ -327,7 +333,7 @@ def _components(operation: Operation) -> list[Component]:
     return [own[key] for key in zip(of.causes, of.labels, strict=True)]
 
 
-def _require_own(scene: ExportSource, history: History) -> None:
+def _require_same_instrument(scene: ExportSource, history: History) -> None:
     """Refuse a scene of another instrument. Raises Problem."""
     plain = scene.setup.plain()
     allowed = f"a scene of {history.name} ({history.sha256[:12]}), which the record is of: camera: {history.name}"
@@ -339,13 +345,15 @@ def _require_own(scene: ExportSource, history: History) -> None:
         raise Problem("the scene is of another instrument", f"{name} ({found[:12]})", allowed)
 
 
-def _ends(operation: Operation, history: History, following: Following) -> tuple[Mark, Mark]:
+def _ends(operation: Operation, history: History, result: FilterResult) -> tuple[ValidityLimit, ValidityLimit]:
     """The first reading, and the end of the forecast. Raises Problem: there are no readings."""
     first = history.first("monitor")
-    if first is None or not following.readings:
+    if first is None or not result.readings:
         raise Problem("the record has no reading of the monitor", None, "python -m twin.operate ingest RECORD RUN")
-    end = following.time + round(operation.plan.operation.horizon * MICRO)
-    return Mark(int(first["time_us"]), "the first reading of the monitor"), Mark(end, "the horizon of the forecast")
+    end = result.time + round(operation.plan.operation.horizon * MICRO)
+    return ValidityLimit(int(first["time_us"]), "the first reading of the monitor"), ValidityLimit(
+        end, "the horizon of the forecast"
+    )
 
 
 def _at(course: Course, k: int) -> Course:
@@ -354,18 +362,20 @@ def _at(course: Course, k: int) -> Course:
     return replace(course, **{name: getattr(course, name)[k : k + 1] for name in names})
 
 
-def _marks(following: Following) -> list[Mark]:
+def _validity_limits(result: FilterResult) -> list[ValidityLimit]:
     """What an estimate does not hold across."""
     marks = [
-        Mark(moment, f"the event {name}, with which {', '.join(causes)} step")
-        for moment, name, causes in following.events
+        ValidityLimit(moment, f"the event {name}, with which {', '.join(causes)} step")
+        for moment, name, causes in result.events
         if causes
     ]
-    for jump in following.jumps:
-        marks += [Mark(moment, f"a jump of {jump.body} was found") for moment in (jump.after_us, jump.until_us)]
-    for one in following.breaks:
+    for jump in result.jumps:
+        marks += [
+            ValidityLimit(moment, f"a jump of {jump.body} was found") for moment in (jump.after_us, jump.until_us)
+        ]
+    for one in result.requirements:
         if one.breaks_us is not None:
-            marks.append(Mark(one.breaks_us, f"{one.quantity} no longer keeps its requirement"))
+            marks.append(ValidityLimit(one.breaks_us, f"{one.quantity} no longer keeps its requirement"))
     return marks
 
 
@@ -400,10 +410,10 @@ def _changes(
     return out
 
 
-def _notes(time: int, held: Validity, following: Following, version: str) -> tuple[str, ...]:
+def _notes(time: int, held: Validity, result: FilterResult, version: str) -> tuple[str, ...]:
     return (
-        f"The camera is as estimated for {utc_text(time)} from {following.readings} readings up to "
-        f"{utc_text(following.time)}; the estimate holds from {utc_text(held.since)} ({held.since_reason}) to "
+        f"The camera is as estimated for {utc_text(time)} from {result.readings} readings up to "
+        f"{utc_text(result.time)}; the estimate holds from {utc_text(held.since)} ({held.since_reason}) to "
         f"{utc_text(held.until)} ({held.until_reason}).",
         f"Version {version}.",
     )
@@ -434,12 +444,17 @@ _RELIEFS = 4.0
 
 
 def _warnings(
-    following: Following, time: int, scene: int | None, export: Export | None, left: Sequence[LeftOut], prior: Prior
+    result: FilterResult,
+    time: int,
+    scene: int | None,
+    export: Export | None,
+    left: Sequence[OmittedComponent],
+    prior: Prior,
 ) -> tuple[str, ...]:
-    out = list(following.warnings)
+    out = list(result.warnings)
     if scene is not None and abs(scene - time) > APART:
         out.append(f"the scene was taken at {utc_text(scene)}, and the estimate is for {utc_text(time)}")
-    for one in following.breaks:
+    for one in result.requirements:
         if not one.holds_now:
             out.append(f"{one.quantity} does not keep its requirement")
     for name, line in (export.lines if export is not None else {}).items():
@@ -447,9 +462,9 @@ def _warnings(
             out.append(f"{name} has no rational polynomials: {line.refused}")
     if left:
         out.append(f"{STATE}.yaml does not have {len(left)} motions that a job cannot say")
-    if prior.left_out:
-        most = max(one.share or 0.0 for one in prior.left_out)
-        text = f"{PRIOR}.yaml does not have the {len(prior.left_out)} components that matter least"
+    if prior.omitted:
+        most = max(one.share or 0.0 for one in prior.omitted)
+        text = f"{PRIOR}.yaml does not have the {len(prior.omitted)} components that matter least"
         out.append(f"{text}; none makes more than {100.0 * most:.2g} percent of the variance of a spot or a parameter")
     return tuple(out)
 
@@ -467,7 +482,7 @@ def _cameras(one: Products) -> dict[str, dict[str, float]]:
     return out
 
 
-LEFT_OUT: Record[LeftOut] = Record(
+OMITTED: Record[OmittedComponent] = Record(
     "A component that a file does not have.",
     Quantity("component", lambda one: one.name, "body, kind and axis"),
     Quantity("amount", lambda one: one.amount / one.unit_size, "estimated amount, of a prior its standard deviation"),
@@ -479,13 +494,13 @@ LEFT_OUT: Record[LeftOut] = Record(
 STATE_FILE: Record[Products] = Record(
     "The job of the estimated state.",
     Quantity("file", lambda one: f"{STATE}.yaml", "for python -m twin.render"),
-    Quantity("left_out", lambda one: list(one.state_left_out), "motions that a job cannot say", record=LEFT_OUT),
+    Quantity("omitted", lambda one: list(one.omitted_from_state), "motions that a job cannot express", record=OMITTED),
 )
 PRIOR_FILE: Record[Products] = Record(
     "What is uncertain of that state.",
     Quantity("file", lambda one: f"{PRIOR}.yaml", "for disturbances of a job or of python -m twin.asbuilt"),
     Quantity("components", lambda one: len(one.prior.components), "that it has"),
-    Quantity("left_out", lambda one: list(one.prior.left_out), "that it does not have", record=LEFT_OUT),
+    Quantity("omitted", lambda one: list(one.prior.omitted), "components that it omits", record=OMITTED),
 )
 PRODUCTS: Record[Products] = Record(
     "products.json. What an operation's estimate says for one time.",
@@ -506,8 +521,8 @@ PRODUCTS: Record[Products] = Record(
     Quantity("valid_within_percent", lambda one: SHARE, "by which errors may be larger than at the time itself"),
     Quantity("version", lambda one: one.version, "SHA-256 of the record's last entry, the plan and the program"),
     Quantity("program", lambda one: f"{WRITER} {importlib.metadata.version(WRITER)}", "that wrote it"),
-    Quantity("readings", lambda one: one.following.readings, "of the monitor that the estimate rests on"),
-    Quantity("newest_utc", lambda one: utc_text(one.following.time), "time of the newest of them"),
+    Quantity("readings", lambda one: one.filter_result.readings, "of the monitor that the estimate rests on"),
+    Quantity("newest_utc", lambda one: utc_text(one.filter_result.time), "time of the newest of them"),
     Quantity("estimate", _cameras, "every quantity of every camera and of both together, with its sigma"),
     Quantity(
         "changes",
@@ -555,8 +570,8 @@ def product_files(one: Products) -> tuple[dict[str, bytes], dict[str, Any]]:
 def summary(one: Products) -> str:
     """What there is, for the terminal."""
     lines = [
-        f"{one.history.name} at {utc_text(one.time)}, from {one.following.readings} readings up to "
-        f"{utc_text(one.following.time)}",
+        f"{one.history.name} at {utc_text(one.time)}, from {one.filter_result.readings} readings up to "
+        f"{utc_text(one.filter_result.time)}",
         f"holds from {utc_text(one.validity.since)}: {one.validity.since_reason}",
         f"holds until {utc_text(one.validity.until)}: {one.validity.until_reason}",
     ]

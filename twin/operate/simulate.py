@@ -158,15 +158,15 @@ def drawn_life(
     own, steps = causes_of(stated), list[Step]()
     for number, (cause, where) in enumerate(own.items()):
         steps += _jumps(stated, cause, where, times, np.random.default_rng(stream(seed, _JUMPS, number)))
-    came = _drawn_dates(sorted(causes), times, seed) if dates is None else tuple(sorted(dates))
-    for number, (moment, name) in enumerate(came):
+    updated = _drawn_dates(sorted(causes), times, seed) if dates is None else tuple(sorted(dates))
+    for number, (moment, name) in enumerate(updated):
         for k, cause in enumerate(causes.get(name, ())):
             rng = np.random.default_rng(stream(seed, _EVENTS, number, k))
             steps.append(Step(moment, cause, "", name, _step(stated, own.get(cause, []), rng)))
     rng = np.random.default_rng(stream(seed, _COEFFICIENTS))
     warm = dict.fromkeys(c.body for c in stated.components if c.kind == "temperature")
     coefficients = dict(zip(warm, (coefficient_error * rng.standard_normal(len(warm))).tolist(), strict=True))
-    return Life(times, stated.components, drawn, tuple(sorted(steps, key=_when)), came, coefficients)
+    return Life(times, stated.components, drawn, tuple(sorted(steps, key=_when)), updated, coefficients)
 
 
 def _jumps(
@@ -265,7 +265,7 @@ class Simulation:
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
+class SimulatedRecord:
     """What came of a simulated life.
 
     Attributes
@@ -289,7 +289,9 @@ class Recorded:
     lost: tuple[tuple[int, str], ...]
 
 
-def recorded(plan: OperationSetup, experiment: MonitorExperiment, what: Simulation, advance: Advance) -> Recorded:
+def simulate_record(
+    plan: OperationSetup, experiment: MonitorExperiment, what: Simulation, advance: Advance
+) -> SimulatedRecord:
     """Draw a life, trace and render its states, and recover what the monitor reads of them.
 
     Parameters
@@ -334,7 +336,7 @@ def recorded(plan: OperationSetup, experiment: MonitorExperiment, what: Simulati
             numbers += found.numbers.tolist()
         advance(RENDER, int(piece[-1]) + 1, len(life.times))
     truth = ReadingTable.joined(tables).true() if tables else {}
-    return Recorded(life, life.times[numbers], tuple(readings), truth, tuple(lost))
+    return SimulatedRecord(life, life.times[numbers], tuple(readings), truth, tuple(lost))
 
 
 def _readings(
@@ -350,7 +352,7 @@ def _readings(
 
 
 def write_simulated(
-    folder: RunFolder, plan: OperationSetup, experiment: MonitorExperiment, what: Simulation, found: Recorded
+    folder: RunFolder, plan: OperationSetup, experiment: MonitorExperiment, what: Simulation, found: SimulatedRecord
 ) -> None:
     """Write what the instrument would send down, and a file that says what its tables hold; not the truth.
 
@@ -420,7 +422,7 @@ def sensed_temperatures(reference: float, what: Simulation, life: Life) -> dict[
     return out
 
 
-def truth_numbers(plan: OperationSetup, what: Simulation, found: Recorded) -> dict[str, Any]:
+def truth_numbers(plan: OperationSetup, what: Simulation, found: SimulatedRecord) -> dict[str, Any]:
     """What only the simulation knows, as plain data: changes of cameras, angle and ground by the exact trace, steps,
     coefficients and temperatures.
 

@@ -21,13 +21,13 @@ from twin.framework.procedure import WRITE, Advance
 from twin.framework.reference_frames import described
 from twin.framework.run_folder import RunFolder, chosen, json_text, write_manifest
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.operate.estimate.operation_model import keep_plan, read_plan
+from twin.operate.estimate.operation_model import read_plan, store_plan
 from twin.operate.record.entries import utc_text
-from twin.operate.record.history import History, initialised
-from twin.operate.record.taking import Taken
+from twin.operate.record.history import History, initialise_record
+from twin.operate.record.taking import IngestResult
 from twin.operate.record.telemetry import CONFIG, read_table_file, read_telemetry, tables_of
-from twin.operate.simulate import FOLDER, LIFE, TELEMETRY, Simulation, recorded, truth_numbers, write_simulated
-from twin.operate.terminal import moment_said, problems_of
+from twin.operate.simulate import FOLDER, LIFE, TELEMETRY, Simulation, simulate_record, truth_numbers, write_simulated
+from twin.operate.terminal import input_errors, utc_option
 
 PROGRAM = "twin.operate"
 CALIBRATE, TAKE = "calibrate", "take into the record"
@@ -71,7 +71,7 @@ def simulation(options: Mapping[str, str], several: Mapping[str, Sequence[str]],
         raise InputErrorText(f"--coefficient-error: {options['--coefficient-error']} is below zero; write 30%, or 0%")
     if not sigma > 0.0:
         raise InputErrorText(f"--sensor-sigma: {options['--sensor-sigma']} is no standard deviation; write 0.05 K")
-    start = moment_said("--from", options["--from"])
+    start = utc_option("--from", options["--from"])
     dates = tuple((moment, name) for name, moment in (_at("--event", text, EVENTS) for text in several["--event"]))
     return Simulation(
         start,
@@ -96,7 +96,7 @@ def _words(several: Mapping[str, Sequence[str]]) -> Iterator[str]:
 
 
 def _quantity(option: str, text: str, kind: Kind) -> float:
-    with problems_of(option):
+    with input_errors(option):
         return parse_quantity(text, kind)
 
 
@@ -107,12 +107,12 @@ def _at(option: str, text: str, known: Collection[str] | None = None) -> tuple[s
         raise InputErrorText(f"{option}: {text!r} does not say when; write {name or 'NAME'}@2027-06-01T00:00:00Z")
     if known is not None:
         _known(option, name, known)
-    return name, moment_said(option, moment)
+    return name, utc_option(option, moment)
 
 
 def _known(option: str, name: str, names: Collection[str]) -> None:
     """Raises InputErrorText: none of these names."""
-    with problems_of(option):
+    with input_errors(option):
         if name not in names:
             raise unknown("no such name", name, sorted(names))
 
@@ -187,14 +187,14 @@ def simulate_into(
     with ExitStack() as open_record:
         history = None
         if record is not None:
-            initialised(record, plan.model, simulated=True)
+            initialise_record(record, plan.model, simulated=True)
             history = open_record.enter_context(History(record))
             _is_empty(history)
             # requirements are checked against the instrument; those of a life were when it was simulated
-            keep_plan(plan if complete else read_plan(file, history), file, history)
+            store_plan(plan if complete else read_plan(file, history), file, history)
         folder = RunFolder(target, force)
         advance(CALIBRATE, 1, 1)
-        found = recorded(plan, experiment, what, advance)
+        found = simulate_record(plan, experiment, what, advance)
         if not found.readings:
             raise InputErrorText(f"no state can be read, the first since {found.lost[0][1]}")
         advance(WRITE, 0, 1)
@@ -235,7 +235,7 @@ def _again(truth: Path | None, what: Simulation, backend: Backend) -> Iterator[s
         yield from ("--truth", NO_TRUTH)
 
 
-def take_files(history: History, file: Path) -> list[Taken]:
+def take_files(history: History, file: Path) -> list[IngestResult]:
     """Take all tables that a file names into a record.
 
     Parameters
@@ -247,7 +247,7 @@ def take_files(history: History, file: Path) -> list[Taken]:
     """
     spec = read_telemetry(file, history)
     every = ((table, path) for table in spec.readings for path in tables_of(spec, table))
-    return [history.take(read_table_file(table, path, history)) for table, path in every]
+    return [history.ingest(read_table_file(table, path, history)) for table, path in every]
 
 
 def _is_empty(history: History) -> None:

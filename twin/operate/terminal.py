@@ -22,7 +22,7 @@ from twin.operate.record import NotARecord, RecordFailed, file_of, require_file
 if TYPE_CHECKING:
     from scenes.specs.operation import OperationSetup
     from twin.operate.estimate.operation_filter import Operation
-    from twin.operate.estimate.reported_estimate import Following
+    from twin.operate.estimate.reported_estimate import FilterResult
     from twin.operate.record.entries import Alarm
     from twin.operate.record.history import History
 
@@ -56,7 +56,7 @@ def told() -> Iterator[Console]:
 
 
 @contextmanager
-def problems_of(what: str = "") -> Iterator[None]:
+def input_errors(what: str = "") -> Iterator[None]:
     """Raise InputErrorText for a Problem of what a command was asked for: an option with its dashes, or its place."""
     try:
         yield
@@ -65,7 +65,7 @@ def problems_of(what: str = "") -> Iterator[None]:
         raise InputErrorText(f"{what}: {text}" if what else text) from None
 
 
-def moment_said(option: str, text: str) -> int:
+def utc_option(option: str, text: str) -> int:
     """Microseconds of TAI since 2000 of a UTC that a command was given.
 
     Parameters
@@ -82,7 +82,7 @@ def moment_said(option: str, text: str) -> int:
     """
     from twin.operate.record.entries import micros
 
-    with problems_of(option):
+    with input_errors(option):
         return micros(text)
 
 
@@ -149,9 +149,9 @@ class Call:
 
     def planned(self, plan: Path | None) -> OperationSetup:
         """Return the plan in a file, or that of the record. Raises InputError; InputErrorText: the record has none."""
-        from twin.operate.estimate.operation_model import kept_plan, read_plan
+        from twin.operate.estimate.operation_model import read_plan, stored_plan
 
-        setup = kept_plan(self.history) if plan is None else read_plan(plan, self.history)
+        setup = stored_plan(self.history) if plan is None else read_plan(plan, self.history)
         if setup is None:
             raise InputErrorText(
                 f"the record keeps no plan of operation; name one, or keep one: python -m twin.operate init RECORD "
@@ -176,10 +176,10 @@ class Call:
         """
         from twin.operate.estimate.operation_filter import Operation
 
-        standing, history = cli.Standing("follow the record"), history or self.history
-        with problems_of(history.url), cli.heartbeat(self.errors, standing.__str__, self.options.silent):
-            made = Operation(history, setup, lambda done, of: standing.advance("readings", done, of))
-            made.follow()
+        position, history = cli.WorkProgress("follow the record"), history or self.history
+        with input_errors(history.url), cli.heartbeat(self.errors, position.__str__, self.options.silent):
+            made = Operation(history, setup, lambda done, of: position.advance("readings", done, of))
+            made.filter_readings()
         return made
 
     @property
@@ -187,13 +187,13 @@ class Call:
         """Whether the record has a plan and a reading of the monitor."""
         return self.history.plan() is not None and self.history.first("monitor") is not None
 
-    def estimate(self, plan: Path | None = None) -> tuple[Operation, Following, list[Alarm]]:
+    def estimate(self, plan: Path | None = None) -> tuple[Operation, FilterResult, list[Alarm]]:
         """Return the estimate under a plan, what it says, and the alarms that are new, which are then in the record."""
         from twin.operate.estimate.reported_estimate import raise_alarms
 
         operation = self.followed(self.planned(plan))
-        following = operation.follow()
-        return operation, following, raise_alarms(self.history, operation.plan.operation, following)
+        filter_result = operation.filter_readings()
+        return operation, filter_result, raise_alarms(self.history, operation.plan.operation, filter_result)
 
     def write_new(self, out: Path, files: Mapping[str, bytes], what: str) -> None:
         """Write files into a new folder.

@@ -87,19 +87,19 @@ def unpacked(content: bytes, *classes: type) -> Any:
 
 SPANS = (1, 3, 10)
 """Readings in a row that are held together against what was expected of them."""
-KEPT = 200
+HISTORY_LENGTH = 200
 """Innovations and readings that were left out, of which the last are kept."""
-FAR = 6.0
+OUTLIER_SIGMAS = 6.0
 """Standard deviations of a sensor's reading from what was expected, beyond which it is not used."""
-RECENT = 10
+SENSOR_WINDOW = 10
 """Readings of a sensor by which it is judged."""
-LOOSE = 3.0
+INFLATION_SIGMAS = 3.0
 """Standard deviations beyond which a reading widens what is stated of temperatures, where several sensors disagree."""
-DOUBTS = 3
+DOUBTFUL_OUTLIERS = 3
 """Of these, how many far ones make a sensor doubtful."""
-SILENT = 10.0
+SILENT_INTERVALS = 10.0
 """Intervals after which a sensor from which nothing came is dead."""
-CHANCE = 1e-4
+STUCK_PROBABILITY = 1e-4
 """Of as many equal readings in a row by a sensor that works, below which it is called stuck."""
 
 
@@ -137,7 +137,7 @@ class Sensor:
     recent: tuple[float, ...] = ()
     stuck: bool = False
 
-    def came(self, time: int, value: float, sigma: float) -> Sensor:
+    def updated(self, time: int, value: float, sigma: float) -> Sensor:
         """With one more reading."""
         again = value == self.value
         step = self.step if again or not self.readings else min(self.step, abs(value - self.value))
@@ -154,17 +154,17 @@ class Sensor:
             since_us=self.since_us if again else time,
             step=step,
             sigma=sigma,
-            stuck=bool(repeats >= 3 and alike**repeats * max(self.readings, 1) < CHANCE),
+            stuck=bool(repeats >= 3 and alike**repeats * max(self.readings, 1) < STUCK_PROBABILITY),
         )
 
-    def judged(self, white: float) -> Sensor:
+    def with_residual(self, white: float) -> Sensor:
         """With its newest reading against what was expected of it."""
-        return replace(self, recent=(*self.recent, white)[-RECENT:])
+        return replace(self, recent=(*self.recent, white)[-SENSOR_WINDOW:])
 
     @property
-    def far(self) -> int:
+    def outliers(self) -> int:
         """How many of its last readings were far from what was expected."""
-        return sum(abs(white) > FAR for white in self.recent)
+        return sum(abs(white) > OUTLIER_SIGMAS for white in self.recent)
 
     @property
     def disagrees(self) -> bool:
@@ -185,15 +185,15 @@ class Sensor:
         if self.stuck:
             return "stuck", self.since_us, f"{self.repeats + 1} readings in a row of {self.value:.6g} K"
         usual = (self.last_us - self.first_us) / max(self.readings - 1, 1)
-        if self.readings > 1 and now - self.last_us > SILENT * usual:
-            silent = (now - self.last_us) / MICRO / 86_400.0
+        if self.readings > 1 and now - self.last_us > SILENT_INTERVALS * usual:
+            stuck_sensors = (now - self.last_us) / MICRO / 86_400.0
             return (
                 "dead",
                 self.last_us,
-                f"nothing came for {silent:.3g} days; it used to every {usual / MICRO / 86_400.0:.3g}",
+                f"nothing came for {stuck_sensors:.3g} days; it used to every {usual / MICRO / 86_400.0:.3g}",
             )
-        if self.far >= DOUBTS and alone:
-            text = f"{self.far} of the last {len(self.recent)} readings far from what was expected"
+        if self.outliers >= DOUBTFUL_OUTLIERS and alone:
+            text = f"{self.outliers} of the last {len(self.recent)} readings far from what was expected"
             return "doubtful", self.last_us, text
         return "ok", self.first_us, ""
 
@@ -223,7 +223,7 @@ class Scores:
     log_score: float = 0.0
     chi_square: float = 0.0
 
-    def with_one(self, white: Array, log_score: float) -> Scores:
+    def updated(self, white: Array, log_score: float) -> Scores:
         """With one more reading."""
         count = self.readings + 1
         return Scores(
@@ -237,7 +237,7 @@ class Scores:
 
 
 @dataclass(frozen=True)
-class Told:
+class JumpDetection:
     """A jump, and the reading at which it was told, microseconds."""
 
     time: int
@@ -245,12 +245,12 @@ class Told:
 
 
 @dataclass(frozen=True, eq=False)
-class Standing:
+class EstimatorState:
     """Where an estimate stands.
 
     Attributes
     ----------
-    belief : Belief
+    filter_state : Belief
         What is believed; seconds count from the epoch.
     time : int
         Of the newest entry, microseconds.
@@ -289,23 +289,23 @@ class Standing:
         Bodies whose sensors have disagreed with what is stated at the same time as others.
     """
 
-    belief: FilterState
+    filter_state: FilterState
     time: int
     scores: Scores = field(default_factory=Scores)
     innovations: tuple[tuple[int, float, int], ...] = ()
-    jumps: tuple[Told, ...] = ()
+    jumps: tuple[JumpDetection, ...] = ()
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
-    left_out: tuple[tuple[int, str, str, str], ...] = ()
-    spread: Array = field(default_factory=lambda: np.zeros((4, 0)))
+    excluded: tuple[tuple[int, str, str, str], ...] = ()
+    scatter_sums: Array = field(default_factory=lambda: np.zeros((4, 0)))
     basis: Array = field(default_factory=lambda: np.zeros((0, 0)))
     used: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    left: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    told: tuple[tuple[int, float, int], ...] = ()
-    silent: tuple[tuple[str, int], ...] = ()
+    undetected_shares: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    new_innovations: tuple[tuple[int, float, int], ...] = ()
+    stuck_sensors: tuple[tuple[str, int], ...] = ()
     pending: tuple[int, int] | None = None
-    bad: tuple[tuple[int, str], ...] = ()
-    first: tuple[tuple[int, float, int], ...] = ()
-    accused: tuple[str, ...] = ()
+    bad_readings: tuple[tuple[int, str], ...] = ()
+    first_innovations: tuple[tuple[int, float, int], ...] = ()
+    disagreeing: tuple[str, ...] = ()
 
     @property
     def explained(self) -> Array:
@@ -314,19 +314,19 @@ class Standing:
         """
         count = self.scores.readings
         if count < 2:
-            return np.full(self.spread.shape[1], np.nan)
-        total, square, left, left_square = self.spread
+            return np.full(self.scatter_sums.shape[1], np.nan)
+        total, square, left, left_square = self.scatter_sums
         whole = square / count - (total / count) ** 2
         rest = left_square / count - (left / count) ** 2
         return np.where(whole > 0.0, 1.0 - rest / np.where(whole > 0.0, whole, 1.0), np.nan)
 
-    def without(self, time: int, kind: str, subject: str, reason: str) -> Standing:
+    def excluding(self, time: int, kind: str, subject: str, reason: str) -> EstimatorState:
         """With an entry that is not used."""
         return replace(
-            self, time=max(self.time, time), left_out=(*self.left_out, (time, kind, subject, reason))[-KEPT:]
+            self, time=max(self.time, time), excluded=(*self.excluded, (time, kind, subject, reason))[-HISTORY_LENGTH:]
         )
 
-    def decided(self, left_out: str) -> Standing:
+    def with_decision(self, excluded: str) -> EstimatorState:
         """With the decision on the reading that was set aside.
 
         Parameters
@@ -336,48 +336,48 @@ class Standing:
         """
         assert self.pending is not None
         number, time = self.pending
-        kept = [one for one in self.left_out if (one[0], one[1]) != (time, "monitor")]
-        bad = tuple(one for one in self.bad if one[0] != time)
-        if not left_out:
-            return replace(self, pending=None, left_out=tuple(kept), bad=bad)
-        good, bad = self.used != number, (*bad, (time, left_out))
-        kept = [*kept, (time, "monitor", "monitor", left_out)]
-        return replace(self, pending=None, left_out=tuple(kept), bad=bad, used=self.used[good], left=self.left[good])
+        kept = [one for one in self.excluded if (one[0], one[1]) != (time, "monitor")]
+        bad = tuple(one for one in self.bad_readings if one[0] != time)
+        if not excluded:
+            return replace(self, pending=None, excluded=tuple(kept), bad_readings=bad)
+        good, bad = self.used != number, (*bad, (time, excluded))
+        kept = [*kept, (time, "monitor", "monitor", excluded)]
+        return replace(self, pending=None, excluded=tuple(kept), bad_readings=bad, used=self.used[good], undetected_shares=self.undetected_shares[good])
 
     @property
-    def found_stuck(self) -> tuple[tuple[str, int], ...]:
+    def newly_stuck(self) -> tuple[tuple[str, int], ...]:
         """Sensors that repeat themselves, whose first equal readings have been used: (body, time_us of the first)."""
         stuck = ((one.body, one.since_us) for one in self.sensors.values() if one.stuck)
-        return tuple(one for one in stuck if one not in self.silent)
+        return tuple(one for one in stuck if one not in self.stuck_sensors)
 
     @property
-    def together(self) -> tuple[str, ...]:
+    def jointly_disagreeing(self) -> tuple[str, ...]:
         """Bodies whose sensors disagree with what is stated, where several do: it is then the prior that is wrong, and
         not all of these sensors. Empty where one disagrees, or none.
         """
         found = tuple(sorted(one.body for one in self.sensors.values() if one.disagrees))
         return found if len(found) > 1 else ()
 
-    def read(self, time: int, found: Innovation) -> Standing:
+    def with_innovation(self, time: int, found: Innovation) -> EstimatorState:
         """With the innovation of a reading of the monitor that was taken."""
-        came = (time, found.chi_square, len(found.white))
-        scores = self.scores.with_one(found.white, found.log_score)
-        innovations = (*self.innovations, came)[-KEPT:]
-        first = (*self.first, came)[: SPANS[-1]]
-        return replace(self, scores=scores, innovations=innovations, told=(*self.told, came), first=first)
+        innovation = (time, found.chi_square, len(found.white))
+        scores = self.scores.updated(found.white, found.log_score)
+        innovations = (*self.innovations, innovation)[-HISTORY_LENGTH:]
+        first = (*self.first_innovations, innovation)[: SPANS[-1]]
+        return replace(self, scores=scores, innovations=innovations, new_innovations=(*self.new_innovations, innovation), first_innovations=first)
 
-    def anew(self) -> Standing:
+    def with_counters_reset(self) -> EstimatorState:
         """The same, counting what is used from now on."""
-        return replace(self, used=self.used[:0], left=self.left[:0], told=())
+        return replace(self, used=self.used[:0], undetected_shares=self.undetected_shares[:0], new_innovations=())
 
     @classmethod
-    def from_bytes(cls, content: bytes) -> Standing:
+    def from_bytes(cls, content: bytes) -> EstimatorState:
         """Return what `packed` made bytes of."""
-        return cast("Standing", unpacked(content, cls, Scores, Sensor, Told))
+        return cast("EstimatorState", unpacked(content, cls, Scores, Sensor, JumpDetection))
 
 
 @dataclass(frozen=True, eq=False)
-class Taking:
+class EntryFilter:
     """Takes a record's entries one after the other.
 
     Attributes
@@ -404,7 +404,7 @@ class Taking:
         """Of a time in microseconds."""
         return (time - self.epoch) / MICRO
 
-    def start(self, time: int, silent: tuple[tuple[str, int], ...] = ()) -> Standing:
+    def start(self, time: int, stuck_sensors: tuple[tuple[str, int], ...] = ()) -> EstimatorState:
         """Before any entry.
 
         Parameters
@@ -415,10 +415,10 @@ class Taking:
             Sensors that are known to repeat themselves.
         """
         spread = np.zeros((4, len(self.model.quantities)))
-        belief, basis = self.how.start(self.seconds(time)), self.how.space.basis
-        return Standing(belief, time, spread=spread, basis=basis, silent=silent)
+        filter_state, basis = self.how.start(self.seconds(time)), self.how.space.basis
+        return EstimatorState(filter_state, time, scatter_sums=spread, basis=basis, stuck_sensors=stuck_sensors)
 
-    def take(self, standing: Standing, entries: Sequence[Mapping[str, Any]]) -> Standing:
+    def take(self, state: EstimatorState, entries: Sequence[Mapping[str, Any]]) -> EstimatorState:
         """All entries of one moment.
 
         Parameters
@@ -429,19 +429,21 @@ class Taking:
             Of one time, each with its content as plain data and, as ``decided``, whether somebody includes it and why;
             None where nobody has decided.
         """
-        standing = replace(standing, time=max(standing.time, int(entries[0]["time_us"])))
+        state = replace(state, time=max(state.time, int(entries[0]["time_us"])))
         for one in entries:
-            if (decided := one["decided"]) is not None and not decided[0]:
-                reason = f"entry {one['id']} was excluded: {decided[1]}"
-                standing = standing.without(int(one["time_us"]), str(one["kind"]), str(one["subject"]), reason)
+            if (decision := one["decided"]) is not None and not decision[0]:
+                reason = f"entry {one['id']} was excluded: {decision[1]}"
+                state = state.excluding(
+                    int(one["time_us"]), str(one["kind"]), str(one["subject"]), reason
+                )
         entries = [one for one in entries if one["decided"] is None or one["decided"][0]]
         warm = sorted((one for one in entries if one["kind"] == "temperature"), key=lambda one: str(one["subject"]))
         for one in warm:
-            standing = self._temperature(standing, one)
+            state = self._temperature(state, one)
         for one in entries:
             if one["kind"] == "monitor":
-                standing = self._monitor(standing, one)
-        return standing
+                state = self._monitor(state, one)
+        return state
 
     def observed(self, entry: Mapping[str, Any]) -> Observed:
         """What an entry that is used says.
@@ -463,67 +465,73 @@ class Taking:
         sigma = np.array([(one["row_sigma"], one["column_sigma"]) for one in found])
         return Observed(time, (place - self.reference).ravel(), np.diag(sigma.ravel() ** 2))
 
-    def _updated(self, standing: Standing, entry: Mapping[str, Any], observed: Observed) -> tuple[Standing, Innovation]:
-        belief, found = self.how.update(standing.belief, observed, entry["decided"] is not None)
-        used = np.append(standing.used, np.int64(entry["id"]))
+    def _updated(
+        self, state: EstimatorState, entry: Mapping[str, Any], observed: Observed
+    ) -> tuple[EstimatorState, Innovation]:
+        filter_state, found = self.how.update(state.filter_state, observed, entry["decided"] is not None)
+        used = np.append(state.used, np.int64(entry["id"]))
         # of no motion that may jump there is nothing to count rows by
-        before = standing.left.reshape(len(standing.used), len(self.how.walking))
-        left = np.concatenate([before, standing.belief.undetected[None]])
-        return replace(standing, belief=belief, used=used, left=left), found
+        before = state.undetected_shares.reshape(len(state.used), len(self.how.walking))
+        left = np.concatenate([before, state.filter_state.undetected[None]])
+        return replace(state, filter_state=filter_state, used=used, undetected_shares=left), found
 
-    def _temperature(self, standing: Standing, entry: Mapping[str, Any]) -> Standing:
+    def _temperature(self, state: EstimatorState, entry: Mapping[str, Any]) -> EstimatorState:
         time, body, content = int(entry["time_us"]), str(entry["subject"]), entry["content"]
-        sensor = standing.sensors.get(body, Sensor(body)).came(
+        sensor = state.sensors.get(body, Sensor(body)).updated(
             time, float(content["values"][0]), float(content["sigma"])
         )
-        standing = replace(standing, sensors={**standing.sensors, body: sensor})
+        state = replace(state, sensors={**state.sensors, body: sensor})
         if self.how.heat is None or body not in self.how.heat.sensors:
-            return standing.without(time, "temperature", body, "nothing is stated of its temperature")
+            return state.excluding(time, "temperature", body, "nothing is stated of its temperature")
         included = entry["decided"] is not None
-        if not included and (sensor.stuck or (body, sensor.since_us) in standing.silent):
-            return standing.without(time, "temperature", body, "its sensor repeats itself")
+        if not included and (sensor.stuck or (body, sensor.since_us) in state.stuck_sensors):
+            return state.excluding(time, "temperature", body, "its sensor repeats itself")
         observed = self.observed(entry)
-        there = self.how.at(standing.belief, observed.time)
+        there = self.how.at(state.filter_state, observed.time)
         white = float(self.how.whitened(there.state, observed).white[0])
-        sensor = sensor.judged(white)
-        standing = replace(standing, sensors={**standing.sensors, body: sensor})
-        if body in standing.together:  # then it is not the sensor that is wrong
+        sensor = sensor.with_residual(white)
+        state = replace(state, sensors={**state.sensors, body: sensor})
+        if body in state.jointly_disagreeing:  # then it is not the sensor that is wrong
             times = max(abs(white), 1.0)
-            loose = self.how.inflated(there, observed, times) if times > LOOSE else there
-            accused = tuple(sorted({*standing.accused, *standing.together}))
-            standing = replace(standing, belief=loose, accused=accused)
-        elif abs(white) > FAR and not included:
+            loose = self.how.inflated(there, observed, times) if times > INFLATION_SIGMAS else there
+            disagreeing = tuple(sorted({*state.disagreeing, *state.jointly_disagreeing}))
+            state = replace(state, filter_state=loose, disagreeing=disagreeing)
+        elif abs(white) > OUTLIER_SIGMAS and not included:
             reason = f"{abs(white):.3g} standard deviations from what was expected"
-            return standing.without(time, "temperature", body, reason)
-        return self._updated(standing, entry, observed)[0]
+            return state.excluding(time, "temperature", body, reason)
+        return self._updated(state, entry, observed)[0]
 
-    def _monitor(self, standing: Standing, entry: Mapping[str, Any]) -> Standing:
+    def _monitor(self, state: EstimatorState, entry: Mapping[str, Any]) -> EstimatorState:
         time = int(entry["time_us"])
         if entry["content"]["numbers"].get("sigma_holds") is False:
-            return standing.without(time, "monitor", "monitor", "its own sigma does not hold")
-        observed, before = self.observed(entry), standing.belief.pending
-        standing, found = self._updated(standing, entry, observed)
-        if found.settled and standing.pending is not None and before is not None:
-            number, when = standing.pending
-            standing = standing.decided("" if found.earlier else self._bad(number, before.innovation))
+            return state.excluding(time, "monitor", "monitor", "its own sigma does not hold")
+        observed, before = self.observed(entry), state.filter_state.pending
+        state, found = self._updated(state, entry, observed)
+        if found.settled and state.pending is not None and before is not None:
+            number, when = state.pending
+            state = state.with_decision("" if found.earlier else self._outlier_text(number, before.innovation))
             if found.earlier is not None:
-                standing = standing.read(when, found.earlier)
+                state = state.with_innovation(when, found.earlier)
         if found.bad is not None:
             number = int(entry["id"])
-            reason = f"{self._bad(number, found)}; the next reading decides whether it is left out"
-            standing = replace(standing, pending=(number, time), bad=(*standing.bad, (time, reason))[-KEPT:])
-            return standing.without(time, "monitor", "monitor", reason)
-        belief, space, rows = standing.belief, self.how.space, self.model.rows
-        values = rows @ self.how.parameters_of(belief.mean, belief.covariance, observed.time)[0]
-        rest = values - rows @ space.heat_outputs(belief.mean, observed.time)[space.width :]
+            reason = f"{self._outlier_text(number, found)}; the next reading decides whether it is left out"
+            state = replace(
+                state, pending=(number, time), bad_readings=(*state.bad_readings, (time, reason))[-HISTORY_LENGTH:]
+            )
+            return state.excluding(time, "monitor", "monitor", reason)
+        filter_state, space, rows = state.filter_state, self.how.space, self.model.rows
+        values = rows @ self.how.parameters_of(filter_state.mean, filter_state.covariance, observed.time)[0]
+        rest = values - rows @ space.heat_outputs(filter_state.mean, observed.time)[space.width :]
         spread = np.stack([values, values**2, rest, rest**2])
         return replace(
-            standing.read(time, found),
-            jumps=standing.jumps if found.jump is None else (*standing.jumps, Told(time, found.jump)),
-            spread=standing.spread + (spread if found.earlier is None else 2.0 * spread),
+            state.with_innovation(time, found),
+            jumps=state.jumps
+            if found.jump is None
+            else (*state.jumps, JumpDetection(time, found.jump)),
+            scatter_sums=state.scatter_sums + (spread if found.earlier is None else 2.0 * spread),
         )
 
-    def _bad(self, number: int, found: Innovation) -> str:
+    def _outlier_text(self, number: int, found: Innovation) -> str:
         """Why a reading is taken for a bad one."""
         assert found.bad is not None
         camera, channel = self.model.spots[found.bad.coordinate // 2]

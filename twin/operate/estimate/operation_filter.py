@@ -35,25 +35,25 @@ from scenes.specs.operation import OperationSetup
 from scenes.yaml.errors import Problem
 from twin.framework.provenance import source_digest
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.operate.estimate.estimate_snapshot import Standing, Taking, packed, unpacked
+from twin.operate.estimate.estimate_snapshot import EntryFilter, EstimatorState, packed, unpacked
 from twin.operate.estimate.operation_model import OperationModel, plan_digest, traced_model
 from twin.operate.estimate.reported_estimate import (
-    Break,
     Course,
-    Following,
-    FoundJump,
+    DetectedJump,
+    FilterResult,
     Motions,
+    RequirementStatus,
     SensorState,
     beyond,
-    widening,
+    inflation_factors,
 )
 from twin.operate.record.entries import DECISION, MICRO, digest_of_data, utc_text
 from twin.operate.record.history import USED, History, content_of
 
 DAY = 86_400 * MICRO
-EVERY = 1000
+CHECKPOINT_READINGS = 1000
 """Readings after which it is kept for good where the estimate stands."""
-HEAD = 16
+HEAD_READINGS = 16
 """Readings since it was kept after which it is kept at all: to follow as many again is as quick as to write it down."""
 _MODEL, _HEAD = -1, 0
 """Numbers under which a record keeps what was traced, and where the estimate stands after all readings."""
@@ -86,12 +86,12 @@ class Operation:
         history: History,
         plan: OperationSetup,
         advance: Callable[[int, int], None] = lambda done, of: None,
-        before_it: Operation | None = None,
+        previous: Operation | None = None,
     ) -> None:
         self.history, self.plan, self._advance = history, plan, advance
-        self._stood: tuple[Standing | None, int] = None, 0
+        self._previous: tuple[EstimatorState | None, int] = None, 0
         self._newest = self._saved = 0
-        self._silent: tuple[tuple[str, int], ...] = ()
+        self._stuck_sensors: tuple[tuple[str, int], ...] = ()
         first = history.first("monitor")
         if first is None:
             allowed = "a run of twin.recover or twin.render; python -m twin.operate ingest takes one"
@@ -104,19 +104,19 @@ class Operation:
         ]
         self._before = {(camera, channel): one for camera, channel, one in before}
         self._sensors = tuple(body for body in history.subjects("temperature") if body in history.bodies["warm"])
-        self._plan_digest: str = plan_digest(plan) if before_it is None else before_it._plan_digest
+        self._plan_digest: str = plan_digest(plan) if previous is None else previous._plan_digest
         order = [list(plan.model.instrument.cameras), list(plan.disturbances.causes)]
         own = [self._plan_digest, order, self.epoch, list(self._sensors), [list(one) for one in before]]
         self.key = digest_of_data([source_digest(), *own])
         """By which it is recognised what an estimate rests on beside the readings."""
-        if before_it is not None and before_it.key == self.key:
-            known = vars(before_it)
+        if previous is not None and previous.key == self.key:
+            known = vars(previous)
             vars(self).update({name: known[name] for name in ("experiment", "model") if name in known})
-            if "_taking" in known and before_it.events == self.events:
-                vars(self)["_taking"] = known["_taking"]
-                self._stood, self._saved = (known.get("standing"), before_it._newest), before_it._saved
+            if "_entry_filter" in known and previous.events == self.events:
+                vars(self)["_entry_filter"] = known["_entry_filter"]
+                self._previous, self._saved = (known.get("estimator_state"), previous._newest), previous._saved
 
-    def again(self) -> Operation:
+    def updated(self) -> Operation:
         """The estimate of the same record under the same plan with what has come since; quicker than a new one."""
         return Operation(self.history, self.plan, self._advance, self)
 
@@ -149,7 +149,7 @@ class Operation:
         return tuple((time, name, tuple(known[name])) for time, name in found if known.get(name))
 
     @cached_property
-    def _taking(self) -> Taking:
+    def _entry_filter(self) -> EntryFilter:
         causes = self.model.how.stated.causes
         steps = []
         for time, _, own in self.events:
@@ -157,13 +157,13 @@ class Operation:
             steps.append(Step(((motions, 1.0),), (((time - self.epoch) / MICRO, 1.0),)))
         how = replace(self.model.how, steps=tuple(steps))
         reference = np.array([(self._before[spot]["row"], self._before[spot]["column"]) for spot in self.model.spots])
-        return Taking(self.model, how, self.epoch, reference, self.history.temperature)
+        return EntryFilter(self.model, how, self.epoch, reference, self.history.temperature)
 
     def _moments(self, after_us: int | None) -> Iterator[list[dict[str, Any]]]:
         """Entries that are used, those of one time together, in the order of time."""
         own = (one for one in self.history.entries(after_us=after_us) if one["kind"] in USED)
-        for _, together in groupby(own, key=lambda one: int(one["time_us"])):
-            yield [{**one, "content": content_of(one), "decided": self._decisions.get(one["id"])} for one in together]
+        for _, entries in groupby(own, key=lambda one: int(one["time_us"])):
+            yield [{**one, "content": content_of(one), "decided": self._decisions.get(one["id"])} for one in entries]
 
     @cached_property
     def _decisions(self) -> dict[int, tuple[bool, str]]:
@@ -172,124 +172,128 @@ class Operation:
         return {int(one["entry"]): (bool(one["included"]), str(one["why"])) for one in found}
 
     @cached_property
-    def standing(self) -> Standing:
+    def estimator_state(self) -> EstimatorState:
         """Where the estimate stands after all readings, of which those that are new are taken."""
         with one_blas_thread():
-            return self._followed()
+            return self._latest_state()
 
-    def _followed(self) -> Standing:
-        taking, newest = self._taking, self.history.newest_id()
+    def _latest_state(self) -> EstimatorState:
+        entry_filter, newest = self._entry_filter, self.history.newest_id()
         self._newest = newest
-        standing = self._kept()
-        moments = list(self._moments(None if standing is None else standing.time))
+        state = self._load_state()
+        moments = list(self._moments(None if state is None else state.time))
         count = 0
         while count < len(moments):
-            if standing is None:
-                standing = taking.start(int(moments[0][0]["time_us"]))
-            before = standing.scores.readings
-            standing = taking.take(standing, moments[count])
+            if state is None:
+                state = entry_filter.start(int(moments[0][0]["time_us"]))
+            before = state.scores.readings
+            state = entry_filter.take(state, moments[count])
             count += 1
-            if standing.found_stuck:
-                standing = self._without(standing)
-                moments, count = list(self._moments(None if standing is None else standing.time)), 0
-                if standing is None:
-                    standing = taking.start(int(moments[0][0]["time_us"]), self._silent)
+            if state.newly_stuck:
+                state = self._rewind(state)
+                moments, count = list(self._moments(None if state is None else state.time)), 0
+                if state is None:
+                    state = entry_filter.start(int(moments[0][0]["time_us"]), self._stuck_sensors)
                 continue
-            number = standing.scores.readings // EVERY
-            if number > before // EVERY:
-                self._keep(standing, number, newest)
-                standing = standing.anew()
+            number = state.scores.readings // CHECKPOINT_READINGS
+            if number > before // CHECKPOINT_READINGS:
+                self._save_state(state, number, newest)
+                state = state.with_counters_reset()
             self._advance(count, len(moments))
-        assert standing is not None  # there is a reading of the monitor
-        if standing.scores.readings >= self._saved + HEAD:
-            self._keep(standing, _HEAD, newest)
-            self._saved = standing.scores.readings
-        return standing
+        assert state is not None  # there is a reading of the monitor
+        if state.scores.readings >= self._saved + HEAD_READINGS:
+            self._save_state(state, _HEAD, newest)
+            self._saved = state.scores.readings
+        return state
 
-    def _without(self, standing: Standing) -> Standing | None:
+    def _rewind(self, state: EstimatorState) -> EstimatorState | None:
         """Where the estimate stood before a sensor began to repeat itself; its readings from there on are not used."""
-        self._silent = (*standing.silent, *standing.found_stuck)
-        since = min(time for _, time in standing.found_stuck)
+        self._stuck_sensors = (*state.stuck_sensors, *state.newly_stuck)
+        since = min(time for _, time in state.newly_stuck)
         self.history.drop_checkpoints(self.key, since)
         self._saved = 0
         kept = self.history.checkpoint(self.key, before_us=since, valid=True)
-        return None if kept is None else replace(Standing.from_bytes(kept.content).anew(), silent=self._silent)
+        return (
+            None
+            if kept is None
+            else replace(EstimatorState.from_bytes(kept.content).with_counters_reset(), stuck_sensors=self._stuck_sensors)
+        )
 
-    def _kept(self) -> Standing | None:
+    def _load_state(self) -> EstimatorState | None:
         """Where the estimate stood before what is new; None for nowhere."""
-        standing, newest = self._stood
-        if standing is not None and not self.history.came_late(newest, standing.time):
-            return standing
+        state, newest = self._previous
+        if state is not None and not self.history.came_late(newest, state.time):
+            return state
         kept = self.history.checkpoint(self.key, valid=True)
         if kept is None:
             return None
-        standing = Standing.from_bytes(kept.content)
-        self._saved = standing.scores.readings
-        if not self._fits(standing):
+        state = EstimatorState.from_bytes(kept.content)
+        self._saved = state.scores.readings
+        if not self._has_same_basis(state):
             self.history.drop_checkpoints(self.key, self.epoch)
             self._saved = 0
             return None
         # what was used up to one that is kept for good is kept with it
-        return standing.anew() if kept.number > _HEAD else standing
+        return state.with_counters_reset() if kept.number > _HEAD else state
 
-    def _fits(self, standing: Standing) -> bool:
+    def _has_same_basis(self, state: EstimatorState) -> bool:
         """Whether states that were kept are those of this computer's linear algebra."""
-        own = self._taking.how.space.basis
-        if standing.basis.shape != own.shape:
+        own = self._entry_filter.how.space.basis
+        if state.basis.shape != own.shape:
             return False
-        return bool(np.all(np.abs(standing.basis - own) <= 1e-9 * np.abs(own).max(axis=1, keepdims=True)))
+        return bool(np.all(np.abs(state.basis - own) <= 1e-9 * np.abs(own).max(axis=1, keepdims=True)))
 
-    def _keep(self, standing: Standing, number: int, newest: int) -> None:
-        self.history.save_checkpoint(self.key, number, standing.time, newest, packed(standing))
+    def _save_state(self, state: EstimatorState, number: int, newest: int) -> None:
+        self.history.save_checkpoint(self.key, number, state.time, newest, packed(state))
 
-    def follow(self) -> Following:
+    def filter_readings(self) -> FilterResult:
         """Take all readings that are new, and tell what is known."""
-        standing = self.standing
-        now = self.forecast([standing.time])
-        jumps = tuple(self._found(one.time, one.jump) for one in standing.jumps)
+        state = self.estimator_state
+        now = self.forecast([state.time])
+        jumps = tuple(self._detected_jump(one.time, one.jump) for one in state.jumps)
         sensors = []
-        for one in standing.sensors.values():
-            state, since, reason = one.state(standing.time, one.body not in standing.together)
-            sensors.append(SensorState(one.body, state, since, one.last_us, reason))
-        return Following(
-            standing.time,
-            standing.scores.readings,
+        for one in state.sensors.values():
+            condition, since, reason = one.state(state.time, one.body not in state.jointly_disagreeing)
+            sensors.append(SensorState(one.body, condition, since, one.last_us, reason))
+        return FilterResult(
+            state.time,
+            state.scores.readings,
             now,
-            standing.scores,
-            standing.innovations,
+            state.scores,
+            state.innovations,
             jumps,
             self.events,
             tuple(sorted(sensors, key=lambda one: one.body)),
-            standing.left_out,
-            {one.name: share for one, share in zip(self.quantities, standing.explained.tolist(), strict=True)},
-            self._widened,
+            state.excluded,
+            {one.name: share for one, share in zip(self.quantities, state.explained.tolist(), strict=True)},
+            self._sigma_inflation,
             self.too_many_jumps,
-            self._breaks(),
-            standing.bad,
-            standing.pending is not None,
-            self._too_small(),
+            self._requirement_status(),
+            state.bad_readings,
+            state.pending is not None,
+            self._understated_causes(),
         )
 
     def power(self) -> tuple[DetectionPower, ...]:
         """Return the smallest jump of each body that is found, at the mean interval of the readings so far; empty where
         there is one reading.
         """
-        count, noise = self.standing.scores.readings, self.model.how.reference_noise
+        count, noise = self.estimator_state.scores.readings, self.model.how.reference_noise
         if count < 2 or noise is None:
             return ()
-        interval = (self.standing.time - self.epoch) / MICRO / (count - 1)
+        interval = (self.estimator_state.time - self.epoch) / MICRO / (count - 1)
         with one_blas_thread():
             return detection_power(self.model.how, interval, noise)
 
-    def _too_small(self) -> tuple[str, ...]:
+    def _understated_causes(self) -> tuple[str, ...]:
         """Causes of the temperatures of bodies whose sensors disagree with what is stated at the same time."""
-        stated, heat, accused = self.model.how.stated, self.model.how.heat, self.standing.accused
+        stated, heat, disagreeing = self.model.how.stated, self.model.how.heat, self.estimator_state.disagreeing
         if heat is None:
             return ()
-        lasting = (k for k in heat.motions.tolist() if stated.bodies[k] in accused and not stated.laws[k].white)
+        lasting = (k for k in heat.motions.tolist() if stated.bodies[k] in disagreeing and not stated.laws[k].white)
         return tuple(dict.fromkeys(stated.causes[k] for k in lasting))
 
-    def _found(self, told: int, jump: Jump) -> FoundJump:
+    def _detected_jump(self, told: int, jump: Jump) -> DetectedJump:
         sizes = tuple(zip(jump.labels, jump.units, jump.sizes, jump.sigmas, strict=True))
         after, until = (self.epoch + round(time * MICRO) for time in (jump.after, jump.until))
         change, spread, rows = np.array(jump.change), np.array(jump.spread), self.model.rows
@@ -297,11 +301,13 @@ class Operation:
         read, changed = rows @ (self.model.reading @ change[:width]), rows @ change[width:]
         sigma = np.sqrt(np.einsum("qi,ij,qj->q", rows, spread[width:, width:], rows))
         each = zip(self.quantities, read.tolist(), changed.tolist(), sigma.tolist(), strict=True)
-        carried = {one.name: (was, now, spread) for one, was, now, spread in each}
-        return FoundJump(jump.body, after, until, told, sizes, jump.log_ratio, jump.chance, jump.rivals, carried)
+        line_changes = {one.name: (was, now, spread) for one, was, now, spread in each}
+        return DetectedJump(
+            jump.body, after, until, told, sizes, jump.log_ratio, jump.chance, jump.rivals, line_changes
+        )
 
-    def _breaks(self) -> tuple[Break, ...]:
-        operation, start = self.plan.operation, self.standing.time
+    def _requirement_status(self) -> tuple[RequirementStatus, ...]:
+        operation, start = self.plan.operation, self.estimator_state.time
         if not operation.requirements:
             return ()
         days = max(1, round(operation.horizon * MICRO / DAY))
@@ -311,10 +317,12 @@ class Operation:
             k = [each.name for each in ahead.quantities].index(one.name)
             chance = beyond(ahead.values[:, k], ahead.sigmas[:, k], one.largest)
             broken = np.flatnonzero(chance > 1.0 - one.probability)
-            breaks = int(ahead.times[broken[0]]) if len(broken) else None
+            breaks_us = int(ahead.times[broken[0]]) if len(broken) else None
             unit = self.quantities[k].parameter.unit
             holds = not (len(broken) and broken[0] == 0)
-            out.append(Break(one.name, unit, one.largest, one.probability, float(chance[0]), holds, breaks))
+            out.append(
+                RequirementStatus(one.name, unit, one.largest, one.probability, float(chance[0]), holds, breaks_us)
+            )
         return tuple(out)
 
     def forecast(self, times_us: Sequence[int] | NDArray[np.int64]) -> Course:
@@ -331,32 +339,32 @@ class Operation:
             a time before it.
         """
         times = np.asarray(times_us, np.int64)
-        if len(times) and times.min() < self.standing.time:
-            allowed = f"times from {utc_text(self.standing.time)} on, that of the newest reading"
+        if len(times) and times.min() < self.estimator_state.time:
+            allowed = f"times from {utc_text(self.estimator_state.time)} on, that of the newest reading"
             raise Problem("a forecast of what is past", utc_text(int(times.min())), allowed)
-        how = self._taking.how
+        how = self._entry_filter.how
         with one_blas_thread():
-            found = [how.parameters(self._now, self._taking.seconds(int(time))) for time in times]
-        return self._course(times, found, np.full(len(times), self._widened))
+            found = [how.parameters(self._now, self._entry_filter.seconds(int(time))) for time in times]
+        return self._course(times, found, np.full(len(times), self._sigma_inflation))
 
     @cached_property
     def _now(self) -> FilterState:
         """What is known after all readings, jumps that are not told counted by their chances."""
-        return self._taking.how.mixture(self.standing.belief)
+        return self._entry_filter.how.mixture(self.estimator_state.filter_state)
 
     @cached_property
-    def _widened(self) -> float:
+    def _sigma_inflation(self) -> float:
         """Of sigmas now, where the last readings contradict what is stated."""
-        squares = self._unexplained(self.standing.innovations)
-        told = [time for time, _, _ in self.standing.innovations]
-        return float(widening(squares, [len(squares)], False, self._lasting(told))[0])
+        squares = self._unexplained(self.estimator_state.innovations)
+        told = [time for time, _, _ in self.estimator_state.innovations]
+        return float(inflation_factors(squares, [len(squares)], False, self._lasting(told))[0])
 
     def _lasting(self, told: Sequence[int]) -> list[tuple[int, Array]]:
         """Return contradictions that widen sigma for good: of the first readings, and of what bodies of jumps do not
         explain; and the number of readings before each.
         """
-        out = [(0, self._unexplained(self.standing.first))]
-        jumps = [] if self.too_many_jumps else self.standing.jumps
+        out = [(0, self._unexplained(self.estimator_state.first_innovations))]
+        jumps = [] if self.too_many_jumps else self.estimator_state.jumps
         return out + [(int(np.searchsorted(told, one.time)) + 1, np.array([one.jump.rest])) for one in jumps]
 
     @cached_property
@@ -364,28 +372,28 @@ class Operation:
         """Whether more jumps were told than is stated, one in a thousand times by chance; a body of which nothing is
         stated of how often it jumps does so once.
         """
-        stated, lasted = self.model.how.stated, (self.standing.time - self.epoch) / MICRO
+        stated, lasted = self.model.how.stated, (self.estimator_state.time - self.epoch) / MICRO
         every = {body: law.every_s for body, law in zip(stated.bodies, stated.laws, strict=True) if law.jump}
         mean = sum(1.0 if rate is None else lasted / rate for rate in every.values())
-        count = len(self.standing.jumps)
+        count = len(self.estimator_state.jumps)
         return bool(count > 1 and pdtrc(count - 1, mean) < FALSE_ALARM)
 
     def _unexplained(self, innovations: Sequence[tuple[int, float, int]]) -> Array:
         """(N, 2) chi-square and degrees of freedom of readings; none of those that jumps explain which were told, but
         where there are more of these than is stated: then it is not jumps that the readings ask for.
         """
-        jumps = [] if self.too_many_jumps else [self._found(one.time, one.jump) for one in self.standing.jumps]
+        jumps = [] if self.too_many_jumps else [self._detected_jump(one.time, one.jump) for one in self.estimator_state.jumps]
         out = np.array([(square, degrees) for _, square, degrees in innovations], np.float64).reshape(-1, 2)
         times = np.array([time for time, _, _ in innovations], np.int64)
         for one in jumps:
-            out[(times > one.after_us) & (times <= one.told_us)] = 0.0
+            out[(times > one.after_us) & (times <= one.detected_us)] = 0.0
         return out
 
-    def _course(self, times: NDArray[np.int64], found: Sequence[tuple[Array, Array]], widened: Array) -> Course:
+    def _course(self, times: NDArray[np.int64], found: Sequence[tuple[Array, Array]], sigma_inflation: Array) -> Course:
         rows = self.model.rows
         changes = np.array([one for one, _ in found]).reshape(len(times), rows.shape[1])
         covariance = np.array([one for _, one in found]).reshape(len(times), rows.shape[1], rows.shape[1])
-        covariance = covariance * widened[:, None, None] ** 2
+        covariance = covariance * sigma_inflation[:, None, None] ** 2
         variance = np.einsum("qi,tij,qj->tq", rows, covariance, rows)
         sigmas = np.sqrt(np.maximum(variance, 0.0))
         return Course(times, self.quantities, changes @ rows.T, sigmas, changes, covariance)
@@ -404,16 +412,16 @@ class Operation:
             a time before it.
         """
         times = np.asarray(times_us, np.int64)
-        found = self._past(times, self._taking.how.parameters_of)
-        return self._course(times, found, self._widened_at(times))
+        found = self._states_at(times, self._entry_filter.how.parameters_of)
+        return self._course(times, found, self._sigma_inflation_at(times))
 
-    def _widened_at(self, times: NDArray[np.int64]) -> Array:
+    def _sigma_inflation_at(self, times: NDArray[np.int64]) -> Array:
         """(T,) of sigmas of times past; of those after the newest reading as it is now."""
-        told = [one for span in self._spans(None) for one in span.told]
+        told = [one for span in self._segments(None) for one in span.new_innovations]
         squares = self._unexplained(told)
         number = np.searchsorted([time for time, _, _ in told], times, side="right")
-        out = widening(squares, number, True, self._lasting([time for time, _, _ in told]))
-        out[times >= self.standing.time] = self._widened
+        out = inflation_factors(squares, number, True, self._lasting([time for time, _, _ in told]))
+        out[times >= self.estimator_state.time] = self._sigma_inflation
         return out
 
     def motions(self, time_us: int, acting: bool = False) -> Motions:
@@ -433,39 +441,39 @@ class Operation:
             a time before it.
         """
         stated = self.model.how.stated
-        how = replace(self._taking.how, steps=(*self._taking.how.steps, *self._steps()))
-        since = self._taking.seconds(self.epoch)
-        found = self._past(
+        how = replace(self._entry_filter.how, steps=(*self._entry_filter.how.steps, *self._steps()))
+        since = self._entry_filter.seconds(self.epoch)
+        found = self._states_at(
             np.array([time_us], np.int64),
             lambda mean, covariance, time: how.motions_of(mean, covariance, time, since, acting),
         )
         (mean, spread), size = found[0], stated.sigmas
-        spread = spread * self._widened_at(np.array([time_us], np.int64))[0] ** 2
+        spread = spread * self._sigma_inflation_at(np.array([time_us], np.int64))[0] ** 2
         return Motions(int(time_us), stated.labels, stated.units, size * mean, size[:, None] * spread * size)
 
     def _steps(self, told_after: int | None = None) -> tuple[Step, ...]:
-        own = (one for one in self.standing.jumps if told_after is None or one.time > told_after)
+        own = (one for one in self.estimator_state.jumps if told_after is None or one.time > told_after)
         return tuple(Step.of(one.jump) for one in own)
 
-    def _past(
+    def _states_at(
         self, times: NDArray[np.int64], each: Callable[[Array, Array, float], tuple[Array, Array]]
     ) -> list[tuple[Array, Array]]:
         """What is made of the states at times, by all readings; from the newest on it is what a forecast has."""
-        taking, last = self._taking, self.standing
+        entry_filter, last = self._entry_filter, self.estimator_state
         if len(times) and times.max() >= last.time:
             with one_blas_thread():
                 ahead = []
-                for second in (taking.seconds(int(time)) for time in times[times >= last.time]):
-                    there = taking.how.at(self._now, second)
+                for second in (entry_filter.seconds(int(time)) for time in times[times >= last.time]):
+                    there = entry_filter.how.at(self._now, second)
                     ahead.append(each(there.mean, there.covariance, second))
-            past, ahead_of = iter(self._past(times[times < last.time], each)), iter(ahead)
+            past, ahead_of = iter(self._states_at(times[times < last.time], each)), iter(ahead)
             return [next(ahead_of if time >= last.time else past) for time in times]
         if not len(times):
             return []
         self._require_known(int(times.min()))
         with one_blas_thread():
-            seconds = [taking.seconds(int(time)) for time in times]
-            how, start, observed, left = self._knowing(int(times.min()))
+            seconds = [entry_filter.seconds(int(time)) for time in times]
+            how, start, observed, left = self._smoothing_inputs(int(times.min()))
             return smoothed(how, start, observed, seconds, left, each)
 
     def smooth_jointly(self, times_us: Sequence[int] | NDArray[np.int64]) -> tuple[Array, Array]:
@@ -488,16 +496,16 @@ class Operation:
         Problem
             a time before it.
         """
-        times, taking = np.asarray(times_us, np.int64), self._taking
-        seconds = [taking.seconds(int(time)) for time in times]
+        times, entry_filter = np.asarray(times_us, np.int64), self._entry_filter
+        seconds = [entry_filter.seconds(int(time)) for time in times]
         with one_blas_thread():
-            if not len(times) or times[0] >= self.standing.time:
-                values, covariance = smooth_jointly(taking.how, self._now, (), seconds, ())
+            if not len(times) or times[0] >= self.estimator_state.time:
+                values, covariance = smooth_jointly(entry_filter.how, self._now, (), seconds, ())
             else:
                 self._require_known(int(times[0]))
-                how, start, observed, left = self._knowing(int(times[0]))
+                how, start, observed, left = self._smoothing_inputs(int(times[0]))
                 values, covariance = smooth_jointly(how, start, observed, seconds, left)
-        wide = self._widened_at(times)
+        wide = self._sigma_inflation_at(times)
         return values, covariance * wide[:, None, None, None] * wide[:, None]
 
     def _require_known(self, time: int) -> None:
@@ -506,49 +514,51 @@ class Operation:
             allowed = f"times from {utc_text(begin)} on, that of the first reading"
             raise Problem("a time before all readings", utc_text(time), allowed)
 
-    def _knowing(self, time: int) -> tuple[SeriesFilter, FilterState, list[Observed], list[Array]]:
+    def _smoothing_inputs(self, time: int) -> tuple[SeriesFilter, FilterState, list[Observed], list[Array]]:
         """What a look back to a time rests on: the filter that knows of all jumps that were told, where it begins, the
         readings from there on, and what of jumps could not be told before each.
         """
-        taking, start = self._taking, self._before_all(time)
+        entry_filter, start = self._entry_filter, self._checkpoint_before(time)
         told = None if start is None else start.time
-        steps = (*taking.how.steps, *self._steps(told))
-        used, left = self._used(told)
+        steps = (*entry_filter.how.steps, *self._steps(told))
+        used, left = self._used_entries(told)
         wanted = set(used.tolist())
-        every = (one for together in self._moments(told) for one in together)
-        said = {one["id"]: taking.observed(one) for one in every if one["id"] in wanted}
+        every = (one for entries in self._moments(told) for one in entries)
+        said = {one["id"]: entry_filter.observed(one) for one in every if one["id"] in wanted}
         observed = [said[number] for number in used.tolist()]
-        belief = (taking.start(self._begin()) if start is None else start).belief
-        belief = _alone(belief)
-        knowing = replace(taking.how, steps=steps, window=0)
-        belief, with_hints = with_hinted_jumps(taking.how, knowing, belief, observed, list(left))
-        return knowing, belief, observed, with_hints
+        filter_state = (entry_filter.start(self._begin()) if start is None else start).filter_state
+        filter_state = _without_search(filter_state)
+        knowing = replace(entry_filter.how, steps=steps, window=0)
+        filter_state, with_hints = with_hinted_jumps(entry_filter.how, knowing, filter_state, observed, list(left))
+        return knowing, filter_state, observed, with_hints
 
-    def _used(self, after_us: int | None) -> tuple[NDArray[np.int64], Array]:
+    def _used_entries(self, after_us: int | None) -> tuple[NDArray[np.int64], Array]:
         """Ids of the entries that were used after a time at which it was kept, and what could not be told then."""
-        spans = self._spans(after_us)
-        width = len(self._taking.how.walking)
-        left = np.concatenate([one.left.reshape(len(one.used), width) for one in spans])
-        used, pending = np.concatenate([one.used for one in spans]), self.standing.pending
+        spans = self._segments(after_us)
+        width = len(self._entry_filter.how.walking)
+        left = np.concatenate([one.undetected_shares.reshape(len(one.used), width) for one in spans])
+        used, pending = np.concatenate([one.used for one in spans]), self.estimator_state.pending
         good = used != (0 if pending is None else pending[0])
         return used[good], left[good]
 
-    def _spans(self, after_us: int | None) -> list[Standing]:
+    def _segments(self, after_us: int | None) -> list[EstimatorState]:
         """Where the estimate was kept for good after a time and stands now; each knows what was used since the last."""
-        return [one for one in self._every_span if after_us is None or one.time > after_us]
+        return [one for one in self._all_segments if after_us is None or one.time > after_us]
 
     @cached_property
-    def _every_span(self) -> list[Standing]:
-        last = self.standing  # what is new is taken and kept first
-        kept = (Standing.from_bytes(one.content) for one in self.history.checkpoints(self.key) if one.number > _HEAD)
-        return [*(replace(one, belief=_alone(one.belief)) for one in kept), last]
+    def _all_segments(self) -> list[EstimatorState]:
+        last = self.estimator_state  # what is new is taken and kept first
+        kept = (
+            EstimatorState.from_bytes(one.content) for one in self.history.checkpoints(self.key) if one.number > _HEAD
+        )
+        return [*(replace(one, filter_state=_without_search(one.filter_state)) for one in kept), last]
 
     def _begin(self) -> int:
         return min(int(one["time_us"]) for kind in USED if (one := self.history.first(kind)) is not None)
 
-    def _before_all(self, time: int) -> Standing | None:
+    def _checkpoint_before(self, time: int) -> EstimatorState | None:
         """The newest that was kept for good before a time and before all jumps that were told since; None for none."""
-        last = self.standing
+        last = self.estimator_state
         while True:
             kept = self.history.checkpoint(self.key, before_us=time, valid=True)
             if kept is None:
@@ -557,11 +567,11 @@ class Operation:
                 self.epoch + int(one.jump.chances[0][0] * MICRO) for one in last.jumps if one.time > kept.time_us
             ]
             if not earlier or min(earlier) >= kept.time_us:
-                return Standing.from_bytes(kept.content)
+                return EstimatorState.from_bytes(kept.content)
             time = min(earlier)
 
 
-def _alone(belief: FilterState) -> FilterState:
+def _without_search(filter_state: FilterState) -> FilterState:
     """What is known without the steps that are looked for, which take most of its memory."""
-    state, none = belief.state.alone(), belief.after[:0]
-    return replace(belief, state=state, search=None, after=none, until=none, pending=None)
+    state, none = filter_state.state.alone(), filter_state.after[:0]
+    return replace(filter_state, state=state, search=None, after=none, until=none, pending=None)

@@ -178,12 +178,12 @@ def quantity_names(instrument: InstrumentSpec) -> tuple[str, ...]:
     return tuple(names)
 
 
-def keep_plan(setup: OperationSetup, file: Path, history: History) -> bool:
+def store_plan(setup: OperationSetup, file: Path, history: History) -> bool:
     """Keep a plan in the record, with the instrument and the disturbances that it names; whether it is a new one."""
-    return history.keep_plan(str(file.absolute()), setup.plain())
+    return history.store_plan(str(file.absolute()), setup.plain())
 
 
-def kept_plan(history: History) -> OperationSetup | None:
+def stored_plan(history: History) -> OperationSetup | None:
     """The plan that the record keeps and that counts; None for none.
 
     Raises

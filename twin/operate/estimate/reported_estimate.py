@@ -86,7 +86,7 @@ class _Dated:
 
 
 @dataclass(frozen=True)
-class FoundJump(_Dated):
+class DetectedJump(_Dated):
     """A jump that was told.
 
     Attributes
@@ -110,12 +110,12 @@ class FoundJump(_Dated):
     body: str
     after_us: int
     until_us: int
-    told_us: int
+    detected_us: int
     sizes: tuple[tuple[str, str, float, float], ...]
     log_ratio: float
     false_alarm: float
     rivals: Mapping[str, float]
-    carried: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    line_changes: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
 
     @property
     def found(self) -> str:
@@ -138,7 +138,7 @@ class FoundJump(_Dated):
                     "share": shown,
                     "share_sigma": wide,
                 }
-                for name, (read, changed, sigma) in self.carried.items()
+                for name, (read, changed, sigma) in self.line_changes.items()
                 for shown, wide in [(changed / read, sigma / abs(read)) if read else (None, None)]
             ],
         }
@@ -168,7 +168,7 @@ class SensorState(_Dated):
 
 
 @dataclass(frozen=True)
-class Break(_Dated):
+class RequirementStatus(_Dated):
     """A requirement.
 
     Attributes
@@ -216,7 +216,7 @@ class Motions:
 
 
 @dataclass(frozen=True, eq=False)
-class Following:
+class FilterResult:
     """What is known after all readings of a record.
 
     Attributes
@@ -260,24 +260,24 @@ class Following:
     now: Course
     scores: Scores
     innovations: tuple[tuple[int, float, int], ...]
-    jumps: tuple[FoundJump, ...]
+    jumps: tuple[DetectedJump, ...]
     events: tuple[tuple[int, str, tuple[str, ...]], ...]
     sensors: tuple[SensorState, ...]
-    left_out: tuple[tuple[int, str, str, str], ...]
+    excluded: tuple[tuple[int, str, str, str], ...]
     explained: Mapping[str, float]
-    widened: float
+    sigma_inflation: float
     too_many_jumps: bool
-    breaks: tuple[Break, ...]
+    requirements: tuple[RequirementStatus, ...]
     bad_readings: tuple[tuple[int, str], ...] = ()
     undecided: bool = False
-    too_small: tuple[str, ...] = ()
+    understated_causes: tuple[str, ...] = ()
 
     @property
     def warnings(self) -> list[str]:
         """Return what a reader has to know before the numbers are used, one sentence each."""
         out = []
-        if self.widened > 1.0:
-            text = f"all sigmas are {self.widened:.3g} times as wide as it would make them"
+        if self.sigma_inflation > 1.0:
+            text = f"all sigmas are {self.sigma_inflation:.3g} times as wide as it would make them"
             out.append(f"the last or the first readings contradict what is stated; {text}")
         if self.too_many_jumps:
             out.append(f"{len(self.jumps)} jumps are more than is stated: something else moves, or more of it")
@@ -286,9 +286,9 @@ class Following:
         if len(self.bad_readings) > MOST_BAD:
             text = "either the readings are worse than usual, or the prior is too small"
             out.append(f"{len(self.bad_readings)} readings were taken for bad ones: {text}")
-        if self.too_small:
+        if self.understated_causes:
             text = "they are stated too small, or of another course in time, and their sigmas do not hold"
-            out.append(f"sensors of several bodies together disagree with {', '.join(self.too_small)}: {text}")
+            out.append(f"sensors of several bodies together disagree with {', '.join(self.understated_causes)}: {text}")
         return out
 
     def to_dict(self) -> dict[str, Any]:
@@ -304,14 +304,14 @@ class Following:
             "jumps": [one.to_dict() for one in self.jumps],
             "events": _rows("name causes", self.events),
             "sensors": [one.to_dict() for one in self.sensors],
-            "left_out": _rows("kind subject reason", self.left_out),
+            "excluded": _rows("kind subject reason", self.excluded),
             "explained": {name: share if np.isfinite(share) else None for name, share in self.explained.items()},
-            "widened": self.widened,
+            "widened": self.sigma_inflation,
             "too_many_jumps": self.too_many_jumps,
             "bad_readings": _rows("reason", self.bad_readings),
             "undecided": self.undecided,
-            "too_small": list(self.too_small),
-            "requirements": [one.to_dict() for one in self.breaks],
+            "understated_causes": list(self.understated_causes),
+            "requirements": [one.to_dict() for one in self.requirements],
         }
 
 
@@ -336,7 +336,7 @@ def beyond(value: Array, sigma: Array, limit: float) -> Array:
     return np.asarray(ndtr((value - limit) / scale) + ndtr((-value - limit) / scale))
 
 
-def widening(
+def inflation_factors(
     squares: Array, now: Sequence[int] | NDArray[np.intp], centred: bool, lasting: Sequence[tuple[int, Array]] = ()
 ) -> Array:
     """(T,) by how much sigmas are wider than what is stated makes them, where readings contradict it: the root of their
@@ -377,11 +377,11 @@ LEAST = 1e-6
 """Chance below which no number is told."""
 _CLOSE = 3.0
 """Difference of log likelihood ratios, below which another body explains a jump nearly as well: 20 to 1."""
-BROKEN, BREAKS, JUMP, SENSOR, CONTRADICTION = "broken", "breaks", "jump", "sensor", "contradiction"
+BROKEN, BREAKS, JUMP, SENSOR, CONTRADICTION = "broken", "requirements", "jump", "sensor", "contradiction"
 Row = Mapping[str, Any]
 
 
-def raise_alarms(history: History, plan: OperationSpec, following: Following) -> list[Alarm]:
+def raise_alarms(history: History, plan: OperationSpec, result: FilterResult) -> list[Alarm]:
     """Add to a record what of its estimate is to be known and has not been told.
 
     Parameters
@@ -399,24 +399,26 @@ def raise_alarms(history: History, plan: OperationSpec, following: Following) ->
         The alarms that are new.
     """
     before = history.alarms()
-    return [one for one in alarms_of(plan, following) if not _is_told(one, before) and history.raise_alarm(one)]
+    return [one for one in alarms_of(plan, result) if not _is_told(one, before) and history.raise_alarm(one)]
 
 
-def alarms_of(plan: OperationSpec, following: Following) -> Iterator[Alarm]:
+def alarms_of(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
     """What of an estimate is to be known, whether it has been told or not."""
-    for one in following.breaks:
+    for one in result.requirements:
         if not one.holds_now or one.breaks_us is not None:
-            yield _of_requirement(one, following.time, following.now.quantities)
-    for jump in following.jumps:
+            yield _of_requirement(one, result.time, result.now.quantities)
+    for jump in result.jumps:
         yield _of_jump(jump)
-    for sensor in following.sensors:
+    for sensor in result.sensors:
         if sensor.state != "ok":
             text = f"the sensor of {sensor.body} is {sensor.state} since {utc_text(sensor.since_us)}: {sensor.reason}"
             yield Alarm(SENSOR, sensor.body, sensor.since_us, text, sensor.to_dict())
-    if following.too_small:
-        text = next(one for one in following.warnings if following.too_small[0] in one)
-        yield Alarm(CONTRADICTION, "temperatures", following.time, text, {"causes": list(following.too_small)})
-    far = [*_contradictions(plan, following), *map(_of_bad, following.bad_readings)]
+    if result.understated_causes:
+        text = next(one for one in result.warnings if result.understated_causes[0] in one)
+        yield Alarm(
+            CONTRADICTION, "temperatures", result.time, text, {"causes": list(result.understated_causes)}
+        )
+    far = [*_contradictions(plan, result), *map(_of_bad, result.bad_readings)]
     yield from sorted(far, key=lambda one: one.time)[-1:]
 
 
@@ -455,7 +457,7 @@ def percent(chance: float) -> str:
     return f"{fixed(100.0 * chance, decimals_for(100.0 * rest))} %"
 
 
-def _of_requirement(one: Break, time: int, quantities: Sequence[Quantity]) -> Alarm:
+def _of_requirement(one: RequirementStatus, time: int, quantities: Sequence[Quantity]) -> Alarm:
     name, allowed = name_of(one.quantity, quantities), percent(1.0 - one.probability)
     limit = f"{plain(one.limit)} {one.unit}"
     if not one.holds_now:
@@ -466,7 +468,7 @@ def _of_requirement(one: Break, time: int, quantities: Sequence[Quantity]) -> Al
     return Alarm(BREAKS, one.quantity, time, text, one.to_dict())
 
 
-def _of_jump(one: FoundJump) -> Alarm:
+def _of_jump(one: DetectedJump) -> Alarm:
     near = [body for body, ratio in one.rivals.items() if ratio > one.log_ratio - _CLOSE][:3]
     rivals = f"; {', '.join(near)} would explain it nearly as well" if near else ""
     content = {**one.to_dict(), "after_us": one.after_us, "until_us": one.until_us}
@@ -485,16 +487,18 @@ def _of_bad(bad: tuple[int, str]) -> Alarm:
     return Alarm(CONTRADICTION, "monitor", time, text, {"time_utc": utc_text(time), "reason": reason})
 
 
-def _contradictions(plan: OperationSpec, following: Following) -> Iterator[Alarm]:
+def _contradictions(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
     """Readings that are too far from their predictions; those at which a jump was found are explained by it.
 
     Of the chance of a false alarm in the whole life each reading has the share of the time since the one before it.
     """
-    spans = [(one.after_us, one.told_us) for one in following.jumps]
-    told = following.innovations
+    spans = [(one.after_us, one.detected_us) for one in result.jumps]
+    told = result.innovations
     # the first of all has no other before it, and a chance of a false alarm of its own
     befores = (
-        [told[0][0] - round(plan.mission * MICRO) if following.readings == len(told) else told[0][0]] if told else []
+        [told[0][0] - round(plan.mission * MICRO) if result.readings == len(told) else told[0][0]]
+        if told
+        else []
     )
     befores += [time for time, _, _ in told[:-1]]
     for before, (time, chi_square, degrees) in zip(befores, told, strict=True):

@@ -71,7 +71,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Refused:
+class Refusal:
     """What is not taken.
 
     Attributes
@@ -120,7 +120,7 @@ class Alarm:
 
 
 @dataclass(frozen=True)
-class Given:
+class FileContent:
     """What one file holds.
 
     Attributes
@@ -140,7 +140,7 @@ class Given:
     file: str
     sha256: str
     meaning: str
-    items: Sequence[Entry | Refused]
+    items: Sequence[Entry | Refusal]
     frames: Mapping[str, str]
 
 

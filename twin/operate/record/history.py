@@ -24,7 +24,7 @@ from twin.operate.record.entries import (
     DECISION,
     Alarm,
     Entry,
-    Given,
+    FileContent,
     canonical,
     digest_of_data,
     digest_of_job,
@@ -40,14 +40,14 @@ from twin.operate.record.schema import (
     PLAN,
     REFUSED,
     SOURCE,
+    database_errors,
     engine_of,
-    failures_told,
     opened,
     said,
     url_of,
     writing,
 )
-from twin.operate.record.taking import Taken, Taking
+from twin.operate.record.taking import Ingest, IngestResult
 
 USED = ("monitor", "temperature")
 """Kinds of entries that change the estimate; events do by what they step."""
@@ -107,10 +107,10 @@ class History:
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """A transaction that sees the record at one moment."""
-        with failures_told(), self._engine.connect() as connection, connection.begin():
+        with database_errors(), self._engine.connect() as connection, connection.begin():
             yield connection
 
-    def take(self, given: Given, late: bool = False) -> Taken:
+    def ingest(self, given: FileContent, late: bool = False) -> IngestResult:
         """Add what a file holds, all of it in one step: after an interruption all of it is there, or nothing.
 
         Parameters
@@ -132,7 +132,7 @@ class History:
         for attempt in (True, False):
             try:
                 with writing(self._engine) as connection:
-                    return Taking(connection, self.simulated, late).take(given)
+                    return Ingest(connection, self.simulated, late).ingest(given)
             except IntegrityError as error:  # of databases without a lock: another writer was first
                 if not attempt:
                     raise RecordFailed(said(error)) from None
@@ -180,8 +180,8 @@ class History:
                 "number": len(before),
             }
             one = Entry(DECISION, str(number), int(row["time_us"]), content)
-            given = Given("twin.operate exclude", digest_of_data(content), one.digest, [one], {})
-            Taking(connection, self.simulated, True).write(given, one.digest, None, [(one, one.digest)], {})
+            given = FileContent("twin.operate exclude", digest_of_data(content), one.digest, [one], {})
+            Ingest(connection, self.simulated, True).write(given, one.digest, None, [(one, one.digest)], {})
         keys = {key: row[key] for key in ("kind", "subject", "time_utc")}
         return {"entry": number, **keys, "included": included, "why": why}
 
@@ -260,7 +260,7 @@ class History:
             "open": sum(not one["taken_since"] for one in refused),
         }
 
-    def keep_plan(self, file: str, content: Mapping[str, Any]) -> bool:
+    def store_plan(self, file: str, content: Mapping[str, Any]) -> bool:
         """Keep a plan of operation, which from now on counts.
 
         Parameters
@@ -534,7 +534,7 @@ def bodies_of(job: ResolvedJob) -> dict[str, list[str]]:
     return {"warm": warm, "cameras": list(job.instrument.cameras)}
 
 
-def initialised(place: str, job: ResolvedJob, simulated: bool = False) -> tuple[int, ...]:
+def initialise_record(place: str, job: ResolvedJob, simulated: bool = False) -> tuple[int, ...]:
     """Make a record where there is none.
 
     Parameters

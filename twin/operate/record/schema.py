@@ -323,14 +323,14 @@ def opened(url: URL) -> Engine:
 @contextmanager
 def writing(engine: Engine) -> Iterator[Connection]:
     """A transaction of the one writer of this moment."""
-    with failures_told(), engine.connect().execution_options(writing=True) as connection, connection.begin():
+    with database_errors(), engine.connect().execution_options(writing=True) as connection, connection.begin():
         if engine.dialect.name == "postgresql":
             connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_LOCK})")
         yield connection
 
 
 @contextmanager
-def failures_told() -> Iterator[None]:
+def database_errors() -> Iterator[None]:
     """What a database says when it cannot do what it should. Raises RecordFailed."""
     try:
         yield

@@ -10,7 +10,7 @@ from typing import Any
 from sqlalchemy import Connection, delete, func, insert, select
 
 from scenes.yaml.input_file import parse_json
-from twin.operate.record.entries import MICRO, Entry, Given, Refused, canonical, digest_of_data, now, utc_text
+from twin.operate.record.entries import MICRO, Entry, FileContent, Refusal, canonical, digest_of_data, now, utc_text
 from twin.operate.record.schema import CHECKPOINT, ENTRY, FRAME, REFUSED, SOURCE
 
 SAME_IMAGES = 0.2
@@ -29,7 +29,7 @@ Before = Mapping[tuple[str, str, str], tuple[float, float]]
 
 
 @dataclass(frozen=True)
-class Taken:
+class IngestResult:
     """What became of one file.
 
     Attributes
@@ -62,7 +62,7 @@ class Taken:
         return {"new": self.new, "known": self.known, "refused": refused, "refused_before": self.refused_before}
 
 
-class Taking:
+class Ingest:
     """One file on its way into the record.
 
     Parameters
@@ -81,7 +81,7 @@ class Taking:
         self.seen: dict[tuple[str, str], int] = {}
         self.first: tuple[str, Before] | None = None
 
-    def take(self, given: Given) -> Taken:
+    def ingest(self, given: FileContent) -> IngestResult:
         """Compare what the file holds with the record and add what is new."""
         taking = digest_of_data([given.sha256, given.meaning])
         source = self.connection.execute(select(SOURCE.c.id).where(SOURCE.c.taking == taking)).first()
@@ -90,7 +90,7 @@ class Taking:
         digests, refused, kept = iter(entries), [], []
         again = 0
         for item in given.items:
-            if isinstance(item, Refused):
+            if isinstance(item, Refusal):
                 refused.append((item, item.entry.digest if item.entry else None))
                 continue
             one, digest = next(digests)
@@ -98,7 +98,7 @@ class Taking:
             if digest in known:
                 again += 1
             elif reason := self._wrong(one):
-                refused.append((Refused(reason, one.line, one), digest))
+                refused.append((Refusal(reason, one.line, one), digest))
                 continue
             else:
                 kept.append((one, digest))
@@ -111,11 +111,11 @@ class Taking:
         if kept or fresh or not before:
             self.write(given, taking, None if source is None else int(source[0]), kept, fresh)
         told = tuple((one.line, one.reason) for one, _ in refused)
-        return Taken(given.file, len(kept), again, told, before, len(refused) - len(fresh))
+        return IngestResult(given.file, len(kept), again, told, before, len(refused) - len(fresh))
 
     def _fresh(
-        self, given: Given, refused: list[tuple[Refused, str | None]], before: bool
-    ) -> dict[str, tuple[Refused, str | None]]:
+        self, given: FileContent, refused: list[tuple[Refusal, str | None]], before: bool
+    ) -> dict[str, tuple[Refusal, str | None]]:
         """Return what is refused for the first time, by digest: a reading counts once whatever file it comes in, and a
         row that could not be read once in each file, however the file grows.
         """
@@ -196,11 +196,11 @@ class Taking:
 
     def write(
         self,
-        given: Given,
+        given: FileContent,
         taking: str,
         source: int | None,
         kept: list[tuple[Entry, str]],
-        refused: Mapping[str, tuple[Refused, str | None]],
+        refused: Mapping[str, tuple[Refusal, str | None]],
     ) -> None:
         """Add rows to the record, and drop what was kept of estimates that these change.
 

@@ -35,8 +35,8 @@ from twin.framework.run_folder import Manifest, is_run_folder, read_manifest
 from twin.operate.record.entries import (
     MICRO,
     Entry,
-    Given,
-    Refused,
+    FileContent,
+    Refusal,
     canonical,
     digest_of_data,
     digest_of_job,
@@ -71,7 +71,7 @@ def kind_of_run(folder: Path) -> str:
     return next((kind for kind in RUNS if is_file(folder / RESULTS[kind])), "")
 
 
-def run_entries(place: Path, kind: str, moment: int, history: History, stated: bool) -> Given:
+def run_entries(place: Path, kind: str, moment: int, history: History, stated: bool) -> FileContent:
     """The readings of a run folder; what is wrong with it stands in their place.
 
     Parameters
@@ -92,7 +92,7 @@ def run_entries(place: Path, kind: str, moment: int, history: History, stated: b
     file = folder / RESULTS.get(kind, RESULTS["monitor"])
     manifest = read_manifest(folder)
     digest, frames = "", {}
-    items: list[Entry | Refused]
+    items: list[Entry | Refusal]
     try:
         if not kind or manifest is None or not is_file(file):
             allowed = f"a finished run folder with {names_text(RESULTS.values())}"
@@ -102,8 +102,10 @@ def run_entries(place: Path, kind: str, moment: int, history: History, stated: b
         _is_of(folder, history, stated and kind != "monitor")
         items = list(_found(kind, read_json(file), moment, digest, frames))
     except (Problem, InputError) as error:
-        items = [Refused(one_line(error))]
-    return Given(str(file), digest or digest_of_data(str(file)), digest_of_data([kind, moment, stated]), items, frames)
+        items = [Refusal(one_line(error))]
+    return FileContent(
+        str(file), digest or digest_of_data(str(file)), digest_of_data([kind, moment, stated]), items, frames
+    )
 
 
 def _frames(manifest: Manifest) -> dict[str, str]:
@@ -221,19 +223,19 @@ def tables_of(spec: TelemetrySpec, table: ReadingTableSpec) -> list[Path]:
         raise table.error(problem, ("files",), found=table.files, allowed=allowed) from None
 
 
-def read_table_file(table: ReadingTableSpec, path: Path, history: History) -> Given:
+def read_table_file(table: ReadingTableSpec, path: Path, history: History) -> FileContent:
     """What one table holds; one that cannot be read is refused as a whole."""
     try:
         digest = digest_of(path)
         items, frames = _items(table, path, history)
     except InputError as error:
-        items, frames = [Refused(one_line(one), one.line) for one in error.issues], {}
+        items, frames = [Refusal(one_line(one), one.line) for one in error.issues], {}
     except OSError as error:
-        digest, items, frames = digest_of_data(str(path)), [Refused(f"cannot be read: {error.strerror}")], {}
-    return Given(str(path), digest, digest_of_data(table.plain()), items, frames)
+        digest, items, frames = digest_of_data(str(path)), [Refusal(f"cannot be read: {error.strerror}")], {}
+    return FileContent(str(path), digest, digest_of_data(table.plain()), items, frames)
 
 
-def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[Entry | Refused], dict[str, str]]:
+def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[Entry | Refusal], dict[str, str]]:
     rows = rows_apart(path, LARGEST)
     if not rows:
         raise InputError(Issue("an empty table", str(path), 1, allowed="a row of heads, and rows below it"))
@@ -251,19 +253,19 @@ def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[
             text = f"{'no' if head not in heads else 'more than one'} column {head!r}"
             raise InputError(Issue(text, str(path), line, (), names_text(heads), None, nearest(head, heads)))
     place = {head: heads.index(head) for head in wanted}
-    items: list[Entry | Refused] = []
+    items: list[Entry | Refusal] = []
     for number, cells in rows[1:]:
         if isinstance(cells, str):
-            items.append(Refused(cells, number))
+            items.append(Refusal(cells, number))
             continue
         if len(cells) != len(heads):
-            items.append(Refused(f"{len(cells)} cells under {len(heads)} heads", number))
+            items.append(Refusal(f"{len(cells)} cells under {len(heads)} heads", number))
             continue
         row = {head: cells[k].strip() for head, k in place.items()}
         try:
             moment = _moment(table, row[table.time])
         except Problem as problem:
-            items.append(Refused(f"{table.time}: {one_line(problem)}", number))
+            items.append(Refusal(f"{table.time}: {one_line(problem)}", number))
             continue
         if table.kind in VALUES:
             read = ((one, column, [row[head] for head in column.column]) for one, column in table.columns.items())
@@ -280,37 +282,37 @@ def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[
 
 def _keyword_items(
     table: ReadingTableSpec, rows: Sequence[tuple[int, list[str] | str]], history: History
-) -> list[Entry | Refused]:
+) -> list[Entry | Refusal]:
     """Lines of ``KEYWORD = TIME NUMBER``; other keywords, and lines without a number after a time, are not readings."""
     by_keyword = {one.column[0]: (subject, one) for subject, one in table.columns.items()}
-    items: list[Entry | Refused] = []
+    items: list[Entry | Refusal] = []
     for number, cells in rows:
         if isinstance(cells, str):
-            items.append(Refused(cells, number))
+            items.append(Refusal(cells, number))
             continue
         keyword, _, rest = ",".join(cells).partition("=")
         words = rest.split()
         if keyword.strip() not in by_keyword:
             continue
         if len(words) != 2:
-            items.append(Refused(f"{keyword.strip()}: not a time and a number; found {shown(rest.strip())}", number))
+            items.append(Refusal(f"{keyword.strip()}: not a time and a number; found {shown(rest.strip())}", number))
             continue
         subject, column = by_keyword[keyword.strip()]
         try:
             moment = _moment(table, words[0])
         except Problem as problem:
-            items.append(Refused(one_line(problem), number))
+            items.append(Refusal(one_line(problem), number))
             continue
         items.append(_tried(_reading, table, history, subject, column, [words[1]], moment, number))
     return items
 
 
-def _tried(make: Callable[..., Entry], *of: Any) -> Entry | Refused:
+def _tried(make: Callable[..., Entry], *of: Any) -> Entry | Refusal:
     """Return an entry, or why there is none; the last argument is its line."""
     try:
         return make(*of)
     except Problem as problem:
-        return Refused(one_line(problem), of[-1])
+        return Refusal(one_line(problem), of[-1])
 
 
 def _moment(table: ReadingTableSpec, text: str) -> int:
@@ -431,7 +433,7 @@ class Sources:
     watching: bool = False
     seen: dict[str, State] = field(default_factory=dict)
 
-    def look(self, history: History) -> Iterator[Given]:
+    def look(self, history: History) -> Iterator[FileContent]:
         """What they hold now; of what is watched only what has changed since the last look.
 
         Raises
@@ -458,7 +460,7 @@ class Sources:
                 if (run / MANIFEST).resolve() not in named:  # the time of others stands in a table
                     yield from self._run(run, None, history)
 
-    def _tables(self, file: Path, history: History, named: set[Path]) -> Iterator[Given]:
+    def _tables(self, file: Path, history: History, named: set[Path]) -> Iterator[FileContent]:
         """What the tables hold that a YAML file describes; the run folders that they name are added to ``named``."""
         spec = read_telemetry(file, history)
         for table in spec.readings:
@@ -468,7 +470,7 @@ class Sources:
                 if not self._is_seen(path, own):
                     yield read_table_file(table, path, history)
 
-    def _run(self, place: Path, moment: int | None, history: History) -> Iterator[Given]:
+    def _run(self, place: Path, moment: int | None, history: History) -> Iterator[FileContent]:
         folder = place if place.is_dir() else place.parent
         moment = time_of_name(folder.name) if moment is None else moment
         if moment is None and place in self.places:
@@ -479,7 +481,7 @@ class Sources:
             reason = (
                 "a run folder does not say when it was read; put the UTC into its name, recover-2026-03-05T03-05-00Z"
             )
-            yield Given(str(folder), digest_of_data(str(folder)), "", [Refused(f"{folder.name}: {reason}")], {})
+            yield FileContent(str(folder), digest_of_data(str(folder)), "", [Refusal(f"{folder.name}: {reason}")], {})
         else:
             yield run_entries(place, "", moment, history, self.stated)
 
