@@ -196,9 +196,9 @@ def psf(
 
     Returns
     -------
-    (count, count) ndarray
-        Irradiance, 1/m^2, of unit power through the pupil: rows along y, columns along x. Times ``step**2`` it sums to
-        the share of the light that falls on the grid.
+    (N, N) ndarray
+        With N = ``count``: irradiance, 1/m^2, of unit power through the pupil; rows along y, columns along x. Times
+        ``step**2`` it sums to the share of the light that falls on the grid.
 
     Raises
     ------
