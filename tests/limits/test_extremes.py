@@ -99,7 +99,7 @@ def test_an_instrument_beyond_all_is_refused(tmp_path: Path) -> None:
     assert took["processor"] < SECONDS
     assert took["used"] < BYTES
     assert re.search(r"monitor\.area_ccd\.rows: this needs about 1\d\d GB of memory", said)
-    assert "and 4 GB may be taken" in said
+    assert "and 4 GB may be used" in said
     told = re.search(r"at most (\d+) rows and columns", said)
     assert told is not None
     assert 1024 < int(told[1]) < 2048

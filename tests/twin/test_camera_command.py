@@ -268,7 +268,7 @@ def test_a_journal_that_cannot_be_kept_is_reported(tmp_path) -> None:
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))  # as on a full disk
         try:
-            with pytest.raises(RunFolderError, match="what it holds is kept, go on with --resume"):
+            with pytest.raises(RunFolderError, match="the finished work in it is kept, continue with --resume"):
                 journal.keep({repr(beam): BeamFacts(beam)})
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -30,7 +30,7 @@ from tests.twin.commands import invoke
 from tests.twin.study_bench import REFUSED
 from twin.framework import frame_store
 from twin.framework.data_files import FrameFacts, preview_png, tiff
-from twin.framework.frame_store import frame_room, in_file, kept_bytes, largest_of, let_go, mean_of
+from twin.framework.frame_store import allocate_frames, in_file, largest_of, mean_of, release_memory, resident_bytes
 from twin.main_job.render_job import render_job
 from twin.render import app
 from twin.sensors import area_detector, exposure_kernel
@@ -417,8 +417,8 @@ def test_frames_in_a_file_are_those_in_memory(small: None, monkeypatch: pytest.M
     assert in_file(stored)
     assert in_file(stored[1, 3])
     assert not in_file(kept)
-    let_go(stored)
-    let_go(kept)
+    release_memory(stored)
+    release_memory(kept)
     np.testing.assert_array_equal(stored, kept)
     np.testing.assert_array_equal(mean_of(stored), mean_frames(kept))
     np.testing.assert_array_equal(mean_of(stored), kept.mean(axis=-3))  # as pictures have it: all sums are exact
@@ -452,9 +452,9 @@ def test_a_full_disk_is_said_before(small: None, monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(frame_store.os, "posix_fallocate", full)
     with pytest.raises(OSError, match="GB of frames do not fit on the disk"):
-        frame_room((2, 100, 30, 30))
+        allocate_frames((2, 100, 30, 30))
 
 
 def test_what_lies_in_a_file_takes_no_memory() -> None:
-    assert kept_bytes(1e6) == 1e6
-    assert kept_bytes(1e12) == kept_bytes(5e9) < 0.2e9
+    assert resident_bytes(1e6) == 1e6
+    assert resident_bytes(1e12) == resident_bytes(5e9) < 0.2e9

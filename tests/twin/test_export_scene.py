@@ -151,7 +151,7 @@ def test_polynomials_alone_are_corrected(folder: Path, tmp_path: Path, form: str
     """The same polynomials from three formats take the same correction, as the scene's own do."""
     model = read_rpc(folder / "RPC_SCENE.XML")
     (tmp_path / "a_RPC.TXT").write_text(model.text())
-    (tmp_path / "a.tif").write_bytes(tiff(np.zeros((1, 32, 32), np.uint16), FrameFacts(place=model)))
+    (tmp_path / "a.tif").write_bytes(tiff(np.zeros((1, 32, 32), np.uint16), FrameFacts(georeference=model)))
     (tmp_path / "RPC_SCENE.XML").write_bytes((folder / "RPC_SCENE.XML").read_bytes())
     points = ("--control", folder / "points.gcp")
     result = run("export", tmp_path / form, *points, "--out", tmp_path / "out")

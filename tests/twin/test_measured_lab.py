@@ -159,7 +159,7 @@ def test_exported_comparisons_are_those_of_the_bench(tmp_path: Path) -> None:
 def test_export_is_for_simulated_benches(folder: Path, tmp_path: Path) -> None:
     code, told = run("turntable", folder / "turntable.yaml", "--export", tmp_path / "files", "--out", tmp_path / "run")
     assert code == 2
-    assert "turntable.yaml:6: measured: measurements are files already" in told
+    assert "turntable.yaml:6: measured: --export writes the measurements of a simulated bench" in told
     (tmp_path / "there").mkdir()
     code, told = run("turntable", JOBS / "turntable.yaml", "--export", tmp_path / "there", "--out", tmp_path / "run")
     assert code == 2

@@ -42,7 +42,7 @@ def test_the_environment_says_what_may_be_taken(text: str, number: float, monkey
 @pytest.mark.parametrize("text", ["8", "much", "-1 GB", "1 TB"])
 def test_another_text_is_bad_input(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(LIMIT, text)
-    with pytest.raises(InputError, match="no amount of memory"):
+    with pytest.raises(InputError, match="is not an amount of memory"):
         free_memory()
 
 
@@ -78,7 +78,7 @@ def experiment(backend: Backend) -> MonitorExperiment:
 def nothing_is_ordinary(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small jobs are refused, too."""
     monkeypatch.setattr(memory, "ORDINARY", 0.0)
-    monkeypatch.setattr(memory, "taken_already", lambda: 0.0)
+    monkeypatch.setattr(memory, "reusable_memory", lambda: 0.0)
 
 
 @pytest.mark.usefixtures("nothing_is_ordinary")
@@ -96,7 +96,7 @@ def test_what_would_fit_is_told(changes, key, unit, experiment, monkeypatch) -> 
     size = replace(experiment.size(), **changes)
     limit = f"{0.5e-6 * (size.bytes(detector) + experiment.size().bytes(detector)):.0f} MB"
     monkeypatch.setenv(LIMIT, limit)
-    with pytest.raises(InputError, match=r"needs about \d.* and .* may be taken") as caught:
+    with pytest.raises(InputError, match=r"needs about \d.* and .* may be used") as caught:
         require_memory(resolved, size, detector)
     assert ".".join(map(str, caught.value.key)).endswith(key)
     told = re.match(rf"at most (\d+) {unit}", caught.value.allowed or "")
@@ -146,9 +146,9 @@ def test_a_large_ccd_is_refused_wherever_an_instrument_is_used(tmp_path, backend
 
 def test_runs_of_a_study_are_counted(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv(LIMIT, "1 GB")
-    monkeypatch.setattr(memory, "taken_already", lambda: 0.0)
+    monkeypatch.setattr(memory, "reusable_memory", lambda: 0.0)
     setup = resolve_study(STUDIES_BEYOND["ten million runs"].write(tmp_path))
-    with pytest.raises(InputError, match=r"this needs about [\d.]+ GB of memory, and 1 GB may be taken") as caught:
+    with pytest.raises(InputError, match=r"this needs about [\d.]+ GB of memory, and 1 GB may be used") as caught:
         require_study_memory(setup)
     assert caught.value.key == ("design", "runs")
     told = re.match(r"at most (\d+) runs", caught.value.allowed or "")
@@ -156,7 +156,7 @@ def test_runs_of_a_study_are_counted(tmp_path, monkeypatch) -> None:
     assert study_bytes(setup, int(told[1])) <= 1e9 < study_bytes(setup, int(told[1]) + 1)
     # the study's own limit, where that is less
     monkeypatch.setenv(LIMIT, "900 GB")
-    with pytest.raises(InputError, match=r"4 GB may be taken; .*, or a larger limits\.memory"):
+    with pytest.raises(InputError, match=r"4 GB may be used; .*, or a larger limits\.memory"):
         require_study_memory(setup)
 
 
@@ -168,7 +168,7 @@ def check_refused(done: object, file: Path | None, key: str, unit: str, folder: 
     """Exit code 2 with file, line, key and the number that fits; nothing was written."""
     assert done.exit_code == 2, done.output  # type: ignore[attr-defined]
     said = " ".join(done.stderr.split())  # type: ignore[attr-defined]
-    assert re.search(rf"{re.escape(key)}: .*this needs about [\d.]+ GB of memory, and 1 GB may be taken", said), said
+    assert re.search(rf"{re.escape(key)}: .*this needs about [\d.]+ GB of memory, and 1 GB may be used", said), said
     assert re.search(rf"allowed: at most \d+ {unit}, or more memory", said), said
     if file is not None:
         assert re.search(rf"{re.escape(file.name)}:\d+: {re.escape(key)}", said), said

@@ -100,7 +100,7 @@ SHOWN = Table("readings", "Readings", "", ("number",), [])
 
 @pytest.mark.parametrize("verdict", ["", "No full stop", "One sentence. And another. And more.", "Is it? No. Yes."])
 def test_a_verdict_is_two_sentences_at_most(verdict: str) -> None:
-    with pytest.raises(ValueError, match="not one or two sentences"):
+    with pytest.raises(ValueError, match="a verdict must be one or two sentences"):
         Report("Level", verdict, (), (), SHOWN, ())
 
 
@@ -111,7 +111,7 @@ def test_a_verdict_is_two_sentences_at_most(verdict: str) -> None:
         (lambda: SvgFigure("a", "A", "B", "<p>"), "not an <svg>"),
         (lambda: PngFigure("a", "A", "B", b"GIF"), "not a PNG"),
         (lambda: Table("a", "A", "B", ("x", "y"), [(1,)]), "a row of 1 cells under 2 heads"),
-        (lambda: Report("Level", "It holds.", (), (), SHOWN, (Section("A", (), (SHOWN,)),)), "is called readings"),
+        (lambda: Report("Level", "It holds.", (), (), SHOWN, (Section("A", (), (SHOWN,)),)), "has the name readings"),
     ],
 )
 def test_what_is_no_artefact_is_refused(make: Callable[[], object], said: str) -> None:
@@ -122,9 +122,9 @@ def test_what_is_no_artefact_is_refused(make: Callable[[], object], said: str) -
 def test_numbers_have_no_verdict_but_the_reports() -> None:
     told = Report("Level", "It holds.", (), (), SHOWN, ())
     expected = {"a": 1, "verdict": "It holds.", "warnings": []}
-    assert told.told({"a": 1, "verdict": "It holds."}) == told.told({"a": 1}) == expected
+    assert told.with_verdict({"a": 1, "verdict": "It holds."}) == told.with_verdict({"a": 1}) == expected
     with pytest.raises(ValueError, match="verdict"):
-        told.told({"verdict": {"before": False}})
+        told.with_verdict({"verdict": {"before": False}})
 
 
 def test_statements_become_a_verdict_and_what_follows_it() -> None:
@@ -291,7 +291,7 @@ def test_a_report_that_cannot_be_made_costs_no_numbers(tmp_path: Path, monkeypat
     done = invoke(app, "level", path, "--out", out)
     assert done.exit_code == 1
     assert "Traceback" in done.stderr
-    assert f"error: the report could not be made; all else is in {out}" in " ".join(done.stderr.split())
+    assert f"error: the report could not be made; everything else is in {out}" in " ".join(done.stderr.split())
     assert len(json.loads((out / "level.json").read_text("utf-8"))["readings_arcsec"]) == 5
     told = "the report could not be made: RuntimeError: no such font"
     assert told in json.loads((out / "manifest.json").read_text("utf-8"))["warnings"]

@@ -24,7 +24,7 @@ from twin.framework.data_files import (
     DataColumn,
     DataTable,
     FrameFacts,
-    MapPlace,
+    MapGeoreference,
     MissingPackage,
     csv_table,
     tiff,
@@ -96,8 +96,10 @@ def test_times_maps_and_heights_say_where_and_when_they_are(tmp_path) -> None:
         assert file["FRAMES"].data["frame"].tolist() == [1, 2]
         assert file[0].header["XPIXSZ"] == 5.5
     for heights, dtype in ((True, np.float32), (False, np.uint16)):
-        place = MapPlace(116.0, 40.0, 2e-5, -1e-5, heights)
-        (tmp_path / "map.tiff").write_bytes(tiff(frames[:1].astype(dtype), FrameFacts(place=place, note="a map")))
+        place = MapGeoreference(116.0, 40.0, 2e-5, -1e-5, heights)
+        (tmp_path / "map.tiff").write_bytes(
+            tiff(frames[:1].astype(dtype), FrameFacts(georeference=place, note="a map"))
+        )
         with fits.open(io.BytesIO(frames_fits(read_frames(tmp_path / "map.tiff"), []))) as file:
             header = file[0].header
             assert [header[key] for key in ("LON0", "LAT0", "DLON", "DLAT")] == pytest.approx(
@@ -187,7 +189,7 @@ def test_files_that_are_no_frames_of_a_run_are_refused(tmp_path) -> None:
 def test_columns_that_make_no_table_are_refused() -> None:
     one = DataColumn.of("a", [1.0], "", "one")
     for columns in ((one, one), (one, DataColumn.of("b", [1.0, 2.0], "", "two"))):
-        with pytest.raises(ValueError, match="columns of one length with different names"):
+        with pytest.raises(ValueError, match="columns must have the same length and different names"):
             DataTable("t", "a title", columns)
     assert one.unit == ""
     with pytest.raises(KeyError):

@@ -302,7 +302,7 @@ def test_somebody_else_takes_the_name_meanwhile(tmp_path):
             folder.write_text("a.txt", "mine")
             take()
 
-    with pytest.raises(RunFolderError, match="in place"):
+    with pytest.raises(RunFolderError, match="cannot move the output folder to"):
         lose()
     assert everything(tmp_path) == {"run", "run/theirs.txt"}
 
@@ -475,7 +475,10 @@ def test_a_folder_of_the_user_is_refused_and_stays(tmp_path: Path) -> None:
             kept.begin()
     assert own.read_text() == "my own data"
     (tmp_path / "x.samples").write_text("a file")
-    for place, said in (("x", "is in the way"), ("x.samples/below", "cannot use .*: Not a directory")):
+    for place, said in (
+        ("x", "is needed for the intermediate results"),
+        ("x.samples/below", "cannot use .*: Not a directory"),
+    ):
         with KeptWork(tmp_path / place, "x", "samples", False) as kept, pytest.raises(RunFolderError, match=said):
             kept.begin()
 

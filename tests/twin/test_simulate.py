@@ -222,7 +222,10 @@ def _gdal(rpc: RationalPolynomial, shape: tuple[int, int], points: np.ndarray) -
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with MemoryFile(tiff(np.zeros((1, *shape), np.uint16), FrameFacts(place=rpc))) as memory, memory.open() as file:
+        with (
+            MemoryFile(tiff(np.zeros((1, *shape), np.uint16), FrameFacts(georeference=rpc))) as memory,
+            memory.open() as file,
+        ):
             assert file.shape == shape
             with RPCTransformer(file.rpcs) as transformer:
                 rows = transformer.rowcol(*points.T, op=lambda value: value)

@@ -22,7 +22,7 @@ from tests.tiers import quick
 from tests.twin.study_bench import ROOT
 from twin.framework import cluster
 from twin.framework.cli import InputErrorText
-from twin.framework.cluster import _children_deaf_to_ctrl_c
+from twin.framework.cluster import _children_ignore_interrupts
 from twin.framework.console import PROGRAMS as ALL_PROGRAMS
 from twin.framework.durable import ending_later
 
@@ -165,7 +165,7 @@ def exit_code_of_a_worker() -> int:
 
 @pytest.mark.second
 def test_workers_leave_ctrl_c_to_their_command() -> None:
-    with _children_deaf_to_ctrl_c():
+    with _children_ignore_interrupts():
         assert exit_code_of_a_worker() == 0
     assert exit_code_of_a_worker() == 1
 
@@ -184,9 +184,9 @@ def test_a_cluster_that_cannot_be_used_is_told(monkeypatch: pytest.MonkeyPatch) 
 
     assert cluster._differences(client(w=(versions, source))) == []
     (other,) = cluster._differences(client(w=(versions | {"numpy": "0"}, source)))
-    assert other.startswith("the worker w has other versions: numpy 0 instead of")
+    assert other.startswith("the worker w has other package versions: numpy 0 instead of")
     monkeypatch.setattr(cluster, "WORKER_SECONDS", 0.0)
-    monkeypatch.setattr(cluster, "REACH_SECONDS", 0.5)
+    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.5)
     # its own settings are read at its import, and one inside of `set` would be forgotten with the certificates
     import distributed  # noqa: F401
 
@@ -195,10 +195,10 @@ def test_a_cluster_that_cannot_be_used_is_told(monkeypatch: pytest.MonkeyPatch) 
         (lambda: cluster._differences(client(w=ImportError("numpy"))), r"w cannot import the twin \(numpy\)"),
         (lambda: cluster._differences(client(w=(versions, "another"))), "w has other source files of the twin"),
         (lambda: cluster._differences(client()), "the workers do not answer: division"),
-        (lambda: cluster.Workers(client("closed"), False).next_finished(), "the scheduler is gone"),
+        (lambda: cluster.Workers(client("closed"), False).next_finished(), "the connection to the scheduler is lost"),
         (lambda: cluster._wait_for_worker(cluster.Workers(client(), False), "a", print), "a had no workers for 0 s"),
         (lambda: cluster.remote_workers("tcp://127.0.0.1:9", print).__enter__(), "9 cannot be reached"),
-        (lambda: cluster._check_address("tls://127.0.0.1:9"), "the certificates that Dask is told of cannot be used"),
+        (lambda: cluster._check_address("tls://127.0.0.1:9"), "the certificates configured for Dask cannot be used"),
     ):
         with dask.config.set(certificates), pytest.raises((cluster.ClusterError, InputErrorText), match=said):
             act()

@@ -173,7 +173,7 @@ def test_resume_of_a_finished_study_computes_nothing(done) -> None:
     ("address", "told"),
     [
         *((address, "not an address") for address in ("nowhere", "tls://", "tcp://host", "tcp://host:99999999")),
-        ("tls://127.0.0.1:1", "TLS needs certificates; name them to Dask by DASK_DISTRIBUTED__COMM__TLS__CA_FILE"),
+        ("tls://127.0.0.1:1", "TLS needs certificates; configure them for Dask with DASK_DISTRIBUTED__COMM__TLS__CA"),
     ],
 )
 def test_a_scheduler_that_cannot_be_reached_by_what_is_given(tmp_path, address, told) -> None:
@@ -200,7 +200,7 @@ def test_a_signal_keeps_what_is_done(tmp_path, number, code) -> None:
     finally:
         process.kill()
     assert process.returncode == code, errors
-    assert re.search(r"what is done is kept, go on with: .*--resume", errors), errors
+    assert re.search(r"finished work is kept, continue with: .*--resume", errors), errors
     assert "Traceback" not in errors, errors
     assert blocks(tmp_path / "run") >= 1
     assert not (tmp_path / "run").exists()

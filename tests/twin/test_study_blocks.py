@@ -103,7 +103,7 @@ def test_a_damaged_line_is_told_and_a_damaged_head_refused(setup, kept) -> None:
     assert missing == [0]
     assert told.endswith("1 line of it is corrupt; what it held is computed again")
     kept.write_bytes(b"\n".join([lines[0][:-9], *lines[1:]]))
-    with pytest.raises(RunFolderError, match="cannot be read; begin anew without --resume"):
+    with pytest.raises(RunFolderError, match="cannot be read; start again without --resume"):
         opened(setup, kept)
 
 
@@ -193,10 +193,10 @@ def test_what_was_begun_is_gone_on_with_or_dropped(tmp_path, monkeypatch) -> Non
 
     monkeypatch.setattr("twin.study.study_command.run_study", broken)
     first = run(file, "--out", out)
-    again = f"the workers died; what is done is kept, go on with: python -m twin.study {file} --out {out} --resume"
+    again = f"the workers died; finished work is kept, continue with: python -m twin.study {file} --out {out} --resume"
     assert (first.exit_code, again in first.stderr) == (1, True), first.stderr
     refused = run(file, "--out", out)
-    assert (refused.exit_code, "begin anew with --force" in refused.stderr) == (2, True)
+    assert (refused.exit_code, "start again with --force" in refused.stderr) == (2, True)
     assert run(file, "--out", out, "--resume").exit_code == 1
     assert run(file, "--out", out, "--force").exit_code == 1
     assert seen == [[], ["0"], []]
@@ -284,7 +284,7 @@ def test_a_study_all_of_whose_runs_failed_ends_with_1(tmp_path) -> None:
     )
     said = invoke(command.app, file, "--out", tmp_path / "run", "--workers", 1)
     assert said.exit_code == 1
-    assert "all 4 runs failed, see report.html; all else is in" in said.stderr
+    assert "all 4 runs failed, see report.html; everything else is in" in said.stderr
     assert (tmp_path / "run" / "study.nc").exists()
 
 
@@ -334,4 +334,4 @@ def test_options_that_do_not_go_together_are_refused(tmp_path, monkeypatch) -> N
     for workers in (8, 1):
         with cluster.chosen_workers(workers, None, told.append, small.study.limits) as found:
             assert found.count == min(workers, 2)
-    assert told == ["2 workers instead of 8: no more fit into the memory of its limits, 1 GB"]
+    assert told == ["2 workers instead of 8: no more fit into the memory limit, 1 GB"]

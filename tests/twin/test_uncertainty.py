@@ -95,7 +95,7 @@ def test_what_rests_on_the_stated_numbers(monkeypatch):
     assert run.warnings == ("blurred",)
     assert uncertainty_report(run).warnings[0] == "blurred"
     numbers = uncertainty_numbers(run)
-    assert "blurred" in uncertainty_report(run).told(numbers)["warnings"]
+    assert "blurred" in uncertainty_report(run).with_verdict(numbers)["warnings"]
     height = numbers["quantities"]["ground"]["height_m"]
     sigma, first = height["after"][BEST]["sigma"], height["elasticities"][0]
     assert (first["number"], first["stated"], first["unit"]) == ("mirror_figure figure Z7", 2.0, "nm")

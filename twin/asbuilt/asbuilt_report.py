@@ -1,4 +1,6 @@
-"""Report of an instrument as built: verdict, merits before and after, what is known and what is not, the next move."""
+"""Report of an instrument as built: verdict, merits before and after the measurements, observability, and the next
+move.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ from matplotlib.figure import Figure
 from optics.numerics.number_tree import FrozenMap
 from twin.asbuilt.asbuilt_run import ALONG, AsBuiltRun, Standing, motions, moves_plain, responses
 from twin.asbuilt.built_instrument import CORRELATION, POSTERIOR, instrument_text, posterior_files
-from twin.framework.artefact import CameraFile, Cell, CsvFile, OwnDecimals, SvgFigure, Table, plain, significant
+from twin.framework.artefact import CameraFile, Cell, CsvFile, DecimalNumber, SvgFigure, Table, plain, significant
 from twin.framework.report import Report, Section, answer
 from twin.framework.svg import (
     BLUE,
@@ -29,13 +31,15 @@ from twin.framework.svg import (
 from twin.tolerance.monitor_merit import merit_head, merit_unit, shown_merit
 
 _MOST_COMBINATIONS = 12
+"""Largest number of combinations of motions in the table."""
 _FEW = 3
+"""Largest number of candidate measurements that the verdict names."""
 BANDS = FrozenMap({"prior": GREY, "as built": BLUE, "after the next move": GREEN})
-"""What bands of a figure are called, and their colours."""
+"""Labels of the bands in a figure, and their colours."""
 
 
 def asbuilt_report(run: AsBuiltRun) -> Report:
-    """Report of an instrument as built."""
+    """Return the report of an instrument as built."""
     with look("asbuilt"):
         along = to_svg(_along_figure(run))
         known = to_svg(_known_figure(run))
@@ -142,7 +146,7 @@ def _is_nothing(run: AsBuiltRun, name: str) -> bool:
 
 
 def _short(amount: str | float) -> str:
-    """An amount in words with four digits."""
+    """Return an amount as text with four digits."""
     if isinstance(amount, str):
         number, _, unit = amount.partition(" ")
         return f"{plain(float(number), 4)} {unit}"
@@ -155,7 +159,7 @@ def _cell(value: float, one: Standing) -> Cell:
         return None
     spread = shown_merit(one.now[3], one.merit) or 0.0
     places = 3 if abs(spread) < 10.0 else 1
-    return OwnDecimals(found, places)
+    return DecimalNumber(found, places)
 
 
 def _between(values: Sequence[float], one: Standing) -> str:

@@ -62,7 +62,7 @@ def main(
         report = replace(compare_report(comparison), code=0 if comparison.same else DIFFERENT)
         limits = ["--rtol", f"{rtol:g}"] + ([] if sigmas is None else ["--sigmas", f"{sigmas:g}"])
         config = {"runs": [str(run) for run in runs], "rtol": rtol, "sigmas": sigmas}
-        facts = {"config": dump_yaml(config), "again": (PROGRAM, *map(str, runs), *limits), "given": tuple(runs)}
+        facts = {"config": dump_yaml(config), "again": (PROGRAM, *map(str, runs), *limits), "input_paths": tuple(runs)}
         return finished(session, KIND, report, numbers(comparison), backend="", program=PROGRAM, **facts)
 
     run_command("compare", options, lambda: None, work)

@@ -1,4 +1,4 @@
-"""Report of a search for a monitor's layout: the front, what limits each layout, drawings, the instruments' files."""
+"""Report of a search for a monitor's layout: the front, what limits each layout, drawings, and the instruments' files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scenes.models.monitor_layout import layout_spec, number_of
 from twin.design.layout_bench import LayoutFacts
 from twin.design.layout_search import ALIKE, optima
 from twin.design.monitor_design import GOAL_NAMES, UNITS, MonitorDesignRun, Point, verdict
-from twin.framework.artefact import CameraFile, Cell, SvgFigure, Table, decimals_for, shown_unit
+from twin.framework.artefact import CameraFile, Cell, SvgFigure, Table, decimals_for, unit_for_reports
 from twin.framework.report import Report, Section, answer
 from twin.framework.svg import BLUE, GREY, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.main_job.light_path_plots import side_view_svg
@@ -22,17 +22,18 @@ from twin.pictures.light_paths import trace_light_paths
 from twin.sensors.area_detector import coarse_warnings
 
 _MOST_CAUSES = 6
+"""Largest number of causes in a panel."""
 
 
 def monitor_design_report(run: MonitorDesignRun) -> Report:
-    """Report of a search."""
+    """Return the report of a search for a monitor's layout."""
     setup, found = run.setup, run.found
     start, test = setup.instrument.name, setup.test
     rows = [_row(run, start, found.start), *(_row(run, point.name, point.facts) for point in run.points)]
     heads = (
         "layout",
         "beams per end",
-        *(f"{GOAL_NAMES[g]}, σ [{shown_unit(UNITS[g][0])}]" for g in test.goal.wanted),
+        *(f"{GOAL_NAMES[g]}, σ [{unit_for_reports(UNITS[g][0])}]" for g in test.goal.wanted),
         "worst σ / goal",
         "pupil [%]",
         "prisms [kg]",
@@ -75,8 +76,11 @@ _FRONT = (
     "wanted, against the share of the imaging pupil that its prisms take and against their mass. Named ones are on the "
     "front: no other is better in all three."
 )
+"""Caption of the figure of the front."""
 _CAUSES = "Standard deviations by cause before any measurement and as the start and the best layout leave them."
+"""Caption of the figure of the causes."""
 _PUPILS = "Of the first camera as light comes in; X points toward the central prism. Filled: left; open: right."
+"""Caption of the figure of the pupils."""
 
 
 def _row(run: MonitorDesignRun, name: str, facts: LayoutFacts) -> list[str | int | float]:
@@ -103,7 +107,7 @@ def _search_text(run: MonitorDesignRun) -> str:
 
 
 def starts_text(run: MonitorDesignRun) -> str:
-    """Whether all starts come to the same end."""
+    """Return a sentence on whether all starts reach the same optimum."""
     groups, count = optima(run.found, run.bench), len(run.found.ends)
     lost = count - sum(len(group) for group in groups)
     best = [run.merit(group[0].layouts[0]) for group in groups]
@@ -156,7 +160,7 @@ def _named(run: MonitorDesignRun) -> list[tuple[str, LayoutFacts]]:
 
 
 def _causes_of(run: MonitorDesignRun, facts: LayoutFacts, name: str, goal: str, measured: bool) -> dict[str, float]:
-    """Standard deviations by cause, of the camera in which the goal's quantity is worse, units of the goal."""
+    """Return standard deviations by cause, for the camera in which the goal's quantity is worse, in the goal's unit."""
     key = max(run.bench.goals_of(goal), key=lambda one: facts.sigmas[name][one])
     shares = (facts.shares if measured else facts.shares_before)[name][key]
     return {cause: sqrt(max(share, 0.0)) / UNITS[goal][1] for cause, share in shares.items()}
@@ -165,7 +169,7 @@ def _causes_of(run: MonitorDesignRun, facts: LayoutFacts, name: str, goal: str, 
 def _cause_table(run: MonitorDesignRun, name: str) -> Table:
     heads, columns = ["cause"], []
     for goal in run.setup.test.goal.wanted:
-        unit = shown_unit(UNITS[goal][0])
+        unit = unit_for_reports(UNITS[goal][0])
         columns.append(_causes_of(run, run.found.start, name, goal, False))
         heads.append(f"{GOAL_NAMES[goal]}, unmeasured [{unit}]")
         for label, facts in _named(run)[:2]:
@@ -181,7 +185,7 @@ def _cause_table(run: MonitorDesignRun, name: str) -> Table:
 
 
 def _front_figure(run: MonitorDesignRun) -> Figure:
-    """Layouts: sigma against pupil share, and against mass."""
+    """Plot sigma of all layouts against pupil share and against mass."""
     figure = new_figure(3.6)
     left, right = figure.subplots(1, 2, sharey=True)
     costs = (("share of the imaging pupil [%]", lambda f: 100.0 * f.pupil_share), ("prisms [kg]", lambda f: f.mass))
@@ -211,7 +215,7 @@ def _front_figure(run: MonitorDesignRun) -> Figure:
 
 
 def _cause_figure(run: MonitorDesignRun) -> Figure:
-    """Standard deviations by cause: unmeasured, start, best; a panel for each goal, of the worst disturbances."""
+    """Plot standard deviations by cause, unmeasured, of the start and of the best; a panel for each goal."""
     goals = tuple(run.setup.test.goal.wanted)
     figure = new_figure(3.4)
     panels = figure.subplots(1, len(goals), squeeze=False)[0]
@@ -240,14 +244,14 @@ def _cause_bars(axes: Axes, run: MonitorDesignRun, goal: str) -> None:
     values = [column.get(c, 0.0) for _, _, column in columns for c in causes]
     top = max(values)
     axes.set(xscale="log", xlim=(max(min((v for v in values if v > 0.0), default=top), 1e-4 * top) / 2, 2.0 * top))
-    axes.set_xlabel(f"{GOAL_NAMES[goal]}, σ [{shown_unit(UNITS[goal][0])}] ({name})")
+    axes.set_xlabel(f"{GOAL_NAMES[goal]}, σ [{unit_for_reports(UNITS[goal][0])}] ({name})")
     axes.grid(axis="x", color=LIGHT, lw=0.4)
     axes.set_axisbelow(True)
     plain_axes(axes)
 
 
 def _pupil_figure(run: MonitorDesignRun) -> Figure:
-    """Where the beams of the start and of each layout go through the entrance pupil."""
+    """Plot the positions in the entrance pupil of the beams of the start and of each layout."""
     shown = _named(run)[:4]
     figure = new_figure(3.0)
     radius = 0.5e3 * next(iter(run.setup.cameras.values())).entrance_pupil

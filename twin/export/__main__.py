@@ -68,7 +68,7 @@ def main(
         done = export(run, manifest, frames, tables, session.folder, session.advance)
         again = (PROGRAM, str(run), "--frames", frames, "--tables", tables)
         config = dump_yaml({"run": str(run), "frames": frames, "tables": tables})
-        facts = {"config": config, "again": again, "given": (run,)}
+        facts = {"config": config, "again": again, "input_paths": (run,)}
         return finished(session, KIND, export_report(done), done.numbers(), backend="", program=PROGRAM, **facts)
 
     run_command(f"{run.resolve().name}-files", options, read, work)

@@ -1,1 +1,1 @@
-"""What every command shares: its options and progress, its run folder, results, reports, pages, figures and files."""
+"""Shared parts of all commands: options and progress, run folders, results, reports, pages, figures and files."""

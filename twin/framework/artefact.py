@@ -1,4 +1,4 @@
-"""Figures, tables and data of reports and run folders, and numbers as text."""
+"""Figures, tables and data files of reports and run folders, and the formatting of numbers as text."""
 
 from __future__ import annotations
 
@@ -17,35 +17,41 @@ from twin.framework.data_files import csv_table
 
 MINUS = "\N{MINUS SIGN}"
 SAME = 1e-6
-"""Below this a number per unit motion (arcsec, um) is rounding and is shown as 0."""
+"""Rounding threshold of numbers per unit motion (arcsec, µm): smaller ones are shown as 0."""
 SYMBOLS = {"d_alpha": "Δα", "d_beta": "Δβ", "d_gamma": "Δγ", "d_f": "Δf"}
-"""How tables, figures and sentences call the changes of a camera; units stand in brackets: Δα [arcsec], Δf [µm], with
-the micro sign. Keys of files are plain letters with the unit at the end: d_alpha_arcsec, d_f_um.
+"""Symbols of the changes of a camera in tables, figures and sentences. The unit follows in brackets, with the micro
+sign: Δα [arcsec], Δf [µm]. Keys of files are plain letters with the unit at the end: d_alpha_arcsec, d_f_um.
 """
 FAR = 3.0
-"""Residuals beyond this many sigma are marked."""
+"""Residuals beyond this many sigma are marked in tables."""
 
 
-def shown_unit(unit: str) -> str:
-    """A unit as reports write it, of its name in files: ``µm`` of ``um``, ``%`` of ``percent``."""
+def unit_for_reports(unit: str) -> str:
+    """Return a unit as reports spell it, from its name in files: ``µm`` for ``um``, ``%`` for ``percent``."""
     return unit.replace("um", "µm").replace("percent", "%")
 
 
 def _typeset(text: str) -> str:
+    """Replace hyphens by minus signs."""
     return text.replace("-", MINUS)
 
 
 def fixed(value: float, decimals: int, sign: bool = False) -> str:
-    """A fixed-point number; what rounds to zero has no sign.
+    """Format a number with a fixed number of decimals; a number that rounds to zero has no sign.
 
     Parameters
     ----------
     value : float
-        The number; infinities and NaN become a dash.
+        Number to format; infinities and NaN become a dash.
     decimals : int
-        Digits behind the point.
+        Digits after the decimal point.
     sign : bool
-        Whether numbers above zero have a plus sign.
+        True to write a plus sign before positive numbers.
+
+    Returns
+    -------
+    str
+        Formatted number, with a typographic minus sign.
     """
     if not math.isfinite(value):
         return "\N{EM DASH}"
@@ -54,18 +60,23 @@ def fixed(value: float, decimals: int, sign: bool = False) -> str:
 
 
 def decimals_for(sigma: float, digits: int = 2, most: int = 7, default: int = 4) -> int:
-    """Decimals that show ``sigma`` with that many digits.
+    """Return the number of decimals that shows a standard deviation with the requested number of significant digits.
 
     Parameters
     ----------
     sigma : float
-        Standard deviation, in the unit in which numbers are shown.
+        Standard deviation, in the unit in which the numbers are shown.
     digits : int
-        Significant digits of it that are to be seen.
+        Significant digits of sigma to show.
     most : int
-        Decimals at most.
+        Largest number of decimals.
     default : int
-        Decimals where sigma is zero or not finite.
+        Number of decimals if sigma is zero or not finite.
+
+    Returns
+    -------
+    int
+        Digits after the decimal point.
     """
     if not (math.isfinite(sigma) and sigma > 0):
         return default
@@ -73,18 +84,25 @@ def decimals_for(sigma: float, digits: int = 2, most: int = 7, default: int = 4)
 
 
 def significant(value: float, digits: int = 3, floor: float = SAME, sign: bool = False) -> str:
-    """A number with some significant digits, one less where a power of ten is written; below ``floor`` it is 0.
+    """Format a number with a number of significant digits.
+
+    Sizes below 1e-3 or from 1e7 are written with a power of ten and one digit less.
 
     Parameters
     ----------
     value : float
-        The number; infinities and NaN become a dash.
+        Number to format; infinities and NaN become a dash.
     digits : int
         Significant digits.
     floor : float
-        Size below which a number is rounding and is shown as 0.
+        Absolute value below which the number is rounding error and is shown as 0.
     sign : bool
-        Whether numbers above zero have a plus sign.
+        True to write a plus sign before positive numbers.
+
+    Returns
+    -------
+    str
+        Formatted number, with a typographic minus sign.
     """
     if not math.isfinite(value):
         return "\N{EM DASH}"
@@ -100,30 +118,35 @@ def significant(value: float, digits: int = 3, floor: float = SAME, sign: bool =
 
 
 def plain(value: float, digits: int = 5) -> str:
-    """A number that was given, without trailing zeros.
+    """Format an input number without trailing zeros.
 
     Parameters
     ----------
     value : float
-        The number.
+        Number to format.
     digits : int
-        Significant digits at most.
+        Largest number of significant digits.
+
+    Returns
+    -------
+    str
+        Formatted number, with a typographic minus sign.
     """
     return _typeset(f"{value:.{digits}g}")
 
 
 def residual(value: float, sigma: float) -> float | None:
-    """The ratio value / sigma, or None without noise."""
+    """Return the normalised residual value / sigma, or None if sigma is zero."""
     return value / sigma if sigma > 0 else None
 
 
 def tick_text(value: float) -> str:
-    """A whole number with its sign, for axes."""
+    """Format an axis tick as a whole number with its sign."""
     return _typeset(f"{value:+,.0f}").replace(",", "\N{NARROW NO-BREAK SPACE}") if value else "0"
 
 
 def residual_text(ratio: float | None) -> str:
-    """A residual in sigma."""
+    """Format a normalised residual, in sigma; None becomes a dash."""
     if ratio is None:
         return "\N{EM DASH}"
     if abs(ratio) < 10:
@@ -137,11 +160,11 @@ _SVG_NAMESPACE = 'xmlns="http://www.w3.org/2000/svg"'
 Cell = str | float | int | None
 
 
-class OwnDecimals(float):
-    """A number of a table that is shown with decimals of its own, as in a column whose rows have different units."""
+class DecimalNumber(float):
+    """Table number that carries its own number of decimals, for columns whose rows have different units."""
 
-    def __new__(cls, value: float, decimals: int) -> OwnDecimals:
-        """The number ``value``, shown with so many decimals."""
+    def __new__(cls, value: float, decimals: int) -> DecimalNumber:
+        """Make the number ``value``, shown with ``decimals`` digits after the point."""
         made = super().__new__(cls, value)
         made.decimals = decimals
         return made
@@ -150,22 +173,22 @@ class OwnDecimals(float):
 
 
 class Marked(str):
-    """A text of a table's cell that says more than itself.
+    """Text of a table cell with a second line, a style, a key for programs and a hint.
 
     Attributes
     ----------
     below : str
-        a second, smaller line.
+        Second, smaller line.
     look : str
-        How it is set off, a class of the style sheet: ``truth``, ``near``, ``far``, ``wrong``, a verdict.
+        Class of the style sheet that sets the cell off: ``truth``, ``near``, ``far``, ``wrong``, or a verdict.
     key : str
         Name by which programs find the cell in a page.
     hint : str
-        Shown to who points at the cell.
+        Text shown when the reader points at the cell.
     """
 
     def __new__(cls, text: str, below: str = "", look: str = "", key: str = "", hint: str = "") -> Marked:
-        """The text ``text`` with what else the cell says."""
+        """Make a cell with the text ``text`` and its additions."""
         made = super().__new__(cls, text)
         made.below, made.look, made.key, made.hint = below, look, key, hint
         return made
@@ -177,18 +200,18 @@ class Marked(str):
 
 
 def residual_cell(text: str, ratio: float | None, key: str, hint: str = "") -> Marked:
-    """A reading with its departure from the truth in sigma below it, and a mark where that is beyond FAR.
+    """Return a cell with a reading and, below it, its residual in sigma, marked if the residual exceeds FAR.
 
     Parameters
     ----------
     text : str
-        The reading.
+        Formatted reading.
     ratio : float | None
-        Reading minus truth over sigma; None without noise.
+        (reading - truth) / sigma; None without noise.
     key : str
         Name by which programs find the cell.
     hint : str
-        Shown to who points at the cell.
+        Text shown when the reader points at the cell.
     """
     far = ratio is not None and abs(ratio) > FAR
     return Marked(text, f"{'▲' if far else '●'} {residual_text(ratio)} σ", "far" if far else "near", key, hint)
@@ -196,22 +219,23 @@ def residual_cell(text: str, ratio: float | None, key: str, hint: str = "") -> M
 
 @dataclass(frozen=True, eq=False)
 class Artefact:
-    """Something to show beside the checks.
+    """Figure, table or data file of a report: the base class.
 
     Attributes
     ----------
     name : str
-        Of its file, without ending: small letters, digits, - and _; unique in its group.
+        Name of the file without its extension: lower-case letters, digits, - and _; unique in its group.
     title : str
         Heading in the report; empty for none.
     caption : str
-        What it shows, in sentences; words between backticks are shown as code.
+        Sentences that describe the content; words between backticks are shown as code.
     kind : str
-        Ending of its file: ``svg``, ``png``, ``csv``, ``json``.
+        Extension of the file: ``svg``, ``png``, ``csv``, ``json``.
     within : str | None
-        File of the run folder that holds it; None for a file of its own, empty if only the page shows it.
+        Path of the file in the run folder that contains the artefact; None for a file of its own, empty if only the
+        page shows it.
     full : Table | None
-        Table with all digits that a reader can take away from the page.
+        Table with all digits that a reader can download from the page.
     """
 
     kind: ClassVar[str]
@@ -222,45 +246,45 @@ class Artefact:
     full: Table | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        """Refuse names that are no file names."""
+        """Raise ValueError if the name cannot be a file name."""
         if not _NAME.fullmatch(self.name):
             raise ValueError(f"artefact name {self.name!r}: only small letters, digits, - and _ can be used")
         self.content()
 
     @property
     def file(self) -> str:
-        """Path of its file in the run folder, empty if it has none."""
+        """Path of the file in the run folder; empty if there is none."""
         return f"artefacts/{self.name}.{self.kind}" if self.within is None else self.within
 
     @property
-    def handed(self) -> Table | None:
-        """What a reader can take away from the page with all digits."""
+    def download(self) -> Table | None:
+        """Table with all digits that a reader can download from the page, or None."""
         return self.full
 
     @property
-    def said(self) -> str:
-        """The caption, or what stands in its place."""
+    def shown_caption(self) -> str:
+        """Caption shown in the report, or a note that replaces it."""
         return self.caption
 
     def content(self) -> bytes:
-        """What the file holds."""
+        """Return the content of the file."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False)
 class SvgFigure(Artefact):
-    """A drawing; ``svg`` is one <svg> element, as ``twin.framework.svg.to_svg`` makes it."""
+    """Drawing as one <svg> element, as returned by ``twin.framework.svg.to_svg``."""
 
     kind: ClassVar[str] = "svg"
     svg: str
 
     @property
     def drawing(self) -> Markup:
-        """The drawing for a page: made by this program, not by a user."""
+        """Drawing as markup for a page; it needs no escaping, since this program made it."""
         return Markup(self.svg)
 
     def content(self) -> bytes:
-        """The drawing as a file of its own."""
+        """Return the drawing as a separate SVG file."""
         if not self.svg.startswith("<svg"):
             raise ValueError(f"artefact {self.name!r}: not an <svg> element")
         head = self.svg[: self.svg.index(">")]
@@ -270,18 +294,18 @@ class SvgFigure(Artefact):
 
 @dataclass(frozen=True, eq=False)
 class PngFigure(Artefact):
-    """A picture; ``png`` is the file's content."""
+    """Bitmap image; ``png`` is the content of the PNG file."""
 
     kind: ClassVar[str] = "png"
     png: bytes
 
     @property
     def address(self) -> str:
-        """The picture as a data address, for a page that needs nothing else."""
+        """Image as a data URL, for a self-contained page."""
         return "data:image/png;base64," + base64.b64encode(self.png).decode("ascii")
 
     def content(self) -> bytes:
-        """The picture."""
+        """Return the PNG file."""
         if not self.png.startswith(b"\x89PNG"):
             raise ValueError(f"artefact {self.name!r}: not a PNG file")
         return self.png
@@ -289,11 +313,23 @@ class PngFigure(Artefact):
 
 @dataclass(frozen=True, eq=False)
 class Table(Artefact):
-    """A table for the report, and as CSV; heads carry the units.
+    """Table of a report, also written as CSV; the column heads include the units.
 
-    ``decimals`` are those that the report shows of a column's numbers, None for so many significant ``digits``; the CSV
-    holds all digits. ``over``: heads above the heads, each with the number of columns that it spans. ``bands``: row ->
-    title of the rows from there on, of a table in parts.
+    Attributes
+    ----------
+    heads : sequence of str
+        Column heads.
+    rows : sequence of sequences of Cell
+        Rows of the table.
+    decimals : sequence of int or None
+        Digits after the point that the report shows in each column; None for ``digits`` significant digits. The CSV has
+        all digits.
+    digits : int
+        Significant digits of columns without ``decimals``.
+    over : sequence of (str, int)
+        Second row of heads above the heads, each with the number of columns that it spans.
+    bands : mapping of int to str
+        Row number -> title of the part of the table that begins there.
     """
 
     kind: ClassVar[str] = "csv"
@@ -305,14 +341,14 @@ class Table(Artefact):
     bands: Mapping[int, str] = field(default_factory=FrozenMap)
 
     @property
-    def handed(self) -> Table | None:
-        """``full``, or itself if its cells are plain numbers and texts."""
+    def download(self) -> Table | None:
+        """Table given as ``full``, or this table if its cells are plain numbers and texts."""
         if self.full is not None or any(isinstance(cell, Marked) for row in self.rows for cell in row):
             return self.full
         return self
 
     def shown(self) -> list[list[Cell]]:
-        """The rows as the report shows them."""
+        """Return the rows as the report shows them."""
         places = [*self.decimals, *[None] * (len(self.heads) - len(self.decimals))]
         return [
             [
@@ -324,22 +360,22 @@ class Table(Artefact):
 
     @property
     def cells(self) -> list[list[Marked]]:
-        """The rows for a page."""
+        """Rows as marked cells, for a page."""
         return [[cell if isinstance(cell, Marked) else Marked(cell_text(cell)) for cell in row] for row in self.shown()]
 
     @property
     def words(self) -> list[bool]:
-        """Whether a column holds words, which begin at its left, or numbers."""
+        """For each column, True if it holds words (aligned left) and False if it holds numbers."""
         columns = [[row[k] for row in self.rows] for k in range(len(self.heads))]
         return [all(isinstance(cell, str) and _is_word(cell) for cell in column) for column in columns]
 
     def _text(self, value: float, place: int | None) -> str:
-        if isinstance(value, OwnDecimals):
+        if isinstance(value, DecimalNumber):
             return fixed(value, value.decimals)
         return significant(value, self.digits, floor=0.0) if place is None else fixed(value, place)
 
     def content(self) -> bytes:
-        """The table with all its digits."""
+        """Return the table as CSV with all digits."""
         for row in self.rows:
             if len(row) != len(self.heads):
                 raise ValueError(f"artefact {self.name!r}: a row of {len(row)} cells under {len(self.heads)} heads")
@@ -347,12 +383,12 @@ class Table(Artefact):
 
     @property
     def address(self) -> str:
-        """The table as a data address: a page can hand it out without a file beside it."""
+        """Table as a data URL of CSV, so that a page can offer it without a second file."""
         return "data:text/csv;charset=utf-8;base64," + base64.b64encode(self.content()).decode("ascii")
 
 
 def cell_text(value: Cell) -> str:
-    """A cell of a table, with at most six digits."""
+    """Format a table cell, with at most six digits."""
     if value is None:
         return ""
     if isinstance(value, str):
@@ -361,86 +397,87 @@ def cell_text(value: Cell) -> str:
 
 
 def _is_word(cell: str) -> bool:
+    """Return True for a cell that holds words rather than a number."""
     return not isinstance(cell, Marked) or not cell.look or cell.look.startswith(("text", "verdict"))
 
 
 @dataclass(frozen=True, eq=False)
 class Data(Artefact):
-    """Plain data, kept as JSON and named in the report."""
+    """Plain data, written as JSON and listed in the report."""
 
     kind: ClassVar[str] = "json"
     data: Any
 
     def content(self) -> bytes:
-        """The data; NaN and infinities are refused."""
+        """Return the data as JSON; NaN and infinities raise ValueError."""
         return (json.dumps(self.data, indent=2, allow_nan=False) + "\n").encode()
 
 
 @dataclass(frozen=True, eq=False)
 class Text(Artefact):
-    """Words of a report beside its figures and tables: ``caption`` is a paragraph, ``points`` are a list below it."""
+    """Paragraph of a report beside its figures and tables: ``caption``, with a list of ``points`` below it."""
 
     kind: ClassVar[str] = "txt"
     points: Sequence[str] = ()
 
     def content(self) -> bytes:
-        """The words."""
+        """Return the paragraph and its points as text."""
         return "\n".join([self.caption, *self.points, ""]).encode()
 
 
 @dataclass(frozen=True, eq=False)
 class Piece(Artefact):
-    """A part of a page that this program wrote, with all texts of users escaped in it."""
+    """Part of a page as HTML that this program wrote, with all user texts in it escaped."""
 
     kind: ClassVar[str] = "html"
     markup: Markup
 
     def content(self) -> bytes:
-        """The part."""
+        """Return the HTML."""
         return self.markup.encode()
 
 
 @dataclass(frozen=True, eq=False)
 class Undrawn(Artefact):
-    """A note in the place of a figure that could not be drawn.
+    """Note that replaces a figure that could not be drawn.
 
     Attributes
     ----------
     why : str
-        The error.
+        Text of the error.
     """
 
     kind: ClassVar[str] = "txt"
     why: str
 
     def content(self) -> bytes:
-        """The note."""
+        """Return the note as a text file."""
         return f"{self.note}\n".encode()
 
     @property
     def note(self) -> str:
-        """What is missing, and why."""
+        """Note with the title of the missing figure and the error."""
         return f"the figure {self.title!r} could not be drawn: {self.why}"
 
     @property
-    def said(self) -> str:
-        """The note as a sentence."""
+    def shown_caption(self) -> str:
+        """Note as a sentence."""
         return f"{self.note[0].upper()}{self.note[1:]}."
 
 
 @dataclass(frozen=True, eq=False)
 class CameraFile(Data):
-    """A camera as a file of the library; ``data`` is its YAML text."""
+    """Camera as a file of the library; ``data`` is its YAML text."""
 
     kind: ClassVar[str] = "yaml"
 
     def content(self) -> bytes:
-        """The file."""
+        """Return the file."""
         return str(self.data).encode()
 
 
 @dataclass(frozen=True, eq=False)
 class CsvFile(CameraFile):
-    """A table that other files name, kept beside the page; ``data`` is its text."""
+    """Table that other files refer to, written beside the page; ``data`` is its CSV text."""
 
     kind: ClassVar[str] = "csv"

@@ -1,4 +1,4 @@
-"""What the commands share: options, exit codes, errors as one sentence, and an orderly end on signals."""
+"""Shared parts of the commands: options, exit codes, error messages in one sentence, and a clean end on signals."""
 
 from __future__ import annotations
 
@@ -26,52 +26,52 @@ from scenes.yaml.standard_output import BAD_INPUT, FAILURE, code_of, print_error
 
 DOUBTFUL, INTERRUPTED = 3, 128 + signal.SIGINT
 NO_NAME = (errno.ENAMETOOLONG, errno.ELOOP)
-"""Error numbers of names that no file can have."""
+"""Error numbers of paths that no file can have."""
 LARGEST_SEED = 2**63 - 1
-BACKEND_HELP = f"Where to trace: {' or '.join(NAMES)}."
-OUT_HELP = "Run folder to make. Default: runs/NAME-001, -002, ... (the first that is free), NAME that of the file."
+BACKEND_HELP = f"Backend of the ray trace: {' or '.join(NAMES)}."
+OUT_HELP = "Run folder to make. Default: runs/NAME-001, -002, ... (the first free one), with the NAME of the file."
 
 File = Annotated[Path, typer.Argument(readable=False, help="YAML file of the test, or the config.yaml of a run.")]
 Out = Annotated[Path | None, typer.Option(readable=False, help=OUT_HELP)]
 Seed = Annotated[
-    int | None, typer.Option(min=0, max=LARGEST_SEED, help="Seed of everything drawn; overrides the file's.")
+    int | None, typer.Option(min=0, max=LARGEST_SEED, help="Seed of all random numbers; overrides that of the file.")
 ]
 BackendName = Annotated[str, typer.Option("--backend", help=BACKEND_HELP)]
 Force = Annotated[bool, typer.Option("--force", help="Replace the run folder if it exists.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout, and nothing else.")]
-EXPORT_HELP = "Also write what was measured as a folder of tables that the same command reads, with a test file."
+EXPORT_HELP = "Also write the measurements as a folder of tables that the same command can read, with a test file."
 Export = Annotated[Path | None, typer.Option("--export", readable=False, metavar="DIR", help=EXPORT_HELP)]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
-STRICT_HELP = "Exit with code 3 where a sigma does not hold or another verdict on the result is negative."
+STRICT_HELP = "Exit with code 3 if a sigma is not reliable or another verdict on the result is negative."
 Strict = Annotated[bool, typer.Option("--strict", help=STRICT_HELP)]
 WORKERS_HELP = "Number of worker processes. Default: one for each core."
 Workers = Annotated[int | None, typer.Option(min=1, max=1024, help=WORKERS_HELP)]
-SCHEDULER_HELP = "Use a running Dask cluster, as of `python -m twin.study --scheduler`."
+SCHEDULER_HELP = "Address of a running Dask cluster to use, as for `python -m twin.study --scheduler`."
 Scheduler = Annotated[str | None, typer.Option(help=SCHEDULER_HELP)]
 
 
 @dataclass(frozen=True)
 class Options:
-    """What the user chose: every field is an option of the commands that make a run folder, see `with_options`.
+    """Options that the user chose; every field is an option of the commands that make a run folder, see `with_options`.
 
     Attributes
     ----------
-    out : Out
-        Run folder, None for the next free one.
-    seed : Seed
-        None for the file's.
-    export : Export
-        Folder for what was measured, None for none.
-    backend : BackendName
-        Where to trace.
-    force : Force
-        Replace the run folder.
-    as_json : AsJson
-        Print the numbers as JSON.
-    quiet : Quiet
-        Print nothing.
-    strict : Strict
-        End with the exit code DOUBTFUL where a verdict on the result is negative.
+    out : Path | None
+        Run folder; None for the next free one.
+    seed : int | None
+        Seed; None for that of the file.
+    export : Path | None
+        Folder for the measured data; None for no export.
+    backend : str
+        Backend of the ray trace.
+    force : bool
+        True to replace an existing run folder.
+    as_json : bool
+        True to print the numbers as JSON.
+    quiet : bool
+        True to print nothing but errors.
+    strict : bool
+        True to end with the exit code DOUBTFUL if a verdict on the result is negative.
     """
 
     out: Out = None
@@ -85,26 +85,26 @@ class Options:
 
     @property
     def silent(self) -> bool:
-        """Whether no progress is shown."""
+        """True if no progress is shown."""
         return self.as_json or self.quiet
 
 
 Command = Callable[..., None]
-"""Function of whose signature Typer makes a command with its arguments and options."""
+"""Function from whose signature Typer makes a command with arguments and options."""
 
 
 def program(**more: Any) -> typer.Typer:
-    """Return a program without commands, set up as all are; ``more`` goes to Typer."""
+    """Return a Typer program without commands, with the settings that all programs share; ``more`` goes to Typer."""
     return typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False, **more)
 
 
 def unnamed(meant: Callable[[Sequence[str]], str]) -> type[TyperGroup]:
-    """Return the class of a program whose subcommand need not be named.
+    """Return the class of a program that works without naming its subcommand.
 
     Parameters
     ----------
-    meant : Callable[[Sequence[str]], str]
-        Words after the program, of which the first is no subcommand -> the subcommand.
+    meant : callable
+        Function of the words after the program, the first of which is not a subcommand, that returns the subcommand.
     """
 
     class Group(TyperGroup):
@@ -120,69 +120,73 @@ def unnamed(meant: Callable[[Sequence[str]], str]) -> type[TyperGroup]:
 
 
 def with_options(*without: str) -> Callable[[Command], Command]:
-    """Return what gives a command the options of `Options`, for its parameter ``options``, after its own.
+    """Return a decorator that adds the options of `Options` to a command and passes them as its parameter ``options``.
 
     Parameters
     ----------
     without : str
-        Fields of `Options` that are no options of the command.
+        Fields of `Options` that the command does not offer.
     """
     hints = get_type_hints(Options, include_extras=True)
-    chosen = {one.name: one.default for one in fields(Options) if one.name not in without}
+    chosen = {parameter.name: parameter.default for parameter in fields(Options) if parameter.name not in without}
     shared = [Parameter(name, Parameter.KEYWORD_ONLY, default=chosen[name], annotation=hints[name]) for name in chosen]
 
     def made(work: Command) -> Command:
-        def command(**given: Any) -> None:
-            options = Options(**{name: given.pop(name) for name in chosen})
-            work(**given, options=options)
+        def command(**arguments: Any) -> None:
+            options = Options(**{name: arguments.pop(name) for name in chosen})
+            work(**arguments, options=options)
 
-        own = [one for one in signature(work, eval_str=True).parameters.values() if one.name != "options"]
-        return with_parameters(wraps(work)(command), [*own, *shared])
+        parameters = [
+            parameter for parameter in signature(work, eval_str=True).parameters.values() if parameter.name != "options"
+        ]
+        return with_parameters(wraps(work)(command), [*parameters, *shared])
 
     return made
 
 
 def with_parameters(command: Command, parameters: Sequence[Parameter]) -> Command:
-    """Return a command that takes its arguments by name, with the parameters of which Typer makes them."""
+    """Return a command that takes its arguments by keyword, with the parameters from which Typer makes its options."""
     command.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
-    command.__annotations__ = {one.name: one.annotation for one in parameters}
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return command
 
 
 def end_strictly(errors: Console, numbers: Any) -> None:
-    """End with the exit code of a result whose sigmas do not hold.
+    """End with the exit code DOUBTFUL if a verdict on the result is negative.
 
     Parameters
     ----------
     errors : Console
-        Where the negative verdicts are named.
+        Console that lists the negative verdicts.
     numbers : Any
-        Of the result, plain data.
+        Numbers of the result, plain data.
 
     Raises
     ------
     typer.Exit
-        a verdict is negative, see `twin.framework.provenance.negative_verdicts`.
+        A verdict is negative, see `twin.framework.provenance.negative_verdicts`.
     """
     from twin.framework.owned_files import first_names
     from twin.framework.provenance import negative_verdicts
 
     if negative := negative_verdicts(numbers):
-        print_error(errors, f"--strict: not to be relied on, false in the result: {first_names(negative)}")
+        print_error(
+            errors, f"--strict: the result is not reliable, since these verdicts are false: {first_names(negative)}"
+        )
         raise typer.Exit(DOUBTFUL)
 
 
 class InputErrorText(Exception):
-    """Bad input that has no file to point at."""
+    """Invalid input that does not come from a file."""
 
 
 class Incomplete(Exception):
-    """Work that could not be completed although nothing is wrong with what was asked; the message says why.
+    """Work that could not be completed although the request is valid; the message gives the reason.
 
     Attributes
     ----------
-    trace
-        Traceback of a fault of the program in another process, as text.
+    trace : str
+        Traceback of a program error in another process, as text.
     """
 
     def __init__(self, message: str, trace: str = "") -> None:
@@ -191,12 +195,12 @@ class Incomplete(Exception):
 
 
 def require_one_of(option: str, value: str, allowed: Collection[str]) -> None:
-    """Complain about a format that an option does not have.
+    """Raise InputErrorText if the value of an option is not one of those allowed.
 
     Raises
     ------
     InputErrorText
-        The value is none of those allowed.
+        The value is not one of those allowed.
     """
     if value not in allowed:
         near = nearest(value, allowed)
@@ -205,32 +209,32 @@ def require_one_of(option: str, value: str, allowed: Collection[str]) -> None:
 
 
 def check_backend(name: str) -> None:
-    """Complain about an unknown backend before anything is started.
+    """Raise InputErrorText for an unknown backend, before any work starts.
 
     Raises
     ------
     InputErrorText
-        There is none of that name.
+        No backend has this name.
     """
     if name not in NAMES:
         raise InputErrorText(f"unknown backend {name!r}; choose {' or '.join(NAMES)}")
 
 
-def nothing_kept() -> str:
-    """What is left of most commands that are broken off."""
+def no_results_kept() -> str:
+    """Return the message of a command that keeps nothing when it is interrupted."""
     return "nothing was kept"
 
 
 @contextmanager
-def explained(errors: Console, left: Callable[[], str] = nothing_kept) -> Iterator[None]:
-    """Turn the errors that a user can cause into one sentence on ``errors`` and the command's exit code.
+def explained(errors: Console, left: Callable[[], str] = no_results_kept) -> Iterator[None]:
+    """Turn errors that a user can cause into one sentence on ``errors`` and the command's exit code.
 
     Parameters
     ----------
     errors : Console
-        Where it is said.
-    left : Callable[[], str]
-        What is left of the work when it is broken off.
+        Console for the sentence.
+    left : callable
+        Returns the text that says what is kept of interrupted work.
     """
     try:
         yield
@@ -238,11 +242,11 @@ def explained(errors: Console, left: Callable[[], str] = nothing_kept) -> Iterat
         print_error(errors, str(error))
         raise typer.Exit(BAD_INPUT) from None
     except KeyboardInterrupt:
-        _say_broken(errors, f"interrupted: {left()}")
+        _print_interruption(errors, f"interrupted: {left()}")
         raise typer.Exit(INTERRUPTED) from None
     except SystemExit:
-        if left is not nothing_kept:
-            _say_broken(errors, f"terminated: {left()}")
+        if left is not no_results_kept:
+            _print_interruption(errors, f"terminated: {left()}")
         raise
     except Incomplete as error:
         errors.print(error.trace, end="", markup=False, highlight=False, soft_wrap=True)
@@ -254,14 +258,14 @@ def explained(errors: Console, left: Callable[[], str] = nothing_kept) -> Iterat
         print_error(errors, f"{str(error.filename)[:80]}: {error.strerror}")
         raise typer.Exit(BAD_INPUT) from None
     except Exception as error:
-        # the work that failed has imported these; help and a bad file do not wait for them
+        # imported here, so that help and errors in a file do not wait for them
         from optics.numerics.array_math import PhysicalError, UnphysicalError
         from optics.numerics.backend import BackendUnavailable
         from optics.numerics.extension_table import EntryPointError
         from optics.numerics.llvm import LibraryMissing
         from twin.framework.run_folder import RunFolderError
 
-        # a number that cannot be is a fault of the program; light that a state loses is one of what was asked for
+        # an unphysical number is a fault of the program; light that a state loses is a fault of the request
         asked = isinstance(error, RunFolderError | PhysicalError) and not isinstance(error, UnphysicalError)
         if not asked and not isinstance(error, BackendUnavailable | EntryPointError | LibraryMissing):
             raise
@@ -269,28 +273,30 @@ def explained(errors: Console, left: Callable[[], str] = nothing_kept) -> Iterat
         raise typer.Exit(code_of(error.__cause__) if asked else FAILURE) from None
 
 
-def _say_broken(errors: Console, text: str) -> None:
+def _print_interruption(errors: Console, text: str) -> None:
     errors.print(text, style="bold red", markup=False, highlight=False, soft_wrap=True)
 
 
 TICK_SECONDS = 8.0
-"""From one line of progress to the next where there is no terminal: nobody waits longer than 10 s for a word."""
+"""Interval between two progress lines where there is no terminal, in seconds: no user waits longer than 10 s for a sign
+of life.
+"""
 
 
 @contextmanager
 def heartbeat(console: Console, says: Callable[[], str], silent: bool, seconds: float | None = None) -> Iterator[None]:
-    """Inside the block a line now and then says how far a command is, where no terminal shows it.
+    """Print a progress line at regular intervals inside the block, unless a terminal shows the progress.
 
     Parameters
     ----------
     console : Console
-        Where it is said; nothing is where it is a terminal, which shows progress itself.
-    says : Callable[[], str]
-        One line.
+        Console for the lines; if it is a terminal, nothing is printed, since it shows the progress itself.
+    says : callable
+        Returns the text of a line.
     silent : bool
-        Whether nothing shall be said.
+        True to print nothing.
     seconds : float | None
-        From one line to the next, None for TICK_SECONDS.
+        Interval between two lines, in seconds; None for TICK_SECONDS.
     """
     if silent or console.is_terminal:
         yield
@@ -307,18 +313,18 @@ def heartbeat(console: Console, says: Callable[[], str], silent: bool, seconds: 
         yield
     finally:
         ended.set()
-        thread.join()  # no line comes after the block
+        thread.join()  # so that no line is printed after the block
 
 
 LONG = 300.0
-"""Seconds of work above which it is said once how long it takes."""
-_TELLING = 5.0
-"""Seconds of a part that tell its pace: the first ones also compile."""
+"""Remaining time above which the expected duration is announced once, in seconds."""
+_PACE_SECONDS = 5.0
+"""Time after which the pace of a part can be estimated, in seconds: the first pieces also compile."""
 
 
 @dataclass
-class Standing:
-    """How far a piece of work is; ``advance`` is what it calls."""
+class WorkProgress:
+    """Progress of a piece of work; the work calls ``advance``."""
 
     part: str = "start"
     done: int = 0
@@ -327,21 +333,21 @@ class Standing:
     before: int = 0
 
     def advance(self, part: str, done: int, total: int) -> None:
-        """So many of so many parts of this are done."""
+        """Record that ``done`` of ``total`` pieces of a part are done."""
         if part != self.part or done < self.done:
             self.begun, self.before = time.monotonic(), done
         self.part, self.done, self.total = part, done, total
 
     @property
     def left(self) -> float:
-        """Seconds that the part still takes, by the pieces that were done since it began; 0 where none tells it."""
+        """Estimated remaining time of the part, in seconds, from its pace so far; 0 if no piece is done yet."""
         spent, pieces = time.monotonic() - self.begun, self.done - self.before
         return spent * (self.total - self.done) / pieces if pieces > 0 else 0.0
 
     @property
     def long(self) -> bool:
-        """Whether the part still takes long, as far as it can be told."""
-        return time.monotonic() - self.begun > _TELLING and self.left > LONG
+        """True if the pace of the part is known and its remaining time exceeds LONG."""
+        return time.monotonic() - self.begun > _PACE_SECONDS and self.left > LONG
 
     def __str__(self) -> str:
         text = f"{self.part}: {self.done} of {self.total}" if self.total > 1 else self.part
@@ -352,7 +358,7 @@ class Standing:
 
 
 def time_text(seconds: float | None) -> str:
-    """A time in the unit that suits it."""
+    """Format a duration given in seconds, in a suitable unit."""
     if seconds is None:
         return "an unknown time"
     if seconds < 120.0:
@@ -361,7 +367,7 @@ def time_text(seconds: float | None) -> str:
 
 
 def progress_columns(width: int) -> tuple[progress.ProgressColumn, ...]:
-    """Columns of a progress display: what is done, in ``width`` letters, how far, since when and for how long."""
+    """Return the columns of a progress display: description (``width`` letters), bar, elapsed and remaining time."""
     return (
         progress.SpinnerColumn(),
         progress.TextColumn(f"{{task.description:{width}}}", markup=False),
@@ -373,22 +379,22 @@ def progress_columns(width: int) -> tuple[progress.ProgressColumn, ...]:
 
 
 def result_table(title: str | None = None) -> Table:
-    """An empty table for a result in the terminal."""
+    """Return an empty table for a result in the terminal."""
     return Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
 
 
 def print_whole(console: Console, table: Table) -> None:
-    """A table with all its digits: a number that is cut is worse than a line that wraps."""
+    """Print a table with all its digits, in lines that wrap rather than numbers that are cut."""
     console.width = max(console.width, console.measure(table, options=console.options.update(width=1000)).maximum)
     console.print(table)
 
 
-def print_place(console: Console, target: Path) -> None:
-    """Where the run folder and its report are."""
+def print_paths(console: Console, target: Path) -> None:
+    """Print the paths of the run folder and its report."""
     console.print(f"run folder: {target}", markup=False, highlight=False, soft_wrap=True)
     console.print(f"report:     {target / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
 
 
 def print_verdict(console: Console, verdict: str) -> None:
-    """The sentence that a result begins with."""
+    """Print the verdict of a result."""
     console.print(verdict, style="bold", markup=False, highlight=False, soft_wrap=True)

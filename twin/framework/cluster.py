@@ -1,4 +1,4 @@
-"""Worker processes: a local cluster that is made for a command and ends with it, or one that somebody else runs."""
+"""Worker processes: a local cluster that a command starts and stops, or a running cluster that it uses."""
 
 from __future__ import annotations
 
@@ -20,33 +20,33 @@ from urllib.parse import urlsplit
 from optics.numerics.backend import ONE_THREAD, cores
 from twin.framework import cli, durable, owned_files, provenance
 
-if TYPE_CHECKING:  # it takes half a second, and a study's file is read before workers are started
+if TYPE_CHECKING:  # its import takes half a second, and a study's file is read before workers are started
     from distributed import Client
 
     from scenes.specs.study import LimitsSpec
 
-REACH_SECONDS = 5.0
-"""How long a scheduler may take to answer before the user is told that it does not."""
+CONNECT_SECONDS = 5.0
+"""Time within which a scheduler has to answer, in seconds."""
 LOST_SECONDS = 10.0
-"""How long a scheduler may be away before the command breaks off."""
+"""Time without a scheduler after which the command gives up, in seconds."""
 WORKER_SECONDS = 60.0
-"""How long to wait for the first worker, and for one that takes the place of the last."""
+"""Time to wait for the first worker, and for a replacement of the last one, in seconds."""
 LEAST_MEMORY = 0.5e9
-"""Bytes that a worker process takes at least: interpreter, libraries, an instrument with its calibration."""
+"""Least memory of a worker process, in bytes: interpreter, libraries, an instrument with its calibration."""
 RETRIES = 2
-"""How often a task is given to another worker after the one that had it died."""
+"""Number of times that a task is given to another worker after its worker died."""
 SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
 ENCRYPTED = ("tls://", "wss://")
 SCRATCH = "twin-study"
-"""Beginning of the names of folders that workers write into."""
+"""Prefix of the names of the folders that workers write into."""
 
 
 AHEAD = 4
-"""Pieces of work that are handed over for each worker: one is done, the others wait."""
+"""Tasks submitted per worker: one runs, the others wait."""
 
 
 class ClusterError(cli.Incomplete):
-    """The workers cannot be used any longer; the message says why."""
+    """Failure of the workers; the message gives the reason."""
 
 
 @dataclass(eq=False)
@@ -56,11 +56,11 @@ class Workers:
     Attributes
     ----------
     client : Client
-        Of Dask.
+        Dask's client.
     local : bool
-        Whether they are this command's own.
-    warnings : list[str]
-        What the user should know.
+        True if this command started the workers.
+    warnings : list of str
+        Warnings for the user.
     """
 
     client: Client
@@ -70,27 +70,27 @@ class Workers:
 
     @property
     def count(self) -> int:
-        """Number of worker processes that the scheduler knows of now."""
+        """Number of worker processes that the scheduler knows now."""
         return len(self.client.scheduler_info(n_workers=-1)["workers"])
 
     def submit(self, work: Callable[[Any], Any], argument: Any) -> Any:
-        """Start a piece of work; ``next_finished`` hands it back when it is done."""
+        """Submit a task; ``next_finished`` returns its future when it is done."""
         future = self.client.submit(work, argument, pure=False, retries=0)
         future.add_done_callback(self._finished.put)
         return future
 
     def next_finished(self, tick: Callable[[], None] = lambda: None) -> Any:
-        """The next piece of work that is done, well or not.
+        """Return the next future that is done, successfully or not.
 
         Parameters
         ----------
-        tick : Callable[[], None]
+        tick : callable
             Called about twice a second while waiting.
 
         Raises
         ------
         ClusterError
-            The scheduler is gone, or all processes of this command and none has come back.
+            The scheduler is gone, or all processes of this command died and none was replaced.
         """
         lost: float | None = None
         alone: float | None = None
@@ -107,34 +107,34 @@ class Workers:
                 if self.local and not self.count:
                     alone = time.monotonic() if alone is None else alone
                     if time.monotonic() - alone > WORKER_SECONDS:
-                        raise ClusterError(f"no worker process has come back for {WORKER_SECONDS:.0f} s")
+                        raise ClusterError(f"all workers ended, and none restarted within {WORKER_SECONDS:.0f} s")
                 else:
                     alone = None
                 continue
             lost = time.monotonic() if lost is None else lost
             if self.client.status in ("closing", "closed") or time.monotonic() - lost > LOST_SECONDS:
-                raise ClusterError("the scheduler is gone")
+                raise ClusterError("the connection to the scheduler is lost")
 
     def each(self, work: Callable[[Any], Any], arguments: Iterable[Any]) -> Iterator[list[tuple[int, Any]]]:
-        """Do a piece of work with every argument, never more than a few ahead.
+        """Run a function on every argument, with only a few tasks submitted ahead.
 
         Parameters
         ----------
-        work : Callable[[Any], Any]
+        work : callable
             Function of one argument.
-        arguments : Iterable[Any]
-            Of the pieces.
+        arguments : iterable
+            Argument of each task.
 
         Yields
         ------
-        list[tuple[int, Any]]
-            Numbers of the arguments with the futures of their pieces that are done meanwhile, well or not; one at
-            least.
+        list of (int, Any)
+            Index of the argument and future of each task finished since the last yield, successfully or not; at least
+            one.
 
         Raises
         ------
         ClusterError
-            As of ``next_finished``.
+            The workers cannot be used, see ``next_finished``.
         """
         left = enumerate(arguments)
         running: dict[Any, tuple[int, Any]] = {}
@@ -152,7 +152,7 @@ class Workers:
 
 
 def killed(error: BaseException) -> bool:
-    """Whether a task failed because the workers that had it died."""
+    """Return True if a task failed because its workers died."""
     from distributed.scheduler import KilledWorker
 
     return isinstance(error, KilledWorker)
@@ -160,30 +160,31 @@ def killed(error: BaseException) -> bool:
 
 @contextmanager
 def local_workers(count: int) -> Iterator[Workers]:
-    """Worker processes on this machine with one thread each; they, and what they leave on disk, end with the block.
+    """Start worker processes on this machine with one thread each; they and their files on disk end with the block.
 
-    Whoever may send a task to a worker runs programs as its user, and a port of this machine is open to all its users.
-    So all speak TLS with a key that is made for the command and kept in memory, and a peer without it is refused.
+    Whoever may send a task to a worker can run programs as its user, and a port of this machine is open to all users.
+    All connections therefore use TLS with a key that is made for the command and kept in memory; a peer without it is
+    refused.
     """
-    with owned_files.scratch(SCRATCH) as place, _cluster(count, place) as workers:
+    with owned_files.scratch(SCRATCH) as folder, _cluster(count, folder) as workers:
         yield workers
 
 
 @contextmanager
-def _cluster(count: int, place: Path) -> Iterator[Workers]:
-    """Workers of this command's own, who write below ``place``."""
+def _cluster(count: int, folder: Path) -> Iterator[Workers]:
+    """Start local workers that write below the folder ``place``."""
     import dask
     from distributed import Client, LocalCluster
     from distributed.security import Security
 
     settings = {
-        # set before the processes start: NumPy reads them when it is imported
+        # set before the processes start, since NumPy reads them when it is imported
         "distributed.nanny.pre-spawn-environ": {**ONE_THREAD},
         "distributed.scheduler.allowed-failures": RETRIES,
-        # what is computed is small and handed over at once; a worker is never to wait for memory
-        # nothing is told by HTTP, neither about the scheduler nor about the workers
+        # no information about the scheduler or the workers is served by HTTP
         "distributed.scheduler.http.routes": [],
         "distributed.worker.http.routes": [],
+        # results are small and sent at once; a worker must never pause for memory
         "distributed.worker.memory.target": False,
         "distributed.worker.memory.spill": False,
         "distributed.worker.memory.pause": False,
@@ -191,13 +192,13 @@ def _cluster(count: int, place: Path) -> Iterator[Workers]:
         "distributed.scheduler.worker-ttl": None,
         "distributed.admin.large-graph-warning-threshold": "1GB",
         "distributed.comm.timeouts.connect": "60s",
-        "temporary-directory": str(place),
+        "temporary-directory": str(folder),
         "logging": {"distributed": "critical", "distributed.nanny": "critical", "tornado": "critical"},
     }
-    with _kept_environment():
+    with _restored_environment():
         _silence()
         with dask.config.set(settings), ExitStack() as stack:
-            with durable.ending_later(), _children_deaf_to_ctrl_c():
+            with durable.ending_later(), _children_ignore_interrupts():
                 cluster = LocalCluster(
                     n_workers=count,
                     threads_per_worker=1,
@@ -205,11 +206,11 @@ def _cluster(count: int, place: Path) -> Iterator[Workers]:
                     host="127.0.0.1",
                     protocol="tls",
                     security=Security.temporary(),
-                    # no dashboard; its port cannot be left out, so it is a free one, seen by this machine only
+                    # no dashboard; a port is required all the same, so a free one of this machine only
                     dashboard_address="127.0.0.1:0",
                     worker_dashboard_address="127.0.0.1:0",
                     scheduler_kwargs={"dashboard": False},
-                    local_directory=str(place),
+                    local_directory=str(folder),
                     memory_limit=0,
                     silence_logs=logging.CRITICAL,
                 )
@@ -218,13 +219,13 @@ def _cluster(count: int, place: Path) -> Iterator[Workers]:
 
 
 @contextmanager
-def _children_deaf_to_ctrl_c() -> Iterator[None]:
-    """Threads that begin inside the block, and the processes that they start, do not hear SIGINT.
+def _children_ignore_interrupts() -> Iterator[None]:
+    """Block SIGINT for threads that begin inside the block, and for the processes that they start.
 
-    A terminal sends it to all processes of a command. This one ends its workers, which otherwise, while they import
-    and while they compute, would each tell of it with a traceback.
+    A terminal sends SIGINT to all processes of a command. The command ends its workers itself; otherwise each worker
+    would print a traceback while it imports or computes.
     """
-    # whoever starts the tracker unblocks the signal, so that it is started before
+    # starting the tracker unblocks the signal, so it is started before
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -234,8 +235,8 @@ def _children_deaf_to_ctrl_c() -> Iterator[None]:
 
 
 @contextmanager
-def _kept_environment() -> Iterator[None]:
-    """Restore the variables of this process at the end: Dask's nannies set here what their workers are to inherit."""
+def _restored_environment() -> Iterator[None]:
+    """Restore the environment variables of this process at the end: Dask's nannies set those of their workers here."""
     before = dict(os.environ)
     try:
         yield
@@ -247,22 +248,22 @@ def _kept_environment() -> Iterator[None]:
 
 @contextmanager
 def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Workers]:
-    """Workers of a running cluster.
+    """Connect to the workers of a running cluster.
 
     Parameters
     ----------
     address : str
-        Of its scheduler, ``tls://host:port`` or ``tcp://host:port``. For TLS Dask is told the certificates by its own
-        configuration, ``distributed.comm.tls``.
-    tell : Callable[[str], None]
-        Told that there are no workers yet.
+        Address of the scheduler, ``tls://host:port`` or ``tcp://host:port``. For TLS, Dask reads the certificates from
+        its own configuration, ``distributed.comm.tls``.
+    tell : callable
+        Called with a message if there are no workers yet.
 
     Raises
     ------
     InputErrorText
-        It cannot be reached, no certificates are named, or its workers do not have the twin.
+        The scheduler cannot be reached, no certificates are configured, or the workers do not have the twin.
     ClusterError
-        It has no workers.
+        The cluster has no workers.
     """
     _check_address(address)
     import dask
@@ -270,7 +271,7 @@ def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Worker
 
     _silence()
     settings = {
-        "distributed.comm.timeouts.connect": f"{REACH_SECONDS}s",
+        "distributed.comm.timeouts.connect": f"{CONNECT_SECONDS}s",
         "logging": {"distributed": "critical"},
         "distributed.comm.retry.count": 0,
     }
@@ -278,7 +279,7 @@ def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Worker
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                client = Client(address, timeout=REACH_SECONDS, set_as_default=False)
+                client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             text = f"the scheduler {address} cannot be reached ({reason}); start it with `dask scheduler`"
@@ -296,26 +297,25 @@ def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Worker
 def chosen_workers(
     count: int | None, scheduler: str | None, warn: Callable[[str], None], limits: LimitsSpec | None = None
 ) -> Iterator[Workers]:
-    """Workers that the user chose, inside the block: those of a running cluster, or processes of this machine, as many
-    as fit into the memory.
+    """Provide the workers that the user chose: those of a running cluster, or as many local processes as memory allows.
 
     Parameters
     ----------
     count : int | None
-        Of processes of this machine, None for one per core.
+        Number of local processes; None for one per core.
     scheduler : str | None
         Address of a running cluster.
-    warn : Callable[[str], None]
-        Told what the user should know.
+    warn : callable
+        Called with each warning for the user.
     limits : LimitsSpec | None
-        Of the memory.
+        Limits of the memory.
 
     Raises
     ------
     InputErrorText
-        Both are chosen, or a cluster that cannot be used.
+        Both are chosen, or the cluster cannot be used.
     ClusterError
-        a cluster without workers.
+        The cluster has no workers.
     """
     refuse_both(count, scheduler)
     who: AbstractContextManager[Workers]
@@ -325,7 +325,7 @@ def chosen_workers(
         wanted = cores() if count is None else count
         fit = wanted if limits is None else max(1, min(wanted, int(limits.bytes // LEAST_MEMORY)))
         if limits is not None and fit < wanted:
-            warn(f"{fit} workers instead of {wanted}: no more fit into the memory of its limits, {limits.memory}")
+            warn(f"{fit} workers instead of {wanted}: no more fit into the memory limit, {limits.memory}")
         who = local_workers(fit)
     with who as workers:
         for text in workers.warnings:
@@ -334,24 +334,24 @@ def chosen_workers(
 
 
 def refuse_both(workers: int | None, scheduler: str | None) -> None:
-    """See that not both are asked for: processes of this machine, and a running cluster.
+    """Raise InputErrorText if both local processes and a running cluster are requested.
 
     Raises
     ------
     InputErrorText
-        Both are.
+        Both are requested.
     """
     if workers is not None and scheduler is not None:
         raise cli.InputErrorText("--workers and --scheduler exclude each other: a cluster has its own workers")
 
 
 def _check_address(address: str) -> None:
-    """Whether a scheduler can be there at all, and what TLS needs to reach it.
+    """Check the address of a scheduler and, for TLS, that certificates are configured.
 
     Raises
     ------
     InputErrorText
-        No address, or no certificates.
+        The address is invalid, or there are no certificates.
     """
     try:
         parts = urlsplit(address)
@@ -360,7 +360,7 @@ def _check_address(address: str) -> None:
         whole = None
     if not (address.startswith(SCHEMES) and whole):
         raise cli.InputErrorText(
-            f"--scheduler {address}: not an address; write it as tls://host:8786 or tcp://host:8786"
+            f"--scheduler {address}: not a valid address; write it as tls://host:8786 or tcp://host:8786"
         )
     if not address.startswith(ENCRYPTED):
         return
@@ -370,13 +370,14 @@ def _check_address(address: str) -> None:
     try:
         known = Security().get_connection_args("client").get("ssl_context")
     except (OSError, ValueError, TypeError) as error:
-        text = f"--scheduler {address}: the certificates that Dask is told of cannot be used ({error}); see {names}"
+        text = f"--scheduler {address}: the certificates configured for Dask cannot be used ({error}); see {names}"
         raise cli.InputErrorText(text) from None
     if known is None:
-        raise cli.InputErrorText(f"--scheduler {address}: TLS needs certificates; name them to Dask by {names}")
+        raise cli.InputErrorText(f"--scheduler {address}: TLS needs certificates; configure them for Dask with {names}")
 
 
 def _wait_for_worker(workers: Workers, address: str, tell: Callable[[str], None]) -> None:
+    """Wait for the first worker of a running cluster."""
     end = time.monotonic() + WORKER_SECONDS
     announced = False
     while not workers.count:
@@ -389,41 +390,43 @@ def _wait_for_worker(workers: Workers, address: str, tell: Callable[[str], None]
 
 
 def _differences(client: Client) -> list[str]:
-    """Versions of the workers that differ from ours: their numbers may differ in the last digits, or more.
+    """Return warnings about package versions of the workers that differ from those here, which may change results.
 
     Raises
     ------
     InputErrorText
-        They cannot import the twin, or have another one.
+        A worker cannot import the twin, or has other source files of it.
     """
     try:
-        theirs = client.run(_program, on_error="return")
+        replies = client.run(_program, on_error="return")
     except Exception as error:
         raise ClusterError(f"the workers do not answer: {error}") from error
     ours, source = _program()
     out = []
-    for address, found in theirs.items():
-        if isinstance(found, BaseException):
-            text = f"the worker {address} cannot import the twin ({found}); start it from the twin's environment"
+    for address, reply in replies.items():
+        if isinstance(reply, BaseException):
+            text = f"the worker {address} cannot import the twin ({reply}); start it from the twin's environment"
             raise cli.InputErrorText(text)
-        if found[1] != source:
-            text = f"the worker {address} has other source files of the twin or its extensions; install the same there"
+        if reply[1] != source:
+            text = f"the worker {address} has other source files of the twin or its extensions; install the same"
             raise cli.InputErrorText(text)
         different = [
-            f"{name} {found[0].get(name)} instead of {own}" for name, own in ours.items() if found[0].get(name) != own
+            f"{name} {reply[0].get(name)} instead of {version}"
+            for name, version in ours.items()
+            if reply[0].get(name) != version
         ]
         if different:
-            out.append(f"the worker {address} has other versions: {', '.join(different)}")
+            out.append(f"the worker {address} has other package versions: {', '.join(different)}")
     return out
 
 
 def _program() -> tuple[dict[str, str], str]:
-    """Versions of the packages, checksum of the program's own source files."""
+    """Return the versions of the packages, and the checksum of the program's source files."""
     return provenance.versions(), provenance.source_digest()
 
 
 def _silence() -> None:
-    """Dask tells of every lost connection on the terminal; what matters of it the command says itself."""
+    """Silence Dask's log, which prints every lost connection; the command reports those that matter."""
     for name in ("distributed", "distributed.client", "distributed.core", "distributed.nanny", "tornado"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     os.environ.setdefault("DASK_LOGGING__DISTRIBUTED", "critical")

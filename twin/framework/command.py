@@ -1,4 +1,4 @@
-"""The one way of the commands that make a run folder: options, progress, the folder, the result in the terminal."""
+"""Shared course of the commands that make a run folder: options, progress, run folder, result in the terminal."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What a command tells in the terminal when its run folder is complete.
+    """Output of a command in the terminal when its run folder is complete.
 
     Attributes
     ----------
-    numbers : Mapping[str, Any]
+    numbers : mapping
         Plain data, for ``--json``.
-    show : Callable[[Console], None]
+    show : callable
         Prints the result for a reader.
     problem : str
-        Why something asked for is not in the run folder, empty for nothing; the exit code is then 1.
+        Reason why a requested file is missing from the run folder, empty if none is; the exit code is then 1.
     code : int
-        Exit code that the result itself asks for, of a command whose answer it is.
+        Exit code that the result itself asks for.
     """
 
     numbers: Mapping[str, Any]
@@ -51,30 +51,30 @@ class Result:
 
 
 def finished(session: Session, kind: str, report: Report, numbers: Mapping[str, Any], **facts: Any) -> Result:
-    """Write the run folder of a command that shows a report, and what it tells in the terminal.
+    """Write the run folder of a command that makes a report, and return its output for the terminal.
 
     Parameters
     ----------
     session : Session
-        The command at work.
+        Session of the command.
     kind : str
-        Of the numbers, which stand in KIND.json.
+        Kind of the run; its numbers go into KIND.json.
     report : Report
-        Of the run, with the exit code that it asks for.
-    numbers : Mapping[str, Any]
-        Of the run; the report's verdict is added to them.
+        Report of the run, with the exit code that it asks for.
+    numbers : mapping
+        Numbers of the run; the verdict and warnings of the report are added to them.
     facts : Any
-        How it was run, as `twin.framework.page.RunFacts` takes them, beside what the session knows.
+        Fields of `twin.framework.page.RunFacts` beside those known from the session.
     """
     from twin.framework import reference_frames
     from twin.framework.page import RunFacts, write_test
 
-    told = report.told(numbers)
+    complete = report.with_verdict(numbers)
     known = {"started": session.started, "seconds": session.seconds, "backend": session.backend.name}
     known["checks"] = report.checks
-    write_test(kind, told, report, RunFacts(**{**known, **facts}), session.folder)
+    write_test(kind, complete, report, RunFacts(**{**known, **facts}), session.folder)
     return Result(
-        reference_frames.described(kind, told), lambda console: print_report(report, console), code=report.code
+        reference_frames.described(kind, complete), lambda console: print_report(report, console), code=report.code
     )
 
 
@@ -86,53 +86,53 @@ def run_command(
     options: cli.Options,
     resolve: Callable[[], Given],
     work: Callable[[Given, Session], Result],
-    kept: KeptWork | None = None,
+    storage: KeptWork | None = None,
 ) -> None:
-    """Read what is asked for, do it in a run folder and print what it gave.
+    """Read the input, compute in a run folder and print the result.
 
     Parameters
     ----------
     stem : str
-        Of the run folder's name where the user chose none.
+        Name of the run folder if the user chose none.
     options : cli.Options
-        What the user chose.
-    resolve : Callable[[], Given]
-        Reads the files and checks what is asked for. Raises InputError, InputErrorText.
-    work : Callable[[Given, Session], Result]
+        Options that the user chose.
+    resolve : callable
+        Reads the files and checks the request. Raises InputError, InputErrorText.
+    work : callable
         Computes and writes all files of the run folder, the manifest last. Raises InputError.
-    kept : KeptWork | None
-        Where the work is kept meanwhile; it goes when the run folder is complete.
+    storage : KeptWork | None
+        Folder of intermediate results for ``--resume``; it is removed when the run folder is complete.
 
     Raises
     ------
     typer.Exit
-        With the exit code of a failure, which has been told.
+        The command failed; the error has been printed.
     """
     errors = Console(stderr=True)
-    with cli.explained(errors, cli.nothing_kept if kept is None else kept.left), kept or nullcontext():
+    with cli.explained(errors, cli.no_results_kept if storage is None else storage.left), storage or nullcontext():
         cli.check_backend(options.backend)
-        given = resolve()
-        # a bad file is told before these are imported
+        request = resolve()
+        # imported here, so that an error in the file is reported without delay
         from optics.numerics.backend import load_backend
         from twin.framework import provenance, run_folder
 
         folder = run_folder.RunFolder(run_folder.chosen(options.out, stem), options.force)
         started, clock = time.time(), time.monotonic()
         tracer = load_backend(options.backend)
-        provenance.program_digest()  # of the files that compute, which may be others when the run ends
+        provenance.program_digest()  # now, since the source files may change before the run ends
         with durable.exit_on_terminate(), folder, progress_shown(errors, options.silent) as advance:
-            result = work(given, Session(folder, tracer, advance, started, clock))
-        if kept is not None:
-            kept.finish()
+            result = work(request, Session(folder, tracer, advance, started, clock))
+        if storage is not None:
+            storage.finish()
     with to_stdout(errors, f"the run is complete in {folder.target}"):
         if options.as_json:
             print_json(result.numbers)
         elif not options.quiet:
             console = Terminal()
             result.show(console)
-            cli.print_place(console, folder.target)
+            cli.print_paths(console, folder.target)
     if result.problem:
-        print_error(errors, f"{result.problem}; all else is in {folder.target}")
+        print_error(errors, f"{result.problem}; everything else is in {folder.target}")
         raise typer.Exit(FAILURE)
     if result.code:
         raise typer.Exit(result.code)
@@ -142,17 +142,19 @@ def run_command(
 
 @contextmanager
 def progress_shown(errors: Console, silent: bool) -> Iterator[Advance]:
-    """Inside the block a terminal shows how far each part of the work is and how long it still takes; elsewhere a line
-    now and then says it. Of a part that takes long it is said once in any case.
+    """Show the progress of each part of the work inside the block.
+
+    A terminal shows progress bars; elsewhere a line is printed at intervals. The expected duration of a long part is
+    printed once in any case.
 
     Parameters
     ----------
     errors : Console
-        Where it is shown.
+        Console for the progress.
     silent : bool
-        Whether nothing shall be.
+        True to show nothing.
     """
-    standing, hidden = cli.Standing(), silent or not errors.is_terminal
+    state, hidden = cli.WorkProgress(), silent or not errors.is_terminal
 
     def say(text: str) -> None:
         if not silent:
@@ -160,13 +162,13 @@ def progress_shown(errors: Console, silent: bool) -> Iterator[Advance]:
 
     with (
         Progress(*cli.progress_columns(28), console=errors, disable=hidden, transient=True) as bar,
-        cli.heartbeat(errors, standing.__str__, silent),
+        cli.heartbeat(errors, state.__str__, silent),
     ):
-        yield _advance(bar, standing, say)
+        yield _advance(bar, state, say)
 
 
-def _advance(bar: Progress, standing: cli.Standing, say: Callable[[str], None]) -> Advance:
-    """Shows every part of the work as a line, from its beginning on."""
+def _advance(bar: Progress, state: cli.WorkProgress, say: Callable[[str], None]) -> Advance:
+    """Return an ``Advance`` that shows every part of the work as a line."""
     parts: dict[str, TaskID] = {}
     long: set[str] = set()
 
@@ -174,27 +176,27 @@ def _advance(bar: Progress, standing: cli.Standing, say: Callable[[str], None]) 
         if part not in parts:
             parts[part] = bar.add_task(part, total=total)
         bar.update(parts[part], completed=done, total=total)
-        standing.advance(part, done, total)
-        if part not in long and standing.long:
+        state.advance(part, done, total)
+        if part not in long and state.long:
             long.add(part)
-            say(f"note: {part}: about {cli.time_text(standing.left)} left")
+            say(f"note: {part}: about {cli.time_text(state.left)} left")
 
     return advance
 
 
 def add_tests(app: typer.Typer, program: str, apart: Collection[str] = ()) -> None:
-    """Add to a program all its tests of `PROCEDURES`, ``lab focus`` to ``lab``, with the options that all have.
+    """Add all tests of a program in `PROCEDURES` to it, ``lab focus`` to ``lab``, with the shared options.
 
-    A test that exports has an option ``--export``.
+    A test that can export has the option ``--export``.
 
     Parameters
     ----------
     app : typer.Typer
-        Of the program.
+        Application of the program.
     program : str
         First word of the tests' names.
-    apart : Collection[str]
-        Commands that have options of their own and are added by the program itself.
+    apart : collection of str
+        Commands with options of their own, which the program adds itself.
     """
     for name in PROCEDURES:
         of, _, command = name.partition(" ")
@@ -210,7 +212,7 @@ def add_tests(app: typer.Typer, program: str, apart: Collection[str] = ()) -> No
 
 
 def _add_unusable(app: typer.Typer, command: str, error: EntryPointError) -> None:
-    """Add a test of another distribution that cannot be used: its help says why, and the others work."""
+    """Add a test of another distribution that cannot be loaded, with the reason as its help."""
 
     @app.command(command, help=str(error), context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
     def unusable() -> None:
@@ -219,6 +221,7 @@ def _add_unusable(app: typer.Typer, command: str, error: EntryPointError) -> Non
 
 
 def _test(name: str, file: cli.File, options: cli.Options) -> None:
+    """Run a test with the shared options."""
     run_test(name, file, options)
 
 
@@ -226,34 +229,34 @@ def run_test(
     name: str,
     file: Path,
     options: cli.Options,
-    kept: KeptWork | None = None,
+    storage: KeptWork | None = None,
     read: Callable[[], Any] | None = None,
     words: tuple[str, ...] = (),
     **changes: Any,
 ) -> None:
-    """Read a test, run it, write its run folder and print what it gave.
+    """Read a test, run it, write its run folder and print the result.
 
     Parameters
     ----------
     name : str
-        Of the test in `PROCEDURES`: program and subcommand.
+        Name of the test in `PROCEDURES`: program and subcommand.
     file : Path
-        Of the test; the run folder is called like it.
+        File of the test; the run folder is named after it.
     options : cli.Options
-        What the user chose.
-    kept : KeptWork | None
-        See `run_command`.
-    read : Callable[[], Any] | None
-        Reads the set-up, by options that this test alone has; None for that of the file. Raises InputError.
-    words : tuple[str, ...]
-        Further options with which the run is made again from its config.yaml.
+        Options that the user chose.
+    storage : KeptWork | None
+        Folder of intermediate results, see `run_command`.
+    read : callable | None
+        Reads the set-up, if the test has options that change it; None to read it from the file. Raises InputError.
+    words : tuple of str
+        Further command-line options that are needed to repeat the run from its config.yaml.
     changes : Any
-        Attributes of the `Procedure` that are others by options that this test alone has.
+        Attributes of the `Procedure` that options of this test replace.
 
     Raises
     ------
     typer.Exit
-        With the exit code of a failure, which has been told.
+        The command failed; the error has been printed.
     """
     procedure = replace(PROCEDURES[name], **changes)
     called = f"twin.{name}"
@@ -263,41 +266,41 @@ def run_test(
         from twin.framework.report import numbers_only, with_warnings
         from twin.framework.run_folder import write_manifest
 
-        # a folder that cannot be made is told before the run
+        # a folder that cannot be made is reported before the run
         folder = None if options.export is None else _export_folder(setup, options.export, options.force)
         setup, number, facts = seeded(procedure, setup, options.seed)
-        run, given = performed(procedure, setup, session.backend, number, session.advance)
+        run, input_warnings = performed(procedure, setup, session.backend, number, session.advance)
         if folder is not None:
             with folder:
                 for name, content in procedure.export(run).items():
                     folder.write_bytes(name, content if isinstance(content, bytes) else content.encode())
-                said = {"test": procedure.kind, "backend": session.backend.name, "seed": number}
-                write_manifest(folder, program, session.started, session.seconds, **said)
+                facts_of_export = {"test": procedure.kind, "backend": session.backend.name, "seed": number}
+                write_manifest(folder, program, session.started, session.seconds, **facts_of_export)
         try:
             made, problem = procedure.report(run), ""
-        except Exception as error:  # minutes or hours of computing are not thrown away for a figure
+        except Exception as error:  # hours of computing must not be lost because of a figure
             problem = "the report could not be made"
             made = numbers_only(called, f"{procedure.kind}.json", error)
             Console(stderr=True).print(traceback.format_exc(), markup=False, highlight=False, soft_wrap=True)
-        shown, numbers = with_warnings(made, given), procedure.numbers(run)
+        shown, numbers = with_warnings(made, input_warnings), procedure.numbers(run)
         facts |= {"program": program, "command": command, "options": words}
         return replace(finished(session, procedure.kind, shown, numbers, **facts), problem=problem)
 
-    run_command(file.stem, options, read or partial(read_for, called, file, procedure.resolve), work, kept)
+    run_command(file.stem, options, read or partial(read_for, called, file, procedure.resolve), work, storage)
 
 
 def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:
-    """The folder of ``--export``, checked before anything is computed.
+    """Return the folder of ``--export``, checked before anything is computed.
 
     Raises
     ------
     InputError
-        The test names measurements, which are files already.
+        The test reads measurements, which are files already.
     RunFolderError
         The folder cannot be made.
     """
     if "measured" in type(setup.test).model_fields:
-        text = "measurements are files already; --export writes those of a simulated bench"
+        text = "--export writes the measurements of a simulated bench; this test reads measurements from files"
         raise setup.test.error(text, ("measured",), allowed="the file of a simulated test")
     from twin.framework.run_folder import RunFolder, RunFolderError
 
@@ -308,7 +311,7 @@ def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:
 
 
 def print_report(report: Report, console: Console) -> None:
-    """The verdict, the main table of a report, and what else was found."""
+    """Print the verdict, the main table, the lead and the warnings of a report."""
     from twin.framework.artefact import cell_text
 
     cli.print_verdict(console, report.verdict)
@@ -318,7 +321,7 @@ def print_report(report: Report, console: Console) -> None:
         text = all(isinstance(row[k], str) for row in summary.rows)
         table.add_column(escape(head), justify="left" if text else "right", no_wrap=text)
     for row in summary.shown():
-        table.add_row(*(escape(cell_text(cell)) for cell in row))  # [m] is a unit
+        table.add_row(*(escape(cell_text(cell)) for cell in row))  # escaped, since [m] is a unit and no markup
     cli.print_whole(console, table)
     for line in report.lead:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
@@ -326,6 +329,6 @@ def print_report(report: Report, console: Console) -> None:
 
 
 def print_warnings(console: Console, warnings: Sequence[str]) -> None:
-    """What the user should know before using the numbers."""
+    """Print warnings about the numbers."""
     for warning in warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)

@@ -1,8 +1,8 @@
-"""The command ``camtwin``: every program under one name, from whatever folder it is started.
+"""The command ``camtwin``: every program under one name, from any working directory.
 
-``camtwin render JOB`` is ``python -m twin.render JOB``, but it never looks for modules where it is started, not even
-for one that is named ``twin.py``. Names and lines of the programs stand here, so that help and completion of the
-first word import none of them.
+``camtwin render JOB`` is ``python -m twin.render JOB``, but it never looks for modules in the working directory, not
+even for one that is named ``twin.py``. Names and descriptions of the programs are listed here, so that help and
+completion of the first word import none of them.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 PROGRAMS = {
     "render": ("twin.render", "perturb an instrument, render its images, recover the changes"),
-    "recover": ("twin.recover", "recover the same from measured frames"),
-    "live": ("twin.live", "the twin in a browser: turn a knob, the spots move"),
+    "recover": ("twin.recover", "recover the changes from measured frames"),
+    "live": ("twin.live", "the twin in a browser: move a slider, the spots follow"),
     "lab": ("twin.lab", "laboratory tests: focus, distortion, turntable"),
     "orbit": ("twin.orbit", "adjust, angle, calibrate, check, export, jitter, match, monitor, simulate"),
     "study": ("twin.study", "vary any key of a job; statistics, sensitivities, gradients"),
     "design": ("twin.design", "optimise a camera, or find the layout of a monitor"),
     "tolerance": ("twin.tolerance", "tolerances with compensators: sensitivities, yield, allocation"),
-    "asbuilt": ("twin.asbuilt", "one instrument as built: its state by all that was measured"),
+    "asbuilt": ("twin.asbuilt", "state of one instrument as built, from all its measurements"),
     "operate": (
         "twin.operate",
         "init, ingest, status, forecast, alarms, exclude, products, report, export, simulate, judge",
@@ -35,24 +35,24 @@ PROGRAMS = {
     "camera": ("twin.camera", "wavefront, spots, MTF, distortion of a camera; refocus it"),
     "lens": ("scenes.lens", "read and write prescriptions of Zemax, CODE V and batoid"),
     "mtf": ("analysis.mtf", "MTF from a slanted edge or bars in any image"),
-    "uncertainty": ("twin.uncertainty", "what limits a monitor, and whether its sigmas hold"),
-    "compare": ("twin.compare", "what differs between run folders"),
-    "verify": ("twin.verify", "is a run folder intact, does its run come out the same again"),
+    "uncertainty": ("twin.uncertainty", "uncertainty budget of a monitor, and coverage of its sigmas"),
+    "compare": ("twin.compare", "differences between run folders"),
+    "verify": ("twin.verify", "check that a run folder is intact and its run reproducible"),
     "export": ("twin.export", "frames and tables of a run folder for other programs"),
-    "validate": ("twin.validate", "the papers' equations and tables, printed beside measured"),
+    "validate": ("twin.validate", "equations and tables of the papers, compared with the simulation"),
     "schema": ("scenes.schema", "JSON Schemas of the YAML files, for editors"),
-    "doctor": ("twin.doctor", "can this machine run the twin"),
+    "doctor": ("twin.doctor", "check that this machine can run the twin"),
 }
-"""First word -> the module that is run, and one line of what it does."""
+"""First word of the command -> the module that runs, and its description in one line."""
 COMPLETE = "_CAMTWIN_COMPLETE"
-"""Variable by which a shell asks for completions."""
+"""Environment variable by which a shell asks for completions."""
 _BEFORE = __name__.removesuffix("twin.framework.console")
-"""What stands before the modules' names where the packages were installed within another one; else nothing."""
+"""Package prefix of the modules' names if the packages are installed inside another package; otherwise empty."""
 
 
 @cache
 def parser(program: str) -> Any:
-    """Return the command of a program, with its parser; of a program with subcommands the group.
+    """Return the Click command of a program with its parser; of a program with subcommands, the group.
 
     A program has a Typer application ``app`` or a function ``main``.
     """
@@ -69,7 +69,10 @@ def parser(program: str) -> Any:
 
 
 def _application() -> typer.Typer:
-    """Help, version, completion and what is wrong with the first word; the programs themselves only by their lines."""
+    """Return the application for help, version, completion and errors in the first word.
+
+    Each program appears only with its one-line description.
+    """
     import typer
     from typer.core import TyperCommand, TyperGroup
 
@@ -79,13 +82,13 @@ def _application() -> typer.Typer:
             super().__init__(**{**attrs, "commands": lines})
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-            """Find the program's own parser; only completion comes here."""
+            """Return the parser of the named program; only completion calls this."""
             name, command, rest = super().resolve_command(ctx, args)
             return name, parser(PROGRAMS[args[0]][0]) if command else command, rest
 
     app = typer.Typer(cls=Programs, rich_markup_mode=None, pretty_exceptions_enable=False, no_args_is_help=True)
 
-    def told(asked: bool) -> None:
+    def show_version(asked: bool) -> None:
         if asked:
             from importlib.metadata import version
 
@@ -94,22 +97,22 @@ def _application() -> typer.Typer:
             raise typer.Exit
 
     @app.callback()
-    def every(
+    def camtwin(
         version: bool = typer.Option(
-            False, "--version", callback=told, is_eager=True, help="Show the version and exit."
+            False, "--version", callback=show_version, is_eager=True, help="Show the version and exit."
         ),
     ) -> None:
-        """A digital twin of space mapping cameras and of their on-board autocollimation monitor.
+        """Run a program of the digital twin of space mapping cameras and of their on-board autocollimation monitor.
 
-        camtwin PROGRAM --help says more.
+        camtwin PROGRAM --help describes a program.
         """
 
     return app
 
 
 def main() -> None:
-    """Run the program that the first word names, with the words after it."""
-    # for processes that are started from here
+    """Run the program that the first word names, with the remaining words as its arguments."""
+    # inherited by processes that are started from here
     os.environ["PYTHONSAFEPATH"] = "1"
     if sys.argv[1:2] and sys.argv[1] in PROGRAMS and COMPLETE not in os.environ:
         module, _ = PROGRAMS[sys.argv.pop(1)]
@@ -117,7 +120,7 @@ def main() -> None:
     else:
         try:
             _application()(prog_name="camtwin")
-        except OSError as error:  # help is written by a library, which has no word for a full disk
+        except OSError as error:  # the library that writes the help does not report a full disk
             from scenes.yaml.standard_output import leave_stdout
 
             leave_stdout()

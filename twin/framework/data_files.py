@@ -1,12 +1,12 @@
-"""Data, tables and images in formats that other programs read.
+"""Data, tables and images in file formats that other programs read.
 
-Tables: CSV has the unit in brackets behind the name of a column. Parquet has ``unit`` and ``description`` in each
-field's metadata, FITS the unit as TUNITn, in the standard's own spelling, and the description as TCOMMn.
+Tables: CSV has the unit in brackets after the name of a column. Parquet has ``unit`` and ``description`` in each
+field's metadata; FITS has the unit as TUNITn, in the spelling of the standard, and the description as TCOMMn.
 
-CF knows units by UDUNITS and quantities by its table of standard names, in which a camera has few. A unit that UDUNITS
-does not know (pixels, waves, grey values) is a count: its ``units`` are 1, and ``counted_in`` says of what.
+netCDF: CF takes units from UDUNITS and quantities from its table of standard names, which has few for a camera. A unit
+that UDUNITS does not know (pixels, waves, grey values) is a count: its ``units`` are 1, and ``counted_in`` names it.
 
-They are made in memory: on a full disk HDF5 crashes the process, and nothing says why.
+Files are made in memory, because HDF5 crashes the process without a message when the disk is full.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import tifffile
 
 from optics.numerics.extension_table import ExtensionTable
 from optics.numerics.number_tree import FrozenMap
-from twin.framework.frame_store import FileRoom, in_file, mean_of, parts
+from twin.framework.frame_store import FileBuffer, in_file, mean_of, parts
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -38,29 +38,29 @@ import unicodedata
 from dataclasses import field
 
 CONVENTIONS = "CF-1.11"
-SPELT: Mapping[str, str] = FrozenMap({"deg": "degree", "mas": "milliarcsec"})
-"""Unit as the program writes it -> as UDUNITS does; all that are in neither mapping are the same."""
+UDUNITS_NAMES: Mapping[str, str] = FrozenMap({"deg": "degree", "mas": "milliarcsec"})
+"""Unit as the program writes it -> as UDUNITS does; units that are neither here nor in COUNTS are the same in both."""
 COUNTS = frozenset(("px", "waves", "DN", "photons"))
-"""Units that count something."""
+"""Units that count something; UDUNITS does not know them."""
 WRITER = "space-camera-twin"
 
 
 Gridded = tuple[str | tuple[str, ...], Any, Mapping[str, Any]]
-"""Axes, values and attributes of a variable, as xarray takes them."""
+"""Axes, values and attributes of a variable, in the form that xarray accepts."""
 
 
 @dataclass(frozen=True, eq=False)
 class GridData:
-    """Arrays on named axes, to be written without xarray, whose import takes longer than most files.
+    """Arrays on named axes for a netCDF file, without importing xarray, which takes longer than writing most files.
 
     Attributes
     ----------
-    variables : Mapping[str, Gridded]
-        Name -> real numbers.
-    coords : Mapping[str, Gridded]
-        Name -> coordinates of the axes, real numbers or texts.
-    attrs : Mapping[str, Any]
-        Of all, ``title`` among them.
+    variables : mapping
+        Name -> variable of real numbers.
+    coords : mapping
+        Name -> coordinates of an axis, real numbers or texts.
+    attrs : mapping
+        Attributes of the file, including ``title``.
     """
 
     variables: Mapping[str, Gridded]
@@ -68,93 +68,99 @@ class GridData:
     attrs: Mapping[str, Any]
 
     def to_xarray(self) -> xr.Dataset:
-        """The same as a data set."""
+        """Return the data as an xarray data set."""
         import xarray as xr
 
         return xr.Dataset(self.variables, self.coords, self.attrs)
 
 
 def netcdf(data: xr.Dataset | GridData) -> bytes:
-    """A data set as the contents of a netCDF-4 file by CF 1.11; the same data give the same bytes.
+    """Return a data set as the content of a netCDF-4 file with CF-1.11 attributes; equal data give equal bytes.
 
     Parameters
     ----------
     data : xr.Dataset | GridData
-        With ``title`` among its attributes; of every variable ``long_name`` and of numbers ``units``, which are 1 where
-        there are none.
+        Data with the attribute ``title``. Every variable has the attribute ``long_name``, and numbers have ``units``;
+        without units, 1 is written.
+
+    Returns
+    -------
+    bytes
+        Content of the file.
     """
     if isinstance(data, GridData):
         return _grid_file(data)
-    told = follow_cf(data)
+    data_set = follow_cf(data)
     # coordinates have no gaps
-    view = told.to_netcdf(engine="h5netcdf", encoding={name: {"_FillValue": None} for name in told.coords})
+    view = data_set.to_netcdf(engine="h5netcdf", encoding={name: {"_FillValue": None} for name in data_set.coords})
     content = bytes(view)
-    # xarray hands out a window on its buffer, which complains when it is thrown away with the window still open
+    # xarray returns a view of its buffer; without release, freeing the buffer raises an error
     if isinstance(view, memoryview):
         view.release()
     return content
 
 
 def _grid_file(data: GridData) -> bytes:
-    """The file that xarray makes of the same data, to the byte."""
+    """Return the same bytes that xarray writes for this data."""
     import h5netcdf
     import h5py
 
-    every = [
-        *((name, one, False) for name, one in data.variables.items()),
+    variables = [
+        *((name, variable, False) for name, variable in data.variables.items()),
         *((*of, True) for of in data.coords.items()),
     ]
     buffer = io.BytesIO()
     with h5netcdf.File(buffer, "w") as file:
         file.attrs.update(_cf_attributes(data.attrs))
-        for _, (dims, values, _), _ in every:
+        for _, (dims, values, _), _ in variables:
             for dim, size in zip(_axes(dims), np.shape(values), strict=True):
                 if dim not in file.dimensions:
                     file.dimensions[dim] = size
-        for name, (dims, values, attrs), coordinate in every:
+        for name, (dims, values, attrs), coordinate in variables:
             axes, array = _axes(dims), np.asarray(values)
             if array.dtype.kind not in "fU":
-                raise TypeError(f"{name}: neither real numbers nor texts: {array.dtype}")
+                raise TypeError(f"{name}: {array.dtype} values cannot be written; only real numbers and texts can")
             text = array.dtype.kind == "U"
             # coordinates have no gaps
             fill = None if coordinate or text else array.dtype.type(np.nan)
             kind = h5py.string_dtype() if text else array.dtype
-            made = file.create_variable(name, axes, dtype=kind, fillvalue=fill)
-            made.attrs.update(_units(attrs, not text))
-            of_it = sorted(k for k, (on, *_) in data.coords.items() if k not in axes and set(_axes(on)) <= set(axes))
-            if of_it and not coordinate:
-                made.attrs["coordinates"] = " ".join(of_it)
-            made[...] = array.astype(object) if text else array
+            created = file.create_variable(name, axes, dtype=kind, fillvalue=fill)
+            created.attrs.update(_units(attrs, not text))
+            related = sorted(k for k, (on, *_) in data.coords.items() if k not in axes and set(_axes(on)) <= set(axes))
+            if related and not coordinate:
+                created.attrs["coordinates"] = " ".join(related)
+            created[...] = array.astype(object) if text else array
     return buffer.getvalue()
 
 
 def _axes(dims: str | tuple[str, ...]) -> tuple[str, ...]:
+    """Return the axes of a variable as a tuple."""
     return (dims,) if isinstance(dims, str) else dims
 
 
 def read_netcdf(content: bytes) -> xr.Dataset:
-    """The data set in the bytes of a netCDF file, loaded whole; units of time stay as they are written.
+    """Read a data set from the bytes of a netCDF file into memory; units of time stay as written.
 
     Raises
     ------
     Exception
-        The file is damaged, in whatever way the libraries stumble over it; also where they would only warn.
+        The file is damaged; the type depends on the library that fails. Warnings of the libraries are raised as well.
     """
     import h5py
     import xarray as xr
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # where HDF5 cannot open it, h5netcdf would leave half an object that prints an error of its own later
+        # if HDF5 cannot open it, h5netcdf would leave an incomplete object that prints an error later
         with h5py.File(io.BytesIO(content)):
             pass
-        # read from memory, since of a damaged file the library leaves the file open
+        # read from memory, since the library leaves a damaged file open
         with xr.open_dataset(io.BytesIO(content), engine="h5netcdf", decode_timedelta=False) as data:
             return data.load()
 
 
 def follow_cf(data: xr.Dataset) -> xr.Dataset:
-    """The data set with the attributes that CF asks for; values are the same."""
+    """Return the data set with the attributes that CF requires, and unchanged values."""
     out = data.assign_attrs(_cf_attributes(data.attrs))
     for name in out.variables:
         variable = out.variables[name]
@@ -164,11 +170,11 @@ def follow_cf(data: xr.Dataset) -> xr.Dataset:
 
 
 def _cf_attributes(attributes: Mapping[Any, Any]) -> dict[str, Any]:
-    """Attributes of a file with those that CF asks for."""
+    """Return the attributes of a file with those that CF requires."""
     version = f"{WRITER} {importlib.metadata.version(WRITER)}"
-    # CF wants a history, which begins here; it names no time, so that the same run gives the same bytes
-    said = {"Conventions": CONVENTIONS, "source": f"simulation by {version}", "history": f"written by {version}"}
-    return {**attributes, **said}
+    # CF requires a history, which begins here; it has no time, so that the same run gives the same bytes
+    required = {"Conventions": CONVENTIONS, "source": f"simulation by {version}", "history": f"written by {version}"}
+    return {**attributes, **required}
 
 
 _FORMULA = re.compile(r"[=+\-@\t\r].")
@@ -176,7 +182,7 @@ _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?|[+-]?(inf|
 
 
 def _units(attributes: Mapping[Any, Any], numbers: bool) -> dict[str, Any]:
-    """Attributes of a variable with units that UDUNITS knows; texts have none."""
+    """Return the attributes of a variable with units that UDUNITS knows; texts have none."""
     rest = {str(key): value for key, value in attributes.items() if key != "units"}
     if not numbers:
         return rest
@@ -184,7 +190,7 @@ def _units(attributes: Mapping[Any, Any], numbers: bool) -> dict[str, Any]:
     counted, _, how = unit.partition(" ")
     if counted in COUNTS:
         return {"units": "1", "counted_in": " ".join(filter(None, (counted, how))), **rest}
-    return {"units": SPELT.get(unit, unit) or "1", **rest}
+    return {"units": UDUNITS_NAMES.get(unit, unit) or "1", **rest}
 
 
 def csv_table(rows: Iterable[Sequence[Any]]) -> bytes:
@@ -199,36 +205,38 @@ def csv_table(rows: Iterable[Sequence[Any]]) -> bytes:
 
 
 def _harmless(cell: Any) -> Any:
+    """Return a cell with a quotation mark before a text that a spreadsheet would take for a formula."""
     return f"'{cell}" if isinstance(cell, str) and _FORMULA.match(cell) and not _NUMBER.fullmatch(cell) else cell
 
 
 SPOT_STRETCH = 30.0
-"""Steepness of an asinh stretch that shows faint diffraction rings beside a spot's core."""
+"""Steepness of the asinh stretch that shows faint diffraction rings beside a spot's core."""
 
 ENLARGE = 4
+"""Magnification of small pictures."""
 LARGEST_ENLARGED = 600
-"""Rows or columns from which a picture is shown as large as it is."""
+"""Number of rows or columns from which a picture is not magnified."""
 
 
-class Placed(Protocol):
-    """What says where on the ground the pixels of an image lie."""
+class Georeference(Protocol):
+    """Georeference of an image."""
 
     def tags(self) -> list[tuple[Any, ...]]:
-        """Tags as tifffile takes them: code, type, count, value, only once in the file."""
+        """Return tags in the form that tifffile accepts: code, type, count, value, written once per file."""
 
 
 @dataclass(frozen=True)
-class MapPlace:
-    """Where the pixels of a map lie: longitude and latitude are linear in column and row.
+class MapGeoreference:
+    """Georeference of a map in longitude and latitude, which are linear in column and row.
 
     Attributes
     ----------
     longitude, latitude : float
-        Of the middle of the first pixel, degrees.
+        Position of the centre of the first pixel, in degrees.
     per_column, per_row : float
-        Degrees of longitude and of latitude, the latter below zero where rows go south.
+        Longitude per column and latitude per row, in degrees; the latter is negative if rows go south.
     heights : bool
-        Whether the values are heights above the ellipsoid of WGS 84.
+        True if the values are heights above the WGS 84 ellipsoid.
     """
 
     longitude: float
@@ -238,7 +246,7 @@ class MapPlace:
     heights: bool = False
 
     def tags(self) -> list[tuple[Any, ...]]:
-        """Tags of a GeoTIFF (OGC 19-008r4): pixels are areas, the corner of the first is the tie point."""
+        """Return the tags of a GeoTIFF (OGC 19-008r4); pixels are areas, the tie point is the first one's corner."""
         scale = (self.per_column, -self.per_row, 0.0)
         tie = (0.0, 0.0, 0.0, self.longitude - 0.5 * self.per_column, self.latitude - 0.5 * self.per_row, 0.0)
         system = 4979 if self.heights else 4326
@@ -248,22 +256,22 @@ class MapPlace:
 
 @dataclass(frozen=True)
 class FrameFacts:
-    """What recorded frames are, for whoever has nothing but their file.
+    """Description of recorded frames, written into their file.
 
     Attributes
     ----------
     camera : str
-        Whose CCD it is, for people: ``forward, left area CCD``; empty if nobody says.
+        Camera and detector, in words: ``forward, left area CCD``; empty if unknown.
     pitch : float | None
-        Of the pixels, metres; None if nobody says, as the others.
+        Pixel pitch, in metres; None if unknown, here and below.
     exposure : float | None
-        Of each frame, seconds.
-    times : tuple[float, ...] | None
-        Of each frame in the course, seconds.
+        Exposure time of each frame, in seconds.
+    times : tuple of float | None
+        Time of each frame in the course, in seconds.
     note : str
-        What else is to be known.
-    place : Placed | None
-        Of a map, or of an image from orbit; the TIFF then is a GeoTIFF.
+        Further remarks.
+    georeference : Georeference | None
+        Georeference of a map or an image from orbit; the TIFF is then a GeoTIFF.
     """
 
     camera: str = ""
@@ -271,10 +279,10 @@ class FrameFacts:
     exposure: float | None = None
     times: tuple[float, ...] | None = None
     note: str = ""
-    place: Placed | None = None
+    georeference: Georeference | None = None
 
     def page(self, k: int) -> dict[str, Any]:
-        """What is known of frame number ``k``, as plain data."""
+        """Return the known facts of frame number ``k`` as plain data."""
         known = {
             "camera": self.camera or None,
             "frame": k + 1,
@@ -288,36 +296,41 @@ class FrameFacts:
 
 _MODEL, _EXPOSURE_TIME = 272, 33434
 _RATIONAL = 10**6
-"""Denominator of exposure times in tags."""
+"""Denominator of exposure times in TIFF tags."""
 
 
 def tiff(frames: np.ndarray, facts: FrameFacts) -> bytes | memoryview:
-    """Frames (N, H, W) as a TIFF file of N pages, each with what is known of it in its tags.
+    """Return frames as a TIFF file with one page per frame and the facts of each frame in its tags.
 
-    ImageDescription holds all as JSON; XResolution and YResolution are pixels per centimetre; Model is the camera,
-    ExposureTime in seconds as in Exif. Row 0 is the first of the CCD.
+    ImageDescription holds all facts as JSON; XResolution and YResolution are pixels per centimetre; Model is the
+    camera; ExposureTime is in seconds, as in Exif. Row 0 is the first row of the CCD.
 
     Parameters
     ----------
-    frames : np.ndarray
-        uint16 or float (N, H, W).
+    frames : (N, H, W) ndarray of uint16 or float
+        Recorded frames.
     facts : FrameFacts
-        What is known of them.
+        Description of the frames.
+
+    Returns
+    -------
+    bytes or memoryview
+        Content of the file.
     """
-    # made in memory: on a full disk NumPy's writer does not say why it failed
-    stream = FileRoom(frames.nbytes) if in_file(frames) else io.BytesIO()
+    # in memory, because on a full disk NumPy's writer does not report why it failed
+    stream = FileBuffer(frames.nbytes) if in_file(frames) else io.BytesIO()
     tags: list[tuple[Any, ...]] = []
     if facts.camera:
         tags.append((_MODEL, "s", 0, facts.camera, True))
     if facts.exposure is not None:
         tags.append((_EXPOSURE_TIME, "2I", 1, (round(_RATIONAL * facts.exposure), _RATIONAL), True))
-    if facts.place is not None:
-        tags += facts.place.tags()
+    if facts.georeference is not None:
+        tags += facts.georeference.tags()
     scale: dict[str, Any] = {}
     if facts.pitch is not None:
         scale = {"resolution": (1e-2 / facts.pitch,) * 2, "resolutionunit": "CENTIMETER"}
     with tifffile.TiffWriter(stream) as file:
-        for k, frame in enumerate(frame for _, some in parts(frames) for frame in some):
+        for k, frame in enumerate(frame for _, part in parts(frames) for frame in part):
             about = json.dumps(facts.page(k))
             file.write(
                 frame,
@@ -329,30 +342,30 @@ def tiff(frames: np.ndarray, facts: FrameFacts) -> bytes | memoryview:
                 extratags=tags,
                 **scale,
             )
-    return stream.contents() if isinstance(stream, FileRoom) else stream.getvalue()
+    return stream.contents() if isinstance(stream, FileBuffer) else stream.getvalue()
 
 
 FRAME_FORMATS = ExtensionTable[Callable[[np.ndarray, FrameFacts], bytes | memoryview]]("frame_formats", {"tiff": tiff})
-"""Ending of a file of recorded frames -> its contents, of frames uint16 (N, H, W) and what is known of them. A new one
-is added here.
+"""File extension -> function that writes (N, H, W) uint16 frames and their description in this format. New formats are
+added here.
 """
 
 
 def frame_files(
     name: str, frames: np.ndarray, facts: FrameFacts, stretch: float | None = SPOT_STRETCH
 ) -> Iterator[tuple[str, bytes | memoryview]]:
-    """(file, contents) of everything that a run folder has of recorded frames: all formats, and a picture to look at.
+    """Yield (path, content) of all files that a run folder has of recorded frames: every format, and a picture.
 
     Parameters
     ----------
     name : str
-        Of the frames.
-    frames : np.ndarray
-        uint16 (N, H, W).
+        Name of the frames.
+    frames : (N, H, W) ndarray of uint16
+        Recorded frames.
     facts : FrameFacts
-        What is known of them.
+        Description of the frames.
     stretch : float | None
-        Of the picture, see ``preview``.
+        Steepness of the picture's grey scale, see ``preview``.
     """
     for ending, contents in FRAME_FORMATS.items():
         yield f"images/{name}.{ending}", contents(frames, facts)
@@ -360,7 +373,10 @@ def frame_files(
 
 
 def preview(frames: np.ndarray, stretch: float | None = SPOT_STRETCH) -> np.ndarray:
-    """Eight-bit picture of the mean of frames (N, H, W), enlarged; ``stretch`` None keeps grey values in proportion."""
+    """Return a magnified 8-bit picture of the mean of (N, H, W) frames.
+
+    ``stretch`` is the steepness of an asinh grey scale; None gives a linear one.
+    """
     mean = mean_of(frames) if in_file(frames) else frames.mean(axis=0)
     low, high = (np.percentile(mean, 5) if stretch else mean.min()), mean.max()
     level = np.clip((mean - low) / max(high - low, 1.0), 0.0, 1.0)
@@ -371,7 +387,7 @@ def preview(frames: np.ndarray, stretch: float | None = SPOT_STRETCH) -> np.ndar
 
 
 def preview_png(frames: np.ndarray, stretch: float | None = SPOT_STRETCH) -> bytes:
-    """``preview`` as a PNG file."""
+    """Return ``preview`` as a PNG file."""
     return bytes(cv2.imencode(".png", preview(frames, stretch))[1].tobytes())
 
 
@@ -382,32 +398,32 @@ FITS_UNITS: Mapping[str, str] = FrozenMap(
         **{"K/m": "K/m", "m/s": "m/s", "1/m": "m-1", "1/mm": "mm-1", "DN": "adu", "px": "pixel", "photons": "photon"},
     }
 )
-"""Unit as the program writes it -> as FITS 4.0 does, of those that FITS has."""
+"""Unit as the program writes it -> as FITS 4.0 does, for the units that FITS has."""
 ASCII_SIGNS: Mapping[str, str] = FrozenMap(
     {"Δ": "d ", "σ": "sigma", "χ²": "chi2", "µ": "u", "\N{GREEK SMALL LETTER MU}": "u", "α": "alpha", "β": "beta"}
     | {"γ": "gamma", "°": "deg", "±": "+-", "×": "x", "\N{MINUS SIGN}": "-", "…": "..."}
 )
-"""Signs of reports -> what stands for them where only ASCII may stand."""
+"""Signs used in reports -> their replacement where only ASCII is allowed."""
 
 
 class MissingPackage(Exception):
-    """A format needs a package that is not installed; the message says which and how to get it."""
+    """Missing package of a file format; the message names it and how to install it."""
 
 
 @dataclass(frozen=True, eq=False)
 class DataColumn:
-    """A column.
+    """Column of a data table.
 
     Attributes
     ----------
     name : str
-        Of it.
-    values : np.ndarray
-        (N,) float64, where NaN is none; int64; or texts, where None is none.
+        Name of the column.
+    values : (N,) ndarray
+        Values as float64 (NaN is missing), int64, or texts (None is missing).
     unit : str
-        Of the numbers as the program writes it, empty for pure numbers and texts.
+        Unit of the numbers as the program writes it; empty for pure numbers and texts.
     description : str
-        What it holds.
+        Meaning of the values.
     """
 
     name: str
@@ -417,14 +433,14 @@ class DataColumn:
 
     @classmethod
     def of(cls, name: str, values: Sequence[Any], unit: str, description: str) -> DataColumn:
-        """Make a column of plain values: numbers, whole where all are, or texts; None where there is none."""
-        there = [value for value in values if value is not None]
-        whole = bool(there) and all(isinstance(value, bool | int) for value in there)
-        if whole and len(there) == len(values) and all(-(2**63) <= value < 2**63 for value in there):
+        """Make a column from plain values: numbers (integers if all are) or texts; None is missing."""
+        known = [value for value in values if value is not None]
+        whole = bool(known) and all(isinstance(value, bool | int) for value in known)
+        if whole and len(known) == len(values) and all(-(2**63) <= value < 2**63 for value in known):
             return cls(name, np.array(values, np.int64), unit, description)
-        # a float64 would change the digits of larger whole numbers
-        exact = not whole or all(abs(value) <= 2**53 for value in there)
-        if there and exact and all(isinstance(value, bool | int | float) for value in there):
+        # float64 would change the digits of larger integers
+        exact = not whole or all(abs(value) <= 2**53 for value in known)
+        if known and exact and all(isinstance(value, bool | int | float) for value in known):
             numbers = [math.nan if value is None else float(value) for value in values]
             return cls(name, np.array(numbers, np.float64), unit, description)
         texts = np.array([None if value is None else str(value) for value in values], object)
@@ -432,25 +448,25 @@ class DataColumn:
 
     @property
     def plain(self) -> list[Any]:
-        """The values as plain data, None where there is none."""
+        """Values as plain data; None is missing."""
         values = self.values.tolist()
         return [None if isinstance(value, float) and math.isnan(value) else value for value in values]
 
 
 @dataclass(frozen=True, eq=False)
 class DataTable:
-    """A table.
+    """Table for other programs.
 
     Attributes
     ----------
     name : str
-        Of it and of its file.
+        Name of the table and of its file.
     title : str
-        What it is.
-    columns : tuple[DataColumn, ...]
-        Of one length, their names all different.
-    facts : Mapping[str, str]
-        What else is to be known: name -> text.
+        Title of the table.
+    columns : tuple of DataColumn
+        Columns of one length with different names.
+    facts : mapping of str to str
+        Further facts: name -> text.
     """
 
     name: str
@@ -459,23 +475,23 @@ class DataTable:
     facts: Mapping[str, str] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
-        """Refuse columns that make no table."""
+        """Raise ValueError if lengths of columns differ or names repeat."""
         names = [column.name for column in self.columns]
         if len(set(names)) < len(names) or len({len(column.values) for column in self.columns}) != 1:
-            raise ValueError(f"table {self.name!r}: columns of one length with different names are needed")
+            raise ValueError(f"table {self.name!r}: columns must have the same length and different names")
 
     @property
     def rows(self) -> int:
-        """How many."""
+        """Number of rows."""
         return len(self.columns[0].values)
 
     def column(self, name: str) -> DataColumn:
-        """The column of that name.
+        """Return the column of that name.
 
         Raises
         ------
         KeyError
-            There is none.
+            No column has this name.
         """
         for column in self.columns:
             if column.name == name:
@@ -484,11 +500,13 @@ class DataTable:
 
 
 def _csv(table: DataTable) -> bytes:
+    """Return a table as CSV, with units in the heads."""
     heads = [f"{column.name} [{column.unit}]" if column.unit else column.name for column in table.columns]
     return csv_table([heads, *zip(*(column.plain for column in table.columns), strict=True)])
 
 
 def _parquet(table: DataTable) -> bytes:
+    """Return a table as a Parquet file."""
     try:
         import pyarrow
         from pyarrow import parquet
@@ -510,11 +528,12 @@ def _parquet(table: DataTable) -> bytes:
 
 
 def _writer() -> str:
+    """Return the name and version of this program."""
     return f"{WRITER} {importlib.metadata.version(WRITER)}"
 
 
 def ascii_text(text: str) -> str:
-    """A text in the printable characters that FITS takes."""
+    """Return a text in the printable ASCII characters that FITS allows."""
     for sign, word in ASCII_SIGNS.items():
         text = text.replace(sign, word)
     plain = unicodedata.normalize("NFKD", text).encode("ascii", "backslashreplace").decode()
@@ -522,7 +541,8 @@ def ascii_text(text: str) -> str:
 
 
 def _fits(table: DataTable) -> bytes:
-    # takes longer to import than all other formats
+    """Return a table as a FITS file with one binary table."""
+    # imported here, since this takes longer than for all other formats
     from astropy.io import fits
 
     columns = []
@@ -534,7 +554,7 @@ def _fits(table: DataTable) -> bytes:
         columns.append(fits.Column(ascii_text(column.name), sort, FITS_UNITS.get(column.unit), array=values))
     primary, unit = fits.PrimaryHDU(), fits.BinTableHDU.from_columns(columns, name=ascii_text(table.name))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", fits.verify.VerifyWarning)  # of long texts, which are continued
+        warnings.simplefilter("ignore", fits.verify.VerifyWarning)  # about long texts, which are continued
         for k, column in enumerate(table.columns, start=1):
             also = f" [{column.unit}]" if column.unit and column.unit not in FITS_UNITS else ""
             unit.header[f"TCOMM{k}"] = ascii_text(column.description + also)
@@ -551,4 +571,6 @@ def _fits(table: DataTable) -> bytes:
 TABLE_FORMATS = ExtensionTable[Callable[[DataTable], bytes]](
     "table_formats", {"csv": _csv, "parquet": _parquet, "fits": _fits}
 )
-"""Ending of a file of a table -> its contents; raises MissingPackage. A new one is added here."""
+"""File extension -> function that writes a table in this format; it may raise MissingPackage. New formats are added
+here.
+"""

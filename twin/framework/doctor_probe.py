@@ -1,9 +1,9 @@
 """Small jobs that `twin.doctor` runs in a child process.
 
-`python -m twin.framework.doctor_probe kernel|render|gpu [VARIANT]` is one of them.
+Run ``python -m twin.framework.doctor_probe kernel|render|gpu [VARIANT]``.
 
-A bad LLVM does not raise, it aborts the process; that is why these run apart. Each job writes one line of JSON on
-stdout.
+An unsuitable LLVM aborts the process instead of raising an error, so these jobs run in their own process. Each job
+writes one line of JSON to stdout.
 """
 
 import importlib
@@ -16,7 +16,7 @@ import numpy as np
 import optics  # noqa: F401  (names the LLVM library before drjit is imported)
 
 ULPS = 8
-"""Tolerance of the kernel's results against numpy, in units of float64's spacing: the last bits of atan2 may differ."""
+"""Tolerance of the kernel's results against NumPy, in spacings of float64: the last bits of atan2 may differ."""
 
 
 def kernel(backend: str = "llvm") -> dict[str, Any]:
@@ -38,11 +38,11 @@ def kernel(backend: str = "llvm") -> dict[str, Any]:
     x = np.linspace(-2.0, 2.0, 1001)
     y = np.linspace(0.5, 1.5, 1001)
     a, b = dr.opaque(float64, 0.0) + float64(x), dr.opaque(float64, 0.0) + float64(y)
-    found = dr.maximum(a, b) + dr.minimum(a, 1.0) + dr.clip(a, -1.0, 1.0) + dr.safe_sqrt(a) + dr.atan2(a, b)
+    result = dr.maximum(a, b) + dr.minimum(a, 1.0) + dr.clip(a, -1.0, 1.0) + dr.safe_sqrt(a) + dr.atan2(a, b)
     expected = (
         np.maximum(x, y) + np.minimum(x, 1.0) + np.clip(x, -1.0, 1.0) + np.sqrt(np.maximum(x, 0.0)) + np.arctan2(x, y)
     )
-    error = float(np.max(np.abs(np.asarray(found.numpy()) - expected)))
+    error = float(np.max(np.abs(np.asarray(result.numpy()) - expected)))
     if not error <= ULPS * np.spacing(np.max(np.abs(expected))):
         raise RuntimeError(f"the kernel's results differ from numpy's by {error:.3g}")
     version = dr.detail.llvm_version() if backend == "llvm" else dr.detail.cuda_version()
@@ -96,7 +96,7 @@ def render(variant: str = "llvm_ad_mono") -> dict[str, Any]:
 
 
 def gpu() -> dict[str, Any]:
-    """Say whether Dr.Jit can use an NVIDIA GPU, and if so run the kernel on it."""
+    """Report whether Dr.Jit can use an NVIDIA GPU, and if so run the kernel on it."""
     import drjit as dr
 
     if not dr.has_backend(dr.JitBackend.CUDA):

@@ -1,8 +1,8 @@
-"""Files and folders that outlive a failure of the power, and what waits for a signal that asks the program to end.
+"""Writing of files and folders that survive a power failure, and handling of signals that end the program.
 
-A file system may keep what is written in memory for half a minute, and write names before what they stand for. So
-whatever is to be relied on is written through (``fsync``) before the name that vouches for it: files before their
-folder, a folder before it is renamed, the folder it stands in afterwards.
+A file system may keep written data in memory for half a minute, and may write names before the data they refer to. Data
+that must be reliable is therefore written through (``fsync``) before the name that vouches for it: files before their
+folder, a folder before it is renamed, and its parent folder afterwards.
 """
 
 from __future__ import annotations
@@ -19,20 +19,23 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 PARTIAL = ".partial"
-"""Ending of a file that is being written."""
+"""Extension of a file that is being written."""
 PARTIAL_NAME = r"\.[^/]+\.[0-9a-f]{8}\.partial"
-"""Pattern of the name of such a file: two processes that write the same file do not share it."""
+"""Pattern of the name of a file that is being written; its random token keeps two processes that write the same file
+apart.
+"""
 AT_ONCE = 8
-"""Files written through at once: the disk's journal takes many in one go."""
+"""Number of files written through at once: the disk's journal takes many in one step."""
 _EXCHANGE, _HERE = 2, -100
 """RENAME_EXCHANGE and AT_FDCWD of renameat2(2)."""
 _NO_EXCHANGE = (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP)
 _NOT_FOR_FOLDERS = (errno.EINVAL, errno.EOPNOTSUPP, errno.EBADF)
-"""What file systems that know no fsync of a folder answer, those of a network for instance."""
+"""Error numbers of file systems that have no fsync of a folder, for instance those of a network."""
 
 
-def _sync(place: Path, kind: int) -> None:
-    file = os.open(place, os.O_RDONLY | kind | os.O_CLOEXEC)
+def _sync(path: Path, kind: int) -> None:
+    """Write a file or folder through to the disk."""
+    file = os.open(path, os.O_RDONLY | kind | os.O_CLOEXEC)
     try:
         os.fsync(file)
     except OSError as error:
@@ -42,108 +45,109 @@ def _sync(place: Path, kind: int) -> None:
         os.close(file)
 
 
-def sync_file(place: Path) -> None:
-    """Write a file's content through to the disk. Raises OSError."""
-    _sync(place, os.O_NOFOLLOW)
+def sync_file(path: Path) -> None:
+    """Write the content of a file through to the disk. Raises OSError."""
+    _sync(path, os.O_NOFOLLOW)
 
 
-def sync_folder(place: Path) -> None:
+def sync_folder(path: Path) -> None:
     """Write the names in a folder through to the disk. Raises OSError."""
-    _sync(place, os.O_DIRECTORY)
+    _sync(path, os.O_DIRECTORY)
 
 
-def sync_tree(place: Path) -> None:
-    """Write a folder with all that is below it through to the disk, the files first, itself last. Raises OSError."""
-    tree = [(Path(folder), names) for folder, _, names in os.walk(place)]
+def sync_tree(path: Path) -> None:
+    """Write a folder and everything below it through to the disk, the folder itself last. Raises OSError."""
+    tree = [(Path(folder), names) for folder, _, names in os.walk(path)]
     files = [folder / name for folder, names in tree for name in names if not (folder / name).is_symlink()]
     with ThreadPoolExecutor(AT_ONCE) as pool:
         list(pool.map(sync_file, files))
         list(pool.map(sync_folder, [folder for folder, _ in tree[1:]]))
-    sync_folder(place)
+    sync_folder(path)
 
 
-def make_folders(place: Path) -> list[Path]:
-    """Make a folder and those above it that are missing, so that they outlive a failure of the power.
+def make_folders(path: Path) -> list[Path]:
+    """Make a folder and its missing parents so that they survive a power failure.
 
     Returns
     -------
-    list[Path]
-        Those that were made, the deepest first.
+    list of Path
+        Folders that were made, the deepest first.
 
     Raises
     ------
     OSError
-        One cannot be made.
+        A folder cannot be made.
     """
-    missing = [folder for folder in (place, *place.parents) if not folder.exists()]
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     for folder in reversed(missing):
         folder.mkdir(exist_ok=True)
         sync_folder(folder.parent)
     return missing
 
 
-def write_safely(place: Path, content: bytes) -> None:
-    """Write a file so that under its name it is whole or not there, whenever the power fails.
+def write_safely(path: Path, content: bytes) -> None:
+    """Write a file so that it is complete or absent under its name, even after a power failure.
 
-    Until then it is a hidden file beside its place with a name as ``PARTIAL_NAME``.
+    Until it is complete it is a hidden file in the same folder with a name as in ``PARTIAL_NAME``.
 
     Parameters
     ----------
-    place : Path
-        Of the file; its folder is there.
+    path : Path
+        Path of the file; its folder exists.
     content : bytes
-        Of the file.
+        Content of the file.
 
     Raises
     ------
     OSError
-        The disk is full, or gone.
+        The disk is full or missing.
     """
-    write_all_safely([(place, content)])
+    write_all_safely([(path, content)])
 
 
 def write_all_safely(files: Iterable[tuple[Path, bytes]]) -> None:
-    """Write several files with their contents as ``write_safely`` does; their folders are there.
+    """Write several files as ``write_safely`` does; their folders exist.
 
     Raises
     ------
     OSError
-        The disk is full, or gone; some may be there.
+        The disk is full or missing; some of the files may have been written.
     """
-    every = list(files)
+    pending = list(files)
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        list(pool.map(_write_one, every))
-    for folder in {place.parent for place, _ in every}:
+        list(pool.map(_write_one, pending))
+    for folder in {path.parent for path, _ in pending}:
         sync_folder(folder)
 
 
 def _write_one(file: tuple[Path, bytes]) -> None:
-    place, content = file
-    partial = place.with_name(f".{place.name}.{secrets.token_hex(4)}{PARTIAL}")
+    """Write one file through to the disk under a temporary name and rename it."""
+    path, content = file
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PARTIAL}")
     try:
         with partial.open("wb") as out:
             out.write(content)
             out.flush()
             os.fsync(out.fileno())
-        partial.replace(place)
+        partial.replace(path)
     except OSError:
-        with suppress(OSError):  # its place is wanted for what can be kept
+        with suppress(OSError):  # frees the space for data that can be kept
             partial.unlink(missing_ok=True)
         raise
 
 
 def exchange(first: Path, second: Path) -> bool:
-    """Let two folders of one file system change places in one step: at no time is either name without one.
+    """Exchange the names of two folders of one file system atomically.
 
     Returns
     -------
     bool
-        Whether it was done; not where the system or the file system does not know it.
+        True if done; False if the operating system or the file system does not support it.
 
     Raises
     ------
     OSError
-        One of them is not there, or must not be renamed.
+        A folder is missing or must not be renamed.
     """
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if rename is None:
@@ -157,24 +161,24 @@ def exchange(first: Path, second: Path) -> bool:
 
 
 def put_in_place(new: Path, target: Path, aside: Path) -> None:
-    """Put a folder in the place of another, which then stands aside; ``new`` is written through.
+    """Replace a folder by another and move the former aside; ``new`` must already be written through.
 
-    A program that is killed meanwhile leaves the target as it was, or as it shall be. Only where folders cannot change
-    places in one step it may leave none there; both then stand beside it.
+    A program that is killed meanwhile leaves the target either old or new. Only where folders cannot be exchanged
+    atomically it may leave no target; both folders then exist beside it.
 
     Parameters
     ----------
     new : Path
-        What shall stand at ``target``.
+        Folder to put at ``target``.
     target : Path
-        There is a folder.
+        Existing folder to replace.
     aside : Path
-        Nothing is there.
+        Free path for the former target.
 
     Raises
     ------
     OSError
-        It cannot be done; all is as it was.
+        The replacement failed; nothing has changed.
     """
     if exchange(new, target):
         try:
@@ -189,18 +193,19 @@ def put_in_place(new: Path, target: Path, aside: Path) -> None:
         except BaseException:
             os.rename(aside, target)
             raise
-    # what stands aside is removed next, which must not reach the disk before this
+    # the former target is removed next, which must not reach the disk before this
     sync_folder(target.parent)
 
 
 def ending_signals() -> tuple[signal.Signals, ...]:
-    """Signals that ask the program to end, Ctrl-C aside. SIGHUP does not when ``nohup`` has started it."""
+    """Return the signals that end the program, except Ctrl-C; without SIGHUP if ``nohup`` started it."""
     asked = (signal.SIGTERM, signal.SIGHUP)
     return tuple(number for number in asked if signal.getsignal(number) != signal.SIG_IGN)
 
 
 @contextmanager
 def _handled(asked: Iterable[int], handler: Callable[[int, object], None]) -> Iterator[None]:
+    """Install a signal handler inside the block."""
     before = {number: signal.signal(number, handler) for number in asked}
     try:
         yield
@@ -211,9 +216,10 @@ def _handled(asked: Iterable[int], handler: Callable[[int, object], None]) -> It
 
 @contextmanager
 def exit_on_terminate() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end the program as an exception, as Ctrl-C does, so that a half-written run folder is
-    removed. The exception that leaves the block is the signal's whatever became of it on its way: compiled modules turn
-    one that comes while they are imported or call back into their own, and clearing up may fail after it.
+    """Let SIGTERM and SIGHUP end the program as an exception, as Ctrl-C does, so that a partial run folder is removed.
+
+    The exception that leaves the block is always that of the signal: compiled modules turn one that arrives while they
+    are imported or call back into an exception of their own, and clean-up may fail after it.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -224,7 +230,7 @@ def exit_on_terminate() -> Iterator[None]:
         got.append(number)
         if number == signal.SIGINT:
             raise KeyboardInterrupt
-        if len(got) == 1:  # a second one must not break off the clearing up
+        if len(got) == 1:  # a second signal must not interrupt the clean-up
             raise SystemExit(128 + number)
 
     interrupt = (signal.SIGINT,) if signal.getsignal(signal.SIGINT) is signal.default_int_handler else ()
@@ -239,7 +245,7 @@ def exit_on_terminate() -> Iterator[None]:
 
 @contextmanager
 def ending_later() -> Iterator[None]:
-    """Heed Ctrl-C and signals that ask to end when the block is over, of what cannot be broken off."""
+    """Delay Ctrl-C and ending signals until the end of the block, for work that must not be interrupted."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,4 +1,4 @@
-"""Finished pieces of a command's work, one appended table of them, from which it goes on after any end."""
+"""Journal of finished pieces of a command's work, an append-only file from which an interrupted command continues."""
 
 from __future__ import annotations
 
@@ -19,38 +19,39 @@ from twin.framework import durable, owned_files, provenance
 from twin.framework.run_folder import RunFolderError, reason
 
 UNREADABLE = (ValueError, KeyError, TypeError, AttributeError, RecursionError)
-"""What a line raises that this program has not written, although its checksum is right."""
+"""Exceptions raised by a line that this program has not written although its checksum is right."""
 
 
 class Journal:
-    """Context manager over a file with a line for each finished piece of work.
+    """Context manager over a file with one line for each finished piece of work.
 
-    A piece is on the disk (``fsync``) when ``keep`` returns. Every line begins with its own checksum, so that one that
-    was half written when the power failed, or was damaged since, is seen and left out. The first line says what the
-    work is about, and by which program it is done: numbers of two of them do not mix.
+    A piece is on the disk (``fsync``) when ``keep`` returns. Every line begins with its own checksum, so that a line
+    that was partly written at a power failure, or damaged later, is detected and skipped. The first line identifies the
+    work and the program version, because results of two versions must not be mixed.
 
     Parameters
     ----------
     file
-        Of the journal, made with the first piece; None keeps nothing.
+        File of the journal, made with the first piece; None keeps nothing.
     about
-        All that the results depend on but for the program.
+        Text of everything except the program that the results depend on.
     noun
-        What the work is, for messages.
+        Name of the work in messages.
     classes
-        Dataclasses that pieces consist of.
+        Dataclasses that occur in pieces.
 
     Attributes
     ----------
     known
-        Key -> piece, those that the file held and those that were kept since.
+        Key -> piece, read from the file or kept since.
     damaged
-        Number of lines that are not as they were written.
+        Number of damaged lines.
 
     Raises
     ------
     RunFolderError
-        On entering, the file is about other work, or of another program; then and later, it cannot be used.
+        On entry: the file belongs to other work or another version of the program. At any time: the file cannot be
+        used.
     """
 
     def __init__(self, file: Path | None, about: str, noun: str, classes: Sequence[type[Any]]) -> None:
@@ -62,12 +63,12 @@ class Journal:
         self._begun = False
 
     def __enter__(self) -> Journal:
-        """Read what is there."""
+        """Open the file and read its pieces."""
         try:
             if self.file is not None and os.path.lexists(self.file):
                 self._out = os.fdopen(os.open(self.file, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC), "r+b")
                 content = self._out.read()
-                # the last line of a process that was killed, or of a failure of the power, has no end
+                # after a kill or a power failure the last line may be incomplete
                 whole = content[: content.rfind(b"\n") + 1]
                 self._out.seek(len(whole))
                 self._out.truncate()
@@ -89,21 +90,22 @@ class Journal:
 
     def _close(self) -> None:
         if self._out is not None:
-            with suppress(OSError):  # what could not be written has been told
+            with suppress(OSError):  # a failure to write has been reported
                 self._out.close()
 
     def keep(self, pieces: Mapping[str, Any]) -> None:
-        """Keep finished pieces by their keys."""
+        """Append finished pieces with their keys."""
         if self.file is not None and pieces:
             lines = [{"of": key, "is": _encoded(piece)} for key, piece in pieces.items()]
             try:
                 self._write(self.file, lines if self._begun else [self._head(), *lines])
             except OSError as error:
-                text = f"{self.file}: {reason(error)}; what it holds is kept, go on with --resume"
+                text = f"{self.file}: {reason(error)}; the finished work in it is kept, continue with --resume"
                 raise RunFolderError(text) from error
         self.known.update(pieces)
 
     def _write(self, file: Path, lines: Sequence[Any]) -> None:
+        """Append lines and write them through to the disk."""
         if self._out is None:
             durable.make_folders(file.parent)
             self._out = file.open("xb")
@@ -115,14 +117,15 @@ class Journal:
             self._begun = True
 
     def _head(self) -> dict[str, Any]:
+        """Return the first line: what the results depend on."""
         return {"about": self._about, "versions": provenance.versions(), "sources": provenance.sources()}
 
     def _check(self, head: Any) -> None:
-        """Refuse to go on with other work, or with that of another program."""
-        remedy = "begin anew without --resume, or choose another --out"
+        """Raise RunFolderError if the journal belongs to other work or another version of the program."""
+        remedy = "start again without --resume, or choose another --out"
         try:
             if head["about"] != self._about:
-                text = f"{self.file} holds another {self.noun}: what its results depend on differs"
+                text = f"{self.file} holds another {self.noun}: the inputs of its results differ"
                 raise RunFolderError(f"{text}; {remedy}")
             changed = _changes(
                 head["versions"], provenance.versions(), lambda *names: "{} was {} and is {}".format(*names)
@@ -132,8 +135,8 @@ class Journal:
             raise RunFolderError(f"{self.file} cannot be read; {remedy}") from None
         if changed:
             raise RunFolderError(
-                f"{self.file} was begun with another version of the program, whose results would stand beside new ones "
-                f"(changed: {owned_files.first_names(changed)}); go on with the program as it was, or {remedy}"
+                f"{self.file} was started with another version of the program, and results of two versions do not mix "
+                f"(changed: {owned_files.first_names(changed)}); continue with the former version, or {remedy}"
             )
 
 
@@ -143,14 +146,14 @@ def read_pieces(content: bytes, classes: Sequence[type[Any]]) -> tuple[Any, dict
     Parameters
     ----------
     content : bytes
-        Whole lines.
-    classes : Sequence[type[Any]]
-        Dataclasses that pieces consist of.
+        Complete lines.
+    classes : sequence of type
+        Dataclasses that occur in pieces.
 
     Returns
     -------
-    tuple[Any, dict[str, Any], int]
-        The first line, None where it is damaged; the pieces by their keys; number of damaged lines.
+    tuple
+        The first line (None if it is damaged), the pieces by their keys, and the number of damaged lines.
     """
     lines = [_parsed(line) for line in content.split(b"\n")[:-1]]
     known: dict[str, Any] = {}
@@ -165,12 +168,13 @@ def read_pieces(content: bytes, classes: Sequence[type[Any]]) -> tuple[Any, dict
 
 
 def _line(data: Any) -> bytes:
+    """Return a line with its checksum."""
     text = json.dumps(data).encode()
     return b"%s %s\n" % (_checksum(text), text)
 
 
 def _parsed(line: bytes) -> Any:
-    """The data of a line; None when it is not as it was written."""
+    """Return the data of a line, or None if it is damaged."""
     check, _, text = line.partition(b" ")
     try:
         return json.loads(text) if check == _checksum(text) else None
@@ -179,16 +183,18 @@ def _parsed(line: bytes) -> Any:
 
 
 def _checksum(text: bytes) -> bytes:
+    """Return the first 16 hexadecimal digits of a line's SHA-256."""
     return hashlib.sha256(text).hexdigest()[:16].encode()
 
 
-def _changes(before: Mapping[str, str], now: Mapping[str, str], told: Callable[[str, str, str], str]) -> list[str]:
-    pairs = [(name, before.get(name, "not there"), now.get(name, "not there")) for name in sorted({*before, *now})]
-    return [told(name, old, new) for name, old, new in pairs if old != new]
+def _changes(before: Mapping[str, str], now: Mapping[str, str], describe: Callable[[str, str, str], str]) -> list[str]:
+    """Return a text for each entry that differs between two mappings."""
+    pairs = [(name, before.get(name, "missing"), now.get(name, "missing")) for name in sorted({*before, *now})]
+    return [describe(name, old, new) for name, old, new in pairs if old != new]
 
 
 def _encoded(value: Any) -> Any:
-    """Plain data that hold every bit of a piece."""
+    """Return a piece as plain data that keep every bit."""
     if isinstance(value, np.ndarray):
         data = base64.b64encode(np.ascontiguousarray(value).tobytes()).decode("ascii")
         return {"array": str(value.dtype), "shape": list(value.shape), "data": data}
@@ -198,20 +204,21 @@ def _encoded(value: Any) -> Any:
             "with": {f.name: _encoded(getattr(value, f.name)) for f in fields(value)},
         }
     if isinstance(value, Mapping):
-        return {"map": {key: _encoded(one) for key, one in value.items()}}
+        return {"map": {key: _encoded(item) for key, item in value.items()}}
     if isinstance(value, tuple):
-        return [_encoded(one) for one in value]
+        return [_encoded(item) for item in value]
     return float(value) if isinstance(value, np.floating) else value
 
 
 def _decoded(value: Any, classes: Mapping[str, type[Any]]) -> Any:
+    """Return the piece that was encoded as plain data."""
     if isinstance(value, list):
-        return tuple(_decoded(one, classes) for one in value)
+        return tuple(_decoded(item, classes) for item in value)
     if not isinstance(value, dict):
         return value
     if "array" in value:
         flat = np.frombuffer(base64.b64decode(value["data"]), dtype=value["array"])
         return flat.reshape(value["shape"]).copy()
     if "class" in value:
-        return classes[value["class"]](**{key: _decoded(one, classes) for key, one in value["with"].items()})
-    return FrozenMap({key: _decoded(one, classes) for key, one in value["map"].items()})
+        return classes[value["class"]](**{key: _decoded(item, classes) for key, item in value["with"].items()})
+    return FrozenMap({key: _decoded(item, classes) for key, item in value["map"].items()})

@@ -1,4 +1,7 @@
-"""Reading the lock files in docs/supply/lock: what setup.sh installs, and what is installed other than that."""
+"""Reader of the lock files in docs/supply/lock, which list the packages that setup.sh installs.
+
+The installed packages can be compared with these lists.
+"""
 
 from __future__ import annotations
 
@@ -11,36 +14,36 @@ from pathlib import Path
 from packaging.markers import Marker
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "supply" / "lock"
-"""Beside the source; an installed wheel has none."""
+"""Folder of the lock files beside the source; an installed wheel has none."""
 LAYERS = ("install", "runtime", "live", "test", "peers")
-"""Files of the lock. A later one has only what it adds; the peers are in a folder of their own."""
+"""Lock files in order. Each has only the packages that it adds; the peers are installed in a folder of their own."""
 _PIN = re.compile(r"([A-Za-z0-9._-]+)==([^\s;\\]+)\s*(?:;\s*(.*?))?\s*\\?$")
 _HASH = re.compile(r"--hash=sha256:([0-9a-f]{64})\s*\\?$")
 
 
 class LockError(Exception):
-    """A lock file that is not what pip and this module read; the message names its line."""
+    """Malformed lock file; the message gives the line."""
 
 
 @dataclass(frozen=True)
 class Locked:
-    """One package of a lock file.
+    """Package of a lock file.
 
     Attributes
     ----------
     name : str
-        As the index has it, in lower case with hyphens.
+        Name as in the package index, in lower case with hyphens.
     version : str
-        The only one that is installed.
+        Version that is installed.
     marker : str
-        For which Python and platform, as pip reads it; empty for all.
-    hashes : tuple[str, ...]
-        SHA-256 of the files that are accepted, hexadecimal.
-    asked_by : tuple[str, ...]
-        Names of the packages that need it; the project's own stands for what pyproject.toml names; empty for what is
-        named in a list of its own.
+        Environment marker (Python version, platform) in pip's syntax; empty for all.
+    hashes : tuple of str
+        Hexadecimal SHA-256 of the accepted files.
+    asked_by : tuple of str
+        Names of the packages that need it; the project's own name stands for pyproject.toml; empty if a separate list
+        names it.
     layer : str
-        The file, one of `LAYERS`.
+        Lock file, one of `LAYERS`.
     """
 
     name: str
@@ -52,88 +55,88 @@ class Locked:
 
     @property
     def here(self) -> bool:
-        """Whether this Python on this platform is meant."""
+        """True if the marker includes this Python on this platform."""
         return not self.marker or Marker(self.marker).evaluate()
 
 
 def normal(name: str) -> str:
-    """A package's name as the lock has it."""
+    """Return a package name in the spelling of the lock files."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
 def read_layer(layer: str, folder: Path = FOLDER) -> tuple[Locked, ...]:
-    """The packages of one file.
+    """Read the packages of one lock file.
 
     Parameters
     ----------
     layer : str
         One of `LAYERS`.
     folder : Path
-        Of the lock files.
+        Folder of the lock files.
 
     Raises
     ------
     LockError
-        a line that is neither a pin, nor a hash, nor a comment; a pin without a hash.
+        A line is not a pin, a hash or a comment, or a pin has no hash.
     OSError
-        No such file.
+        The file does not exist.
     """
     file = folder / f"{layer}.txt"
     return parse(file.read_text("utf-8"), layer, str(file))
 
 
 def parse(text: str, layer: str, file: str) -> tuple[Locked, ...]:
-    """The packages that the text of one file lists; `file` is for messages."""
-    found: list[Locked] = []
+    """Parse the text of a lock file into its packages; ``file`` appears in messages."""
+    packages: list[Locked] = []
     pin: re.Match[str] | None = None
     hashes: list[str] = []
-    asked: list[str] = []
+    dependants: list[str] = []
 
     def close(number: int) -> None:
         if pin is not None:
             if not hashes:
                 raise LockError(f"{file}:{number}: {pin[1]} has no hash")
-            found.append(Locked(normal(pin[1]), pin[2], pin[3] or "", tuple(hashes), tuple(asked), layer))
+            packages.append(Locked(normal(pin[1]), pin[2], pin[3] or "", tuple(hashes), tuple(dependants), layer))
 
     lines = text.splitlines()
     for number, line in enumerate(lines, 1):
         bare = line.strip()
         if not line[:1].isspace() and bare and not bare.startswith("#"):
             close(number - 1)
-            pin, hashes, asked = _PIN.match(bare), [], []
+            pin, hashes, dependants = _PIN.match(bare), [], []
             if pin is None:
                 raise LockError(f"{file}:{number}: not a pinned package: {bare}")
         elif bare.startswith("# via "):
-            askers = bare.removeprefix("# via ").split(", ")
-            asked += [normal(word.split(" (")[0]) for word in askers if not word.startswith("-r ")]
+            words = bare.removeprefix("# via ").split(", ")
+            dependants += [normal(word.split(" (")[0]) for word in words if not word.startswith("-r ")]
         elif bare and not bare.startswith("#"):
             digest = _HASH.match(bare)
             if digest is None:
                 raise LockError(f"{file}:{number}: not a hash: {bare}")
             hashes.append(digest[1])
     close(len(lines))
-    return tuple(found)
+    return tuple(packages)
 
 
 def read_lock(folder: Path = FOLDER, layers: Iterable[str] = LAYERS) -> tuple[Locked, ...]:
-    """All packages of some of the files, in their order. Raises what `read_layer` does."""
+    """Read the packages of several lock files, in their order. Raises the errors of `read_layer`."""
     return tuple(package for layer in layers for package in read_layer(layer, folder))
 
 
 @dataclass(frozen=True)
 class Differences:
-    """What this environment has other than the lock files.
+    """Differences between this environment and the lock files.
 
     Attributes
     ----------
     equal : int
-        Number of packages that are those of the lock.
-    missing : tuple[str, ...]
-        name==version of what the twin needs and is not there.
-    other : tuple[str, ...]
-        "name version, locked version".
-    unknown : tuple[str, ...]
-        Names that no file has, and that nobody checked therefore.
+        Number of packages whose version is that of the lock.
+    missing : tuple of str
+        Required packages that are not installed, as ``name==version``.
+    other : tuple of str
+        Packages of another version, as ``name version, locked version``.
+    unknown : tuple of str
+        Names of installed packages that no lock file lists, so that nobody has checked them.
     """
 
     equal: int
@@ -142,32 +145,32 @@ class Differences:
     unknown: tuple[str, ...]
 
 
-def differences(own: str, folder: Path = FOLDER) -> Differences:
-    """Compare what is installed here with the lock. What only --live and --test install may be missing.
+def differences(project: str, folder: Path = FOLDER) -> Differences:
+    """Compare the installed packages with the lock files; packages of --live and --test may be missing.
 
     Parameters
     ----------
-    own : str
-        Name of the project, which is in no lock.
+    project : str
+        Name of the project itself, which no lock file lists.
     folder : Path
-        Of the lock files.
+        Folder of the lock files.
 
     Raises
     ------
     LockError, OSError
-        As `read_layer`.
+        A lock file cannot be read, see `read_layer`.
     """
     installed = {normal(d.name): d.version for d in importlib.metadata.distributions() if d.name}
-    names, equal, missing, other = {own}, set(), [], []
+    names, equal, missing, other = {project}, set(), [], []
     for package in read_lock(folder, LAYERS[:-1]):
         if not package.here:
             continue
         names.add(package.name)
-        found = installed.get(package.name)
-        if found == package.version:
+        version = installed.get(package.name)
+        if version == package.version:
             equal.add(package.name)
-        elif found is not None:
-            other.append(f"{package.name} {found}, locked {package.version}")
+        elif version is not None:
+            other.append(f"{package.name} {version}, locked {package.version}")
         elif package.layer == "runtime":
             missing.append(f"{package.name}=={package.version}")
     return Differences(len(equal), tuple(missing), tuple(other), tuple(sorted(set(installed) - names)))

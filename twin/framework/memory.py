@@ -1,8 +1,8 @@
-"""Memory that a command may take, and the refusal of a job that needs more before anything of it is computed.
+"""Memory available to a command, and refusal of a job that needs more before anything is computed.
 
-A job that can need more than 2 GiB is estimated when it starts, from its numbers of pixels, frames, rays, points and
-runs alone (`require_memory`, `twin.monitor.monitor_memory`). Estimates are of the largest resident memory above that of
-the started program, and within a factor of 1.5 of what is used (tests/limits).
+A job that can need more than 2 GiB is estimated at its start, from its numbers of pixels, frames, rays, points and runs
+(`require_memory`, `twin.monitor.monitor_memory`). Estimates are of the largest resident memory above that of the
+started program, and are within a factor of 1.5 of the memory used (tests/limits).
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from typing import Protocol
 from scenes.yaml.errors import InputError, Issue, KeyPath, shown
 
 LIMIT = "TWIN_MEMORY"
-"""Environment variable with the memory that a command may take, as ``8 GB`` or ``500 MB``, in place of what is free."""
+"""Environment variable with the memory that a command may use, as ``8 GB`` or ``500 MB``; without it, the free memory.
+"""
 
 _AMOUNT = re.compile(r"\s*(?P<number>[0-9]{1,6}(\.[0-9]{1,3})?)\s*(?P<unit>MB|GB)\s*")
 _UNITS = {"MB": 1e6, "GB": 1e9}
@@ -27,36 +28,38 @@ _FREE, _PAGES = Path("/proc/meminfo"), Path("/proc/self/statm")
 _GROUP, _GROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 
 ORDINARY = 600e6
-"""A job that needs no more is never refused, bytes: what is free changes while other processes start, and what a study
-gives must not depend on that.
+"""Memory below which a job is never refused, in bytes: the free memory changes while other processes start, and results
+of a study must not depend on that.
 """
 STARTED = 290e6
-"""Memory of a job of any size beside the imported program: kernels, their compiler, what draws a report, and what the
-heap keeps of arrays that are freed; bytes.
+"""Memory of a job of any size beside the imported program, in bytes: kernels, their compiler, plotting, and freed
+arrays that the heap keeps.
 """
 
 
 def free_memory() -> float:
-    """Bytes that this process may still take: those of the environment variable, else what the system has free for it
-    and its control group and limits leave; infinite where nobody says.
+    """Return the memory that this process may still use, in bytes.
+
+    It is the value of the environment variable, else the least of the system's free memory and what the control group
+    and process limits leave; infinite if none of them is known.
 
     Raises
     ------
     InputError
-        The variable holds something else.
+        The environment variable is not an amount of memory.
     """
     named = os.environ.get(LIMIT)
     if named:
         amount = _AMOUNT.fullmatch(named)
         if amount is None:
-            problem = f"the environment variable {LIMIT} is no amount of memory"
+            problem = f"the environment variable {LIMIT} is not an amount of memory"
             raise InputError(Issue(problem, found=shown(named), allowed="a number with MB or GB, as 8 GB"))
         return float(amount["number"]) * _UNITS[amount["unit"]]
     return min(_of_system(), _of_group(), _of_limits())
 
 
 def _of_system() -> float:
-    """What the system says to be free for new work without swapping."""
+    """Return the memory that the system reports as available without swapping, in bytes."""
     try:
         lines = _FREE.read_text("ascii").splitlines()
         return 1024.0 * int(next(line for line in lines if line.startswith("MemAvailable:")).split()[1])
@@ -65,7 +68,7 @@ def _of_system() -> float:
 
 
 def _of_group() -> float:
-    """What the limits of the control group and of those above it leave."""
+    """Return the memory that the limits of the control group and its parents leave, in bytes."""
     least = float("inf")
     try:
         groups = [line.split(":", 2) for line in _GROUP.read_text("utf-8").splitlines()]
@@ -79,8 +82,8 @@ def _of_group() -> float:
             if not controllers
             else (_GROUPS / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes")
         )
-        place = root / path.lstrip("/")
-        for folder in (place, *place.parents):
+        start = root / path.lstrip("/")
+        for folder in (start, *start.parents):
             if folder != root and root not in folder.parents:
                 break
             limit, taken = _number(folder / most), _number(folder / used)
@@ -89,22 +92,23 @@ def _of_group() -> float:
 
 
 def _number(file: Path) -> float:
+    """Return the number in a file of a control group; infinite without a limit."""
     try:
         return float(file.read_text("ascii"))
-    except (OSError, ValueError):  # no such control group, or ``max``
+    except (OSError, ValueError):  # there is no such control group, or it has no limit (``max``)
         return float("inf")
 
 
 def _of_limits() -> float:
-    """What the limit of the process's addresses (``ulimit -v``) leaves."""
+    """Return the memory that the limit of the address space (``ulimit -v``) leaves, in bytes."""
     most = resource.getrlimit(resource.RLIMIT_AS)[0]
     if most == resource.RLIM_INFINITY:
         return float("inf")
-    return max(float(most) - _own(0), 0.0)
+    return max(float(most) - _process_memory(0), 0.0)
 
 
-def _own(which: int) -> float:
-    """Bytes of this process: of its addresses (0), or resident (1); 0 where the system does not say."""
+def _process_memory(which: int) -> float:
+    """Return the address space (0) or resident memory (1) of this process, in bytes; 0 if unknown."""
     try:
         return float(int(_PAGES.read_text("ascii").split()[which]) * resource.getpagesize())
     except (OSError, ValueError):
@@ -112,37 +116,43 @@ def _own(which: int) -> float:
 
 
 def largest_memory() -> float:
-    """Largest resident memory of this process so far, bytes."""
+    """Return the largest resident memory of this process so far, in bytes."""
     return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 PROGRAM = 140e6
-"""Resident memory of the imported program, bytes."""
+"""Resident memory of the imported program, in bytes."""
 
 
-def taken_already() -> float:
-    """Resident memory of this process beyond that of the imported program, bytes: kernels of jobs that it did before,
-    for instance, which the next job takes over.
+def reusable_memory() -> float:
+    """Return the resident memory of this process beyond that of the imported program, in bytes.
+
+    It includes kernels of earlier jobs, for instance, which the next job reuses.
     """
-    return max(_own(1) - PROGRAM, 0.0)
+    return max(_process_memory(1) - PROGRAM, 0.0)
 
 
 def amount_text(number: float) -> str:
-    """An amount of memory for people: ``3.1 GB``, ``420 MB``."""
+    """Format an amount of memory given in bytes: ``3.1 GB``, ``420 MB``."""
     return f"{1e-9 * number:.3g} GB" if number >= 1e9 else f"{1e-6 * number:.3g} MB"
 
 
 def largest(fits: Callable[[int], bool], most: int, least: int = 0) -> int:
-    """The largest whole number that fits, below one that does not.
+    """Find by bisection the largest whole number that satisfies a condition.
 
     Parameters
     ----------
-    fits : Callable[[int], bool]
-        Whether a number does; if it does, all smaller ones do.
+    fits : callable
+        Condition on a number; if it holds for a number, it holds for all smaller ones.
     most : int
-        a number that does not.
+        Number for which the condition does not hold.
     least : int
-        One below which none is looked for; the result is this where even the next larger one does not fit.
+        Lower bound; it is returned if the condition does not hold for the next larger number.
+
+    Returns
+    -------
+    int
+        Largest number that satisfies the condition.
     """
     low, high = least, most
     while high - low > 1:
@@ -152,29 +162,31 @@ def largest(fits: Callable[[int], bool], most: int, least: int = 0) -> int:
 
 
 class Owner(Protocol):
-    """Where a number stands: a file's part (`Spec`), or the options of a command."""
+    """Source of a number: a part of a file (`Spec`), or the options of a command."""
 
     def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> Exception:
-        """The error that says what is wrong with it, for the caller to raise."""
+        """Return an error about the number, for the caller to raise."""
         ...
 
 
 @dataclass(frozen=True)
 class Lowered:
-    """A number of a file or an option with which a job takes less memory.
+    """Number of a file or an option that determines the memory of a job.
 
     Attributes
     ----------
-    owner, key : Owner
-        The file or the options, and where in it the number stands.
+    owner : Owner
+        File or options that contain the number.
+    key : KeyPath
+        Path of the number in the file or options.
     number : int
-        As it is.
+        Present value.
     unit : str
-        Of the number, in words.
-    bytes : Callable[[int], float]
-        Memory with another number.
+        Unit of the number, in words.
+    bytes : callable
+        Function of the number that returns the memory of the job, in bytes.
     least : int
-        That it may be.
+        Smallest allowed value.
     """
 
     owner: Owner
@@ -186,41 +198,41 @@ class Lowered:
 
 
 def require_memory(
-    lower: Lowered, started: float = STARTED, of_it: str = "", own: float = math.inf, own_key: str = ""
+    lower: Lowered, started: float = STARTED, shares: str = "", file_limit: float = math.inf, limit_key: str = ""
 ) -> None:
-    """See whether a job fits into the memory that is free, and into what its own file lets it have.
+    """Raise an error if a job does not fit into the free memory or the limit of its own file.
 
     Parameters
     ----------
     lower : Lowered
-        The number that decides most of the job's memory.
+        Number that determines most of the job's memory.
     started : float
-        Bytes beside what ``lower`` counts.
-    of_it : str
-        How much of the memory is for what, as a part of the message.
-    own : float
-        Bytes that the job's own file lets it have.
-    own_key : str
-        Where the file says so.
+        Memory beside that of ``lower``, in bytes.
+    shares : str
+        Part of the message on the shares of the memory.
+    file_limit : float
+        Memory that the job's own file allows, in bytes.
+    limit_key : str
+        Key of the file with this limit.
 
     Raises
     ------
     InputError, InputErrorText
-        It does not; at the key or option, with the number that fits.
+        The job does not fit; the message has the key or option and the largest number that fits.
     """
     free = free_memory()
-    # kernels of an earlier job are not free any more, and are taken over
-    room = min(own, max(ORDINARY, free + min(taken_already(), STARTED)))
+    # kernels of an earlier job are no longer free memory, but are reused
+    room = min(file_limit, max(ORDINARY, free + min(reusable_memory(), STARTED)))
     need = started + lower.bytes(lower.number)
     if need <= room:
         return
     most = largest(lambda number: started + lower.bytes(number) <= room, lower.number, lower.least - 1)
-    more = f"more memory (the environment variable {LIMIT}, as 8 GB, says how much may be taken)"
-    if own < free:
-        more = f"a larger {own_key}"
+    more = f"more memory (the environment variable {LIMIT}, for instance 8 GB, sets how much may be used)"
+    if file_limit < free:
+        more = f"a larger {limit_key}"
     raise lower.owner.error(
-        f"this needs about {amount_text(need)} of memory,{f' {of_it},' if of_it else ''} and "
-        f"{amount_text(min(own, free))} may be taken",
+        f"this needs about {amount_text(need)} of memory,{f' {shares},' if shares else ''} and "
+        f"{amount_text(min(file_limit, free))} may be used",
         lower.key,
         found=lower.number,
         allowed=f"at most {most} {lower.unit}, or {more}" if most >= lower.least else more,

@@ -1,9 +1,9 @@
-"""The owner of each file in and beside the folder of a run or study.
+"""Ownership of the files in the folder of a run or study, and of the temporary names beside it.
 
-In the folder checksums decide: a file that somebody has changed is theirs. Beside it are hidden names of a folder that
-is being made or replaced, ``.NAME.TOKEN.partial`` (a run that is being written), ``.NAME.TOKEN.old`` (what it replaces)
-and ``.NAME.TOKEN.lock``, which the process holds locked as long as it lives. The lock is the operating system's and
-ends with the process, however that ends; so a name without a held lock is nobody's.
+Inside the folder checksums decide: a file that was changed belongs to the user. Beside it are hidden names of a folder
+that is being made or replaced: ``.NAME.TOKEN.partial`` (a run that is being written), ``.NAME.TOKEN.old`` (the run that
+it replaces) and ``.NAME.TOKEN.lock``, which the process holds locked as long as it lives. The operating system releases
+the lock when the process ends, however it ends; a name without a held lock therefore belongs to no process.
 """
 
 from __future__ import annotations
@@ -21,48 +21,48 @@ from pathlib import Path
 
 MANIFEST = "manifest.json"
 KEPT_LOCK = ".lock"
-"""File that a command holds locked in the folder of what it keeps for ``--resume``."""
+"""File that a command holds locked in the folder of its intermediate results for ``--resume``."""
 
 NAMED = 5
-"""Files that a message names at most."""
+"""Largest number of files that a message names."""
 
 
 def first_names(names: Sequence[str], most: int = NAMED) -> str:
-    """A list of names for a message: the first of them, and how many more there are.
+    """Return the first names of a list for a message, and how many more there are.
 
     Parameters
     ----------
-    names : Sequence[str]
-        All of them.
+    names : sequence of str
+        All names.
     most : int
-        How many are named.
+        Largest number of names in the text.
     """
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def every_file(folder: Path) -> list[str]:
-    """Paths of all that stands in a folder and is not a folder itself, relative to it, in order."""
+    """Return the sorted paths, relative to a folder, of everything below it that is not a folder."""
     out = []
-    for place, folders, files in os.walk(folder):
-        names = [*files, *(name for name in folders if os.path.islink(os.path.join(place, name)))]
-        out += [(Path(place) / name).relative_to(folder).as_posix() for name in names]
+    for folder_path, folders, files in os.walk(folder):
+        names = [*files, *(name for name in folders if os.path.islink(os.path.join(folder_path, name)))]
+        out += [(Path(folder_path) / name).relative_to(folder).as_posix() for name in names]
     return sorted(out)
 
 
-def foreign_files(folder: Path, listed: Mapping[str, str]) -> list[str]:
-    """Files in the folder of a run that it did not write, or not with these contents.
+def changed_or_added_files(folder: Path, listed: Mapping[str, str]) -> list[str]:
+    """Return the files in the folder of a run that the run did not write, or that were changed since.
 
     Parameters
     ----------
     folder : Path
-        To be looked at.
-    listed : Mapping[str, str]
+        Folder of the run.
+    listed : mapping of str to str
         Files of the run and their SHA-256.
 
     Raises
     ------
     OSError
-        a file cannot be read.
+        A file cannot be read.
     """
 
     def ours(name: str) -> bool:
@@ -71,33 +71,33 @@ def foreign_files(folder: Path, listed: Mapping[str, str]) -> list[str]:
     return [name for name in every_file(folder) if not ours(name)]
 
 
-def is_as_written(place: Path, checksums: Collection[str]) -> bool:
-    """Whether a file, and no link or folder, has one of these SHA-256. Raises OSError."""
-    return place.is_file() and not place.is_symlink() and digest(place) in checksums
+def is_as_written(path: Path, checksums: Collection[str]) -> bool:
+    """Return True if a path is a regular file with one of these SHA-256 checksums. Raises OSError."""
+    return path.is_file() and not path.is_symlink() and digest(path) in checksums
 
 
-def digest(place: Path) -> str:
-    """SHA-256 of a file. Raises OSError."""
-    with place.open("rb") as file:
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a file. Raises OSError."""
+    with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def remove_files(folder: Path, kept: set[str]) -> None:
-    """Remove all files of a folder but some, and the folder if that was all. What says whose they are goes last.
+    """Remove all files of a folder except some, and the folder if it is then empty; the manifest goes last.
 
     Parameters
     ----------
     folder : Path
-        To be removed.
-    kept : set[str]
-        Files that stay, paths relative to it.
+        Folder to remove.
+    kept : set of str
+        Paths, relative to the folder, of files that stay.
     """
     names = [name for name in every_file(folder) if name not in kept]
     for name in sorted(names, key=lambda name: (name == MANIFEST, name)):
         (folder / name).unlink(missing_ok=True)
-    for place, _, _ in os.walk(folder, topdown=False):
-        with suppress(OSError):  # somebody else has put something there
-            os.rmdir(place)
+    for subfolder, _, _ in os.walk(folder, topdown=False):
+        with suppress(OSError):  # another program has put a file there
+            os.rmdir(subfolder)
 
 
 PARTIAL, OLD, LOCK = "partial", "old", "lock"
@@ -106,49 +106,51 @@ _NAME = re.compile(rf"\.(?P<name>.+)\.(?P<token>[0-9a-f]{{8}})\.(?:{PARTIAL}|{OL
 
 
 def _beside(target: Path, token: str) -> dict[str, Path]:
+    """Return the hidden names beside a target, by their ending."""
     return {ending: target.with_name(f".{target.name}.{token}.{ending}") for ending in (PARTIAL, OLD, LOCK)}
 
 
 class Unfinished:
-    """Hidden names beside ``target`` that are this process's own until ``close``.
+    """Hidden names beside a folder that belong to this process until ``close``.
 
     Parameters
     ----------
     target
-        The folder that is being made; the one it stands in exists.
+        Folder that is being made; its parent exists.
 
     Raises
     ------
     OSError
-        Nothing can be written beside it.
+        Nothing can be written beside the folder.
     """
 
     def __init__(self, target: Path) -> None:
         lock = None
-        while lock is None:  # whoever sweeps the folder may hold the lock of a new file for a moment
+        while lock is None:  # a process that sweeps the folder may hold the lock of a new file for a moment
             self._names = _beside(target, secrets.token_hex(4))
             lock = locked(self._names[LOCK])
         self._lock = lock
 
     def path(self, ending: str) -> Path:
-        """The hidden name with that ending, PARTIAL or OLD."""
+        """Return the hidden name with the ending PARTIAL or OLD."""
         return self._names[ending]
 
     def close(self) -> None:
-        """Give the names up; nothing is to stand under them any more."""
+        """Release the names; nothing may exist under them any more."""
         self._names[LOCK].unlink(missing_ok=True)
         os.close(self._lock)
 
 
 @contextmanager
 def scratch(stem: str) -> Iterator[Path]:
-    """A folder of this user alone for what ends with the block, where the system has such. What killed processes of
-    this user left there goes first.
+    """Make a temporary folder that only this user can read and that is removed at the end of the block.
+
+    Folders that killed processes of this user left there are removed first.
 
     Raises
     ------
     OSError
-        It cannot be made.
+        The folder cannot be made.
     """
     target = Path(tempfile.gettempdir()) / stem
     sweep(target.parent)
@@ -163,39 +165,40 @@ def scratch(stem: str) -> Iterator[Path]:
 
 
 def sweep(folder: Path, replaced: Callable[[Path, Path], bool] = lambda former, new: False) -> None:
-    """Clear away what dead processes of this user left in ``folder``; what belongs to a live one is not touched.
+    """Remove what dead processes of this user left in ``folder``; names of living processes are not touched.
 
-    What was half written is removed. What was to be replaced is put back when nothing has taken its place.
+    Partly written folders are removed. A folder that was to be replaced is restored if nothing has taken its place.
 
     Parameters
     ----------
     folder : Path
-        Where runs stand.
-    replaced : Callable[[Path, Path], bool]
-        Given what was to be replaced and what has its place now; removes the former, if that is right, and returns
-        whether it did.
+        Folder that contains run folders.
+    replaced : callable
+        Function of the replaced folder and of the one in its place. It removes the former if that is right, and returns
+        True if it did.
     """
     try:
         names = {(m["name"], m["token"]) for path in folder.iterdir() if (m := _NAME.fullmatch(path.name))}
-    except OSError:  # a folder that cannot be read is told of when it is written to
+    except OSError:  # a folder that cannot be read is reported when it is written to
         return
     for name, token in sorted(names):
-        places = _beside(folder / name, token)
-        with suppress(OSError):  # not ours to remove; it stays for who may
-            if any(place.lstat().st_uid != os.getuid() for place in places.values() if os.path.lexists(place)):
+        paths = _beside(folder / name, token)
+        with suppress(OSError):  # without permission to remove it, it stays
+            if any(place.lstat().st_uid != os.getuid() for place in paths.values() if os.path.lexists(place)):
                 continue
-            if (lock := locked(places[LOCK], certain=True)) is not None:
+            if (lock := locked(paths[LOCK], certain=True)) is not None:
                 try:
-                    _clear(folder / name, places, replaced)
+                    _clear(folder / name, paths, replaced)
                 finally:
                     os.close(lock)
 
 
-def _clear(target: Path, places: dict[str, Path], replaced: Callable[[Path, Path], bool]) -> None:
-    partial, former = places[PARTIAL], places[OLD]
+def _clear(target: Path, paths: dict[str, Path], replaced: Callable[[Path, Path], bool]) -> None:
+    """Remove the hidden names of a dead process beside a target."""
+    partial, former = paths[PARTIAL], paths[OLD]
     if partial.is_dir() and not partial.is_symlink():
         if (partial / MANIFEST).exists() and target.exists() and not former.exists():
-            # complete: it has changed places with the target, or was about to
+            # complete: it had been exchanged with the target, or was about to be
             partial.rename(former)
         else:
             shutil.rmtree(partial)
@@ -204,31 +207,31 @@ def _clear(target: Path, places: dict[str, Path], replaced: Callable[[Path, Path
             former.rename(target)
         elif not replaced(former, target):
             return
-    places[LOCK].unlink(missing_ok=True)
+    paths[LOCK].unlink(missing_ok=True)
 
 
-def locked(place: Path, certain: bool = False) -> int | None:
-    """Open a file, made where it is missing, and lock it.
+def locked(path: Path, certain: bool = False) -> int | None:
+    """Open a file, making it if it is missing, and lock it.
 
     Parameters
     ----------
-    place : Path
-        Of the file.
+    path : Path
+        Path of the file.
     certain : bool
-        Also None where the file system has no locks.
+        True to return None also if the file system has no locks.
 
     Returns
     -------
     int | None
-        The open file; None when another process has it.
+        Descriptor of the open file; None if another process holds the lock.
 
     Raises
     ------
     OSError
-        It cannot be opened.
+        The file cannot be opened.
     """
     while True:
-        lock = os.open(place, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+        lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -237,4 +240,4 @@ def locked(place: Path, certain: bool = False) -> int | None:
                 return None
         if os.fstat(lock).st_nlink:
             return lock
-        os.close(lock)  # its owner has removed it meanwhile
+        os.close(lock)  # its owner has removed the file meanwhile

@@ -1,11 +1,11 @@
-"""Templates of the reports, their Content-Security-Policy, artefacts as they want them, and the run folder of a test.
+"""HTML pages of reports with their Content-Security-Policy, and the files of a test's run folder.
 
-A report holds texts of a user's files, and is opened from a folder or sent to somebody. All texts are escaped where
-they are put in; the policy is there for the day on which one is not. It allows what the page is made of, each piece by
-its checksum, and nothing else: no file beside it, no network, no form, no script that somebody's text brought along.
+A report contains texts from a user's files, and is opened from a folder or sent to other people. All texts are escaped
+where they are inserted; the policy protects if one is not. It allows the pieces of the page, each by its checksum, and
+nothing else: no other file, network, form or script.
 
-One thing is as loose as it has to be: ``style`` attributes are allowed, since Matplotlib gives every line of a figure
-one. They can change how a page looks, and load nothing.
+``style`` attributes are the one exception: they are allowed because Matplotlib gives every line of a figure one. They
+can change the look of a page, but load nothing.
 """
 
 from __future__ import annotations
@@ -29,30 +29,31 @@ from twin.framework.artefact import Artefact
 from twin.framework.report import Report, further_sections
 
 FIGURES = "*{stroke-linejoin: round; stroke-linecap: butt}"
-"""The style sheet that Matplotlib writes into every figure."""
+"""Style sheet that Matplotlib writes into every figure."""
 NOTHING: Mapping[str, str] = {"default-src": "'none'", "base-uri": "'none'", "form-action": "'none'"}
+"""Directives that forbid everything."""
 
 
 def checksum(text: str) -> str:
-    """The source expression of one inline script or style sheet.
+    """Return the source expression of an inline script or style sheet for the policy.
 
     Parameters
     ----------
     text : str
-        All that stands between its tags.
+        Text between its tags.
     """
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode('ascii')}'"
 
 
 def page_policy(style: str, programs: Iterable[str] = ()) -> str:
-    """The policy of a page that needs no other file.
+    """Return the Content-Security-Policy of a self-contained page.
 
     Parameters
     ----------
     style : str
-        Its style sheet, all that stands between the tags.
-    programs : Iterable[str]
-        Scripts that it holds, likewise, and scripts that these put in.
+        Style sheet of the page, the text between its tags.
+    programs : iterable of str
+        Scripts of the page, likewise, and scripts that these insert.
     """
     scripts = [checksum(program) for program in programs]
     return policy(
@@ -67,12 +68,12 @@ def page_policy(style: str, programs: Iterable[str] = ()) -> str:
 
 
 def policy(directives: Mapping[str, str]) -> str:
-    """Directives as one text."""
+    """Return the directives of a policy as one text."""
     return "; ".join(f"{name} {sources}" for name, sources in directives.items())
 
 
 def inline(text: str) -> Markup:
-    """A text for a page, escaped; what stands between backticks is code."""
+    """Return a text as escaped HTML, with words between backticks as code."""
     return text if isinstance(text, Markup) else Markup(_CODE.sub(r"<code>\1</code>", str(escape(text))))
 
 
@@ -81,47 +82,50 @@ _CODE = re.compile("`([^`]+)`")
 
 @cache
 def _template() -> Template:
+    """Return the template of the page."""
     loader = FileSystemLoader(str(files(__package__)))
-    made = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    made.globals["page_policy"], made.filters["inline"] = page_policy, inline
-    return made.get_template("page.html.j2")
+    environment = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.globals["page_policy"], environment.filters["inline"] = page_policy, inline
+    return environment.get_template("page.html.j2")
 
 
 def reproduce(words: Sequence[str]) -> str:
-    """The command line of a program, its subcommand and options that makes a run again, as one types it."""
+    """Return the command line that repeats a run, from its program, subcommand and options."""
     return f"python -m {shlex.join(words)} --out again"
 
 
 @dataclass(frozen=True)
 class RunFacts:
-    """How a test was run.
+    """Facts about how a test was run, for its report and manifest.
 
     Attributes
     ----------
     config : str
-        The test with all it refers to, as YAML; it can be given in place of the test's file.
+        Test with everything it refers to, as YAML; it can replace the test's file.
     program : str
-        That ran it, as the user calls it.
+        Program that ran the test, as the user calls it.
     started : float
-        Seconds since the epoch.
+        Start time, in seconds since the epoch.
     seconds : float
-        That it took.
+        Duration, in seconds.
     backend : str
-        Where it was traced; empty where nothing was.
+        Backend of the ray trace; empty without a trace.
     seed : int | None
-        Of everything that is drawn; None where nothing is.
+        Seed of all random numbers; None if none are drawn.
     command : str
-        Its subcommand.
-    options : tuple[str, ...]
-        Further options of the command that runs it again.
-    again : tuple[str, ...]
-        Words of the command that runs it again, program first, where it is not the test with the run's own config.yaml.
+        Subcommand of the program.
+    options : tuple of str
+        Further options of the command that repeats the run.
+    again : tuple of str
+        Words of the command that repeats the run, program first, if it is not the test with the run's own config.yaml.
     named : Any
-        Plain data in which files stand that the run read, by their absolute paths.
-    given : tuple[Path, ...]
-        Further files and folders that it read, as the user gave them.
-    checks : tuple[provenance.SelfCheck, ...]
-        What it checked of itself beside what stands in its numbers.
+        Plain data that contain absolute paths of files that the run read.
+    input_paths : tuple of Path
+        Further files and folders that the run read, as the user wrote them.
+    checks : tuple of provenance.SelfCheck
+        Self-checks of the run beside those in its numbers.
     """
 
     config: str
@@ -134,32 +138,32 @@ class RunFacts:
     options: tuple[str, ...] = ()
     again: tuple[str, ...] = ()
     named: Any = None
-    given: tuple[Path, ...] = ()
+    input_paths: tuple[Path, ...] = ()
     checks: tuple[provenance.SelfCheck, ...] = ()
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Words of the command that makes the run again in its folder."""
+        """Words of the command that repeats the run in its folder."""
         if self.again:
             return self.again
         seed = () if self.seed is None else ("--seed", str(self.seed))
         command = (self.command,) if self.command else ()
         return (self.program, *command, "config.yaml", *self.options, *seed, "--backend", self.backend)
 
-    def kept(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
-        """What a manifest says of it: how to make it again, what was read, what it checked of itself.
+    def manifest_entries(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the entries of the manifest: the command that repeats the run, its inputs and its self-checks.
 
         Parameters
         ----------
-        numbers : Mapping[str, Any]
-            Of the run.
+        numbers : mapping
+            Numbers of the run.
         """
-        place = {"started_in": str(Path.cwd())} if self.given else {}
+        folder = {"started_in": str(Path.cwd())} if self.input_paths else {}
         checks = [check.to_dict() for check in self.checks or provenance.checks_in(numbers)]
         return {
             "again": list(self.words),
-            **place,
-            "inputs": provenance.inputs_in(self.named, self.given),
+            **folder,
+            "inputs": provenance.inputs_in(self.named, self.input_paths),
             "checks": checks,
         }
 
@@ -169,10 +173,10 @@ def write_artefacts(artefacts: Iterable[Artefact], folder: run_folder.RunFolder)
 
     Parameters
     ----------
-    artefacts : Iterable[Artefact]
-        Of a report.
+    artefacts : iterable of Artefact
+        Artefacts of a report.
     folder : run_folder.RunFolder
-        open.
+        Open run folder.
     """
     for artefact in artefacts:
         if artefact.within is None:
@@ -180,7 +184,7 @@ def write_artefacts(artefacts: Iterable[Artefact], folder: run_folder.RunFolder)
 
 
 def links(names: Iterable[str]) -> Markup:
-    """Files of the run folder, for the last table of a page."""
+    """Return links to files of the run folder, for the last table of a page."""
     return Markup(", ").join(Markup('<a href="{0}">{0}</a>').format(name) for name in names)
 
 
@@ -192,22 +196,22 @@ def report_page(
     programs: Sequence[str] = (),
     scripts: str = "",
 ) -> str:
-    """A report as one page that needs no other file.
+    """Return a report as a self-contained HTML page.
 
     Parameters
     ----------
     report : Report
-        What it says.
-    words : Sequence[str]
-        Of the command that makes the run again, program first.
-    rows : Sequence[tuple[str, str]]
-        Of its last table, (label, text), before the versions.
+        Content of the page.
+    words : sequence of str
+        Words of the command that repeats the run, program first.
+    rows : sequence of (str, str)
+        Rows of the last table, (label, text), before the versions.
     config : str
-        All that was resolved, for readers; empty if the page does not show it.
-    programs : Sequence[str]
-        Scripts of its own that the page may run, as the policy wants them.
+        Resolved configuration shown to readers; empty to show none.
+    programs : sequence of str
+        Scripts that the page may run, in the form that the policy needs.
     scripts : str
-        The elements that hold them, written by this program.
+        HTML elements of these scripts, written by this program.
     """
     return _template().render(
         report=report,
@@ -221,16 +225,16 @@ def report_page(
 
 
 def render_report(kind: str, report: Report, facts: RunFacts) -> str:
-    """``report.html`` of a test as text; its numbers are in KIND.json.
+    """Return ``report.html`` of a test as text; its numbers are in KIND.json.
 
     Parameters
     ----------
     kind : str
-        Of the test.
+        Kind of the test.
     report : Report
-        What it says.
+        Content of the page.
     facts : RunFacts
-        How it was run.
+        Facts about the run.
     """
     rows: list[tuple[str, str]] = [("Numbers", links((f"{kind}.json", "config.yaml")))]
     if report.images:
@@ -245,20 +249,20 @@ def render_report(kind: str, report: Report, facts: RunFacts) -> str:
 def write_test(
     kind: str, numbers: Mapping[str, Any], report: Report, facts: RunFacts, folder: run_folder.RunFolder
 ) -> None:
-    """Write everything into an open run folder: config, numbers, report, artefacts, images, the manifest.
+    """Write all files of a test into an open run folder: config, numbers, report, artefacts, images, manifest.
 
     Parameters
     ----------
     kind : str
-        Of the test.
-    numbers : Mapping[str, Any]
-        Of its run; KIND.json gets them after their frames.
+        Kind of the test.
+    numbers : mapping
+        Numbers of the run, written to KIND.json after their reference frames.
     report : Report
-        Of the test.
+        Report of the test.
     facts : RunFacts
-        How it was run.
+        Facts about the run.
     folder : run_folder.RunFolder
-        open.
+        Open run folder.
     """
     report = replace(report, sections=(*report.sections, *further_sections(kind, numbers)))
     folder.write_text("config.yaml", facts.config)
@@ -273,4 +277,6 @@ def write_test(
             folder.write_bytes(file, content)
     folder.write_text("report.html", render_report(kind, report, facts))
     entries = {"test": kind, "backend": facts.backend, "seed": facts.seed or 0, "warnings": list(report.warnings)}
-    run_folder.write_manifest(folder, facts.program, facts.started, facts.seconds, **entries, **facts.kept(numbers))
+    run_folder.write_manifest(
+        folder, facts.program, facts.started, facts.seconds, **entries, **facts.manifest_entries(numbers)
+    )

@@ -1,4 +1,4 @@
-"""A test being run: how far it is, and how it fails."""
+"""Execution of a test: its progress, its seed, and the errors that name the key to change."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from twin.framework.run_folder import RunFolder
 
 Advance = Callable[[str, int, int], None]
-"""Told what is being done, and how many of how many parts of it are."""
+"""Function called with the part of the work in progress, the number of its pieces that are done, and their total."""
 
 
 WRITE = "write the run folder"
@@ -25,18 +25,18 @@ WRITE = "write the run folder"
 
 
 def silent(part: str, done: int, total: int) -> None:
-    """An ``Advance`` that tells nobody."""
+    """Ignore the progress: an ``Advance`` that shows nothing."""
 
 
 class BenchError(PhysicalError):
-    """The test failed on the bench: what happened, which key of its file is to be changed, and how.
+    """Failure of a test on the bench, with the key of its file to change and the remedy.
 
     Attributes
     ----------
     key
         Key path in the test's file.
     remedy
-        What may be there instead.
+        Allowed values of the key.
     """
 
     def __init__(self, problem: str, key: KeyPath, remedy: str) -> None:
@@ -53,76 +53,76 @@ def performed(
     Parameters
     ----------
     procedure : Procedure
-        The test.
-    setup : ExperimentSetup[Any]
-        What its file says.
+        Test to run.
+    setup : ExperimentSetup
+        Resolved file of the test.
     backend : Backend
-        Where to trace.
+        Backend of the ray trace.
     seed : int
-        Of all that is drawn.
+        Seed of all random numbers.
     advance : Advance
-        Told of the progress.
+        Called with the progress.
 
     Returns
     -------
-    tuple[Any, tuple[str, ...]]
-        Everything that was computed, and what the user should know of what the test was given.
+    tuple of (Any, tuple of str)
+        Results of the run, and warnings about the test's input.
 
     Raises
     ------
     InputError
-        Also for what fails on the bench, at the key that can change it; with what is wrong with what the test was
-        given, which may be the reason.
+        The input is invalid, or the test failed on the bench; the error is at the key that can change it, and warnings
+        about the input are added since they may give the reason.
     """
-    given: tuple[str, ...] = ()
+    input_warnings: tuple[str, ...] = ()
     if procedure.judged:
-        # a command is told of a bad file before this is imported
+        # imported here, so that an error in the file is reported without delay
         from scenes.models.camera_sharpness import blur_warnings
 
-        given = blur_warnings(setup, backend)
+        input_warnings = blur_warnings(setup, backend)
     try:
-        return procedure.run(setup, backend, seed, advance), given
+        return procedure.run(setup, backend, seed, advance), input_warnings
     except BenchError as error:
-        told = setup.test.error(str(error), error.key, allowed=error.remedy)
-        raise InputError(*told.issues, *(Issue(text) for text in given)) from error
+        problem = setup.test.error(str(error), error.key, allowed=error.remedy)
+        raise InputError(*problem.issues, *(Issue(text) for text in input_warnings)) from error
     except InputError as error:
-        raise InputError(*error.issues, *(Issue(text) for text in given)) from error
+        raise InputError(*error.issues, *(Issue(text) for text in input_warnings)) from error
 
 
 def seeded(procedure: Procedure, setup: Any, seed: int | None) -> tuple[Any, int, dict[str, Any]]:
-    """Return a set-up with the seed of its run, this seed, and what a run folder states of both.
+    """Return a set-up with the seed of its run, this seed, and the facts about both for the run folder.
 
     Parameters
     ----------
     procedure : Procedure
-        The test.
+        Test to run.
     setup : Any
-        What its file says.
+        Resolved file of the test.
     seed : int | None
-        In place of the file's; None for that.
+        Seed that replaces the file's; None to keep that.
     """
     number = setup.seed if seed is None else seed
-    made = setup.with_seed(number)
-    drawn = number if procedure.seeded and made is not setup else None
-    return made, number, {"config": made.to_yaml(), "named": made.plain(), "seed": drawn}
+    seeded_setup = setup.with_seed(number)
+    drawn = number if procedure.seeded and seeded_setup is not setup else None
+    return seeded_setup, number, {"config": seeded_setup.to_yaml(), "named": seeded_setup.plain(), "seed": drawn}
 
 
 @dataclass(frozen=True)
 class Session:
-    """A command at work.
+    """Command in progress.
 
     Attributes
     ----------
     folder : RunFolder
-        Its run folder, open.
+        Open run folder.
     backend : Backend
-        Where to trace.
+        Backend of the ray trace.
     advance : Advance
-        Shows the user how far it is.
+        Shows the progress to the user.
     started : float
-        Seconds since the epoch.
+        Start time, in seconds since the epoch.
     clock : float
-        Reading of the monotonic clock then.
+        Reading of the monotonic clock at the start, in seconds.
     """
 
     folder: RunFolder
@@ -133,5 +133,5 @@ class Session:
 
     @property
     def seconds(self) -> float:
-        """Since the start."""
+        """Time since the start, in seconds."""
         return time.monotonic() - self.clock

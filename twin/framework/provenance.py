@@ -1,7 +1,7 @@
-"""Where a run was made: versions, source, processor, linear algebra; and its own checks of itself.
+"""Provenance of a run (versions, source, processor, linear algebra), and its self-checks.
 
-The same program gives the same bytes on the same processor (docs/promises.md). What may differ elsewhere follows from
-what stands here.
+The same program gives the same bytes on the same processor (docs/promises.md). Differences on other machines can be
+explained by the facts recorded here.
 """
 
 from __future__ import annotations
@@ -42,13 +42,11 @@ PACKAGES = (
     "trimesh",
     "karellen-llvm-core",
 )
-"""Those whose numbers results depend on."""
+"""Packages that affect the numbers of results."""
 
 
 def versions() -> dict[str, str]:
-    """Python's and the packages' versions, ``not installed`` where there is none, and those of other distributions
-    that extend tables of this program.
-    """
+    """Return the versions of Python, the packages (``not installed`` if missing) and extensions of the program."""
     return {
         "python": platform.python_version(),
         **{package: _version(package) or "not installed" for package in PACKAGES},
@@ -58,15 +56,16 @@ def versions() -> dict[str, str]:
 
 @cache
 def other_packages() -> dict[str, str]:
-    """Versions of the packages that the program asks for beside PACKAGES: they read, write and draw, and no number
-    depends on them.
+    """Return the versions of required packages that are not in PACKAGES.
+
+    They read, write and draw, but do not affect the numbers.
     """
     try:
-        asked = importlib.metadata.requires(PACKAGES[0]) or []
+        requirements = importlib.metadata.requires(PACKAGES[0]) or []
     except importlib.metadata.PackageNotFoundError:
         return {}
-    named = (_PACKAGE.match(line) for line in asked if "extra ==" not in line)
-    names = sorted({found[0] for found in named if found is not None} - set(PACKAGES))
+    named = (_PACKAGE.match(line) for line in requirements if "extra ==" not in line)
+    names = sorted({match[0] for match in named if match is not None} - set(PACKAGES))
     return {name: version for name in names if (version := _version(name)) is not None}
 
 
@@ -74,6 +73,7 @@ _PACKAGE = re.compile(r"[A-Za-z0-9._-]+")
 
 
 def _version(package: str) -> str | None:
+    """Return the version of a package, or None."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -82,21 +82,22 @@ def _version(package: str) -> str | None:
 
 ROOT = Path(__file__).resolve().parents[2]
 BEFORE = __name__.removesuffix("twin.framework.provenance")
-"""What stands before the names of modules: nothing in a source tree, in a wheel the one package that holds all others
+"""Package prefix of the modules' names: empty in a source tree; in a wheel, the one package that contains the others
 (docs/wheel).
 """
 SOURCES = ("analysis", "optics", "scenes", "twin")
 NOT_IN_RUNS = ("twin/validation/",)
-"""No run of a study needs these."""
+"""Folders that no run of a study needs."""
 
 
 ENDINGS = (".css", ".csv", ".html", ".j2", ".js", ".json", ".py", ".svg", ".tdm", ".txt", ".yaml", ".zmx")
-"""Endings of the packages' own files, as a wheel holds them."""
+"""Extensions of the packages' own files in a wheel."""
 
 
 def _program_files(endings: tuple[str, ...]) -> dict[str, str]:
-    """Files of the packages with these endings, and of other distributions' that extend tables, by their paths from
-    the folder of the package -> SHA-256.
+    """Return path -> SHA-256 of the packages' files with these extensions.
+
+    Packages of other distributions that extend tables are included; paths are relative to the parent of each package.
     """
     found = {}
     for place in (*(ROOT / package for package in SOURCES), *_extensions()):
@@ -107,7 +108,7 @@ def _program_files(endings: tuple[str, ...]) -> dict[str, str]:
 
 
 def _extensions() -> Iterator[Path]:
-    """Folder or file of each package of other distributions that has an entry in a table; nothing is imported."""
+    """Yield the folder or file of each package of other distributions that extends a table, without importing it."""
     for name in sorted({entry.value.partition(":")[0].partition(".")[0] for entry in entries()}):
         if (spec := find_spec(name)) is not None:
             yield from map(Path, spec.submodule_search_locations or filter(None, [spec.origin]))
@@ -115,53 +116,60 @@ def _extensions() -> Iterator[Path]:
 
 @cache
 def sources() -> dict[str, str]:
-    """Source files that compute, as this process found them first -> checksum; comments and docstrings count.
+    """Return source file -> checksum, as this process first read the files; comments and docstrings count.
 
-    To leave these out every file would have to be parsed, a second or two for every command, and nobody edits the
-    program in the middle of a study just to rephrase it.
+    To ignore them every file would have to be parsed, which takes a second or two for every command, and the program is
+    rarely edited in the middle of a study.
     """
-    every = _program_files((".py",))
-    return {name: check[:16] for name, check in every.items() if not name.startswith(NOT_IN_RUNS)}
+    checksums = _program_files((".py",))
+    return {name: check[:16] for name, check in checksums.items() if not name.startswith(NOT_IN_RUNS)}
 
 
 def _checksum(path: Path) -> str:
-    """SHA-256 of a file as the source tree has it."""
+    """Return the SHA-256 of a file as it is in the source tree."""
     text = path.read_bytes()
     return hashlib.sha256(text.replace(BEFORE.encode(), b"") if BEFORE and path.suffix == ".py" else text).hexdigest()
 
 
 def source_digest() -> str:
-    """One checksum for all of ``sources``."""
+    """Return one checksum for all ``sources``."""
     return hashlib.sha256(json.dumps(sources(), sort_keys=True).encode()).hexdigest()
 
 
 @cache
 def program_digest() -> str:
-    """One SHA-256 for every file of the program as this process found them first: code, library, templates; the same
-    for a source tree and for what was installed from it.
+    """Return one SHA-256 for all files of the program as this process first read them: code, library and templates.
+
+    It is the same for a source tree and for an installation made from it.
     """
     return hashlib.sha256(json.dumps(_program_files(ENDINGS), sort_keys=True).encode()).hexdigest()
 
 
 Checksum = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
-SETTINGS = (THREADS_VARIABLE, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES")
-"""Variables of the environment that change how numbers are rounded or how fast they come."""
+SETTINGS = (
+    THREADS_VARIABLE,
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "OPENBLAS_CORETYPE",
+    "NPY_DISABLE_CPU_FEATURES",
+)
+"""Environment variables that change the rounding of numbers or the speed."""
 
 
 class Blas(BaseModel):
-    """A library of linear algebra that the process had loaded.
+    """Linear-algebra library that the process had loaded.
 
     Attributes
     ----------
     name : str
-        ``openblas``.
+        Name of the library, ``openblas``.
     version : str
-        Of it.
+        Version of the library.
     kernels : str
-        Processor whose kernels it chose, ``Haswell``; it decides how sums are rounded.
+        Processor whose kernels the library chose, ``Haswell``; they determine the rounding of sums.
     threads : int
-        That it used.
+        Number of threads.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
@@ -173,29 +181,28 @@ class Blas(BaseModel):
 
 
 class Provenance(BaseModel):
-    """Where a run was made. What is added has a default: folders of earlier programs stay run folders.
+    """Machine and software of a run. New fields have a default, so that folders of earlier versions stay readable.
 
     Attributes
     ----------
-    source : Checksum
+    source : str
         SHA-256 of all files of the program, however it was installed.
     system : str
         Operating system.
     libc : str
-        C library, whose functions are not rounded alike in all versions.
+        C library; rounding of its functions depends on its version.
     processor : str
-        Model that the operating system names.
+        Model reported by the operating system.
     cores : int
-        That the run could use.
-    simd : list[str]
-        Sets of instructions of the processor that NumPy uses.
-    blas : list[Blas]
-        Libraries of linear algebra, in the order of their names.
-    settings : dict[str, str]
-        Variables of the environment that were set and matter.
-    packages : dict[str, str]
-        Version of every package that the program asks for and whose numbers no result depends on: what reads, writes
-        and draws.
+        Cores available to the run.
+    simd : list of str
+        Instruction sets of the processor that NumPy uses.
+    blas : list of Blas
+        Linear-algebra libraries, sorted by name.
+    settings : dict of str to str
+        Relevant environment variables that were set.
+    packages : dict of str to str
+        Versions of required packages that do not affect the numbers: they read, write and draw.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
@@ -212,7 +219,7 @@ class Provenance(BaseModel):
 
     @classmethod
     def here(cls) -> Provenance:
-        """Provenance of what this process computes."""
+        """Return the provenance of computations in this process."""
         loaded = [one for one in threadpool_info() if one["user_api"] == "blas"]
         told = [(one["internal_api"], str(one["version"]), str(one.get("architecture", "")), one) for one in loaded]
         found = [Blas(name=a, version=b, kernels=c, threads=one["num_threads"]) for a, b, c, one in told]
@@ -230,7 +237,7 @@ class Provenance(BaseModel):
 
 
 def _processor() -> str:
-    """Model of the processor; Linux says it in a file, Python itself does not."""
+    """Return the model of the processor; Linux reports it in a file, Python itself does not."""
     try:
         with Path("/proc/cpuinfo").open(encoding="utf-8") as lines:
             named = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
@@ -240,27 +247,28 @@ def _processor() -> str:
 
 
 def _simd() -> list[str]:
-    found: Any = np.show_config(mode="dicts")
-    told = found.get("SIMD Extensions", {})
-    return [*told.get("baseline", []), *told.get("found", [])]
+    """Return the instruction sets that NumPy uses."""
+    configuration: Any = np.show_config(mode="dicts")
+    extensions = configuration.get("SIMD Extensions", {})
+    return [*extensions.get("baseline", []), *extensions.get("found", [])]
 
 
 @dataclass(frozen=True)
 class SelfCheck:
-    """Something that a run worked out to see whether its own numbers can be right.
+    """Self-check of a run: a value that shows whether its numbers can be right.
 
     Attributes
     ----------
     name : str
-        What was checked.
+        Quantity that was checked.
     value : float
-        What came out.
+        Value of the quantity.
     limit : float | None
-        What it must not exceed; None where nothing is refused for it, or the limit is another for every run.
+        Largest allowed value; None if none is defined.
     unit : str
-        Of both, empty for a pure number.
+        Unit of both, empty for a pure number.
     says : str
-        What it means that the limit holds, or not; in one sentence.
+        One sentence on the meaning of the check.
     """
 
     name: str
@@ -271,39 +279,42 @@ class SelfCheck:
 
     @property
     def holds(self) -> bool | None:
-        """Whether the limit does, None without one."""
+        """True if the value is within the limit, None without a limit."""
         return None if self.limit is None else bool(self.value <= self.limit)
 
     def to_dict(self) -> dict[str, Any]:
-        """The check as plain data."""
+        """Return the check as plain data."""
         return {**asdict(self), "holds": self.holds}
 
 
 CHI_SQUARE, WITHIN = re.compile(r"(^|_)chi_square$|^relative_error$|^worst_relative$"), ("chi_square_limit", "limit")
 VERDICT = re.compile(r"(^|_)(agrees?|converged|holds?|settled|stable)$")
-"""Ending of the keys of truth values that judge a result: where one is False, its numbers or their sigmas are not to be
-relied on.
+"""Pattern of the keys of truth values that judge a result: where one is False, the numbers or their sigmas are not
+reliable.
 """
 CANDIDATES = re.compile(r"(^|\.)(intervals|starts)\[").search
-"""Finds lists in a path whose entries are judged each: the result beside them states its verdict by itself."""
+"""Finds lists in a path whose entries are judged one by one; the result beside them has its own verdict."""
 _OF_TRUTH = "0 for yes, 1 for no"
 MOST_CHECKS = 50
-"""Checks of one run that are kept at most."""
+"""Largest number of checks recorded for one run."""
 
 
 def checks_in(numbers: Mapping[str, Any]) -> tuple[SelfCheck, ...]:
-    """What stands in a run's own numbers of whether they can be right: chi-squares of fits, with their limits where
-    these are stated, relative errors, and what converged, agrees or holds.
+    """Return the self-checks in the numbers of a run.
+
+    They are the chi-squares of fits (with their limits, where given), relative errors, and truth values of convergence,
+    agreement and validity.
 
     Parameters
     ----------
-    numbers : Mapping[str, Any]
-        Of the run, nested.
+    numbers : mapping
+        Numbers of the run, nested.
     """
     return tuple(islice(_checks(numbers, ""), MOST_CHECKS))
 
 
 def _checks(tree: Any, path: str) -> Iterator[SelfCheck]:
+    """Yield the self-checks below a path."""
     if isinstance(tree, Mapping):
         limit = next((float(tree[name]) for name in WITHIN if isinstance(tree.get(name), int | float)), None)
         for key, value in tree.items():
@@ -321,61 +332,65 @@ def _checks(tree: Any, path: str) -> Iterator[SelfCheck]:
 
 
 def negative_verdicts(numbers: Mapping[str, Any]) -> list[str]:
-    """Return the paths of all verdicts on a result that are False, such as ``disturbances.agrees``; those of CANDIDATES
-    are left out.
+    """Return the paths of all verdicts on a result that are False, such as ``disturbances.agrees``, except CANDIDATES.
 
     Parameters
     ----------
-    numbers : Mapping[str, Any]
-        Of the result, nested plain data.
+    numbers : mapping
+        Numbers of the result, nested plain data.
     """
     return [
-        one.name for one in _checks(numbers, "") if one.says == _OF_TRUTH and one.value and not CANDIDATES(one.name)
+        check.name
+        for check in _checks(numbers, "")
+        if check.says == _OF_TRUTH and check.value and not CANDIDATES(check.name)
     ]
 
 
-def inputs_in(tree: Any, given: Iterable[Path] = ()) -> dict[str, str]:
-    """Checksums of the files that a resolved set-up names; its paths are absolute.
+def inputs_in(tree: Any, paths: Iterable[Path] = ()) -> dict[str, str]:
+    """Return the checksums of the files that a resolved set-up names by absolute paths.
 
-    What is in the set-up itself, in full, is no input any more: neither the file of the test nor those of the library.
+    Content that the set-up already includes in full, such as the file of the test and those of the library, is not an
+    input.
 
     Parameters
     ----------
     tree : Any
-        The set-up as plain data; every text in it that is the absolute path of a file, or of a folder, is one.
-    given : Iterable[Path]
+        Set-up as plain data; every text in it that is the absolute path of a file or folder counts.
+    paths : iterable of Path
         Further files and folders.
 
     Returns
     -------
-    dict[str, str]
-        Absolute path -> SHA-256, of a folder those of all its files.
+    dict of str to str
+        Absolute path -> SHA-256; for a folder, those of all its files.
     """
     out: dict[str, str] = {}
-    for place in (*map(Path, dict.fromkeys(_paths(tree))), *given):
-        for file in _files(place.absolute()):
+    for path in (*map(Path, dict.fromkeys(_paths(tree))), *paths):
+        for file in _files(path.absolute()):
             if str(file) not in out:
                 out[str(file)] = digest(file)
     return dict(sorted(out.items()))
 
 
 MOST_FILES = 10_000
-"""Files of a folder that is named as an input, at most."""
+"""Largest number of files recorded for a folder that is an input."""
 
 
 def _files(place: Path) -> Iterable[Path]:
+    """Return the files at a path: itself, or all files of a folder."""
     try:
         if place.is_file():
             return (place,)
         if place.is_dir():
             found = (path for path in sorted(place.rglob("*")) if path.is_file())
             return [path for path, _ in zip(found, range(MOST_FILES), strict=False)]
-    except (OSError, ValueError):  # a text that only looks like a path
+    except (OSError, ValueError):  # the text only looks like a path
         pass
     return ()
 
 
 def _paths(tree: Any) -> Iterable[str]:
+    """Yield all texts in plain data that look like absolute paths."""
     if isinstance(tree, Mapping):
         for below in tree.values():
             yield from _paths(below)

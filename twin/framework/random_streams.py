@@ -1,4 +1,4 @@
-"""Independent random streams of one seed, by number: what is drawn of one does not depend on what the others draw."""
+"""Independent numbered random streams of one seed: numbers drawn from one stream do not depend on the others."""
 
 from __future__ import annotations
 
@@ -6,16 +6,21 @@ import numpy as np
 
 
 def stream(seed: int | np.random.SeedSequence, *number: int) -> np.random.SeedSequence:
-    """A random stream of a seed.
+    """Return a numbered random stream of a seed.
 
-    Unlike ``spawn`` it leaves the seed as it is and can be repeated; streams of streams have longer numbers.
+    Unlike ``spawn``, this leaves the seed unchanged and can be repeated; streams of streams have longer numbers.
 
     Parameters
     ----------
     seed : int | np.random.SeedSequence
-        Of a run, or a stream of it.
+        Seed of a run, or one of its streams.
     number : int
-        Of the stream; none for the seed's own, as if nothing had been spawned of it.
+        Number of the stream; without numbers, the stream of the seed itself.
+
+    Returns
+    -------
+    np.random.SeedSequence
+        Random stream.
     """
     root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
     return np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, *number), pool_size=root.pool_size)

@@ -1,9 +1,8 @@
-"""Declared results: a number says once what it is called, its unit, what it means and how it is shown.
+"""Declared results: the name, unit, meaning and format of a number are defined once.
 
-A `Record` lists the quantities of one kind of result. What the JSON files of a run folder, the tables of reports, data
-tables for other programs and the reference say of them is read off this list. Sources are in SI units. The ending of a
-key names the unit in which files have the number, and the record converts it: a length under ``sigma_um`` is a million
-times the metres that its source has.
+A `Record` lists the quantities of one kind of result. The JSON files of a run folder, tables of reports, data tables
+for other programs and the reference are all made from this list. Sources are in SI units. The ending of a key names the
+unit in files, and the record converts to it: a length with the key ``sigma_um`` is 1e6 times the metres of its source.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import numpy as np
 from analysis.arrays import ARCMIN, ARCSEC
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.study import unit_of
-from twin.framework.artefact import Cell, OwnDecimals, Table, shown_unit
+from twin.framework.artefact import Cell, DecimalNumber, Table, unit_for_reports
 from twin.framework.data_files import DataColumn, DataTable
 
 S = TypeVar("S")
@@ -38,27 +37,32 @@ _PER_SI: Mapping[str, float] = FrozenMap(
     }
     | {"percent": 1e2, "ppm": 1e6, "urad": 1e6, "mrad": 1e3}
 )
-"""Unit -> how many of it are one of SI; units that are missing here and below are those of the source."""
+"""Unit -> number of these units in one SI unit; units that are missing here and below are not converted."""
 _SI: Mapping[str, float] = FrozenMap({"arcsec": ARCSEC, "arcmin": ARCMIN, "mas": 1e-3 * ARCSEC})
-"""Unit -> its size in radians: a division keeps one rounding."""
+"""Unit -> its size in radians: a division rounds only once."""
 
 
 def in_unit(value: Any, unit: str) -> Any:
-    """A number or an array in SI units as so many of a unit; None and what has no unit stay as they are.
+    """Convert a number or an array from SI units to another unit; None and values without a unit are unchanged.
 
     Parameters
     ----------
     value : Any
         Number, array, sequence or mapping of numbers, or None.
     unit : str
-        As `scenes.specs.study.unit_of` reads it off a key; "mm2" and the like are squares, "1/mm" is an inverse.
+        Unit as `scenes.specs.study.unit_of` reads it from a key; "mm2" and the like are squares, "1/mm" is an inverse.
+
+    Returns
+    -------
+    Any
+        Converted value.
     """
     if value is None or not unit:
         return value
     if isinstance(value, Mapping):
-        return {name: in_unit(one, unit) for name, one in value.items()}
+        return {name: in_unit(item, unit) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [in_unit(one, unit) for one in value]
+        return [in_unit(item, unit) for item in value]
     if unit == "deg":
         return np.degrees(value)
     if unit in _SI:
@@ -70,31 +74,31 @@ def in_unit(value: Any, unit: str) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Quantity(Generic[S]):
-    """One number, text or array of a result, or a record within it.
+    """Number, text or array of a result, or a record within it.
 
     Attributes
     ----------
     key : str
-        Its name in files; the ending names the unit.
-    of : Callable[[S], Any]
-        Source -> value in SI units, or, with a record, what that record is of: one source, a list or a mapping of
-        sources, or a mapping of such mappings; None where there is none.
+        Name in files; the ending names the unit.
+    of : callable
+        Function of the source that returns the value in SI units. With ``record``: the source of that record, a list or
+        mapping of sources, or a mapping of such mappings. None if there is no value.
     meaning : str
-        What it is, for the reference and for the columns of other programs.
+        Description for the reference and for columns of other programs.
     head : str
-        How tables of reports call it, without its unit; empty for the key's words.
+        Name in tables of reports, without unit; empty to use the words of the key.
     decimals : int | None
-        That reports show, None for six significant digits.
-    record : Record[Any] | None
-        Of what stands below the key.
+        Digits after the point in reports; None for six significant digits.
+    record : Record | None
+        Record below the key.
     where_known : bool
-        Files have the key only where the value is not None.
+        True if files have the key only where the value is not None.
     converted : bool
-        Whether the source is in SI units; False where it already is in the unit of the key.
+        True if the source is in SI units, False if it is already in the unit of the key.
     shown : str
-        Unit in which reports have it, empty for that of the key: ``percent`` of a share.
-    warning : Callable[[S], str] | None
-        Source -> the sentence that warns readers where the value is False; of a verdict on the result.
+        Unit in reports, empty for that of the key: ``percent`` for a fraction.
+    warning : callable | None
+        Function of the source that returns the warning to print if the value, a verdict on the result, is False.
     """
 
     key: str
@@ -110,68 +114,70 @@ class Quantity(Generic[S]):
 
     @property
     def below(self) -> Record[Any] | None:
-        """The record whose quantities stand below the key, also where its rows do; None for a plain value."""
+        """Record whose quantities are below the key, also as rows; None for a plain value."""
         owner = getattr(self.of, "__self__", None)
         return self.record or (owner if isinstance(owner, Record) else None)
 
     @property
     def unit(self) -> str:
-        """Unit as the program writes it, empty for none."""
+        """Unit as the program writes it; empty for none."""
         square = self.key.removesuffix("2") if self.key.endswith("m2") else ""
         return f"{unit_of((square,))}2" if square else unit_of((self.key,))
 
     @property
     def shown_head(self) -> str:
-        """Head of a report's column, with its unit in brackets."""
+        """Column head in reports, with the unit in brackets."""
         words, unit = self.head or self.key.removesuffix(f"_{self.unit}").replace("_", " "), self.shown or self.unit
-        return f"{words} [{shown_unit(unit)}]" if unit else words
+        return f"{words} [{unit_for_reports(unit)}]" if unit else words
 
     def shown_value(self, value: Any) -> Any:
-        """A value as files have it, in the unit of reports."""
+        """Convert a value from the unit of files to that of reports."""
         return in_unit(value, self.shown)
 
     def value(self, source: S) -> Any:
-        """The value as files have it, before it is plain data."""
-        found = self.of(source)
-        if self.record is None or found is None:
-            return in_unit(found, self.unit) if self.converted else found
-        if isinstance(found, Mapping):
-            return _by_name(self.record, found)
-        if isinstance(found, list | tuple):
-            return [self.record(one) for one in found]
-        return self.record(found)
+        """Return the value in the unit of files, not yet as plain data."""
+        value = self.of(source)
+        if self.record is None or value is None:
+            return in_unit(value, self.unit) if self.converted else value
+        if isinstance(value, Mapping):
+            return _by_name(self.record, value)
+        if isinstance(value, list | tuple):
+            return [self.record(item) for item in value]
+        return self.record(value)
 
 
-def _sources(found: Any) -> list[Any]:
-    """Return the sources of a record: none for None, one, those of a list, or of a mapping and the mappings in it."""
-    several = list(found.values()) if isinstance(found, Mapping) else found
+def _sources(sources: Any) -> list[Any]:
+    """Return the sources of a record as a list, from None, one source, a list, or a nested mapping of sources."""
+    several = list(sources.values()) if isinstance(sources, Mapping) else sources
     if isinstance(several, list):
-        return [source for below in several for source in _sources(below)]
-    return [] if found is None else [found]
+        return [source for nested in several for source in _sources(nested)]
+    return [] if sources is None else [sources]
 
 
 def _by_name(record: Record[Any], sources: Mapping[str, Any]) -> dict[str, Any]:
-    """A record of every source of a mapping; of one whose values are mappings, one level further down."""
-    return {k: _by_name(record, one) if isinstance(one, Mapping) else record(one) for k, one in sources.items()}
+    """Return the record of every source of a nested mapping."""
+    return {
+        k: _by_name(record, source) if isinstance(source, Mapping) else record(source) for k, source in sources.items()
+    }
 
 
 class Record(Generic[S]):
-    """The quantities of one kind of result, in the order in which files have them.
+    """Quantities of one kind of result, in the order in which files list them.
 
-    Called with a source it gives the plain data of a file.
+    Calling a record with a source returns the plain data of a file.
 
     Attributes
     ----------
     meaning
-        What the record is.
+        Description of the record.
     quantities
-        Of it, their keys all different.
+        Quantities with different keys.
     """
 
     def __init__(self, meaning: str, *quantities: Quantity[S]) -> None:
-        keys = [one.key for one in quantities]
-        if twice := [key for key in keys if keys.count(key) > 1]:
-            raise ValueError(f"two quantities of one record are called {twice[0]}")
+        keys = [quantity.key for quantity in quantities]
+        if repeated := [key for key in keys if keys.count(key) > 1]:
+            raise ValueError(f"two quantities of a record have the key {repeated[0]}")
         self.meaning, self.quantities = meaning, quantities
 
     def __iter__(self) -> Iterator[Quantity[S]]:
@@ -179,52 +185,64 @@ class Record(Generic[S]):
         return iter(self.quantities)
 
     def __getitem__(self, key: str) -> Quantity[S]:
-        """The quantity of that key."""
-        return next(one for one in self.quantities if one.key == key)
+        """Return the quantity of that key."""
+        return next(quantity for quantity in self.quantities if quantity.key == key)
 
     @property
     def headed(self) -> list[str]:
         """Keys of the quantities that have a head for tables."""
-        return [one.key for one in self.quantities if one.head]
+        return [quantity.key for quantity in self.quantities if quantity.head]
 
     def __call__(self, source: S) -> dict[str, Any]:
-        """The numbers of one source, as JSON holds them."""
-        found = ((one, one.value(source)) for one in self.quantities)
-        return {one.key: plain_data(value) for one, value in found if not (one.where_known and value is None)}
+        """Return the numbers of one source as JSON holds them."""
+        values = ((quantity, quantity.value(source)) for quantity in self.quantities)
+        return {
+            quantity.key: plain_data(value)
+            for quantity, value in values
+            if not (quantity.where_known and value is None)
+        }
 
     def rows(self, source: S) -> list[dict[str, Any]]:
-        """The numbers of a source each of whose quantities is an array of one length, row by row."""
+        """Return the numbers of a source as rows; each of its quantities is an array of the same length."""
         columns = self(source)
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
     def warnings(self, source: S) -> Iterator[str]:
-        """Yield the warnings of all verdicts of a source that are False, those of the records below it included."""
-        for one in self.quantities:
-            if one.warning is not None and (verdict := one.of(source)) is not None and not verdict:
-                yield one.warning(source)
-            if one.record is not None:
-                found = one.of(source)
-                for below in _sources(list(found) if isinstance(found, tuple) else found):
-                    yield from one.record.warnings(below)
+        """Yield the warnings of all verdicts of a source that are False, including those of nested records."""
+        for quantity in self.quantities:
+            if quantity.warning is not None and (verdict := quantity.of(source)) is not None and not verdict:
+                yield quantity.warning(source)
+            if quantity.record is not None:
+                nested = quantity.of(source)
+                for below in _sources(list(nested) if isinstance(nested, tuple) else nested):
+                    yield from quantity.record.warnings(below)
 
     def of_part(self, part: Callable[[T], S]) -> list[Quantity[T]]:
-        """Quantities of this record for the record of an object of which this record's source is a part."""
+        """Return the quantities for the record of an object that has this record's source as a part."""
 
         def through(of: Callable[[S], Any]) -> Callable[[T], Any]:
             return lambda source: of(part(source))
 
-        return [Quantity(**vars(one) | {"of": through(one.of)}) for one in self]
+        return [Quantity(**vars(quantity) | {"of": through(quantity.of)}) for quantity in self]
 
     def flat(self) -> Record[S]:
-        """The record of its rows as a table has them: quantities with a head, and those of records that have one."""
-        found: list[Quantity[Any]] = []
-        for one in self:
-            below = () if one.record is None else one.record.flat()
-            found += [replace(q, key=f"{one.key}.{q.key}", head=f"{q.head} {one.head}") for q in below if one.head]
-            found += [one] if one.head and one.record is None else []
-        return Record(self.meaning, *found)
+        """Return the record of the rows of a table.
+
+        It has the quantities with a head, including those of nested records with a head.
+        """
+        quantities: list[Quantity[Any]] = []
+        for quantity in self:
+            nested = () if quantity.record is None else quantity.record.flat()
+            quantities += [
+                replace(q, key=f"{quantity.key}.{q.key}", head=f"{q.head} {quantity.head}")
+                for q in nested
+                if quantity.head
+            ]
+            quantities += [quantity] if quantity.head and quantity.record is None else []
+        return Record(self.meaning, *quantities)
 
     def _chosen(self, keys: Sequence[str]) -> list[Quantity[S]]:
+        """Return the quantities of these keys, or all."""
         return [self[key] for key in keys] if keys else list(self.quantities)
 
     def table(
@@ -237,91 +255,98 @@ class Record(Generic[S]):
         label: str = "",
         digits: int = 6,
     ) -> Table:
-        """A table of a report.
+        """Return a table of a report.
 
         Parameters
         ----------
         name : str
-            Of its file.
+            Name of the file.
         title : str
-            heading.
+            Heading.
         caption : str
-            What it shows.
-        rows : Sequence[Mapping[str, Any]] | Mapping[str, Mapping[str, Any]]
-            As this record gives them, or the record that this one is `flat` of; or by name, which then is the first
-            column.
-        keys : Sequence[str]
-            Of the columns, in their order; all if none are given.
+            Description of the content.
+        rows : sequence or mapping of mappings
+            Rows as this record, or the record that this one is `flat` of, returns them; a mapping adds its keys as the
+            first column.
+        keys : sequence of str
+            Keys of the columns, in their order; all if empty.
         label : str
             Head of the column of names.
         digits : int
-            Significant ones of numbers without decimals of their own.
+            Significant digits of numbers without decimals of their own.
         """
 
-        def told(row: Mapping[str, Any]) -> list[Cell]:
-            return [one.shown_value(_below(row, one.key)) for one in shown]
+        def cells_of(row: Mapping[str, Any]) -> list[Cell]:
+            return [quantity.shown_value(_below(row, quantity.key)) for quantity in shown]
 
         shown = self._chosen(keys)
-        heads, decimals = [one.shown_head for one in shown], [one.decimals for one in shown]
+        heads, decimals = [quantity.shown_head for quantity in shown], [quantity.decimals for quantity in shown]
         if isinstance(rows, Mapping):
             heads, decimals = [label, *heads], [None, *decimals]
-            cells: list[list[Cell]] = [[first, *told(row)] for first, row in rows.items()]
+            cells: list[list[Cell]] = [[first, *cells_of(row)] for first, row in rows.items()]
         else:
-            cells = [told(row) for row in rows]
+            cells = [cells_of(row) for row in rows]
         return Table(name, title, caption, heads, cells, decimals, digits)
 
     def lines(
         self, numbers: Mapping[str, Any], keys: Sequence[str] = (), truth: Mapping[str, Any] | None = None
     ) -> list[tuple[Cell, ...]]:
-        """Rows of a report's table with a quantity each: head or meaning, value, sigma where one has a sigma, truth.
+        """Return rows of a report's table with one quantity each: head or meaning, value, sigma if there is one, truth.
 
         Parameters
         ----------
-        numbers : Mapping[str, Any]
-            As this record gives them; a sigma stands beside its value, under the key with ``_sigma``.
-        keys : Sequence[str]
-            Of the rows, in their order; all if none are given.
-        truth : Mapping[str, Any] | None
-            True values by the same keys, None for a table without them.
+        numbers : mapping
+            Numbers as this record returns them; the sigma of a value has its key with ``_sigma``.
+        keys : sequence of str
+            Keys of the rows, in their order; all if empty.
+        truth : mapping | None
+            True values by the same keys; None for a table without them.
         """
 
-        def cell(one: Quantity[S], value: Any) -> Cell:
-            shown: Cell = one.shown_value(value)
-            return OwnDecimals(shown, one.decimals) if isinstance(shown, float) and one.decimals is not None else shown
+        def cell(quantity: Quantity[S], value: Any) -> Cell:
+            shown: Cell = quantity.shown_value(value)
+            return (
+                DecimalNumber(shown, quantity.decimals)
+                if isinstance(shown, float) and quantity.decimals is not None
+                else shown
+            )
 
         chosen = self._chosen(keys)
-        parts = [numbers, {one.key: numbers.get(f"{one.key}_sigma") for one in chosen}]
-        parts = [*(part for part in parts if any(part.get(one.key) is not None for one in chosen))]
+        parts = [numbers, {quantity.key: numbers.get(f"{quantity.key}_sigma") for quantity in chosen}]
+        parts = [*(part for part in parts if any(part.get(quantity.key) is not None for quantity in chosen))]
         parts += [] if truth is None else [truth]
-        heads = (replace(one, head=one.head or one.meaning).shown_head for one in chosen)
-        return [(head, *(cell(one, p.get(one.key)) for p in parts)) for head, one in zip(heads, chosen, strict=True)]
+        heads = (replace(quantity, head=quantity.head or quantity.meaning).shown_head for quantity in chosen)
+        return [
+            (head, *(cell(quantity, p.get(quantity.key)) for p in parts))
+            for head, quantity in zip(heads, chosen, strict=True)
+        ]
 
     def data_table(
         self, name: str, title: str, rows: Sequence[Mapping[str, Any]], keys: Sequence[str] = ()
     ) -> DataTable:
-        """A table for other programs, whose columns say their unit and meaning; arguments as for `table`."""
+        """Return a table for other programs, with units and meanings; see `table` for the parameters."""
         columns = (
-            DataColumn.of(one.key, [row.get(one.key) for row in rows], one.unit, one.meaning)
-            for one in self._chosen(keys)
+            DataColumn.of(quantity.key, [row.get(quantity.key) for row in rows], quantity.unit, quantity.meaning)
+            for quantity in self._chosen(keys)
         )
         return DataTable(name, title, tuple(columns))
 
 
 def _below(row: Mapping[str, Any], key: str) -> Any:
-    """Return what stands in a row under a key, whose dots lead into the mappings of the row; None for nothing."""
+    """Return the value in a row under a key, whose dots lead into nested mappings; None if there is none."""
     for name in key.split("."):
         row = (row or {}).get(name)  # type: ignore[assignment]
     return row
 
 
 def plain_data(value: Any) -> Any:
-    """What JSON can hold of a value.
+    """Convert a value to plain data that JSON can hold.
 
     Parameters
     ----------
     value : Any
-        None, a string, a truth value, a number, an array, a sequence, a mapping with strings as keys, or a dataclass,
-        whose fields are written in their order; all of them may be nested. Nothing is converted here.
+        None, string, truth value, number, array, sequence, mapping with string keys, or dataclass (its fields are
+        written in their order), all possibly nested. Units are not converted.
 
     Returns
     -------
@@ -331,7 +356,7 @@ def plain_data(value: Any) -> Any:
     Raises
     ------
     TypeError
-        Anything else, a mapping with other keys, a complex number.
+        The value has another type, a mapping has other keys, or a number is complex.
     """
     if value is None or isinstance(value, str | bool | np.bool_):
         return bool(value) if isinstance(value, np.bool_) else value
@@ -343,10 +368,10 @@ def plain_data(value: Any) -> Any:
         return {one.name: plain_data(getattr(value, one.name)) for one in fields(value)}
     if isinstance(value, Mapping):
         if other := [key for key in value if not isinstance(key, str)]:
-            raise TypeError(f"a key that is no text: {other[0]!r}")
+            raise TypeError(f"a key must be a text: {other[0]!r}")
         return {str(key): plain_data(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
         return plain_data(value.tolist())
     if isinstance(value, list | tuple):
         return [plain_data(item) for item in value]
-    raise TypeError(f"no plain data: {type(value).__name__}")
+    raise TypeError(f"cannot be converted to plain data: {type(value).__name__}")

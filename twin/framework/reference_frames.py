@@ -1,11 +1,11 @@
-"""In which frames the numbers of a file are: stated in the file itself.
+"""Reference frames of the numbers in a run's files, stated in each file.
 
-Every JSON file of a run begins with ``schema``, its kind and version, and ``reference_frames``, what its positions,
-velocities, directions, angles and times refer to and, where a table or an image beside it cannot say so itself, what
-those refer to. netCDF files have the latter among their attributes. Axes and signs are those of docs/conventions.md.
+Every JSON file of a run begins with ``schema`` (its kind and version) and ``reference_frames``, the reference of its
+positions, velocities, directions, angles and times, and of tables or images beside it that cannot state their own.
+netCDF files have the latter among their attributes. Axes and signs are those of docs/conventions.md.
 
-The statements stand in reference_frames.json: for every kind of file the version of its keys, which rises where keys
-go, change their meaning or get another name, and quantity -> what it refers to. A word in braces is one of its phrases.
+The file reference_frames.json has, for every kind of file, the version of its keys (increased when keys are removed,
+renamed or change their meaning), and quantity -> reference. A word in braces stands for one of the file's phrases.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.procedures import PROCEDURES
 
 _FIRST = 2
-"""Version of the keys of a test that states its frames itself."""
+"""Version of the keys of a test that defines its frames itself."""
 _READ = json.loads((files(__package__) / "reference_frames.json").read_text("utf-8"))
 _VERSIONS: Mapping[str, int] = FrozenMap({kind: said["version"] for kind, said in _READ["files"].items()})
 FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
@@ -28,23 +28,23 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
         for kind, said in _READ["files"].items()
     }
 )
-"""Kind of file -> quantity -> what it refers to."""
+"""Kind of file -> quantity -> its reference frame."""
 
 
 def described(kind: str, data: Mapping[str, Any]) -> dict[str, Any]:
-    """The data of a file with its schema and its frames before them.
+    """Return the data of a file preceded by its schema and reference frames.
 
     Parameters
     ----------
     kind : str
-        Of the file.
-    data : Mapping[str, Any]
-        Its contents, plain data.
+        Kind of the file.
+    data : mapping
+        Content of the file, plain data.
 
     Raises
     ------
     KeyError
-        a kind without an entry in `FRAMES` or a test's `frames` of its own.
+        The kind has no entry in `FRAMES` and is no test with its own `frames`.
     """
     if (frames := FRAMES.get(kind)) is None:
         frames = {procedure.kind: procedure.frames for procedure in PROCEDURES.values()}[kind]
@@ -52,5 +52,5 @@ def described(kind: str, data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def frames_text(kind: str) -> str:
-    """The statement in one line, for an attribute."""
+    """Return the reference frames of a kind of file in one line, for an attribute."""
     return "; ".join(f"{quantity}: {frame}" for quantity, frame in FRAMES[kind].items())

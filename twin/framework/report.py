@@ -1,4 +1,4 @@
-"""What the report of a test is made of: tables, sections with figures, images; sections added from elsewhere."""
+"""Parts of a test's report (tables, sections with figures, images), and sections added by extensions."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from twin.framework.provenance import SelfCheck
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """A heading with what belongs under it.
+    """Section of a report.
 
     Attributes
     ----------
     title : str
-        heading.
-    text : tuple[str, ...]
+        Heading.
+    text : tuple of str
         Paragraphs, plain text.
-    artefacts : tuple[Artefact, ...]
-        Figures, tables and data in the order in which they are shown; their names are unique in a report.
+    artefacts : tuple of Artefact
+        Figures, tables and data in the order shown; their names are unique in a report.
     folded : int
-        Number of the last of them that a reader has to ask for.
+        Number of artefacts at the end that are shown only on request.
     name : str
-        By which the head of the page leads to it; empty for a section that is not listed there.
+        Anchor for the links at the head of the page; empty if the section is not listed there.
     closed : bool
-        a reader has to ask for all of it.
+        True if the whole section is shown only on request.
     """
 
     title: str
@@ -45,61 +45,62 @@ class Section:
 
 
 MOST_SENTENCES = 2
-"""Sentences of a verdict; whatever else was found follows it."""
+"""Largest number of sentences in a verdict; further findings go into the lead."""
 
 
 def sentence(statement: str) -> str:
-    """A statement, with or without its full stop, as a sentence. A first word of small letters gets a capital, so
-    that a statement does not begin with a name; a path or a symbol stays as it is.
+    """Return a statement as a sentence with a full stop and, where suitable, an initial capital.
+
+    Only a first word of lower-case letters gets a capital; a path or a symbol stays as it is.
     """
     text = statement.strip().rstrip(".")
     return f"{text[:1].upper() + text[1:] if re.match(r'[a-z]+[ ,:;]', text) else text}."
 
 
 def answer(*statements: str) -> tuple[str, tuple[str, ...]]:
-    """The verdict of a report, and the sentences that follow it in its lead.
+    """Return the verdict of a report, and the sentences that follow it in its lead.
 
     Parameters
     ----------
     statements : str
-        The most important first, each a sentence with or without its full stop; empty ones are left out.
+        Statements with or without full stop, the most important first; empty ones are omitted.
     """
-    said = [sentence(one) for one in statements if one.strip()]
-    return " ".join(said[:MOST_SENTENCES]), tuple(said[MOST_SENTENCES:])
+    sentences = [sentence(statement) for statement in statements if statement.strip()]
+    return " ".join(sentences[:MOST_SENTENCES]), tuple(sentences[MOST_SENTENCES:])
 
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """What a finished test has to say.
+    """Report of a finished test.
 
     Attributes
     ----------
     title : str
-        Of the report.
+        Title of the report.
     verdict : str
-        What was found and how well: at most two sentences, computed from the numbers.
-    lead : tuple[str, ...]
-        What limits it, where to look, what else was found: a few sentences.
-    facts : tuple[tuple[str, str], ...]
-        What was set up, (label, text).
+        Result and its accuracy: at most two sentences, computed from the numbers.
+    lead : tuple of str
+        A few sentences on what limits the result, where to look, and further findings.
+    facts : tuple of (str, str)
+        Set-up of the test, (label, text).
     summary : Table
-        The main table, also printed in the terminal.
-    sections : tuple[Section, ...]
-        The rest of the report.
-    images : Mapping[str, np.ndarray]
+        Main table, also printed in the terminal.
+    sections : tuple of Section
+        Further sections.
+    images : mapping of str to ndarray
         Name -> recorded frames, uint16 (frames, rows, columns).
-    warnings : tuple[str, ...]
-        What the user should know before using the numbers.
-    image_facts : Mapping[str, FrameFacts]
-        Name of images -> what is known of these frames; of some or all.
+    warnings : tuple of str
+        Warnings to read before using the numbers.
+    image_facts : mapping of str to FrameFacts
+        Name of images -> description of these frames; it may lack some.
     code : int
-        Exit code of the command, of a test whose answer it is.
-    conclusions : tuple[str, ...]
-        What follows from the numbers, sentence by sentence, before all tables.
-    files : Mapping[str, bytes]
-        Path in the run folder -> content, of files that no page shows.
-    checks : tuple[SelfCheck, ...]
-        What the run checked of itself; none for what its numbers say.
+        Exit code of a command whose result is an exit code.
+    conclusions : tuple of str
+        Conclusions from the numbers, one sentence each, shown before all tables.
+    files : mapping of str to bytes
+        Path in the run folder -> content, for files that no page shows.
+    checks : tuple of SelfCheck
+        Self-checks of the run; empty to take those in its numbers.
     """
 
     title: str
@@ -118,86 +119,86 @@ class Report:
 
     @property
     def artefacts(self) -> tuple[Artefact, ...]:
-        """All that it shows, the main table first."""
+        """All artefacts, the main table first."""
         return (self.summary, *(artefact for section in self.sections for artefact in section.artefacts))
 
-    def told(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the numbers of the run with the verdict and the warnings beside them.
+    def with_verdict(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the numbers of the run with the verdict and the warnings.
 
         Parameters
         ----------
-        numbers : Mapping[str, Any]
-            By their keys.
+        numbers : mapping
+            Numbers by their keys.
 
         Raises
         ------
         ValueError
-            They have another verdict or other warnings, which would be lost.
+            The numbers already contain another verdict or other warnings, which would be lost.
         """
         added = {"verdict": self.verdict, "warnings": list(self.warnings)}
         for key, value in added.items():
             if numbers.get(key, value) != value:
-                raise ValueError(f"the key {key!r} of a run's numbers is for what its report says")
+                raise ValueError(f"the key {key!r} of a run's numbers is reserved for the report's own")
         return {**numbers, **added}
 
     def __post_init__(self) -> None:
-        """Refuse a verdict of more than two sentences, and two artefacts of one name: they would be one file."""
+        """Raise ValueError for a verdict of more than two sentences, or artefacts with equal names."""
         if not self.verdict.endswith(".") or len(re.findall(r"[.!?]\s+[A-Z]", self.verdict)) >= MOST_SENTENCES:
-            raise ValueError(f"not one or two sentences: {self.verdict!r}")
+            raise ValueError(f"a verdict must be one or two sentences: {self.verdict!r}")
         names = [artefact.name for artefact in self.artefacts if artefact.within is None]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise ValueError(f"more than one artefact is called {', '.join(twice)}")
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        if repeated:
+            raise ValueError(f"more than one artefact has the name {', '.join(repeated)}")
 
 
 def numbers_only(title: str, file: str, error: Exception) -> Report:
-    """What stands in the place of a report that could not be made: the numbers are in their file all the same.
+    """Return the report that replaces one that could not be made, and refers to the file of the numbers.
 
     Parameters
     ----------
     title : str
-        Of the report.
+        Title of the report.
     file : str
-        With the numbers.
+        File with the numbers.
     error : Exception
-        Why there is no more.
+        Error that occurred.
     """
     why = f"the report could not be made: {type(error).__name__}: {' '.join(str(error).split())}"
-    caption = "What was computed, with all digits."
+    caption = "All computed numbers, with all digits."
     summary = Table("files", "Numbers", caption, ("file",), [[file]])
-    return Report(title, f"The report could not be made, the numbers stand in {file}.", (), (), summary, (), {}, (why,))
+    return Report(title, f"The report could not be made; the numbers are in {file}.", (), (), summary, (), {}, (why,))
 
 
-def with_warnings(report: Report, given: tuple[str, ...]) -> Report:
-    """The report with further warnings before its own.
+def with_warnings(report: Report, warnings: tuple[str, ...]) -> Report:
+    """Return the report with further warnings before its own.
 
     Parameters
     ----------
     report : Report
-        Of a run.
-    given : tuple[str, ...]
-        Warnings of what the run was given.
+        Report of a run.
+    warnings : tuple of str
+        Warnings about the input of the run.
     """
-    return replace(report, warnings=(*given, *report.warnings))
+    return replace(report, warnings=(*warnings, *report.warnings))
 
 
 SECTIONS = ExtensionTable[Callable[[Any], Section | None]]("report_sections", {})
-"""Kind of run and name of the section, ``focus skew`` -> the section, of what the run gave; None where it has nothing
-to say. The kind is ``render`` for the main job, and for a test the name of its numbers' file: ``focus``, ``angle``. A
-section stands before the one that says how to reproduce the run; its artefacts are in the run folder. A new one is
+"""Kind of run and name of the section, ``focus skew`` -> function of the run's results that returns the section, or
+None. The kind is ``render`` for the main job, and for a test the name of its file of numbers: ``focus``, ``angle``.
+A section comes before the one on how to reproduce the run; its artefacts are in the run folder. New sections are
 added here.
 """
 
 
 def further_sections(kind: str, run: Any) -> tuple[Section, ...]:
-    """The sections for a run of that kind, in the order of SECTIONS.
+    """Return the added sections of a run of this kind, in the order of SECTIONS.
 
     Parameters
     ----------
     kind : str
-        Of the run.
+        Kind of the run.
     run : Any
-        What the run gave.
+        Results of the run.
     """
-    found = (SECTIONS[name](run) for name in SECTIONS if name.partition(" ")[0] == kind)
-    return tuple(section for section in found if section is not None)
+    sections = (SECTIONS[name](run) for name in SECTIONS if name.partition(" ")[0] == kind)
+    return tuple(section for section in sections if section is not None)

@@ -1,4 +1,4 @@
-"""A run folder: written under a temporary name beside its place and renamed when complete; none is ever half there."""
+"""Run folders, written under a temporary name and renamed when complete, so that no folder is ever incomplete."""
 
 from __future__ import annotations
 
@@ -23,43 +23,43 @@ from twin.framework.owned_files import MANIFEST
 from twin.framework.provenance import Checksum, Provenance, versions
 
 _WAITING = f".{MANIFEST}{owned_files.PARTIAL}"
-"""Name of the manifest until all that it vouches for is on the disk."""
+"""Name of the manifest until all files that it lists are on the disk."""
 
 
 class RunFolderError(Exception):
-    """A run folder cannot be made; the message says why and what to do."""
+    """Failure to make a run folder; the message gives the reason and the remedy."""
 
 
 @dataclass(frozen=True)
 class Numbered:
-    """The first of STEM-001, STEM-002, ... that is free when the folder is put in place.
+    """First free name of STEM-001, STEM-002, ..., chosen when the folder is put in place.
 
     Attributes
     ----------
     folder : Path
-        Where it shall stand.
+        Parent folder.
     stem : str
-        Of its name.
+        Stem of the name.
     """
 
     folder: Path
     stem: str
 
     def free(self) -> Path:
-        """Return the first that does not exist now."""
-        every = (self.folder / f"{self.stem}-{number:03d}" for number in count(1))
-        return next(path for path in every if not os.path.lexists(path))
+        """Return the first path that does not exist now."""
+        candidates = (self.folder / f"{self.stem}-{number:03d}" for number in count(1))
+        return next(path for path in candidates if not os.path.lexists(path))
 
 
 def chosen(out: Path | None, stem: str) -> Path | Numbered:
-    """The folder that the user chose, else the next free one of that name below ``runs``.
+    """Return the folder that the user chose, else the next free one of that stem below ``runs``.
 
     Parameters
     ----------
     out : Path | None
-        Of the option --out, None where it was not given.
+        Value of the option --out; None if it was not used.
     stem : str
-        Of the folder's name.
+        Stem of the folder's name.
     """
     return out if out is not None else Numbered(Path("runs"), stem)
 
@@ -67,22 +67,22 @@ def chosen(out: Path | None, stem: str) -> Path | Numbered:
 class RunFolder:
     """Context manager that makes a run folder.
 
-    Inside the ``with`` block write files below ``path``; on success they appear as ``target`` in one rename, on any
-    error, and on an interrupt, nothing is left behind. What a killed run left beside the target is removed.
+    Write files below ``path`` inside the ``with`` block. On success they appear as ``target`` in one rename; on any
+    error or interrupt nothing is left behind. Files that a killed run left beside the target are removed.
 
     Parameters
     ----------
     target
-        Where the folder shall stand. Of several runs that start together with the same ``Numbered``, each gets a number
-        of its own when it is complete.
+        Path of the folder. Of several runs that start together with the same ``Numbered``, each gets its own number
+        when it is complete.
     force
-        Replace an existing run folder, which stands until this one is complete. Only a folder that is empty, or of
-        which a run's manifest lists every file as it is, is ever replaced.
+        True to replace an existing run folder, which stays until this one is complete. Only an empty folder, or one
+        whose files are all unchanged and listed in a run's manifest, is ever replaced.
 
     Raises
     ------
     RunFolderError
-        The target exists, or cannot be written.
+        The target exists or cannot be written.
     """
 
     def __init__(self, target: Path | Numbered, force: bool = False) -> None:
@@ -95,9 +95,10 @@ class RunFolder:
         try:
             self._check_target()
         except OSError as error:
-            raise RunFolderError(f"cannot look at the output folder {self.target}: {reason(error)}") from error
+            raise RunFolderError(f"cannot read the output folder {self.target}: {reason(error)}") from error
 
     def _check_target(self) -> None:
+        """Raise RunFolderError if the target exists and must not be replaced."""
         target = self.target
         if not os.path.lexists(target):
             return
@@ -122,7 +123,7 @@ class RunFolder:
             self._made_parents = make_folders(self.target.parent)
             owned_files.sweep(self.target.parent, remove_replaced)
             if self._numbered is None:
-                self._check_target()  # what a killed run had put aside may stand there again
+                self._check_target()  # the sweep may have restored a folder that a killed run had moved aside
             self._unfinished = owned_files.Unfinished(self.target)
             self.path = self._unfinished.path(owned_files.PARTIAL)
             self.path.mkdir()
@@ -134,7 +135,7 @@ class RunFolder:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        """Rename when all went well, else remove."""
+        """Rename the folder on success, otherwise remove it."""
         if error is None:
             try:
                 self._publish()
@@ -142,7 +143,7 @@ class RunFolder:
             except BaseException as failure:
                 self._remove()
                 if isinstance(failure, OSError):
-                    text = f"cannot put the output folder {self.target} in place: {reason(failure)}"
+                    text = f"cannot move the output folder to {self.target}: {reason(failure)}"
                     raise RunFolderError(text) from failure
                 raise
         self._remove()
@@ -150,15 +151,16 @@ class RunFolder:
             raise RunFolderError(f"cannot write to {self.target}: {reason(error)}; nothing was kept") from error
 
     def _remove(self) -> None:
-        """Take back everything that was made."""
+        """Remove everything that was made."""
         if self._unfinished is not None:
             shutil.rmtree(self._unfinished.path(owned_files.PARTIAL), ignore_errors=True)
             self._unfinished.close()
-        with suppress(OSError):  # somebody else has put something there
+        with suppress(OSError):  # another program has put a file there
             for parent in self._made_parents:
                 parent.rmdir()
 
     def _publish(self) -> None:
+        """Write the folder through to the disk and rename it to the target."""
         assert self._unfinished is not None
         sync_tree(self.path)
         if (self.path / _WAITING).exists():
@@ -168,7 +170,7 @@ class RunFolder:
             if self.force and self.target.exists():
                 old = self._unfinished.path(owned_files.OLD)
                 put_in_place(self.path, self.target, old)
-                with suppress(OSError):  # the next run beside it tries again
+                with suppress(OSError):  # the next run in this folder tries again
                     remove_run(old, self.target)
             else:
                 self._claim()
@@ -181,7 +183,7 @@ class RunFolder:
             self._unfinished.close()
 
     def _claim(self) -> None:
-        """Take the target's name with an empty folder, which the rename replaces; only one process can make it."""
+        """Reserve the target's name with an empty folder, which the rename replaces; only one process can make it."""
         while True:
             try:
                 self.target.mkdir()
@@ -192,7 +194,7 @@ class RunFolder:
                 self.target = self._numbered.free()
 
     def write_json(self, name: str, data: Any) -> None:
-        """Write a JSON file; NaN and infinities are refused, since JSON has none."""
+        """Write a JSON file; NaN and infinities raise ValueError, since JSON has none."""
         self.write_text(name, json_text(data))
 
     def write_text(self, name: str, text: str) -> None:
@@ -200,94 +202,98 @@ class RunFolder:
         self._place(name).write_text(text, encoding="utf-8")
 
     def write_bytes(self, name: str, content: bytes | memoryview) -> None:
-        """Write a binary file; contents that lie in a file themselves are not held in memory."""
-        place = self._place(name)
+        """Write a binary file; contents that are in a file themselves are copied in parts."""
+        path = self._place(name)
         if not isinstance(content, memoryview):
-            place.write_bytes(content)
+            path.write_bytes(content)
             return
-        from twin.framework.frame_store import PART, let_go  # with NumPy, and most commands write no frames
+        from twin.framework.frame_store import (
+            PART,
+            release_memory,
+        )  # imported here with NumPy, since most commands write no frames
 
-        with place.open("wb") as file:
+        with path.open("wb") as file:
             for start in range(0, len(content), PART):
                 file.write(content[start : start + PART])
-                let_go(content)
+                release_memory(content)
 
     def write_with(self, name: str, writer: Callable[[Path], None]) -> None:
-        """Let ``writer`` make the file of that name."""
+        """Call ``writer`` with the path of the file of that name."""
         writer(self._place(name))
 
     def _place(self, name: str) -> Path:
-        place = self.path / (_WAITING if name == MANIFEST else name)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        return place
+        """Return the path of a file, whose folder is made."""
+        path = self.path / (_WAITING if name == MANIFEST else name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
 
     def checksums(self) -> dict[str, str]:
-        """SHA-256 of every file written so far, by path relative to the folder."""
+        """Return the SHA-256 of every file written so far, by its path relative to the folder."""
         return {name: owned_files.digest(self.path / name) for name in owned_files.every_file(self.path)}
 
 
 def json_text(data: Any) -> str:
-    """The text of a JSON file, as every command writes it."""
+    """Return the text of a JSON file in the format of all commands."""
     return json.dumps(data, indent=2, allow_nan=False) + "\n"
 
 
 def _inside(name: str) -> str:
-    """A path relative to a folder that stays in it."""
+    """Return a relative path, or raise ValueError if it leaves its folder."""
     path = PurePosixPath(name)
     if path.is_absolute() or not path.parts or ".." in path.parts or path.as_posix() != name or "\0" in name:
-        raise ValueError("not the path of a file in the folder")
+        raise ValueError("not a path of a file in the folder")
     return name
 
 
 class Manifest(BaseModel):
-    """All that manifests say, in the order in which they say it; what has a default is said by some programs only.
-    Other people's programs call their files manifest.json as well.
+    """Content of manifest.json, in its order; entries with a default are written by some programs only.
+
+    Programs of other people may use the name manifest.json as well.
 
     Attributes
     ----------
     program : str
-        That made the folder, ``twin.render``.
+        Program that made the folder, ``twin.render``.
     test : str
         Kind of the test, ``focus``.
     gradient : bool
-        The run differentiates a study.
-    again : list[str]
-        Words of the command, without ``python -m``, that makes the run again from its own folder; none where no command
-        can.
+        True if the run differentiates a study.
+    again : list of str
+        Words of the command, without ``python -m``, that repeats the run from its own folder; empty if no command can.
     started_in : str
-        Absolute path of the folder where it was typed, if words of it are relative to that.
-    versions : dict[str, str]
-        Of the twin and of what it uses.
+        Absolute path of the working directory, if words of the command are relative to it.
+    versions : dict of str to str
+        Versions of the twin and of the packages it uses.
     provenance : Provenance | None
-        Source, processor and linear algebra that made it.
+        Source, processor and linear algebra of the run.
     backend : str
-        Where it was traced.
+        Backend of the ray trace.
     seed : int
-        Of all that was drawn.
-    only, fast : str | None
-        The checks that were chosen, None for all; whether with fewer trials.
+        Seed of all random numbers.
+    only, fast : str | None, bool
+        Checks that were chosen (None for all), and True if they used fewer trials.
     frames : int
-        Per state.
+        Number of frames per state.
     runs, failed : int
-        Of a study.
+        Number of runs of a study, and of those that failed.
     started_unix_s : float
-        When, seconds since the epoch.
+        Start time, in seconds since the epoch.
     wall_time_s : float
-        That it took.
+        Duration, in seconds.
     workers : int
-        processes.
+        Number of worker processes.
     worst_relative : float | None
-        Largest relative deviation of derivatives from differences, None where none was compared.
-    warnings : list[str]
-        What the user was told.
-    checks : list[dict[str, Any]]
-        What the run checked of itself, as of `twin.framework.provenance.SelfCheck`.
-    inputs : dict[str, Checksum]
-        Absolute path of every file that the run read and that is not in its folder -> checksum.
-    sha256 : dict[str, Checksum]
-        Checksum of every file of the run but this one, by its path in the folder.
-    digest : Checksum | None
-        Checksum of all else that stands here, see `seal`.
+        Largest relative difference of derivatives and finite differences; None if none were compared.
+    warnings : list of str
+        Warnings shown to the user.
+    checks : list of dict
+        Self-checks of the run, see `twin.framework.provenance.SelfCheck`.
+    inputs : dict of str to str
+        Absolute path of every file that the run read outside its folder -> checksum.
+    sha256 : dict of str to str
+        Path in the folder of every file of the run except the manifest -> checksum.
+    digest : str | None
+        Checksum of all other entries, see `seal`.
     """
 
     model_config = ConfigDict(extra="allow", strict=True, frozen=True)
@@ -318,46 +324,47 @@ class Manifest(BaseModel):
 
     @property
     def kind(self) -> str:
-        """Program, and the kind of a test."""
+        """Program and kind of the test."""
         return f"{self.program} {self.test}".strip()
 
 
 def _ours(named: dict[str, str]) -> dict[str, str]:
+    """Return the versions of a manifest, or raise ValueError if another program made it."""
     if "space-camera-twin" not in named:
         raise ValueError("made by another program")
     return named
 
 
 class FilesOfRun(Protocol):
-    """A folder that a run's files are written into."""
+    """Folder into which the files of a run are written."""
 
     def write_json(self, name: str, data: Any) -> None:
         """Write plain data."""
 
     def checksums(self) -> dict[str, str]:
-        """SHA-256 of every file of the run so far."""
+        """Return the SHA-256 of every file of the run so far."""
 
 
 def write_manifest(folder: FilesOfRun, program: str, started: float, seconds: float, **facts: Any) -> None:
-    """Write the manifest, which lists every other file of the run; the last thing that is done in a folder.
+    """Write the manifest, which lists every other file of the run, as the last file of a folder.
 
     Parameters
     ----------
     folder : FilesOfRun
-        open.
+        Open folder.
     program : str
-        That makes it, as the user calls it.
+        Program that makes the folder, as the user calls it.
     started : float
-        Seconds since the epoch.
+        Start time, in seconds since the epoch.
     seconds : float
-        That it took.
+        Duration, in seconds.
     facts : Any
-        Others that `Manifest` knows, in any order.
+        Other fields of `Manifest`, in any order.
 
     Raises
     ------
     ValueError
-        a fact that it does not know.
+        `Manifest` has no such field.
     """
     entries = {
         **facts,
@@ -369,45 +376,45 @@ def write_manifest(folder: FilesOfRun, program: str, started: float, seconds: fl
         "sha256": folder.checksums(),
     }
     if unknown := sorted(entries.keys() - Manifest.model_fields.keys()):
-        raise ValueError(f"no fact of a manifest: {', '.join(unknown)}")
+        raise ValueError(f"a manifest has no fields {', '.join(unknown)}")
     manifest = {key: entries[key] for key in Manifest.model_fields if key in entries}
     folder.write_json(MANIFEST, {**manifest, "digest": seal(manifest)})
 
 
 def seal(manifest: Mapping[str, Any]) -> str:
-    """SHA-256 of what a manifest says but for its ``digest``: of its JSON with sorted keys and without blanks."""
+    """Return the SHA-256 of a manifest without its ``digest``, from its JSON with sorted keys and without blanks."""
     content = {key: value for key, value in manifest.items() if key != "digest"}
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def altered(folder: Path, manifest: Manifest) -> list[str]:
-    """Files of a run that are not as it wrote them: other bytes, gone, or a link or folder in their place.
+    """Return the files of a run that are not as it wrote them: changed, missing, or replaced by a link or folder.
 
     Parameters
     ----------
     folder : Path
-        Of the run.
+        Folder of the run.
     manifest : Manifest
-        Of it.
+        Manifest of the run.
 
     Raises
     ------
     OSError
-        One cannot be read.
+        A file cannot be read.
     """
     return [name for name, known in manifest.sha256.items() if not owned_files.is_as_written(folder / name, {known})]
 
 
 def read_manifest(folder: Path) -> Manifest | None:
-    """The manifest of a run, None when the folder has none."""
+    """Return the manifest of a run, or None if the folder has none."""
     try:
         return Manifest.model_validate_json((folder / MANIFEST).read_bytes())
-    except (OSError, ValueError):  # of pydantic too; a name with a NUL is none of a folder
+    except (OSError, ValueError):  # pydantic's errors too, and paths with a NUL
         return None
 
 
 def finished_manifest(folder: Path) -> Manifest:
-    """The manifest of a finished run. Raises InputError: the folder has none."""
+    """Return the manifest of a finished run. Raises InputError if the folder has none."""
     manifest = read_manifest(folder)
     if manifest is None:
         problem = "no such folder" if not folder.is_dir() else f"not a run folder: it has no {MANIFEST} of a run"
@@ -416,30 +423,33 @@ def finished_manifest(folder: Path) -> Manifest:
 
 
 def is_run_folder(folder: Path) -> bool:
-    """Whether a folder holds the manifest of a run."""
+    """Return True if a folder holds the manifest of a run."""
     return read_manifest(folder) is not None
 
 
 def unlisted(folder: Path) -> list[str] | None:
-    """Files in the folder of a run that it did not write, or not like this; None when it is none. Raises OSError."""
+    """Return the files in a run folder that the run did not write, or that were changed; None if it is no run folder.
+
+    Raises OSError.
+    """
     manifest = read_manifest(folder)
-    return None if manifest is None else owned_files.foreign_files(folder, manifest.sha256)
+    return None if manifest is None else owned_files.changed_or_added_files(folder, manifest.sha256)
 
 
 def refuse_others(folder: Path, others: Sequence[str]) -> None:
-    """Refuse to replace a folder with files in it that no run put there, or that were changed since.
+    """Raise RunFolderError if a folder to be replaced has files that no run put there, or that were changed since.
 
     Parameters
     ----------
     folder : Path
-        That is to be replaced.
-    others : Sequence[str]
+        Folder to be replaced.
+    others : sequence of str
         Files in it that are not the run's own.
 
     Raises
     ------
     RunFolderError
-        There are some.
+        There are such files.
     """
     if not others:
         return
@@ -447,40 +457,45 @@ def refuse_others(folder: Path, others: Sequence[str]) -> None:
     changed = set(manifest.sha256 if manifest is not None else ())
     named = owned_files.first_names([f"{name} (changed since)" if name in changed else name for name in others])
     raise RunFolderError(
-        f"output folder {folder} also holds what the run did not write: {named}; --force removes only the run's own "
+        f"output folder {folder} also holds files that the run did not write: {named}; --force removes only its own "
         "files, so move these away or choose another folder with --out"
     )
 
 
 def remove_run(old: Path, new: Path) -> None:
-    """Remove the replaced folder of a run; files that were put into it or changed meanwhile move to the new one.
+    """Remove the replaced folder of a run; files that were added or changed meanwhile move to the new one.
 
     Parameters
     ----------
     old : Path
-        The replaced folder, under another name.
+        Replaced folder, under another name.
     new : Path
-        What stands in its place.
+        Folder in its place.
     """
     others = unlisted(old)
     for name in owned_files.every_file(old) if others is None else others:
-        place = new / name
-        while os.path.lexists(place):
-            place = place.with_name(f"{place.name}.kept")
-        place.parent.mkdir(parents=True, exist_ok=True)
-        (old / name).rename(place)
+        path = new / name
+        while os.path.lexists(path):
+            path = path.with_name(f"{path.name}.kept")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        (old / name).rename(path)
     owned_files.remove_files(old, set())
 
 
 def remove_replaced(old: Path, new: Path) -> bool:
-    """Remove what a killed process had replaced, if what it had in its place is complete.
+    """Remove a folder that a killed process had replaced, if the folder in its place is complete.
 
     Parameters
     ----------
     old : Path
-        What was to be replaced, under another name.
+        Replaced folder, under another name.
     new : Path
-        What stands in its place.
+        Folder in its place.
+
+    Returns
+    -------
+    bool
+        True if it was removed.
     """
     if not is_run_folder(new):
         return False
@@ -489,37 +504,37 @@ def remove_replaced(old: Path, new: Path) -> bool:
 
 
 def reason(error: OSError) -> str:
-    """Why a file cannot be, in a few words; HDF5 puts a page into strerror."""
+    """Return the reason of a file error in a few words; HDF5 puts a whole page into strerror."""
     return os.strerror(error.errno) if error.errno else str(error)
 
 
 JOURNAL = ".journal"
-"""Ending of a file with finished pieces of work, `twin.framework.journal`."""
+"""Extension of a file with finished pieces of work, see `twin.framework.journal`."""
 _KEPT = re.compile(rf"{re.escape(owned_files.KEPT_LOCK)}|[^/]+{re.escape(JOURNAL)}|{PARTIAL_NAME}")
-"""Files that commands keep there."""
+"""Pattern of the files that commands keep in such a folder."""
 
 
 class KeptWork:
-    """Context manager over the folder ``OUT.ENDING``, in which a command keeps its work beside its run folder for
-    ``--resume``, and which nobody else uses until the block ends.
+    """Context manager over the folder ``OUT.ENDING``, in which a command keeps intermediate results for ``--resume``.
 
-    Without ``--out`` a command that runs beside another one of the same name takes ``STEM.2.ENDING``, and so on. Files
-    that no command of this program keeps there are never removed; a folder that holds some is refused.
+    The folder is locked until the block ends. Without ``--out``, a command that runs beside another of the same name
+    takes ``STEM.2.ENDING``, and so on. Files that commands of this program do not keep there are never removed; a
+    folder that holds such files is refused.
 
     Parameters
     ----------
     out
-        The run folder that the user chose, None for one below ``runs``.
+        Run folder that the user chose; None for one below ``runs``.
     stem
-        Name of the run folder where the user chose none.
+        Name of the run folder if the user chose none.
     ending
-        What is kept, ``samples`` for instance.
+        Kind of the results, ``samples`` for instance.
     resume
-        Go on with what is there.
+        True to continue with existing results.
     force
-        Else remove what is there; where this is false, refuse to begin anew.
+        Without ``resume``: True to remove existing results, False to refuse to start if there are any.
     command
-        Words of the command that goes on, without ``--resume``.
+        Words of the command that continues, without ``--resume``.
     """
 
     def __init__(
@@ -535,63 +550,64 @@ class KeptWork:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Let others use the folder; where a bad input ends the command before anything was kept, remove it."""
+        """Unlock the folder; if an invalid input ended the command before anything was kept, remove it."""
         if self._lock is not None:
             if kind is not None and self._place and owned_files.every_file(self._place) == [owned_files.KEPT_LOCK]:
                 self.finish()
             os.close(self._lock)
 
     def begin(self) -> Path:
-        """Make or take up the folder, and return it.
+        """Make or reopen the folder, lock it, and return its path.
 
         Raises
         ------
         RunFolderError
-            Another command uses the folder that the user chose, it holds files of somebody else, or it cannot be made.
+            Another command uses the folder that the user chose, it holds other files, or it cannot be made.
         """
         try:
             for number in count(1):
-                place = self._first.with_name(f"{self._first.name}{'' if number == 1 else f'.{number}'}.{self._ending}")
-                self._refuse_others(place)
-                make_folders(place)
-                self._lock = owned_files.locked(place / owned_files.KEPT_LOCK)
+                path = self._first.with_name(f"{self._first.name}{'' if number == 1 else f'.{number}'}.{self._ending}")
+                self._refuse_others(path)
+                make_folders(path)
+                self._lock = owned_files.locked(path / owned_files.KEPT_LOCK)
                 if self._lock is not None:
                     break
                 if self._chosen:
-                    text = f"{place} is in use by another command; wait until it has ended, or choose another --out"
+                    text = f"{path} is in use by another command; wait until it has ended, or choose another --out"
                     raise RunFolderError(text)
-            if not (self._resume or self._force) and owned_files.every_file(place) != [owned_files.KEPT_LOCK]:
+            if not (self._resume or self._force) and owned_files.every_file(path) != [owned_files.KEPT_LOCK]:
                 raise RunFolderError(
-                    f"{place} holds what is done of a run that was broken off; go on with it with --resume, begin anew "
+                    f"{path} holds the finished part of an interrupted run; continue it with --resume, start again "
                     "with --force, or choose another --out"
                 )
-            self._place = place
+            self._place = path
             if not self._resume:
-                owned_files.remove_files(place, {owned_files.KEPT_LOCK})
+                owned_files.remove_files(path, {owned_files.KEPT_LOCK})
         except OSError as error:
-            raise RunFolderError(f"cannot use {place}: {reason(error)}") from error
-        return place
+            raise RunFolderError(f"cannot use {path}: {reason(error)}") from error
+        return path
 
     def left(self) -> str:
-        """What is left of a run that was broken off, for a message."""
+        """Return the message about what is kept of an interrupted run."""
         if self._place is None or not self._place.exists():
             return "nothing was kept"
-        return f"what is done is kept, go on with: {self._command} --resume"
+        return f"finished work is kept, continue with: {self._command} --resume"
 
     def finish(self) -> None:
-        """Remove what was kept: its results stand in the run folder."""
+        """Remove the intermediate results; the final ones are in the run folder."""
         if self._place is not None:
             others = {name for name in owned_files.every_file(self._place) if not _KEPT.fullmatch(name)}
             owned_files.remove_files(self._place, others)
 
-    def _refuse_others(self, place: Path) -> None:
-        if not os.path.lexists(place):
+    def _refuse_others(self, path: Path) -> None:
+        """Raise RunFolderError if the path is not a folder of intermediate results."""
+        if not os.path.lexists(path):
             return
-        if place.is_symlink() or not place.is_dir():
-            raise RunFolderError(f"{place} is in the way of what is kept for --resume; choose another --out")
-        names = owned_files.every_file(place)
+        if path.is_symlink() or not path.is_dir():
+            raise RunFolderError(f"{path} is needed for the intermediate results of --resume; choose another --out")
+        names = owned_files.every_file(path)
         known = owned_files.KEPT_LOCK in names
         if others := [name for name in names if not (known and _KEPT.fullmatch(name))]:
             named = owned_files.first_names(others)
-            text = f"{place} holds files that this program did not write: {named}; move it, or choose another --out"
+            text = f"{path} holds files that this program did not write: {named}; move it, or choose another --out"
             raise RunFolderError(text)

@@ -1,9 +1,9 @@
-"""A second process of a command for what can be done apart: it imports what draws while the first one still computes,
-and then both take piece after piece of the drawing.
+"""Second process of a command for tasks that can run in parallel, such as drawing.
 
-It is a fork of the command, made before anything was computed, and does nothing but what it is sent: it touches no
-device, writes into no run folder and ends with the command. What it fails to give the command does itself, and that
-raises the errors; so a result is never lost, and is the same with the second process as without it.
+It imports the drawing libraries while the first process computes; then both take task after task. It is a fork of the
+command, made before anything was computed, and does only the tasks that it is sent: it touches no device, writes into
+no run folder and ends with the command. Tasks that fail there are repeated by the command itself, which raises the
+errors; so no result is lost, and results are the same with and without the second process.
 """
 
 from __future__ import annotations
@@ -24,21 +24,22 @@ from typing import IO, Any
 from optics.numerics.backend import cores
 
 MOST_TASKS = 256
+"""Largest number of tasks: a task number is one byte."""
 _HEAD = struct.Struct("=QB")
-"""What tells of tasks: bytes that they take, and how many of them the second process does alone."""
+"""Header of a batch of tasks: its size in bytes, and the number of its tasks that only the second process does."""
 PATIENCE = 120.0
-"""Seconds for which one task may keep the command waiting that has nothing else to do; then it is done here, too."""
+"""Time that the command, once idle, waits for the second process before it repeats the task itself, in seconds."""
 
 
 class SecondProcess:
-    """Use as a context: from its beginning on the process is there, if the machine has a core for it.
+    """Context manager that runs the second process, if the machine has a core for it.
 
     Parameters
     ----------
     prepare
-        Done in it at once, imports most of all.
+        Function that the second process calls at once, mainly to import modules.
     wanted
-        False for none: everything is done here.
+        False to do all tasks in this process.
     """
 
     def __init__(self, prepare: Callable[[], object], wanted: bool = True) -> None:
@@ -54,29 +55,30 @@ class SecondProcess:
 
     def __exit__(self, *_: object) -> None:
         if self._child:
-            self._ended(0.0)
+            self._wait_for_end(0.0)
             self._from_child.close()
 
     def __contains__(self, name: str) -> bool:
-        """Whether a task of that name has been started."""
+        """Return True if a task of that name has been started."""
         return name in self._tasks
 
     def start(self, tasks: Mapping[str, Callable[[], Any]], apart: Collection[str] = ()) -> None:
-        """Let it begin with some tasks, beside those that it may have already. Tasks that cannot be pickled, because of
-        what a user has added, are left to this process.
+        """Start some tasks, beside those that were started before.
+
+        Tasks that cannot be pickled, because of user extensions, are left to this process.
 
         Parameters
         ----------
-        tasks : Mapping[str, Callable[[], Any]]
-            Name -> what is to be done, the longest first. They see the values that they hold as they are now.
-        apart : Collection[str]
-            Names of tasks that the second process does first and alone where there is one: what they import it has
-            imported already, and this process need not import it as well.
+        tasks : mapping of str to callable
+            Name -> task, the longest first. Tasks see the values that they hold as they are now.
+        apart : collection of str
+            Names of tasks that only the second process does, first, if it exists: it has already imported the modules
+            they need, and this process need not import them as well.
 
         Raises
         ------
         ValueError
-            There are more than ``MOST_TASKS`` in all.
+            There are more than ``MOST_TASKS`` tasks in total.
         """
         first = len(self._tasks)
         if first + len(tasks) > MOST_TASKS:
@@ -89,35 +91,36 @@ class SecondProcess:
             content = pickle.dumps({numbers[name]: task for name, task in tasks.items()}, pickle.HIGHEST_PROTOCOL)
         except (pickle.PicklingError, TypeError, AttributeError):
             return
-        # through a file: a pipe that nobody reads yet would keep this process waiting
+        # through a file, since a full pipe without a reader would block this process
         os.pwrite(self._to_child.fileno(), content, self._sent)
         self._sent += len(content)
         alone = bytes(number for name, number in numbers.items() if name in apart)
         try:
-            # in this order: a turn is of a task that the second process has or finds announced
+            # in this order: when a task number can be read, its batch has been announced
             os.write(self._batches, _HEAD.pack(len(content), len(alone)) + alone)
             os.write(self._turns[1], bytes(number for name, number in numbers.items() if name not in apart))
         except BrokenPipeError:
-            pass  # it is gone
+            pass  # the second process has ended
 
     def results(self) -> dict[str, Any]:
-        """Name -> result of every task. Raises whatever a task does."""
-        names, found = list(self._tasks), {}
+        """Return name -> result of every task. Raises the exceptions of the tasks."""
+        names, results = list(self._tasks), {}
         if self._child:
-            self._nothing_more()
+            self._close_pipes()
             for number in _turns(self._turns[0]):
-                found[names[number]] = self._tasks[names[number]]()
-            self._ended(PATIENCE)
-            for number, result in _stored(self._from_child):
-                found[names[number]] = result
-        return {name: found[name] if name in found else task() for name, task in self._tasks.items()}
+                results[names[number]] = self._tasks[names[number]]()
+            self._wait_for_end(PATIENCE)
+            for number, result in _stored_results(self._from_child):
+                results[names[number]] = result
+        return {name: results[name] if name in results else task() for name, task in self._tasks.items()}
 
     def _begin(self) -> None:
+        """Fork the second process."""
         sys.stdout.flush()
         sys.stderr.flush()
-        # whoever reads a byte has the task of that number; a pipe gives each to one reader alone
+        # the process that reads a byte has the task of that number; a pipe gives each byte to one reader
         self._turns, batches = os.pipe(), os.pipe()
-        os.set_blocking(self._turns[0], False)  # of two that wait for a byte one would wait in vain
+        os.set_blocking(self._turns[0], False)  # of two processes that wait for a byte, one would wait for ever
         self._to_child: IO[bytes] = tempfile.TemporaryFile()
         self._from_child: IO[bytes] = tempfile.TemporaryFile()
         self._sent = 0
@@ -128,21 +131,21 @@ class SecondProcess:
                 os.close(self._turns[1])
                 self._work(batches[0])
             finally:
-                os._exit(0)  # nothing of the command is closed, written or told twice
+                os._exit(0)  # no buffer of the command is flushed twice
         os.close(batches[0])
         self._batches = batches[1]
         self._child, self._sending = child, True
 
     def _work(self, batches: int) -> None:
-        """All that the second process does."""
-        gc.disable()  # what the first process computes with is left alone
+        """Run the second process: receive tasks, do them and store their results."""
+        gc.disable()  # leaves the memory pages shared with the first process untouched
         for number in (signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_DFL)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first one ends it
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends it
         nowhere = os.open(os.devnull, os.O_RDWR)
         for stream in (0, 1, 2):
             os.dup2(nowhere, stream)
-        # a lock on a run folder ends with the process that holds it, and is held by every copy of its file
+        # every copy of a lock file's descriptor holds the lock, so close all other descriptors
         first, turns = 3, self._turns[0]
         for kept in sorted((batches, turns, self._to_child.fileno(), self._from_child.fileno())):
             os.closerange(first, kept)
@@ -167,7 +170,7 @@ class SecondProcess:
                 continue
             try:
                 turn = os.read(turns, 1)
-            except BlockingIOError:  # the first process has taken it
+            except BlockingIOError:  # the first process has taken the task
                 continue
             if not turn:
                 waiting.remove(turns)
@@ -175,21 +178,21 @@ class SecondProcess:
             self._do(turn[0], tasks)
 
     def _do(self, number: int, tasks: Mapping[int, Callable[[], Any]]) -> None:
-        """Do a task in the second process, and store its result."""
+        """Do a task in the second process and store its result."""
         pickle.dump((number, tasks[number]()), self._from_child)
         self._from_child.flush()
 
-    def _nothing_more(self) -> None:
-        """There are no further tasks: who waits for one is told so."""
+    def _close_pipes(self) -> None:
+        """Close the pipes, which tells the second process that no further tasks come."""
         if self._sending:
             self._sending = False
             os.close(self._turns[1])
             os.close(self._batches)
             self._to_child.close()
 
-    def _ended(self, patience: float) -> None:
-        """Wait for its end, and bring it about when it takes too long."""
-        self._nothing_more()
+    def _wait_for_end(self, patience: float) -> None:
+        """Wait for the end of the second process, and kill it if it takes longer than ``patience`` seconds."""
+        self._close_pipes()
         last = time.monotonic() + patience
         while os.waitpid(self._child, os.WNOHANG) == (0, 0):
             if time.monotonic() > last:
@@ -202,24 +205,24 @@ class SecondProcess:
 
 
 def _turns(pipe: int) -> Iterator[int]:
-    """Numbers of tasks that nobody else has, until there are no more."""
+    """Yield numbers of tasks that no other process has taken, until there are no more."""
     while True:
         select.select([pipe], (), ())
         try:
             number = os.read(pipe, 1)
-        except BlockingIOError:  # the other process has taken it
+        except BlockingIOError:  # the other process has taken the task
             continue
         if not number:
             return
         yield number[0]
 
 
-def _stored(file: IO[bytes]) -> Any:
-    """All whole results in a file."""
+def _stored_results(file: IO[bytes]) -> Any:
+    """Yield all complete results in a file."""
     with file:
         file.seek(0)
         while True:
             try:
                 yield pickle.load(file)
-            except (EOFError, pickle.UnpicklingError):  # nothing more, or it was killed while it wrote
+            except (EOFError, pickle.UnpicklingError):  # the end of the file, or the process was killed while it wrote
                 return

@@ -1,4 +1,4 @@
-"""Figures as inline SVG: one look for all, no pyplot, no global state left behind."""
+"""Figures as inline SVG in one style, without pyplot and without global state."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-if TYPE_CHECKING:  # who only names colours does not wait for what draws
+if TYPE_CHECKING:  # modules that only need the colours do not import Matplotlib
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-# Okabe and Ito's palette: told apart with any colour vision.
+# Palette of Okabe and Ito, which can be distinguished with any colour vision.
 BLUE, ORANGE, GREEN, VERMILION, SKY, PURPLE, YELLOW = (
     "#0072B2",
     "#E69F00",
@@ -29,9 +29,9 @@ BLUE, ORANGE, GREEN, VERMILION, SKY, PURPLE, YELLOW = (
 BROWN = "#7a4a12"
 INK, GREY, LIGHT, SHADE = "#1b1f24", "#6b7280", "#d9dde3", "#eef3f8"
 BEFORE, AFTER = SKY, VERMILION
-"""Centroid marks."""
+"""Colours of the centroid marks before and after the change."""
 GRAY, DIVERGING = "gray", "RdBu_r"
-"""Colour maps of images and of what has a sign."""
+"""Colour maps of images, and of values with a sign."""
 
 _STYLE: dict[str, Any] = {
     "font.size": 9.0,
@@ -53,18 +53,18 @@ _STYLE: dict[str, Any] = {
     "path.simplify": True,
 }
 WIDTH = 10.6
-"""Inches: the width of the page's column at 100 dots per inch."""
+"""Width of the page's column at 100 dots per inch, in inches."""
 
 
 def new_figure(height: float, pads: dict[str, Any] | None = None) -> Figure:
-    """An empty figure as wide as a page's column, arranged without overlap.
+    """Return an empty figure as wide as a page's column, with a layout without overlap.
 
     Parameters
     ----------
     height : float
-        Of the figure, inches.
-    pads : dict[str, Any] | None
-        Arguments of ``ConstrainedLayoutEngine``; None for the usual room between panels.
+        Height of the figure, in inches.
+    pads : dict | None
+        Arguments of ``ConstrainedLayoutEngine``; None for the usual space between panels.
     """
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -73,10 +73,10 @@ def new_figure(height: float, pads: dict[str, Any] | None = None) -> Figure:
 
 @cache
 def _arranged() -> type[Figure]:
-    """Figures that are saved in one drawing and an arrangement.
+    """Return the class of figures that are drawn only once when they are saved.
 
-    To save a figure Matplotlib draws it twice, the first time onto nothing, and needs of that only that its parts are
-    arranged: a quarter of the time. To arrange and to draw an axis it asks ten times for the same ticks.
+    To save a figure, Matplotlib draws it twice, the first time without output and only for the layout, which takes a
+    quarter of the time. To lay out and draw an axis, it computes the same ticks ten times.
     """
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -84,9 +84,9 @@ def _arranged() -> type[Figure]:
     class Arranged(Figure):
         def draw(self, renderer: Any) -> None:
             engine = self.get_layout_engine()
-            with _ticks_kept(self):
+            with _ticks_cached(self):
                 if isinstance(engine, ConstrainedLayoutEngine) and self.canvas.is_saving():
-                    engine.execute(self)  # Matplotlib then takes the engine away and comes again
+                    engine.execute(self)  # Matplotlib then removes the engine and draws again
                 else:
                     super().draw(renderer)
 
@@ -94,50 +94,48 @@ def _arranged() -> type[Figure]:
 
 
 @contextmanager
-def _ticks_kept(figure: Figure) -> Iterator[None]:
-    """While the figure is arranged or drawn, ticks and the places of their labels are worked out once for each size and
-    view of their axes.
-    """
-    every: list[Any] = [axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)]
-    for axis in every:
-        axis._update_ticks, axis._get_ticklabel_bboxes = _kept_of(axis)
+def _ticks_cached(figure: Figure) -> Iterator[None]:
+    """Compute ticks and label positions only once for each size and view of the axes while the figure is drawn."""
+    every_axis: list[Any] = [axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)]
+    for axis in every_axis:
+        axis._update_ticks, axis._get_ticklabel_bboxes = _cached_functions(axis)
     try:
         yield
     finally:
-        for axis in every:
+        for axis in every_axis:
             del axis._update_ticks, axis._get_ticklabel_bboxes
 
 
-def _kept_of(axis: Any) -> tuple[Callable[[], Any], Callable[[Any, Any], Any]]:
-    """The two functions of an axis, which remember what they found last."""
+def _cached_functions(axis: Any) -> tuple[Callable[[], Any], Callable[[Any, Any], Any]]:
+    """Return the two functions of an axis with a cache of their last results."""
     update, boxes = axis._update_ticks, axis._get_ticklabel_bboxes
-    known: dict[str, Any] = {}
+    cache: dict[str, Any] = {}
 
     def same() -> bool:
         now = axis.axes.bbox.bounds, tuple(axis.get_view_interval()), axis.axes.figure.dpi
-        if known.get("at") == now:
+        if cache.get("at") == now:
             return True
-        known.clear()
-        known["at"] = now
+        cache.clear()
+        cache["at"] = now
         return False
 
     def ticks() -> Any:
-        if not same() or "ticks" not in known:
-            known["ticks"] = update()
-        return known["ticks"]
+        if not same() or "ticks" not in cache:
+            cache["ticks"] = update()
+        return cache["ticks"]
 
     def ticklabel_bboxes(shown: Any, renderer: Any) -> Any:
-        if shown is not known.get("ticks"):
+        if shown is not cache.get("ticks"):
             return boxes(shown, renderer)
-        if known.get("by") is not renderer:
-            known["by"], known["boxes"] = renderer, boxes(shown, renderer)
-        return known["boxes"]
+        if cache.get("by") is not renderer:
+            cache["by"], cache["boxes"] = renderer, boxes(shown, renderer)
+        return cache["boxes"]
 
     return ticks, ticklabel_bboxes
 
 
 def look(name: str) -> AbstractContextManager[None]:
-    """Context in which figures are drawn; ``name`` makes an SVG's identifiers its own, and the same in every run."""
+    """Return a context with the figure style; ``name`` makes the SVG's identifiers unique and reproducible."""
     import matplotlib
 
     style: Any = {**_STYLE, "svg.hashsalt": name}
@@ -145,11 +143,11 @@ def look(name: str) -> AbstractContextManager[None]:
 
 
 def to_svg(figure: Figure) -> str:
-    """The figure as an <svg> element that can stand in an HTML page."""
+    """Return a figure as an <svg> element for an HTML page."""
     import matplotlib
 
     text = StringIO()
-    # without a salt Matplotlib draws lots for the identifiers
+    # without a salt Matplotlib uses random identifiers
     with matplotlib.rc_context({"svg.hashsalt": matplotlib.rcParams["svg.hashsalt"] or "figure"}):
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     svg = text.getvalue()
@@ -160,29 +158,29 @@ def to_svg(figure: Figure) -> str:
     return f'{opening} role="img">{rest}'
 
 
-def drawn(name: str, draw: Callable[..., Figure], *given: Any) -> str:
-    """The <svg> element of a figure.
+def drawn(name: str, draw: Callable[..., Figure], *arguments: Any) -> str:
+    """Draw a figure and return its <svg> element.
 
     Parameters
     ----------
     name : str
-        Of the figure, which makes its identifiers its own.
-    draw : Callable[..., Figure]
-        Makes the figure.
-    given : Any
+        Name of the figure, which makes its identifiers unique.
+    draw : callable
+        Function that makes the figure.
+    arguments : Any
         Arguments of ``draw``.
     """
     with look(name):
-        return to_svg(draw(*given))
+        return to_svg(draw(*arguments))
 
 
 def to_png(figure: Figure, dpi: int) -> bytes:
-    """The figure as PNG.
+    """Return a figure as a PNG file.
 
     Parameters
     ----------
     figure : Figure
-        What is drawn.
+        Figure to save.
     dpi : int
         Dots per inch.
     """
@@ -192,19 +190,19 @@ def to_png(figure: Figure, dpi: int) -> bytes:
 
 
 def plain_axes(axes: Axes) -> None:
-    """Only the left and the bottom axis line."""
+    """Hide the top and right axis lines."""
     axes.spines[["top", "right"]].set_visible(False)
 
 
 def panels(heights: Sequence[float], wide: int) -> tuple[Figure, list[Axes]]:
-    """A figure of panels in rows, each row as high as its highest panel.
+    """Return a figure with rows of panels; each row is as high as its highest panel.
 
     Parameters
     ----------
-    heights : Sequence[float]
-        Of the panels in their order, inches.
+    heights : sequence of float
+        Heights of the panels in their order, in inches.
     wide : int
-        Number of panels beside each other; places that are left over stay empty.
+        Number of panels per row; unused positions stay empty.
     """
     rows = [max(heights[k : k + wide]) for k in range(0, len(heights), wide)]
     figure = new_figure(sum(rows))
@@ -217,37 +215,37 @@ def panels(heights: Sequence[float], wide: int) -> tuple[Figure, list[Axes]]:
 def interval_bars(
     axes: Axes, x: np.ndarray, y: np.ndarray, ends: Any, which: Literal["x", "y"] = "y", **how: Any
 ) -> None:
-    """Error bars from the ends of intervals, which need not lie evenly about the values.
+    """Draw error bars from the ends of intervals, which may be asymmetric about the values.
 
     Parameters
     ----------
     axes : Axes
-        where.
-    x : np.ndarray
-        Places of the values along x, (N,).
-    y : np.ndarray
-        And along y, (N,).
-    ends : Any
-        Lower and upper ends of the intervals, (N, 2), in the units of the axis.
-    which : Literal['x', 'y']
-        The axis along which the bars lie.
+        Axes to draw on.
+    x : (N,) ndarray
+        Positions along x.
+    y : (N,) ndarray
+        Positions along y.
+    ends : (N, 2) array_like
+        Lower and upper ends of the intervals, in the units of the axis.
+    which : {'x', 'y'}
+        Axis along which the bars lie.
     how : Any
-        More for ``errorbar``; without ``fmt`` only the bars are drawn, in ink.
+        Further arguments of ``errorbar``; without ``fmt``, only the bars are drawn.
     """
-    reach = np.abs(np.asarray(ends, np.float64).T - (x if which == "x" else y))
+    lengths = np.abs(np.asarray(ends, np.float64).T - (x if which == "x" else y))
     bare: dict[str, Any] = {} if "fmt" in how else {"fmt": "none", "ecolor": INK, "elinewidth": 1.0}
-    axes.errorbar(x, y, **{f"{which}err": reach, **bare, **how})
+    axes.errorbar(x, y, **{f"{which}err": lengths, **bare, **how})
 
 
 def gridded(axes: Axes, which: Literal["both", "x", "y"] = "both") -> None:
-    """Light lines behind what is drawn, and only the left and the bottom axis line.
+    """Draw light grid lines behind the data and hide the top and right axis lines.
 
     Parameters
     ----------
     axes : Axes
-        where.
-    which : Literal['both', 'x', 'y']
-        Along which axis the lines are counted.
+        Axes to draw on.
+    which : {'both', 'x', 'y'}
+        Axis of the grid lines.
     """
     axes.grid(axis=which, color=LIGHT, lw=0.5)
     axes.set_axisbelow(True)
@@ -255,41 +253,41 @@ def gridded(axes: Axes, which: Literal["both", "x", "y"] = "both") -> None:
 
 
 def shared_legend(
-    figure: Figure, axes: Axes, place: str = "upper center", columns: int | None = None, **how: Any
+    figure: Figure, axes: Axes, position: str = "upper center", columns: int | None = None, **how: Any
 ) -> None:
-    """A legend beside all panels, of what one of them shows.
+    """Add a legend beside all panels with the entries of one of them.
 
     Parameters
     ----------
     figure : Figure
-        With all panels.
+        Figure with all panels.
     axes : Axes
-        The panel whose lines are named.
-    place : str
-        Beside the panels, as Matplotlib names it.
+        Panel whose lines are listed.
+    position : str
+        Position beside the panels, in Matplotlib's words.
     columns : int | None
-        Of the legend; None for one row.
+        Number of columns; None for one row.
     how : Any
-        More for ``legend``.
+        Further arguments of ``legend``.
     """
     handles, labels = axes.get_legend_handles_labels()
-    outside: Any = f"outside {place}"
+    outside: Any = f"outside {position}"
     figure.legend(handles, labels, loc=outside, ncols=columns or max(len(labels), 1), **how)
 
 
 def signed_map(axes: Axes, values: np.ndarray, most: float | None = None, **how: Any) -> AxesImage:
-    """An image of (rows, columns) numbers with a sign, white at zero.
+    """Draw an image of (rows, columns) signed numbers, white at zero.
 
     Parameters
     ----------
     axes : Axes
-        where.
-    values : np.ndarray
-        The numbers; NaN is left out.
+        Axes to draw on.
+    values : (rows, columns) ndarray
+        Numbers; NaN is omitted.
     most : float | None
-        Size of the deepest colours; None for the largest number's.
+        Absolute value of the deepest colours; None for the largest absolute value.
     how : Any
-        More for ``imshow``.
+        Further arguments of ``imshow``.
     """
     most = (float(np.nanmax(np.abs(values))) or 1.0) if most is None else most
     return axes.imshow(values, cmap=DIVERGING, vmin=-most, vmax=most, **how)

@@ -16,7 +16,7 @@ from analysis.statistics import gain
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera_tests import MeasuredDistortionSpec
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.framework.artefact import FAR, Artefact, Cell, OwnDecimals, SvgFigure, Table, decimals_for
+from twin.framework.artefact import FAR, Artefact, Cell, DecimalNumber, SvgFigure, Table, decimals_for
 from twin.framework.data_files import FrameFacts
 from twin.framework.report import Report, Section, answer
 from twin.framework.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
@@ -78,7 +78,7 @@ def _facts(run: DistortionRun, data: Mapping[str, Any]) -> tuple[tuple[str, str]
             angles = f"as read, each good to {format_quantity(files.angle_sigma or 0.0, ANGLE)}"
         facts += [
             ("angles", f"{angles}; the line's middle is imaged at {format_quantity(files.zero, ANGLE)}"),
-            ("principal distance, about", format_quantity(run.about, LENGTH)),
+            ("principal distance, about", format_quantity(run.approximate_f, LENGTH)),
             *(("file", f"{one['file']}, {one['rows']} rows") for one in data["files"]),
         ]
     if isinstance(run, SimulatedDistortion):
@@ -125,19 +125,19 @@ def _shares(run: DistortionRun) -> dict[str, float]:
 
 def _verdict(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
     noise, f, sigma = data["noise"], data["principal_distance_mm"], data["principal_distance_mm_sigma"]
-    expected, truth = noise["rejected_expected_of_good"], data.get("truth")
-    known = f"distortion is known to {1e6 * float(np.sqrt(np.mean(run.compensated.sigma**2))):.2f} µm"
-    beside = ""
+    expected, truth = noise["rejected_expected_by_chance"], data.get("truth")
+    distortion_text = f"distortion is known to {1e6 * float(np.sqrt(np.mean(run.compensated.sigma**2))):.2f} µm"
+    truth_text = ""
     if truth is not None:
         ratio = abs(f - truth["principal_distance_mm"]) / sigma
-        well = "within" if ratio <= FAR else "outside"
-        beside = f", {well} {FAR:g} σ of the truth ({truth['principal_distance_mm']:.4f} mm, {ratio:.1f} σ)"
+        within = "within" if ratio <= FAR else "outside"
+        truth_text = f", {within} {FAR:g} σ of the truth ({truth['principal_distance_mm']:.4f} mm, {ratio:.1f} σ)"
         with_it, without = truth["error_rms_compensated_um"], truth["error_rms_raw_um"]
         gain = "compensating them helps" if with_it < without else "compensating them does not help"
-        known += f" and wrong by {with_it:.2f} µm rms, with uncompensated angles by {without:.2f} µm: {gain}"
+        distortion_text += f" and wrong by {with_it:.2f} µm rms, with uncompensated angles by {without:.2f} µm: {gain}"
     return answer(
-        f"The balanced principal distance is {f:.4f} ± {sigma:.4f} mm{beside}, limited by {_limit(run)}",
-        known,
+        f"The balanced principal distance is {f:.4f} ± {sigma:.4f} mm{truth_text}, limited by {_limit(run)}",
+        distortion_text,
         f"points lie within {data['rms_compensated_um']:.2f} µm rms of a smooth curve",
         f"chi-square is {data['chi_square']:.1f} for {data['degrees_of_freedom']} degrees of freedom with stated noise",
         f"of {int(np.sum(run.present))} spots {noise['rejected']} were rejected, where {expected:.0f} are expected "
@@ -169,7 +169,7 @@ def _warnings(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, ...]:
         if kept:
             out.append(f"gross errors that Chauvenet's criterion does not find and that stay in the means: {kept}")
         left = run.bench.true_offset - run.bench.design_offset
-        slope = float(np.polyfit(np.tan(run.bench.turn), left, 1)[0])
+        slope = float(np.polyfit(np.tan(run.bench.field_angle), left, 1)[0])
         if abs(slope) > 0.5 * sigma:
             out.append(
                 "as-built coma that grows over the field moves energy centroids against chief rays and f by "
@@ -192,9 +192,9 @@ def _warnings(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, ...]:
             f"principal point by {1e3 * moved:.3g} mm and is in no sigma: with zero: {np.degrees(zero):.9f} deg it is "
             "gone"
         )
-    if abs(f / run.about - 1.0) > 0.05:
+    if abs(f / run.approximate_f - 1.0) > 0.05:
         out.append(
-            f"the principal distance is {f:.4g} m, but `principal_distance` says {run.about:.4g} m: are the "
+            f"the principal distance is {f:.4g} m, but `principal_distance` says {run.approximate_f:.4g} m: are the "
             "units of angles and places right?"
         )
     if data["probability"] < DOUBTFUL:
@@ -244,18 +244,18 @@ def _curve(run: DistortionRun, data: Mapping[str, Any]) -> Section:
 
 
 def _compensation(run: DistortionRun) -> Section:
-    raw, own = run.raw, run.compensated
+    raw, compensated = run.raw, run.compensated
     pairs = {
-        "distance from the smooth curve": (raw.smooth.residual, own.smooth.residual),
-        "RMS of distortion over the sets": (raw.rms_over_sets, own.rms_over_sets),
+        "distance from the smooth curve": (raw.smooth.residual, compensated.smooth.residual),
+        "RMS of distortion over the sets": (raw.rms_over_sets, compensated.rms_over_sets),
     }
     if isinstance(run, SimulatedDistortion):
-        pairs["error of the distortion (needs the truth)"] = (run.error(raw), run.error(own))
+        pairs["error of the distortion (needs the truth)"] = (run.error(raw), run.error(compensated))
     rows: list[tuple[Cell, ...]] = []
     for name, values in pairs.items():
         before, after = (1e6 * rms(one) for one in values)
-        most = [1e6 * float(np.max(np.abs(one))) for one in values]
-        rows.append((name, before, after, 100.0 * (1.0 - after / before) if before else None, *most))
+        largest = [1e6 * float(np.max(np.abs(one))) for one in values]
+        rows.append((name, before, after, 100.0 * (1.0 - after / before) if before else None, *largest))
     table = Table(
         "distortion-reduction",
         "What compensation brings",
@@ -292,7 +292,7 @@ def _joint(joint: Mapping[str, Any]) -> Section:
         size, sigma = np.array(part[f"values{suffix}"]), np.array(part[f"values{suffix}_sigma"])
         spread = np.array(part["covariance_mm2" if suffix else "covariance"]) / np.outer(sigma, sigma)
         rows: list[tuple[Cell, ...]] = [
-            (label, *(OwnDecimals(v, decimals_for(own)) for v in (value, own)), *(float(v) for v in row))
+            (label, *(DecimalNumber(v, decimals_for(own)) for v in (value, own)), *(float(v) for v in row))
             for label, value, own, row in zip(shown, size, sigma, spread, strict=True)
         ]
         heads = ("", "measured", "sigma", *(f"correlation: {label.split(' [')[0]}" for label in shown))
@@ -321,16 +321,16 @@ def _joint(joint: Mapping[str, Any]) -> Section:
 def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
     heads, digits = (["estimate", *(one.shown_head for one in ESTIMATE)], [None, *(one.decimals for one in ESTIMATE)])
     rows: list[tuple[Cell, ...]] = [(ESTIMATES[name], *one.values()) for name, one in data["estimates"].items()]
-    found = (
+    constant_text = (
         "Equations (1) to (4) (Li et al., doi 10.3788/IRLA20200143) have no constant: W has to count exactly from the "
         f"direction that is imaged to the line's middle. The constant finds it {run.compensated.zero / ARCSEC:.3f} "
         "arcsec from the zero that was given"
     )
-    text, caption = [f"{found}."], "All with compensated angles." if run.compensation is not None else ""
+    text, caption = [f"{constant_text}."], "All with compensated angles." if run.compensation is not None else ""
     if isinstance(run, SimulatedDistortion):
-        off = (run.compensated.zero - run.truth.zero) / ARCSEC
+        zero_error = (run.compensated.zero - run.truth.zero) / ARCSEC
         text = [
-            f"{found}, {off:+.3f} arcsec from the truth: the middle was put on the pinhole to "
+            f"{constant_text}, {zero_error:+.3f} arcsec from the truth: the middle was put on the pinhole to "
             f"{run.truth.zero / ARCSEC:.2f} arcsec, and the compensation at that reading has an error of its own."
         ]
         caption += " Errors are against the same estimate from exact chief rays at the true angles."
@@ -352,7 +352,7 @@ def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
 
 
 def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
-    noise, stated = data["noise"], data["stated_exposure_um"]
+    noise, stated = data["noise"], data["specified_exposure_um"]
     text = [
         f"One spot scatters by {noise['exposure_um']:.3f} µm "
         + ("between the sets" if run.reading.shape[1] > 1 else "by its stated sigmas")
@@ -378,10 +378,10 @@ def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
         )
     ]
     if isinstance(run, SimulatedDistortion):
-        own = run.setup.turntable.dividing_error.repeatability
+        repeatability = run.setup.turntable.dividing_error.repeatability
         text.append(
-            f"The table's repeatability, {format_quantity(own, ANGLE)}, makes "
-            f"{1e6 * run.compensated.fit.value('principal_distance') * own:.2f} µm of the scatter between the sets; "
+            f"The table's repeatability, {format_quantity(repeatability, ANGLE)}, makes "
+            f"{1e6 * run.compensated.fit.value('principal_distance') * repeatability:.2f} µm of the scatter between the sets; "
             f"{data['truth']['gross_errors']} exposures had a gross error. Differences of the line's columns move a "
             f"spot by {noise['centroid_columns_um']:.3f} µm."
         )

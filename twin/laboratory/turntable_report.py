@@ -16,7 +16,7 @@ from analysis.turntable.dividing_error import covered, gaps
 from scenes.specs.turntable import MeasuredTurntableSpec
 from scenes.yaml.units import ANGLE, format_quantity
 from twin.framework import svg
-from twin.framework.artefact import Artefact, OwnDecimals, SvgFigure, Table
+from twin.framework.artefact import Artefact, DecimalNumber, SvgFigure, Table
 from twin.framework.record import Record
 from twin.framework.report import Report, Section, answer
 from twin.laboratory import turntable_run
@@ -163,7 +163,7 @@ def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
     series = run.series
     text = [
         f"Chauvenet's criterion rejects {series.rejected} of {np.sum(series.taken)} comparisons. It would reject "
-        f"{result['rejected_expected_of_good']:.0f} on average if all were good: it trims normal noise, and the RMS "
+        f"{result['rejected_expected_by_chance']:.0f} on average if all were good: it trims normal noise, and the RMS "
         "that remains is that of trimmed readings, for which the σ of one comparison is corrected."
     ]
     if result["suspect_angles"]:
@@ -184,19 +184,19 @@ def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
 def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
     fits, chosen, held, model = result["fits"], result["chosen"], run.held_out, run.model
     best = result["ranking"][0]
-    judged = (
+    ranking_text = (
         "ranked by cross-validation: there are no held-out readings, so that an error with a period below the step "
         "stays unseen"
         if held is None
         else f"ranked at {len(held.angle)} held-out readings, measured in a series of their own with "
         f"σ = {result['heldout_arcsec_sigma']:.4f} arcsec each"
     )
-    misses = (
+    held_out_text = (
         "" if held is None else f"; it has {fits[chosen]['heldout_rms_arcsec']:.4f} arcsec at the held-out readings"
     )
     text = [
-        f"Fits of the means, {judged}. Cross-validation on the calibration points alone chooses the "
-        f"{FIT_NAMES[chosen]}{misses}."
+        f"Fits of the means, {ranking_text}. Cross-validation on the calibration points alone chooses the "
+        f"{FIT_NAMES[chosen]}{held_out_text}."
         + ("" if held is None or best == chosen else f" There the {FIT_NAMES[best]} is the best.")
     ]
     if model is not None:
@@ -267,7 +267,7 @@ def _noise(run: TurntableRun) -> float:
 
 
 def _left(run: TurntableRun, result: Mapping[str, Any]) -> Table:
-    noise = "noise of the calibration, mean over its readings [arcsec]", OwnDecimals(_noise(run), 4)
+    noise = "noise of the calibration, mean over its readings [arcsec]", DecimalNumber(_noise(run), 4)
     lines = [noise, *turntable_run.COMPENSATION.lines(result["compensation"])]
     title = "What is left of a compensated angle"
     return Table("turntable-sigma", title, "Without the repeatability of one comparison.", ("part", "σ"), lines)
@@ -295,26 +295,26 @@ def turntable_report(run: TurntableRun) -> Report:
     limit = max(size, key=lambda name: size[name])
     span = float(np.ptp(run.series.mean)) / ARCSEC
     missed = data["fits"][chosen]["heldout_rms_arcsec"]
-    judged = "" if missed is None else f" and misses held-out angles by {missed:.3f} arcsec RMS"
-    judged += "" if truth is None else f" and the truth by {truth['fits'][chosen]['true_rms_arcsec']:.3f} arcsec"
+    missed_text = "" if missed is None else f" and misses held-out angles by {missed:.3f} arcsec RMS"
+    missed_text += "" if truth is None else f" and the truth by {truth['fits'][chosen]['true_rms_arcsec']:.3f} arcsec"
     verdict, more = answer(
         f"The dividing error spans {span:.2f} arcsec",
-        f"the {FIT_NAMES[chosen]} compensates it to σ = {sigma:.3f} arcsec{judged}, limited by {limit}",
+        f"the {FIT_NAMES[chosen]} compensates it to σ = {sigma:.3f} arcsec{missed_text}, limited by {limit}",
         f"repeats scatter by {data['repeatability_arcsec']:.3f} arcsec",
         f"of {int(np.sum(run.series.taken))} comparisons {data['rejected']} were rejected, where "
-        f"{data['rejected_expected_of_good']:.0f} are expected without gross errors: see what is left of a compensated "
+        f"{data['rejected_expected_by_chance']:.0f} are expected without gross errors: see what is left of a compensated "
         "angle",
     )
-    judge = "cross_validation_rms_arcsec" if run.held_out is None else "heldout_rms_arcsec"
+    judged_key = "cross_validation_rms_arcsec" if run.held_out is None else "heldout_rms_arcsec"
     by = "by cross-validation" if run.held_out is None else "on held-out angles"
     keys = ("repeat_rms_arcsec", "chauvenet_rms_arcsec", "averaging_alone_rms_arcsec", "mean_rms_arcsec")
     rows = [
         *TURNTABLE.lines(data, (*keys, "repeatability_arcsec")),
-        ("compensated angle, σ, mean over the readings [arcsec]", OwnDecimals(sigma, 3)),
+        ("compensated angle, σ, mean over the readings [arcsec]", DecimalNumber(sigma, 3)),
     ]
     for name in data["ranking"]:
         head = f"{FIT_NAMES[name]} {by}{', chosen' if name == chosen else ''} [arcsec]"
-        rows.append((head, OwnDecimals(data["fits"][name][judge], 3)))
+        rows.append((head, DecimalNumber(data["fits"][name][judged_key], 3)))
     certified = spec.measured.reference if isinstance(spec, MeasuredTurntableSpec) else spec.reference.calibration
     return Report(
         "Dividing error of the turntable",

@@ -1,1 +1,1 @@
-"""The monitoring experiment: perturbed states, their truth, spot images, recovery."""
+"""Monitoring experiment: perturbed states, their true changes, spot images, and recovery of the changes."""

@@ -1,13 +1,13 @@
-"""Calibrations that are kept on disk, so that the next process need not compute them again.
+"""Disk cache of calibrations, so that later processes need not compute them again.
 
-What an instrument is calibrated to depends on the program, on the numerical packages, on the processor and on what the
-instrument's files say. The SHA-256 of all of these is the name of an entry; whatever changes, the name changes with it.
-What cannot be named so, such as a surface whose class is not of this program, is computed in every process.
+The calibration of an instrument depends on the program, the numerical packages, the processor and the instrument's
+files. The name of an entry is the SHA-256 of all of these, so any change gives another name. Inputs that cannot be
+digested, such as a surface class of another package, are not cached.
 
-An entry holds some forty kinds of objects of the program: bodies, surfaces, aimed rays, matrices. Only ``pickle``
-writes them without a second description of each that could forget one. To read a pickle can run code, so an entry is
-read only if the folder and the file belong to this user and nobody else can write to them, if its checksum is right,
-and then only with classes of this program and arrays.
+An entry holds about forty kinds of objects of the program: bodies, surfaces, aimed rays, matrices. ``pickle`` writes
+them without a second description of each class that could become incomplete. Since reading a pickle can run code, an
+entry is read only if its folder and file belong to this user, nobody else can write to them, and its checksum is right;
+and then only classes of this program and arrays are accepted.
 """
 
 from __future__ import annotations
@@ -44,11 +44,13 @@ VARIABLE = "TWIN_CALIBRATIONS"
 """Environment variable with the cache folder, or ``off``."""
 OFF = "off"
 NAME = "space-camera-twin"
-"""Folder below the user's cache folder."""
+"""Name of the folder below the user's cache folder."""
 MOST_BYTES = 256 * 2**20
-"""Size of the folder beyond which the entries that were not used for the longest time are removed."""
+"""Size of the cache, in bytes, above which the least recently used entries are removed."""
 MOST_WRITTEN = 64
-"""Entries that one process writes at most: a search over thousands of instruments shall not displace all others."""
+"""Largest number of entries that one process writes: a search over thousands of instruments must not displace all
+others.
+"""
 ENDING = ".calibration"
 
 Value = TypeVar("Value")
@@ -57,7 +59,7 @@ _written = 0
 
 
 class _UnnamedError(TypeError):
-    """An input that no digest can be made of."""
+    """Input that cannot be digested."""
 
 
 def cache_folder() -> Path | None:
@@ -80,10 +82,10 @@ def cache_folder() -> Path | None:
 
 @contextmanager
 def recomputed() -> Iterator[None]:
-    """Leave the cache alone within a ``with`` block or a function so decorated, also in the processes that it starts.
+    """Switch the cache off inside a ``with`` block or decorated function, also for processes that it starts.
 
-    For checks of a result, and where a function or constant of the program is replaced while it runs: no name of an
-    entry contains that.
+    It serves checks of results, and code that replaces a function or constant of the program at run time, since names
+    of entries do not include that.
     """
     before = os.environ.get(VARIABLE)
     os.environ[VARIABLE] = OFF
@@ -98,17 +100,17 @@ def recomputed() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class CacheEntry:
-    """One entry of the cache.
+    """Entry of the cache.
 
     Attributes
     ----------
     key : str | None
-        Its name, 64 hexadecimal digits; None for what is not kept.
+        Name of the entry, 64 hexadecimal digits; None if it is not cached.
     backend : Backend
-        Of the computation; the entry refers to it.
-    specs : tuple[Spec, ...]
-        Specifications that the content refers to. An entry holds none: their error messages name the file that they
-        were read from, which is another for every reader.
+        Backend of the computation; the entry refers to it.
+    specs : tuple of Spec
+        Specifications that the content refers to. The entry does not hold them: their error messages name the file that
+        they were read from, which differs between readers.
     """
 
     key: str | None
@@ -122,11 +124,11 @@ class CacheEntry:
         Parameters
         ----------
         backend : Backend
-            Where it runs. Numbers of graphics cards are not kept, since no name of the card is known.
-        specs : Sequence[Spec]
-            Specifications that it begins with.
+            Backend of the computation. Results of graphics cards are not cached, since no name of the card is known.
+        specs : sequence of Spec
+            Specifications that the computation starts from.
         inputs : Any
-            All else that it depends on.
+            All other inputs.
         """
         registered = SAG_TERMS.data, REFLECTORS.data, NOISE_TERMS.data, dict(GLASSES), dict(MATERIALS)
         key = None if backend.name != "llvm" else _digest(_machine(), backend.name, registered, tuple(specs), inputs)
@@ -137,7 +139,7 @@ class CacheEntry:
         return replace(self, key=None if self.key is None else _digest(self.key, inputs))
 
     def get(self, compute: Callable[[], Value]) -> Value:
-        """Return the content; compute and keep it where there is none."""
+        """Return the content; compute and cache it if there is none."""
         found: Value | None = self.read()
         if found is None:
             found = compute()
@@ -145,7 +147,7 @@ class CacheEntry:
         return found
 
     def read(self) -> Any:
-        """Return the content, None where there is none that can be trusted."""
+        """Return the content, or None if there is none that can be trusted."""
         folder = _private(cache_folder()) if self.key is not None else None
         if folder is None:
             return None
@@ -159,7 +161,7 @@ class CacheEntry:
         return None
 
     def write(self, content: Any) -> None:
-        """Keep a content. Nothing is kept, and nothing said, where the folder cannot be written to."""
+        """Cache a content; if the folder cannot be written to, do nothing."""
         global _written
         folder = cache_folder() if self.key is not None and _written < MOST_WRITTEN else None
         if folder is None:
@@ -186,11 +188,12 @@ class CacheEntry:
             _remove_oldest(folder)
 
     def _head(self) -> bytes:
+        """Return the first line of the entry's file."""
         return f"calibration {self.key}\n".encode()
 
 
 class _Writer(pickle.Pickler):
-    """Writes references in place of the backend and the specifications."""
+    """Pickler that writes references in place of the backend and the specifications."""
 
     def __init__(self, file: io.BytesIO, entry: CacheEntry) -> None:
         super().__init__(file, pickle.HIGHEST_PROTOCOL)
@@ -206,12 +209,12 @@ class _Writer(pickle.Pickler):
         raise pickle.PicklingError(f"{type(thing).__name__} is none of the specifications that were given")
 
     def reducer_override(self, thing: Any) -> Any:
-        """Name members of an enumeration by their value: Python before 3.11.4 would write a call of `getattr`."""
+        """Write members of an enumeration by value: Python before 3.11.4 would write a call of `getattr`."""
         return (type(thing), (thing.value,)) if isinstance(thing, Enum) else NotImplemented
 
 
 class _Reader(pickle.Unpickler):
-    """Reads what `_Writer` wrote, with no classes but this program's and arrays."""
+    """Unpickler for the output of `_Writer` that accepts only classes of this program and arrays."""
 
     def __init__(self, file: io.BytesIO, entry: CacheEntry) -> None:
         super().__init__(file)
@@ -237,11 +240,12 @@ _ARRAYS = {
 
 
 def _of_program(module: str) -> bool:
+    """Return True if a module belongs to this program."""
     return module.removeprefix(provenance.BEFORE).partition(".")[0] in provenance.SOURCES
 
 
 def _private(folder: Path | None) -> Path | None:
-    """The folder, if it is this user's and nobody else can do anything in it."""
+    """Return the folder if it belongs to this user and nobody else can access it, otherwise None."""
     try:
         found = os.stat(folder) if folder is not None else None
     except OSError:
@@ -251,11 +255,15 @@ def _private(folder: Path | None) -> Path | None:
 
 
 def _mine(found: os.stat_result) -> bool:
+    """Return True if a file or folder belongs to this user alone."""
     return hasattr(os, "geteuid") and found.st_uid == os.geteuid() and not found.st_mode & 0o077
 
 
 def _checked(file: Path, head: bytes) -> bytes:
-    """What stands in an entry behind its head. OSError if there is none, or it is damaged or somebody else's."""
+    """Return the content of an entry's file after its head.
+
+    Raises OSError if the file is missing, damaged or of another user.
+    """
     number = os.open(file, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     with open(number, "rb") as opened:
         found = os.fstat(number)
@@ -269,6 +277,7 @@ def _checked(file: Path, head: bytes) -> bytes:
 
 
 def _remove_oldest(folder: Path) -> None:
+    """Remove the least recently used entries beyond MOST_BYTES."""
     with os.scandir(folder) as listed:
         found = [(one.stat(follow_symlinks=False), one.path) for one in listed if one.name.endswith(ENDING)]
     left = sum(one.st_size for one, _ in found)
@@ -282,7 +291,7 @@ def _remove_oldest(folder: Path) -> None:
 
 @cache
 def _machine() -> str:
-    """The program, the packages and the processor, on which the last bits of every number depend."""
+    """Return program, packages and processor as text; the last bits of every number depend on them."""
     here = provenance.Provenance.here().model_dump(mode="json", exclude={"blas", "system"})
     # of the libraries that happen to be loaded, the one that calibrations are computed with
     loaded = [one for one in threadpool_info() if "numpy" in one["filepath"]]
@@ -294,7 +303,7 @@ def _machine() -> str:
 
 
 def _digest(*inputs: Any) -> str | None:
-    """SHA-256 of inputs, and of the files that texts in them name; None where one has a part that it cannot name."""
+    """Return the SHA-256 of inputs and of the files that texts in them name; None if an input cannot be digested."""
     try:
         words = list(_words(inputs))
     except _UnnamedError:
@@ -304,7 +313,7 @@ def _digest(*inputs: Any) -> str | None:
 
 
 def _words(value: Any) -> Iterator[str]:
-    """Name a value exactly: no two different ones have the same words."""
+    """Yield words that identify a value exactly: different values have different words."""
     if value is None or isinstance(value, bool | int | float | complex | bytes):
         yield f"{type(value).__name__} {value!r}"
     elif isinstance(value, str) and not isinstance(value, Enum):
@@ -336,7 +345,7 @@ def _words(value: Any) -> Iterator[str]:
 
 
 def _name(thing: Any) -> str:
-    """Module and name of a class or function of the program."""
+    """Return the module and name of a class or function of the program."""
     if (not _of_program(thing.__module__) and thing.__module__ != "builtins") or "<" in thing.__qualname__:
         raise _UnnamedError(f"{thing!r} is no part of the program")
     return f"{thing.__module__}.{thing.__qualname__}"

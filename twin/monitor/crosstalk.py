@@ -1,4 +1,4 @@
-"""What every estimator says about every elementary motion, against the true change: formula factors and crosstalk."""
+"""Response of every estimator to elementary motions, against the true change: formula factors and crosstalk."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from twin.monitor.motions import ElementaryMotion, line_family, other_motions
 from twin.monitor.truth import truth_jacobian
 
 _SEEN_WITHIN = 0.1
-"""Relative error up to which the words say that a change is seen."""
+"""Relative error up to which the text says that a change is observed."""
 
 PRINTED = {("paper_single", k): f"eq. ({number})" for k, number in enumerate((3, 2, 5, 7))}
 PRINTED |= {("paper_joint", k): "Table 1, joint" for k in range(4)}
@@ -28,18 +28,20 @@ PRINTED |= {("paper_joint", k): "Table 1, joint" for k in range(4)}
 
 @dataclass(frozen=True)
 class FormulaFactor:
-    """A printed formula's reading divided by what it should read, for the motion it was derived for.
+    """Ratio of a printed formula's reading to the expected reading, for the motion for which the formula was derived.
 
     Attributes
     ----------
     formula : str
-        Where it is printed; estimator, parameter: its names in the results.
+        Number of the equation or table in the paper.
+    estimator, parameter : str
+        Names of both in the results.
     motion : str
         Label of the motion.
     by_model : float
-        Reading / change in the paper's own model (thin lens: shift/f, turn, scale * f).
+        Reading / change in the paper's own model (thin lens: shift/f, rotation, scale * f).
     by_truth : float
-        Reading / traced change of the real camera; differs from ``by_model`` by the camera's anamorphism and
+        Reading / traced change of the real camera; it differs from ``by_model`` by the camera's anamorphism and
         distortion.
     """
 
@@ -53,23 +55,23 @@ class FormulaFactor:
 
 @dataclass(frozen=True, eq=False)
 class CameraCrosstalk:
-    """First-order response of one camera's monitor to M elementary motions, per table unit (arcsec, um, ppm).
+    """First-order response of one camera's monitor to M elementary motions, per table unit (arcsec, µm, ppm).
 
     Attributes
     ----------
-    motions : tuple[ElementaryMotion, ...]
-        The four of the paper's own family first.
-    spot_shift : np.ndarray
-        (2 n, M) px, row and column of one spot after the other.
-    true : np.ndarray
-        (P, M) true change of every reading of a camera, in its unit.
-    readings : Mapping[str, np.ndarray]
-        Estimator -> (P, M), what it says.
-    factors : tuple[FormulaFactor, ...]
-        Of the printed formulas.
+    motions : tuple of ElementaryMotion
+        Motions, beginning with the four for which the paper derives its formulas.
+    spot_shift : (2 n, M) ndarray
+        Shifts of the spots, in pixels: row and column of one spot after the other.
+    true : (P, M) ndarray
+        True change of each camera parameter, in its unit.
+    readings : mapping of str to (P, M) ndarray
+        Estimator -> its readings of these changes.
+    factors : tuple of FormulaFactor
+        Factors of the printed formulas.
     observability : ObservabilityReport
-        What the spots' coordinates can and cannot separate.
-    channels : tuple[str, ...]
+        Combinations of the motions that the spots can and cannot separate.
+    channels : tuple of str
         Names of the camera's channels.
     """
 
@@ -87,7 +89,7 @@ class CameraCrosstalk:
         return tuple(f"{channel} {axis}" for channel in self.channels for axis in ("y", "x"))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for crosstalk.json."""
+        """Return plain data for crosstalk.json."""
         rows, keys = [], [one.key for one in parameters.CAMERA_PARAMETERS.values()]
         for k, motion in enumerate(self.motions):
             rows.append(
@@ -108,7 +110,7 @@ class CameraCrosstalk:
         }
 
     def principal_distance_statements(self) -> tuple[str, ...]:
-        """Which changes of focus, spacing and size the spots report as a change of the principal distance."""
+        """Return sentences on how changes of focus, spacing and size are read as changes of the principal distance."""
         out = []
         for k, motion in enumerate(self.motions):
             along_axis = motion.kind == "shift" and motion.axis == 2 and motion.body.count("/") == 2
@@ -134,16 +136,21 @@ class CameraCrosstalk:
 def estimator_gains(
     cameras: Mapping[str, CameraCalibration], stated: Disturbances | None, covariance: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
-    """Estimator -> (4 x cameras, 2 x spots) parameters (rad, m) per pixel of shift, to first order.
+    """Return the first-order gain of each estimator.
 
     Parameters
     ----------
-    cameras : Mapping[str, CameraCalibration]
-        What is calibrated of each.
+    cameras : mapping of str to CameraCalibration
+        Calibration of each camera.
     stated : Disturbances | None
-        What is stated to move, None for nothing.
-    covariance : np.ndarray | None
-        (2 x spots, 2 x spots) px^2 of their shifts, which weighs them; None for no noise.
+        Prior of the disturbances; None for none.
+    covariance : (2 x spots, 2 x spots) ndarray | None
+        Covariance of the spots' shifts, in px^2, which weights them; None for no noise.
+
+    Returns
+    -------
+    dict of str to (4 x cameras, 2 x spots) ndarray
+        Estimator -> parameters (rad, m) per pixel of shift.
     """
     spots = sum(len(camera.channels) for camera in cameras.values())
     still = np.zeros((1, spots, 2))
@@ -153,14 +160,19 @@ def estimator_gains(
 
 
 def crosstalk(experiment: MonitorExperiment, covariance: np.ndarray) -> dict[str, CameraCrosstalk]:
-    """Work out the table for every camera; readings are those of spots without noise, the same for every measurement.
+    """Compute the crosstalk table of every camera, for noise-free spots.
 
     Parameters
     ----------
     experiment : MonitorExperiment
-        The instrument.
-    covariance : np.ndarray
-        (2 C, 2 C) px^2 of the shifts of all spots, by which is told what they can separate.
+        Experiment with the instrument.
+    covariance : (2 C, 2 C) ndarray
+        Covariance of the shifts of all spots, in px^2, which determines what combinations they can separate.
+
+    Returns
+    -------
+    dict of str to CameraCrosstalk
+        Table by camera.
     """
     instrument = experiment.instrument
     sets = {name: (*line_family(name), *other_motions(instrument, name)) for name in instrument.cameras}

@@ -1,16 +1,15 @@
 """Image quality of an instrument's cameras in many perturbed states: wavefront error, defocus, MTF at Nyquist.
 
-All of it at fixed pixels of the line CCD, which look at whatever place of the scene the state brings there: the chief
-ray of the pixel is traced back to the scene, and the beam of that direction forward to the line. A field of +1 is the
-left end of the line (+Y'), -1 the right one.
+All quantities are at fixed pixels of the line CCD, which see whatever part of the scene the state brings there: the
+chief ray of the pixel is traced back to the scene, and the beam from that direction forward to the line. A field of +1
+is the left end of the line (+Y'), -1 the right one.
 
-Wavefront errors are rms over the stop's area. The reference sphere stands about the pixel, which the chief ray meets,
-with the radius of the nominal exit pupil; piston and tilt are taken out. Best focus is where along the light the rms
-is least, with the exact phase sqrt(1 - u^2 - v^2) of a shift. The MTF is that of the traced pupil, polychromatic if
-the camera describes a band, times the pixel and all else that the band says of its line CCD. What prisms and other
-bodies of the instrument take of the beam (``scenes.models.shadow``) is missing in both, unless it is to be ignored.
-
-Means over the light of pupils that bodies and edges cut.
+Wavefront errors are rms over the stop's area. The reference sphere is centred on the pixel, where the chief ray
+arrives, with the radius of the nominal exit pupil; piston and tilt are removed. Best focus is where the rms is least
+along the light, with the exact phase sqrt(1 - u^2 - v^2) of a shift. The MTF is that of the traced pupil, polychromatic
+if the camera describes a band, multiplied by those of the pixel and of the other parts of the band's line CCD. Light
+blocked by prisms and other bodies of the instrument (``scenes.models.shadow``) is missing in both, unless obstruction
+is ignored.
 """
 
 from __future__ import annotations
@@ -54,23 +53,23 @@ from twin.framework.record import Quantity, Record
 from twin.sensors.line_ccd import band_factors
 
 CUT_MEAN_DEGREE = 14
-"""Degree of the polynomials that continue the wavefront of a beam that edges of surfaces cut."""
+"""Degree of the polynomials that continue the wavefront of a beam vignetted by edges of surfaces."""
 
 
 class PupilMean:
-    """Mean over the free part of each stop, of values at nodes of it.
+    """Mean of nodal values over the unobstructed part of each stop.
 
-    Polynomials continue the values into the shadows, where they are taken off. They stand for the rays in the dark of
-    edges, too, which may pass the rims of lenses far outside.
+    Polynomials continue the values into the shadows, whose contribution is subtracted. They also replace rays in the
+    shadow of edges, which may pass far outside the rims of lenses.
 
     Parameters
     ----------
     nodes
-        N of the stop.
+        N nodes of the stop.
     shadows
-        In B stops; None for free beams.
+        Shadows in B stops; None for free beams.
     free
-        Which nodes of each stop light comes through, (B, N); None where rays in the dark are as those in the light.
+        True for the illuminated nodes of each stop, (B, N); None if rays in the shadows can be used as well.
     """
 
     def __init__(self, nodes: PupilNodes, shadows: Shadows | None, free: np.ndarray | None = None) -> None:
@@ -92,11 +91,11 @@ class PupilMean:
         self._added = products(points.real, points.imag, degree)
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Mean (B,) of values as ``flat`` gives them."""
+        """Return the mean (B,) of values as returned by ``flat``."""
         return np.asarray(np.sum(values * self._share, axis=-1))
 
     def flat(self, values: np.ndarray) -> np.ndarray:
-        """Values (B, N) less piston and tilt, (B, N + Q): also at nodes in the shadows."""
+        """Remove piston and tilt from values (B, N); the result (B, N + Q) has nodes in the shadows as well."""
         values = values - values[:, :1]
         if self._added is not None:
             if self._free is None:
@@ -112,56 +111,58 @@ class PupilMean:
 
 
 _SOME = 1e-3
-"""Smallest lit area of a stop, in units of its radius squared, for which a mean is defined."""
+"""Smallest illuminated area of a stop, in units of its radius squared, for which a mean is defined."""
 
 
 FIELDS = (1.0, 0.7, 0.0, -0.7, -1.0)
-"""Field points, as shares of half the line, left end first."""
+"""Field points, as fractions of half the line, left end first."""
 
 PLACES = {"left": 1.0, "centre": 0.0, "right": -1.0}
-"""Fields of which results are named."""
+"""Fields with names in the results."""
 
 WAVELENGTH = 650e-9
-"""Wavelength that is the unit of wavefront errors, metres."""
+"""Wavelength that is the unit of wavefront errors, in metres."""
 
 RINGS = 7
 """Rings of the quadrature over the stop: exact for squares of wavefronts up to order 13."""
 
 MOST_BLUR = 10.0
-"""Wavefront error beyond which a pupil that edges cut gets no MTF, waves rms."""
+"""Wavefront error above which no MTF is computed for a vignetted pupil, in waves rms."""
 
 _DARKEST = 0.99
-"""Share of the light that bodies may take: of less no image is told."""
+"""Largest fraction of the light that bodies may block; beyond it no image quality is given."""
 
 COLOURS = 5
-"""Gauss' wavelengths of a band: four are right to 1e-7 but near cut-offs inside the band, where the MTF is nothing."""
+"""Number of Gauss wavelengths of a band: four are accurate to 1e-7 except near cut-offs inside the band, where the MTF
+vanishes.
+"""
 
 _ROUNDING = 1e-5
-"""By which shares may leave 0 to 1, and an error at best focus that on the line CCD, in waves."""
+"""Tolerance of fractions outside 0 to 1, and of an error at best focus above that on the line CCD, in waves."""
 
 _MTF_ROUNDING = 1e-3
-"""By which an MTF may leave 0 to 1."""
+"""Tolerance of an MTF outside 0 to 1."""
 
 _MOST_WAVES = 1e6
-"""Wavefront error beyond which a number is none of an image, waves rms."""
+"""Wavefront error above which a value is not that of an image, in waves rms."""
 
 _FEW, _APART = quadrature.even_disk(500), 0.02
 """Points of the stop by which the area of shadows is held to their outlines, and by how much they may differ."""
 
 AT_ONCE = 40
-"""States traced in one launch, to bound memory: 40 take 60 MB."""
+"""States traced in one launch, to limit memory: 40 take 60 MB."""
 
 
 @dataclass(frozen=True, eq=False)
 class PupilOutline:
-    """A pupil as the image sees it, in units of its mean radius; x along the line (Y'), y along the track (X').
+    """Pupil as seen from the image, in units of its mean radius; x along the line (Y'), y along the track (X').
 
     Attributes
     ----------
-    axes : np.ndarray
-        From the unit circle to its edge, (2, 2).
-    pieces : np.ndarray
-        Of the shadow in it, (K, V, 2).
+    axes : (2, 2) ndarray
+        Map from the unit circle to the edge of the pupil.
+    pieces : (K, V, 2) ndarray
+        Polygons of the shadow in the pupil.
     """
 
     axes: np.ndarray
@@ -171,30 +172,30 @@ class PupilOutline:
 @shows()
 @dataclass(frozen=True, eq=False)
 class CameraQuality:
-    """One camera in S states at F fields. NaN where it is not known; ``reasons`` says why.
+    """Image quality of one camera in S states at F fields; NaN where unknown, with ``reasons``.
 
     Attributes
     ----------
-    wfe : np.ndarray
-        Rms wavefront error, piston and tilt removed, (S, F), waves.
-    wfe_refocused : np.ndarray
-        The same at each field's own best focus, (S, F), waves.
-    defocus : np.ndarray
-        Best focus minus line CCD along its normal, positive downstream (away from the optics), (S, F), metres.
-    mtf_along_line, mtf_along_track : np.ndarray
-        At the Nyquist frequency, (S, F).
-    light_lost : np.ndarray
-        Share of the light that bodies in the beam take, (S, F).
+    wfe : (S, F) ndarray
+        Rms wavefront error without piston and tilt, in waves.
+    wfe_refocused : (S, F) ndarray
+        Rms wavefront error at each field's own best focus, in waves.
+    defocus : (S, F) ndarray
+        Best focus minus line CCD along its normal, positive downstream (away from the optics), in metres.
+    mtf_along_line, mtf_along_track : (S, F) ndarray
+        MTF at the Nyquist frequency.
+    light_lost : (S, F) ndarray
+        Fraction of the light that bodies in the beam block.
     nyquist : float
-        cycles/m.
-    wavelengths : tuple[float, float]
-        First and last of the light of the MTF, metres.
-    reasons : tuple[str, ...]
-        Of every state; empty if all is known.
-    bodies : Mapping[str, np.ndarray]
-        Each body in the beam -> share of the stop's area that it takes by itself, (S, F).
-    pupils : tuple[tuple[PupilOutline, ...], ...]
-        How the pupils and the shadows in them look, state by state and field by field.
+        Nyquist frequency, in cycles/m.
+    wavelengths : tuple of float
+        First and last wavelength of the light of the MTF, in metres.
+    reasons : tuple of str
+        For every state, why values are unknown; empty if all are known.
+    bodies : mapping of str to (S, F) ndarray
+        Each body in the beam -> fraction of the stop's area that it blocks by itself.
+    pupils : tuple of tuples of PupilOutline
+        Outlines of the pupils and the shadows in them, by state and field.
     """
 
     wfe: np.ndarray
@@ -213,18 +214,18 @@ class CameraQuality:
 @shows()
 @dataclass(frozen=True, eq=False)
 class ImageQuality:
-    """All cameras.
+    """Image quality of all cameras.
 
     Attributes
     ----------
-    fields : tuple[float, ...]
-        Shares of half the line, (F,).
+    fields : (F,) tuple of float
+        Field points, as fractions of half the line.
     wavelength : float
-        Of the waves, metres.
-    cameras : Mapping[str, CameraQuality]
-        By name.
+        Wavelength that is the unit of wavefront errors, in metres.
+    cameras : mapping of str to CameraQuality
+        Image quality by camera.
     obstruction : bool
-        Whether what stands in the beams is missing in the pupils.
+        True if light blocked by bodies in the beams is missing in the pupils.
     """
 
     fields: tuple[float, ...]
@@ -234,31 +235,32 @@ class ImageQuality:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is not known, and why."""
+        """Warnings about unknown values, with their reasons."""
         return tuple(
             f"image quality of {name}: {reason}" for name, c in self.cameras.items() for reason in c.reasons if reason
         )
 
     def state(self, number: int) -> dict[str, CameraState]:
-        """Every camera in one state, for files."""
+        """Return every camera in one state, for files."""
         where = {place: self.fields.index(field) for place, field in PLACES.items() if field in self.fields}
         return {name: CameraState(camera, number, where) for name, camera in self.cameras.items()}
 
 
 @dataclass(frozen=True, eq=False)
 class CameraState:
-    """One camera in one state, and which fields are at the places that files name."""
+    """Image quality of one camera in one state, with the fields that have names in files."""
 
     camera: CameraQuality
     number: int
     places: Mapping[str, int]
 
     def named(self, values: np.ndarray) -> dict[str, float | None]:
-        """Place -> value at it, of values (S, F)."""
+        """Return position -> value, from values (S, F)."""
         return {place: _known(values[self.number, k]) for place, k in self.places.items()}
 
 
 def _known(value: float | np.floating[Any]) -> float | None:
+    """Return a finite value, otherwise None."""
     return float(value) if np.isfinite(value) else None
 
 
@@ -272,10 +274,11 @@ AT_FIELDS: Record[CameraQuality] = Record(
     Quantity("mtf_along_track", lambda c: c.mtf_along_track, "at Nyquist", "MTF at Nyquist along the track", 4),
     Quantity("light_lost", lambda c: c.light_lost, _TAKEN, "light taken by bodies in the beam", 2, shown="percent"),
 )
-"""What is told of every field: the one list that files, reports and scripts follow."""
+"""Quantities given at every field: the list that files, reports and scripts follow."""
 
 
 def _at_places(one: Quantity[CameraQuality]) -> Quantity[CameraState]:
+    """Return the quantity at the named positions of the line, in one state."""
     return Quantity(one.key, lambda of: of.named(one.of(of.camera)), f"{one.meaning}, at places of the line")
 
 
@@ -313,35 +316,35 @@ def image_quality(
     wavelength: float = WAVELENGTH,
     obstruction: bool = True,
 ) -> ImageQuality:
-    """Image quality of every camera in every state.
+    """Compute the image quality of every camera in every state.
 
     Parameters
     ----------
     instrument : Instrument
-        With its cameras.
+        Instrument with its cameras.
     backend : Backend
-        Where to trace.
-    states : Sequence[State]
+        Backend of the ray trace.
+    states : sequence of State
         S states, traced together.
-    fields : Sequence[float]
-        Shares of half the line, +1 at its left end (+Y'), from -1 to 1.
+    fields : sequence of float
+        Field points from -1 to 1, as fractions of half the line, +1 at its left end (+Y').
     wavelength : float
-        Of the waves in which wavefront errors are told, metres.
+        Wavelength that is the unit of wavefront errors, in metres.
     obstruction : bool
-        Whether the bodies in the beams count.
+        True to include light blocked by bodies in the beams.
 
     Returns
     -------
     ImageQuality
-        Numbers of each state, which do not depend on the others but for rounding. A state whose beam is lost or cut has
-        NaN and the reason.
+        Values of each state, which do not depend on the others except for rounding. A state whose beam is lost or
+        vignetted has NaN and the reason.
 
     Raises
     ------
     ValueError
-        No field, or one outside of the line.
+        There is no field, or one is outside the line.
     UnphysicalError
-        a number that cannot be.
+        A value is physically impossible.
     """
     if not fields or not np.all(np.abs(fields) <= 1.0):
         raise ValueError(f"fields from -1 to 1 expected, got {list(fields)}")
@@ -367,13 +370,13 @@ def image_quality(
 def quality_dicts(
     instrument: Instrument, backend: Backend, states: Sequence[State], obstruction: bool = True
 ) -> list[dict[str, Any]]:
-    """Contents of quality.json for each of many states, traced together."""
+    """Return the contents of quality.json for each of many states, traced together."""
     found = image_quality(instrument, backend, states, obstruction=obstruction)
     return [{"cameras": {k: _CAMERA(of) for k, of in found.state(s).items()}} for s in range(len(states))]
 
 
 _COLUMNS = ("light_lost", "wfe", "wfe_refocused", "defocus", "mtf_along_line", "mtf_along_track")
-"""Arrays of ``CameraQuality`` that are worked out together; a further one stands at the end."""
+"""Arrays of ``CameraQuality`` that are computed together; new ones go at the end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -383,19 +386,19 @@ class _Traced:
     Attributes
     ----------
     rays : ImagingRays
-        At the design wavelength.
-    size : np.ndarray
-        Of the line CCD in each, (B,).
-    origin : np.ndarray
-        Of its points on the line CCD, (B, 1, 3).
+        Rays at the design wavelength.
+    size : (B,) ndarray
+        Size of the line CCD relative to nominal.
+    origin : (B, 1, 3) ndarray
+        Image points on the line CCD.
     shadows : shadow.Shadows | None
-        In them; None for free beams.
+        Shadows in the beams; None for free beams.
     outlines : StopOutlines | None
-        Of edges and bodies on their stops; None for a camera whose surfaces have no edges.
-    free : np.ndarray | None
-        Nodes that no edge and no body takes, (B, N); None likewise.
-    again : Callable[[float], ImagingRays]
-        The same beams in light of another wavelength, metres.
+        Outlines of edges and bodies on the stops; None for a camera whose surfaces have no edges.
+    free : (B, N) ndarray | None
+        True for nodes that no edge and no body covers; None likewise.
+    again : callable
+        Function of a wavelength, in metres, that returns the rays of the same beams.
     """
 
     rays: ImagingRays
@@ -408,7 +411,7 @@ class _Traced:
 
 
 class _CameraBench:
-    """What of a camera does not change with its state."""
+    """Data of a camera that do not depend on its state, and the computation of its image quality."""
 
     def __init__(
         self,
@@ -450,7 +453,7 @@ class _CameraBench:
         self.assembly = instrument.assembly
 
     def fill(self, states: list[State], which: np.ndarray, out: np.ndarray, reasons: list[str]) -> None:
-        """Work out some states; where the light of one is lost, both halves by themselves."""
+        """Compute some states; if the light of one is lost, compute both halves separately."""
         try:
             traced = self._trace([states[s] for s in which])
         except (AimError, BeamMissedError, UnphysicalError) as error:
@@ -480,7 +483,7 @@ class _CameraBench:
                     )
 
     def bodies(self, count: int) -> dict[str, np.ndarray]:
-        """Each body that was found in a beam -> share that it takes, (S, F); NaN where the light is lost."""
+        """Return each body in a beam -> fraction that it blocks, (S, F); NaN where the light is lost."""
         out: dict[str, np.ndarray] = {}
         known = np.full((count, len(self.points)), np.nan)
         for which, _ in self._taken:
@@ -491,12 +494,12 @@ class _CameraBench:
         return dict(sorted(out.items()))
 
     def _trace(self, states: list[State]) -> _Traced:
-        """Beams to the line CCD, state by state and field by field.
+        """Trace the beams to the line CCD, by state and field.
 
         Raises
         ------
         AimError, BeamMissedError
-            The light of some state is lost.
+            The light of a state is lost.
         """
         assembly, name = self.assembly, self.name
         placed = assembly.place(states)
@@ -535,7 +538,7 @@ class _CameraBench:
         return _Traced(rays, imaging.size, origin, shadows, outlines, covers, lambda colour: sent(colour)[1])
 
     def _numbers(self, traced: _Traced, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Values (V, B) of _COLUMNS, the share of each beam that is cut, and whether an MTF is not to be had."""
+        """Return values (V, B) of _COLUMNS, the vignetted fraction of each beam, and whether its MTF is unknown."""
         rays, shadows, free = traced.rays, traced.shadows, traced.free
         radius = float(self.model.first_order.exit_pupil_distance[0])
         error = path_to_sphere(rays.position, rays.direction, rays.path, traced.origin, radius)
@@ -576,8 +579,19 @@ class _CameraBench:
     def _pupils(
         self, traced: _Traced, rays: ImagingRays, lit: np.ndarray, colour: float
     ) -> tuple[PupilStack, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Pupils of the beams ``lit``, which of them are smooth for light of a wavelength, metres, and the direction
-        cosines of their rays, (B, N) each.
+        """Return pupils of illuminated beams, whether each is smooth at a wavelength, and the rays' direction cosines.
+
+        Parameters
+        ----------
+        lit : (B,) ndarray of int
+            Indices of the beams.
+        colour : float
+            Wavelength, in metres.
+
+        Returns
+        -------
+        tuple
+            Pupils, smoothness (B,), and direction cosines (u, v), (B, N) each.
         """
         # the image's first axis runs along the line, Y', the second along the track, X'
         # per length of the nominal CCD, in which the pixels keep their pitch
@@ -592,8 +606,9 @@ class _CameraBench:
         return pupils, pupils.residual <= WORST_RESIDUAL * colour, (u, v)
 
     def _in_colours(self, traced: _Traced, lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """``_transfer`` of beams ``lit`` through lenses: each wavelength by its own rays, all about one place, so that
-        lateral colour blurs.
+        """Return ``_transfer`` of beams through lenses, with the rays of each wavelength.
+
+        All wavelengths refer to one image point, so that lateral colour blurs.
         """
         total, known = np.zeros((len(lit), len(self.frequency)), complex), np.ones(len(lit), bool)
         for colour, weight in zip(self.colours, self.weights / np.sum(self.weights), strict=True):
@@ -612,7 +627,10 @@ class _CameraBench:
         colours: np.ndarray,
         weights: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Transfer functions, complex (B, M), and which of them are known, (B,): of pupils that edges cut by lines."""
+        """Return complex transfer functions (B, M) and whether each is known (B,).
+
+        Vignetted pupils are integrated by lines.
+        """
         known = np.ones(len(pupils.centre), bool)
         if traced.outlines is None or traced.free is None:
             return pupils.transfer(self.frequency, colours, weights), known
@@ -630,12 +648,12 @@ class _CameraBench:
         return total, known
 
     def _hold(self, values: np.ndarray, dark: np.ndarray, shadows: shadow.Shadows | None) -> None:
-        """Hold numbers (V, B) of _COLUMNS to what any camera has.
+        """Check values (V, B) of _COLUMNS against physical limits.
 
         Raises
         ------
         UnphysicalError
-            One cannot be; with the camera and what it is.
+            A value is impossible; the message names the camera and the quantity.
         """
         # a beam that something cuts or all but stops is told by its reason, and not by numbers
         told = (dark == 0.0) & (values[0] <= _DARKEST)
@@ -658,7 +676,7 @@ class _CameraBench:
         check_close(f"the share of the stop {of} that bodies take", together[told], lost, "that of the light", _APART)
 
     def _note(self, pupils: PupilStack, lit: np.ndarray, which: np.ndarray) -> None:
-        """Keep how the pupils of states look of which all fields are lit."""
+        """Store the outlines of the pupils of states with all fields illuminated."""
         count = len(self.points)
         size = np.sqrt(np.abs(np.linalg.det(pupils.axes)))[:, None, None]
         axes = pupils.axes / size

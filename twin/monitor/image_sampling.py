@@ -1,12 +1,13 @@
-"""How finely the monitor's pupil has to be sampled for an image, and whether an image that was made can be right.
+"""Sampling of the monitor's pupil for an image, and checks of the computed images.
 
-The field on a pixel is an integral over the aperture, whose phase runs the faster the farther the pixel lies from
-where the rays land. So its nodes are chosen by the largest such distance among all pixels and traced rays: aperture,
-reach and aberration count together. They stand in a ladder of classes, so that many states share one set of nodes.
+The field on a pixel is an integral over the aperture; its phase varies the faster, the farther the pixel is from the
+point where the rays arrive. The nodes are therefore chosen by the largest such distance among all pixels and traced
+rays, which includes aperture, extent of the image and aberration. They form a ladder of classes, so that many states
+share one set of nodes.
 
-What was chosen is checked in every image. A second rule, with other radii and other arms, has to give some pixels
-alike; where the wavefront is too rough for the nodes, or an edge cuts the beam, it does not. And the light on the CCD
-has to be that of the rays that fall on it, up to what diffraction may carry across the CCD's edge.
+Every image is checked. A second rule, with other radii and other arms, has to give the same values at some pixels; it
+does not if the wavefront is too rough for the nodes, or if an edge cuts the beam. The light on the CCD has to equal
+that of the rays that fall on it, within what diffraction may carry across the CCD's edge.
 """
 
 from __future__ import annotations
@@ -22,56 +23,59 @@ from optics.waves.diffraction import Grid, PupilField, at_intersections
 from twin.framework.provenance import SelfCheck
 
 SPOT_RANGES = (0.25, 0.5, 0.8)
-"""Shares of the CCD's half size up to which sharp spots may be off its middle, one class of pupil nodes for each: the
-farther off a spot, the farther its farthest pixel, and the more nodes it needs. Beyond the last the estimators refuse
-it."""
+"""Fractions of the CCD's half size up to which sharp spots may be off its centre, one class of pupil nodes for each:
+the farther off a spot, the farther its farthest pixel, and the more nodes it needs. The estimators refuse spots
+beyond the last one.
+"""
 
 _BLUR_STEP = 1.25
-"""From one class to the next beyond ``SPOT_RANGES``, those of blurred spots."""
+"""Ratio of one class to the next beyond ``SPOT_RANGES``, for blurred spots."""
 
 MOST_PHASE = 400.0
-"""Largest phase of the last class, radians from the middle to the edge of the pupil: 42 000 nodes. A spot that needs
+"""Largest phase of the last class, in radians from the centre to the edge of the pupil: 42 000 nodes. A spot that needs
 more is spread over some hundred times the area of a CCD.
 """
 
 BLUR_PHASE = 1.5
-"""Phase that a blur is counted with, of that of a tilt as steep as its steepest ray's. A tilt turns along one
-direction; astigmatism and trefoil turn two and three times around the pupil, and their harmonics die out as much
-later (by comparison with 72 800 nodes: 3e-6 of the peak for trefoil, less for all other terms to Z37)."""
+"""Weight of a blur's phase, relative to that of a tilt as steep as its steepest ray. A tilt varies along one direction;
+astigmatism and trefoil vary two and three times around the pupil, and their harmonics decay correspondingly later
+(compared with 72 800 nodes: 3e-6 of the peak for trefoil, less for all other terms to Z37).
+"""
 
 _SHARP_PHASE = 1.0
-"""Phase of a blur that the margins of ``quadrature.disk_for`` hold anyway, radians."""
+"""Phase of a blur that the margins of ``quadrature.disk_for`` already include, in radians."""
 
 _WIDER_BEAM = 1.001
-"""Growth of the beam's aperture that needs no more nodes."""
+"""Relative growth of the beam's aperture that needs no additional nodes."""
 
 GOOD = 1e-4
-"""Difference of the two rules beyond which an image is made again with more nodes, of its peak."""
+"""Difference of the two rules, relative to the peak, above which an image is recomputed with more nodes."""
 
 WRONG = 1e-3
-"""Difference beyond which no image is given: a shot-noise sigma of a pixel that holds a million electrons."""
+"""Difference above which an image is refused: the shot-noise sigma of a pixel with a million electrons."""
 
 WINGS = 12.0
-"""How far diffraction may carry light across a CCD's edge, as a phase 2 pi NA r / wavelength; of an Airy pattern less
-than ``LOST`` lies farther out than that (2 / (pi z))."""
+"""Distance over which diffraction may carry light across a CCD's edge, as a phase 2 pi NA r / wavelength; less than
+``LOST`` of an Airy pattern lies farther out (2 / (pi z)).
+"""
 
 LOST = 0.08
-"""Share of a channel's light that the check of its energy leaves to diffraction."""
+"""Fraction of a channel's light that the energy check attributes to diffraction."""
 
 
 @dataclass(eq=False)
 class ImageChecks:
-    """What was found in all images that a path has given so far; an image beyond a limit is never given.
+    """Largest deviations in the checks of all images so far; an image beyond a limit is refused.
 
     Attributes
     ----------
     images : int
-        Number of them.
+        Number of images.
     difference : float
-        Of the two rules at most, of the peak; `WRONG` is the limit.
+        Largest difference of the two rules, relative to the peak; the limit is `WRONG`.
     light : float
-        Too much or too little at most, share of a channel's light beyond what rays and diffraction allow; 0 is the
-        limit.
+        Largest excess or deficit of light, as a fraction of a channel's light beyond what rays and diffraction allow;
+        the limit is 0.
     """
 
     images: int = 0
@@ -83,17 +87,17 @@ class ImageChecks:
 
         Parameters
         ----------
-        difference : np.ndarray
-            (B,) of the two rules.
-        light : np.ndarray
-            (B,) beyond what is allowed, either sign.
+        difference : (B,) ndarray
+            Differences of the two rules.
+        light : (B,) ndarray
+            Light beyond the allowed range, either sign.
         """
         self.images += difference.size
         self.difference = max(self.difference, float(np.max(difference, initial=0.0)))
         self.light = max(self.light, float(np.max(np.abs(light), initial=0.0)))
 
     def told(self) -> tuple[SelfCheck, ...]:
-        """For a manifest; nothing where no image was made."""
+        """Return the checks for a manifest; none if no image was made."""
         if not self.images:
             return ()
         refused = f"{self.images} images; one beyond the limit is refused"
@@ -105,19 +109,19 @@ class ImageChecks:
 
 
 class UncertainImageError(BeamMissedError):
-    """An image of the monitor cannot be worked out to ``WRONG`` of its peak."""
+    """Image of the monitor that cannot be computed to within ``WRONG`` of its peak."""
 
 
 @dataclass(frozen=True)
 class NodeClasses:
-    """Sizes of pupil quadrature, from that of sharp spots near the middle of a CCD to the last that is tried.
+    """Sizes of pupil quadrature, from sharp spots near the centre of a CCD to the largest that is tried.
 
     Attributes
     ----------
     phase_per_pixel : float
-        From the middle to the edge of the nominal pupil, radians for one pixel.
-    half : tuple[float, float]
-        Of the CCD (rows, columns), pixels.
+        Phase from the centre to the edge of the nominal pupil, in radians per pixel.
+    half : tuple of float
+        Half size of the CCD (rows, columns), in pixels.
     """
 
     phase_per_pixel: float
@@ -125,7 +129,7 @@ class NodeClasses:
 
     @property
     def reached(self) -> np.ndarray:
-        """Distances from the rays' middle, in half diagonals of the CCD, up to which each class is right."""
+        """Largest distance from the centre of the rays for each class, in half diagonals of the CCD."""
         most = MOST_PHASE / (self.phase_per_pixel * float(np.hypot(*self.half)))
         steps = 1.0 + SPOT_RANGES[-1]
         out = [1.0 + share for share in SPOT_RANGES]
@@ -135,38 +139,43 @@ class NodeClasses:
         return np.array(out)
 
     def phase(self, number: int) -> float:
-        """Largest phase of a class, radians."""
+        """Return the largest phase of a class, in radians."""
         return float(self.phase_per_pixel * np.hypot(*self.half) * self.reached[number])
 
     @property
     def sharp_count(self) -> int:
-        """Nodes of sharp spots anywhere in the last of ``SPOT_RANGES``, which every instrument takes."""
+        """Number of nodes for sharp spots anywhere in the last of ``SPOT_RANGES``, which every instrument uses."""
         rings, arms = quadrature.disk_size(self.phase(len(SPOT_RANGES) - 1))
         return rings * arms
 
     def nodes(self, number: int) -> PupilNodes:
-        """Pupil nodes of a class."""
+        """Return the pupil nodes of a class."""
         return quadrature.disk_for(self.phase(number))
 
     def second_nodes(self, number: int) -> PupilNodes:
-        """Pupil nodes of the second quadrature, which checks a class."""
+        """Return the pupil nodes of the second quadrature, which checks a class."""
         return quadrature.second_disk_for(self.phase(number))
 
     def class_of(
         self, place: np.ndarray, margin: int = 0, blur: np.ndarray | float = 0.0, widening: np.ndarray | float = 1.0
     ) -> np.ndarray:
-        """Number of the first class that is right for all spots of each state, (S,); the number of classes for none.
+        """Return the first class that suffices for all spots of each state; the number of classes if none does.
 
         Parameters
         ----------
-        place : np.ndarray
-            Middle of the spots (C, S, 2), pixels from the CCD's middle.
+        place : (C, S, 2) ndarray
+            Centres of the spots, in pixels from the CCD's centre.
         margin : int
             Extra pixels rendered on every side of the CCD.
-        blur : np.ndarray | float
-            Of the farthest rays from there, (C, S), pixels.
-        widening : np.ndarray | float
-            Of the beams' apertures against the nominal one, (C, S).
+        blur : (C, S) ndarray | float
+            Distance of the farthest rays from there, in pixels.
+        widening : (C, S) ndarray | float
+            Apertures of the beams, relative to the nominal one.
+
+        Returns
+        -------
+        (S,) ndarray of int
+            Class of each state.
         """
         half = np.array(self.half)
         wide = np.where(np.asarray(widening) > _WIDER_BEAM, widening, 1.0)
@@ -176,19 +185,20 @@ class NodeClasses:
 
 
 def disagreement(images: np.ndarray, second: PupilField, x: Grid, y: Grid) -> np.ndarray:
-    """Largest difference of images from those of a second rule at their corners, on their peak and beside it, (B,), of
-    the peak.
+    """Return the largest difference of each image from a second quadrature, relative to its peak, (B,).
+
+    The images are compared at their corners, at their peak and beside it.
 
     Parameters
     ----------
-    images : np.ndarray
-        As of ``optics.waves.diffraction.image`` on the grid of columns x and rows y, (B, R, C).
+    images : (B, R, C) ndarray
+        Images from ``optics.waves.diffraction.image`` on the grid of columns x and rows y.
     second : PupilField
         Pupils of the same beams at the nodes of the second rule.
     x : Grid
-        Of the images.
+        Columns of the images.
     y : Grid
-        likewise.
+        Rows of the images.
     """
     count, rows, columns = images.shape
     top = np.argmax(images.reshape(count, -1), axis=-1)
@@ -207,21 +217,22 @@ def disagreement(images: np.ndarray, second: PupilField, x: Grid, y: Grid) -> np
 def lost_or_gained(
     light: np.ndarray, place: np.ndarray, share: np.ndarray, half: np.ndarray, wings: np.ndarray
 ) -> np.ndarray:
-    """How far the light of images lies outside what the traced rays allow, (B,): shares of the channel's light,
-    negative for too little.
+    """Return the fraction of each image's light outside the range that the traced rays allow, (B,).
+
+    It is positive for an excess and negative for a deficit.
 
     Parameters
     ----------
-    light : np.ndarray
-        On the image, share of a channel's, (B,).
-    place : np.ndarray
-        Of rays from the middle of the image, (B, N, 2), (row, column) in pixels.
-    share : np.ndarray
-        Light of each, 0 for one that is lost, (B, N).
-    half : np.ndarray
-        Half sizes of the image (rows, columns), pixels.
-    wings : np.ndarray
-        How far diffraction reaches, pixels, (B,).
+    light : (B,) ndarray
+        Light on the image, as a fraction of the channel's.
+    place : (B, N, 2) ndarray
+        Positions of the rays from the centre of the image, (row, column) in pixels.
+    share : (B, N) ndarray
+        Light of each ray, 0 for a lost one.
+    half : (2,) ndarray
+        Half size of the image (rows, columns), in pixels.
+    wings : (B,) ndarray
+        Distance that diffraction reaches, in pixels.
     """
     outside = np.max(np.abs(place) - half, axis=-1)
     most = np.sum(share * (outside < wings[:, None]), axis=-1) + LOST

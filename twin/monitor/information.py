@@ -1,9 +1,8 @@
-"""What the light of a layout can know: information and posterior covariance of all parameters, from the traced
-derivatives of the stated disturbances and the light of every spot.
+"""Information of a layout's light: posterior covariance of all parameters from traced derivatives and spot noise.
 
 The M motions x ~ N(0, C), in standard deviations, move the spots by A x and the cameras by B x. Spots with noise R hold
-the Fisher information A' R^-1 A on them; what is left of the cameras' parameters is B (C^-1 + A' R^-1 A)^-1 B', which
-equals B C B' - B C A' (A C A' + R)^-1 A C B' also where C is singular.
+the Fisher information A' R^-1 A on them. The posterior covariance of the cameras' parameters is B (C^-1 + A' R^-1 A)^-1
+B', which equals B C B' - B C A' (A C A' + R)^-1 A C B' also for singular C.
 """
 
 from __future__ import annotations
@@ -31,25 +30,25 @@ from twin.monitor.truth import ground_geometry
 from twin.sensors.area_detector import EmvaDetector
 
 NOISE = "noise"
-"""What the images add beside the stated causes."""
+"""Name of the variance that the images add to that of the disturbances."""
 _SLOPE = 2  # pixels more on every side of an image, for its slopes
 _PARAMETERS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """What a layout's spots know of its cameras.
+    """Information of a layout's spots about its cameras.
 
     Attributes
     ----------
     disturbances : Disturbances
-        Stated, with their derivatives: D spot coordinates, K cameras.
-    noise : np.ndarray
-        (D, D) px^2 of the shifts, of the images before and after together.
-    quantities : Mapping[str, np.ndarray]
-        Name -> (n, 4 K) rows on all parameters; the quantity's variance is the mean of the rows'.
-    brightest : np.ndarray
-        (C,) expected light of every spot's brightest pixel, as a share of what a pixel can hold.
+        Prior with its derivatives: D spot coordinates, K cameras.
+    noise : (D, D) ndarray
+        Covariance of the shifts by the noise of the images before and after, in px^2.
+    quantities : mapping of str to (n, 4 K) ndarray
+        Name -> rows on all parameters; the quantity's variance is the mean of the rows' variances.
+    brightest : (C,) ndarray
+        Expected signal of every spot's brightest pixel, as a fraction of saturation.
     """
 
     disturbances: Disturbances
@@ -59,26 +58,26 @@ class Information:
 
     @cached_property
     def gain(self) -> np.ndarray:
-        """(4 K, D) of the estimate with the least variance, rad and m per pixel."""
+        """Gain of the estimate with the least variance, (4 K, D), in rad and m per pixel."""
         return self.disturbances.best_gain(self.noise)
 
     @cached_property
     def splits(self) -> Mapping[str, Split]:
-        """Quantity -> its variances by motions, SI."""
+        """Quantity -> its variances by motion, in SI units."""
         return {name: split(rows, self.disturbances, self.noise, self.gain) for name, rows in self.quantities.items()}
 
     def sigma(self, name: str) -> float:
-        """What is left of a quantity, SI."""
+        """Return the posterior standard deviation of a quantity, in SI units."""
         return float(np.sqrt(np.mean(self.splits[name].sigma ** 2)))
 
     def sigma_before(self, name: str) -> float:
-        """Standard deviation of a quantity without any measurement, SI."""
+        """Return the prior standard deviation of a quantity, in SI units."""
         return float(np.sqrt(np.mean(self.splits[name].sigma_before ** 2)))
 
     def slopes(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of a quantity's sigma by A, (D, M), and by the noise R, (D, D); SI per pixel and per px^2.
+        """Return the derivatives of a quantity's sigma by A, (D, M), and by the noise R, (D, D), per px and px^2.
 
-        The gain is the one of least variance, so that its own change does not count: with w = gain' row the variance
+        The gain has the least variance, so its own change does not contribute: with w = gain' row, the variance
         changes by 2 w' dA C (A' w - B' row) + w' dR w.
         """
         stated, rows = self.disturbances, self.quantities[name]
@@ -88,14 +87,14 @@ class Information:
         return 2.0 * weights.T @ left / scale, weights.T @ weights / scale
 
     def shares(self, name: str, measured: bool = True) -> dict[str, float]:
-        """Variance of a quantity by cause, SI; causes are independent of one another, so that shares add up.
+        """Return the variance of a quantity by cause, in SI units; causes are independent, so the variances add up.
 
         Parameters
         ----------
         name : str
-            Of the quantity.
+            Name of the quantity.
         measured : bool
-            What is left of it, with the noise; else before any measurement.
+            True for the posterior variance, including noise; False for the prior variance.
         """
         found = self.splits[name]
         shares = Split.by(found.after if measured else found.before, self.disturbances.causes)
@@ -104,7 +103,7 @@ class Information:
 
     @property
     def spot_sigma(self) -> np.ndarray:
-        """(D,) standard deviations of the spots' places, px."""
+        """Prior standard deviations of the spot coordinates, (D,), in pixels."""
         return np.sqrt(np.diag(self.disturbances.spot_covariance))
 
 
@@ -117,31 +116,31 @@ def information_of(
     alike: bool = False,
     single: bool = True,
 ) -> list[Information]:
-    """What an instrument's spots know, one for each statement of what moves.
+    """Return the information of an instrument's spots, for each prior.
 
     Parameters
     ----------
     instrument : Instrument
-        The instrument.
-    stated : Sequence[DisturbancesSpec]
+        Instrument.
+    stated : sequence of DisturbancesSpec
         Disturbances files.
     detector : EmvaDetector
-        Of the area CCDs.
+        Model of the area CCDs.
     backend : Backend
-        Where to trace.
+        Backend of the ray trace.
     ground : GroundGeometry | None
-        Of a pair; the height is then one of the quantities.
+        Ground geometry of a pair, which adds the height to the quantities.
     alike : bool
-        Spots of one camera and one beam width are taken to have the same noise.
+        True to assume the same noise for spots of one camera and one beam width.
     single : bool
-        Pictures of the spots in single precision, as all others; in double where they are differentiated.
+        True for images in single precision, as elsewhere; False (double) if they are differentiated.
 
     Raises
     ------
     InputError
         The disturbances name a body that the instrument does not have.
     BeamMissedError, AimError
-        Light does not come to the area CCDs.
+        Light does not reach the area CCDs.
     """
     path, thermal = MonitorPath(instrument, backend), ThermalModel(instrument)
     noise, brightest = spot_noise(path, detector, alike, single)
@@ -158,8 +157,10 @@ def information_of(
 
 
 def quantity_rows(instrument: Instrument, ground: GroundGeometry | None) -> dict[str, np.ndarray]:
-    """Name -> (n, 4 K) rows: every camera's d_alpha, d_beta, d_gamma (rad) and d_f (m) as ``camera/d_alpha``; the
-    intersection angle of the first two cameras; height and plan (m) at the line's middle.
+    """Return name -> (n, 4 K) rows of the quantities on all parameters.
+
+    The quantities are d_alpha, d_beta, d_gamma (rad) and d_f (m) of every camera, as ``camera/d_alpha``; the
+    intersection angle of the first two cameras (rad); and the height (m) at the line's centre.
     """
     names = list(instrument.cameras)
     unit = np.eye(_PARAMETERS * len(names))
@@ -178,12 +179,12 @@ def quantity_rows(instrument: Instrument, ground: GroundGeometry | None) -> dict
 
 
 def ground_of(instrument: Instrument) -> GroundGeometry | None:
-    """How a pair of known altitude sees the ground, by the focal lengths along its lines; None for other instruments.
+    """Return the ground geometry of a pair of known altitude, for the focal lengths along its lines; otherwise None.
 
     Raises
     ------
     InputError
-        Its rays do not meet on the ground.
+        The rays of the pair do not intersect on the ground.
     """
     distances = {name: model.line_principal_distance for name, model in instrument.cameras.items()}
     return ground_geometry(instrument, distances)
@@ -192,25 +193,31 @@ def ground_of(instrument: Instrument) -> GroundGeometry | None:
 def spot_noise(
     path: MonitorPath, detector: EmvaDetector, alike: bool = False, single: bool = True
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance of all shifts by the noise of images before and after, (D, D) px^2: of each spot twice the bound that
-    no unbiased fit of its image can beat, with the light of its channel and the instrument's number of frames. And the
-    share of what a pixel can hold that every spot's brightest one gets, (C,).
+    """Return the noise covariance of all shifts, and how full each spot's brightest pixel is.
+
+    The covariance of each spot is twice (images before and after) the Cramer-Rao bound of any unbiased fit of its
+    image, with the light of its channel and the instrument's number of frames.
 
     Parameters
     ----------
     path : MonitorPath
-        The monitor's light.
+        Optical path of the monitor.
     detector : EmvaDetector
-        Of the area CCDs.
+        Model of the area CCDs.
     alike : bool
-        Spots of one camera and one beam width are taken to have one shape; their light is their own.
+        True to assume the same shape, but not the same light, for spots of one camera and one beam width.
     single : bool
-        Pictures of the spots in single precision.
+        True for images in single precision.
+
+    Returns
+    -------
+    tuple of ndarray
+        Covariance (D, D), in px^2, and signal of the brightest pixels (C,), as a fraction of saturation.
 
     Raises
     ------
     BeamMissedError, AimError
-        Light does not come to the area CCDs.
+        Light does not reach the area CCDs.
     """
     channels = path.channels
     groups = {(c.camera, c.aperture) if alike else c.key: c for c in reversed(channels)}
@@ -226,30 +233,32 @@ def spot_noise(
 
 
 def built_noise(path: MonitorPath, detector: EmvaDetector, states: Sequence[State]) -> np.ndarray:
-    """Covariance of all shifts by the noise of images, px^2, (S, D, D), as of ``spot_noise``, of instruments that are
-    built as S states say: both images of each are its own.
+    """Return the noise covariance of all shifts for instruments as built, (S, D, D), in px^2, as ``spot_noise`` does.
+
+    Both images, before and after, are those of the instrument as built.
 
     Parameters
     ----------
     path : MonitorPath
-        The monitor's light.
+        Optical path of the monitor.
     detector : EmvaDetector
-        Of the area CCDs.
-    states : Sequence[State]
-        S of them.
+        Model of the area CCDs.
+    states : sequence of State
+        S states as built.
 
     Raises
     ------
     BeamMissedError, AimError
-        Light does not come to the area CCDs, or no image can be made of it.
+        Light does not reach the area CCDs, or no image can be computed.
     """
     found = [_image_bounds(photons, path, detector)[0] for _, photons in path.iterate_photons(states, margin=_SLOPE)]
     return joint(2.0 * np.concatenate(found))
 
 
 def _image_bounds(photons: np.ndarray, path: MonitorPath, detector: EmvaDetector) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds (S, C, 2, 2) px^2 of spots by their images (S, C, H, W) with the margin of ``_SLOPE``, and how full their
-    brightest pixels are, (S, C).
+    """Return Cramer-Rao bounds (S, C, 2, 2), px^2, and the saturation of the brightest pixels (S, C), from images.
+
+    The images have the margin ``_SLOPE``.
     """
     spec = path.instrument.spec.autocollimator
     exposure = spec.area_ccd.exposure

@@ -1,7 +1,7 @@
-"""The beams of the monitor from every pinhole through the camera and back to the area CCD, and their rays.
+"""Beams of the monitor from every pinhole through the camera and back to the area CCD, and their rays.
 
-A beam is limited by the return face's aperture. Rays are aimed at quadrature nodes of that aperture in every state,
-so that its edge is exact; at the CCD each ray is a plane wave. The face is taken as evenly lit.
+A beam is limited by the return face's aperture. Rays are aimed at quadrature nodes of that aperture in every state, so
+that its edge is exact; at the CCD each ray is a plane wave. The face is assumed to be evenly illuminated.
 """
 
 from __future__ import annotations
@@ -34,12 +34,14 @@ class Aimed:
 
     Attributes
     ----------
-    position, direction : np.ndarray
-        World, (C*S, N, 3).
-    axes : np.ndarray
-        Transverse axes of the aim parameters, (C*S, 1, 2, 3).
-    parameters : np.ndarray
-        Aim parameters (C*S, N, 2); jacobian: d(node)/d(parameters), (C*S, N, 2, 2).
+    position, direction : (C*S, N, 3) ndarray
+        Launch points and unit directions in the world frame.
+    axes : (C*S, 1, 2, 3) ndarray
+        Transverse axes of the aim parameters.
+    parameters : (C*S, N, 2) ndarray
+        Aim parameters.
+    jacobian : (C*S, N, 2, 2) ndarray
+        Derivative d(node)/d(parameters).
     """
 
     position: np.ndarray
@@ -51,24 +53,24 @@ class Aimed:
 
 @dataclass(frozen=True, eq=False)
 class CoarseTrace:
-    """What a few rays say of C channels x S states (channel-major).
+    """Trace with a few rays for C channels x S states (channel-major).
 
     Attributes
     ----------
     fan : RayFan
-        Of the rays from the pinholes.
+        Rays from the pinholes.
     outgoing, back : SystemBatch
         Systems from the pinholes to the return face, and on to the CCDs.
     uploaded : UploadedSystems
-        The latter where they are traced.
-    turn : np.ndarray
-        Change of the aim parameters against the nominal instrument, Zernike terms on the face, (2, C*S, T).
-    place : np.ndarray
-        Middle of the spots, (row, column) in pixels from the CCD's middle, (C, S, 2).
-    blur : np.ndarray
-        Distance of the farthest rays from there, estimated at the aperture's edge, pixels, (C, S).
-    aperture : np.ndarray
-        Numerical apertures of the beams, the largest half width, (C, S).
+        Systems ``back`` on the device.
+    turn : (2, C*S, T) ndarray
+        Change of the aim parameters relative to the nominal instrument, as Zernike terms on the face.
+    place : (C, S, 2) ndarray
+        Centres of the spots, (row, column) in pixels from the CCD's centre.
+    blur : (C, S) ndarray
+        Distance of the farthest rays from there, extrapolated to the aperture's edge, in pixels.
+    aperture : (C, S) ndarray
+        Numerical apertures of the beams (largest half width).
     """
 
     fan: RayFan
@@ -81,7 +83,7 @@ class CoarseTrace:
     aperture: np.ndarray
 
     def take(self, states: np.ndarray, backend: Backend) -> CoarseTrace:
-        """The states of the given indices."""
+        """Return the states of the given indices."""
         channels, count = self.place.shape[:2]
         if np.array_equal(states, np.arange(count)):
             return self
@@ -98,16 +100,16 @@ class CcdRays:
 
     Attributes
     ----------
-    position : np.ndarray
-        On the chip, whose pixels grow with it: metres over ``size``, so that pixels have the nominal pitch, (B, N, 3).
-    direction : np.ndarray
-        Unit, (B, N, 3).
-    path : np.ndarray
-        Optical path, metres, (B, N).
-    valid : np.ndarray
-        (B, N).
-    size : np.ndarray
-        Of the CCD relative to nominal, (B,).
+    position : (B, N, 3) ndarray
+        Positions on the chip, divided by ``size`` so that pixels have the nominal pitch, in metres.
+    direction : (B, N, 3) ndarray
+        Unit directions.
+    path : (B, N) ndarray
+        Optical path, in metres.
+    valid : (B, N) ndarray of bool
+        True for rays that arrive.
+    size : (B,) ndarray
+        Size of the CCD relative to nominal.
     """
 
     position: np.ndarray
@@ -119,14 +121,14 @@ class CcdRays:
 
 @dataclass(frozen=True, eq=False)
 class SpotFocus:
-    """Sharpness of the unperturbed instrument's spots, channel by channel.
+    """Sharpness of the unperturbed instrument's spots, by channel.
 
     Attributes
     ----------
-    error : np.ndarray
-        Rms wavefront error of the returned beam about its best plane tilt, waves, (C,).
-    defocus : np.ndarray
-        How far the focal plane would have to move along its Z for the sharpest spots, metres, (C,).
+    error : (C,) ndarray
+        Rms wavefront error of the returned beam about its best plane tilt, in waves.
+    defocus : (C,) ndarray
+        Displacement of the focal plane along its Z that would give the sharpest spots, in metres.
     """
 
     error: np.ndarray
@@ -139,38 +141,39 @@ below 1e-7 of it where surfaces are smooth; figures of prisms and mirrors that h
 """
 
 SMOOTH = 1e-6
-"""Largest rest of that map, of the beam's aperture, that is left out: 5e-5 of the density of rays."""
+"""Largest residual of that map, relative to the beam's aperture, that is neglected: 5e-5 of the density of rays."""
 
 TOO_ROUGH = 2e-5
-"""Rest beside all terms beyond which no image is given: 1e-3 of the density of rays."""
+"""Residual beyond all terms above which an image is refused: 1e-3 of the density of rays."""
 
 _COARSE_RINGS = 6
 """Rings of the quadrature for means: exact for polynomials to degree 23."""
 
 _SCOUT_RINGS = 4
-"""Rings of the rays that are aimed in every state to find out how far the others have to be turned."""
+"""Rings of the rays that are aimed in every state to find how the launch directions of the others change."""
 
 AIM_TOLERANCE = 1e-9
-"""Where a ray meets the aperture node, metres: it shifts a quadrature node, not the ray's own path, by 4e-8 of the
-radius."""
+"""Largest distance of a ray from its aperture node, in metres: it shifts a quadrature node, not the ray's own path, by
+4e-8 of the radius.
+"""
 
 _CLOSE_TOLERANCE = 0.01 * AIM_TOLERANCE
-"""Likewise of the rays from which those of other states are predicted."""
+"""Tolerance for the rays from which those of other states are predicted, in metres."""
 
 
 class MonitorBeams:
-    """Traces the beams of the monitor channels of one instrument.
+    """Ray trace of the monitor channels of one instrument.
 
     Parameters
     ----------
     instrument
-        The instrument.
+        Instrument.
     backend
-        Where to trace.
+        Backend of the ray trace.
     nodes
         Pupil quadrature, for all states.
     cameras
-        Whose channels; None for all. Numbers of a channel do not depend on which others there are.
+        Cameras whose channels are traced; None for all. Values of a channel do not depend on the other channels.
     """
 
     def __init__(
@@ -201,31 +204,34 @@ class MonitorBeams:
         return 0.5 * widest / float(np.min(scales))
 
     def _with(self, nodes: PupilNodes) -> MonitorBeams:
+        """Return these beams with other nodes."""
         return MonitorBeams(self.instrument, self.backend, nodes, self.cameras)
 
     @cached_property
     def coarse(self) -> MonitorBeams:
-        """These beams with few nodes: enough for means over the aperture, the integral of a smooth function."""
+        """Beams with few nodes: enough for means over the aperture, which are integrals of a smooth function."""
         return self._with(quadrature.disk(_COARSE_RINGS))
 
     @cached_property
     def scout(self) -> MonitorBeams:
-        """These beams with the fewest nodes: enough for the change of a smooth function over the aperture."""
+        """Beams with the fewest nodes: enough for the change of a smooth function over the aperture."""
         return self._with(quadrature.disk(_SCOUT_RINGS))
 
     @cached_property
     def _smooth(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Series of smooth functions: Zernike terms from values on the nodes (T, N); values, d/dx, d/dy from terms (N,
-        T).
+        """Matrices of Zernike series for smooth functions.
+
+        They are the terms from values on the nodes (T, N), and values, d/dx and d/dy from terms (N, T).
         """
         return self._series(MAP_TERMS)
 
     @cached_property
     def _rough(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Series of functions with fine structure, with the matrices of `_smooth`."""
+        """Matrices of Zernike series for functions with fine structure, as in `_smooth`."""
         return self._series(ROUGH_TERMS)
 
     def _series(self, terms: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the matrices of a Zernike series with a number of terms, as in `_smooth`."""
         x, y = self.nodes.x, self.nodes.y
         basis = zernike.basis(terms, x, y)
         # the terms are orthonormal over the disk, and the quadrature is exact for their products
@@ -234,12 +240,12 @@ class MonitorBeams:
         return solve, basis, dx, dy
 
     def area_ratio(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Determinant d(u, v)/d(x, y) of maps from the unit disk, given on the nodes, (..., N).
+        """Return the determinant d(u, v)/d(x, y) of maps from the unit disk, given on the nodes, (..., N).
 
         Raises
         ------
         UncertainImageError
-            a map that is too rough for all terms.
+            A map is too rough for the Zernike terms.
         """
         out, rest = _area_ratio(u, v, self._smooth)
         rough = rest > SMOOTH
@@ -254,7 +260,7 @@ class MonitorBeams:
         return out
 
     def _outgoing(self, placed: PlacedBodies, states: Sequence[State]) -> tuple[RayFan, SystemBatch]:
-        """Rays from each pinhole toward the optics, and the systems up to the return face."""
+        """Return the rays from each pinhole toward the optics, and the systems up to the return face."""
         position, direction = [], []
         for channel in self.channels:
             position.append(placed.translation[:, placed.index[channel.reticle_body]])
@@ -267,17 +273,18 @@ class MonitorBeams:
 
     @cached_property
     def target(self) -> np.ndarray:
-        """Nodes on the return faces, (C, N, 2), metres of their nominal sizes."""
+        """Nodes on the return faces, (C, N, 2), in metres of the nominal size."""
         return self.face_radius[:, None, None] * np.stack([self.nodes.x, self.nodes.y], axis=-1)
 
     def targets(self, states: int) -> np.ndarray:
-        """Values of `target` repeated for each state, channel-major, (C*S, N, 2)."""
+        """Return `target` repeated for each state, channel-major, (C*S, N, 2)."""
         return np.repeat(self.target, states, axis=0)
 
     @cached_property
     def nominal(self) -> Aimed:
-        """Aimed rays of the unperturbed instrument, the start for all other states: at the middle of the face, then at
-        the nodes around it.
+        """Aimed rays of the unperturbed instrument, from which all other states start.
+
+        They are aimed first at the centre of the face, then at the nodes around it.
         """
         fan, outgoing = self._outgoing(self.instrument.assembly.place(), [{}])
         middle, slope = aim(self.backend, outgoing, fan, np.zeros((1, 2)), tolerance=_CLOSE_TOLERANCE)
@@ -287,19 +294,19 @@ class MonitorBeams:
         return Aimed(place, heading, fan.axes, q, slope)
 
     def coarse_trace(self, states: Sequence[State], placed: PlacedBodies | None = None) -> CoarseTrace:
-        """Where the spots of S states fall, and how rays have to be turned to meet the face where they did.
+        """Trace a few rays to find the spots of S states, and the launch directions that hit the nodes of the face.
 
         Parameters
         ----------
-        states : Sequence[State]
+        states : sequence of State
             S states.
         placed : PlacedBodies | None
-            Their bodies, when already placed.
+            Bodies of the states, if already placed.
 
         Raises
         ------
         BeamMissedError, AimError
-            As ``rays``.
+            Light is lost, see ``rays``.
         """
         scout, count = self.scout, len(states)
         placed = self.instrument.assembly.place(states) if placed is None else placed
@@ -328,31 +335,32 @@ class MonitorBeams:
 
     @cached_property
     def place_at_rest(self) -> np.ndarray:
-        """Where ``coarse_trace`` sees the spots of the unperturbed instrument, (C, 1, 2)."""
+        """Spot centres of the unperturbed instrument from ``coarse_trace``, (C, 1, 2), in pixels."""
         return self.coarse_trace([{}]).place
 
     def mean_spots(self, states: Sequence[State]) -> np.ndarray:
-        """Means of the rays, which are the energy centroids of the images: (S, C, 2), row and column, px from the first
-        pixel's centre. Raises as ``rays``.
+        """Return the means of the rays, (S, C, 2), row and column in pixels from the first pixel's centre.
+
+        They are the energy centroids of the images. Raises the errors of ``rays``.
         """
         mean = np.einsum("n,bnk->bk", self.nodes.share, self.rays(states).position[..., 1::-1]) / self.pitch
         middle = 0.5 * (np.array(self.shape) - 1.0)
         return np.asarray(np.swapaxes(mean.reshape(len(self.channels), len(states), 2), 0, 1) + middle)
 
     def rays(self, states: Sequence[State], coarse: CoarseTrace | None = None) -> CcdRays:
-        """Rays at the CCDs for C channels x S states, channel-major.
+        """Trace rays to the CCDs for C channels x S states, channel-major.
 
         Parameters
         ----------
-        states : Sequence[State]
+        states : sequence of State
             S states.
         coarse : CoarseTrace | None
-            What ``coarse_trace`` says of them, if it is known.
+            Result of ``coarse_trace`` for these states, if known.
 
         Raises
         ------
         BeamMissedError, AimError
-            a perturbation moves a beam off the mirrors or a spot off its CCD, named in the message.
+            A perturbation moves a beam off the mirrors or a spot off its CCD; the message names it.
         """
         known = self.coarse_trace(states) if coarse is None else coarse
         start, slope = (np.repeat(a, len(states), axis=0) for a in (self.nominal.parameters, self.nominal.jacobian))
@@ -380,18 +388,18 @@ class MonitorBeams:
         return rays
 
     def _where_lost(self, channel: Channel, state: State, position: np.ndarray, direction: np.ndarray) -> str:
-        """The element, and its body, at which the last of a channel's rays (N, 3) are lost."""
+        """Return the element and the body at which the last of a channel's rays (N, 3) are lost."""
         names = self.instrument.assembly.sequences[f"{channel.key}/monitor"]
         steps = surviving_rays(self.backend, self.instrument.assembly, names, position, direction, state)
         count, element = next((i, element) for i, (element, alive) in enumerate(steps, 1) if not alive.any())
         return f"{element.name} on {element.body}, at surface {count} of {len(names)} of its way"
 
     def fields(self, states: Sequence[State]) -> PupilField:
-        """Plane waves at the CCDs for C channels x S states. Raises as ``rays``."""
+        """Return the plane waves at the CCDs for C channels x S states. Raises the errors of ``rays``."""
         return self.field_of(self.rays(states))
 
     def field_of(self, rays: CcdRays) -> PupilField:
-        """Plane waves of traced rays, channel-major, in each chip's own x, y about its centre."""
+        """Return the plane waves of traced rays, channel-major, in each chip's x, y about its centre."""
         direction = rays.direction
         u, v = direction[..., 0], direction[..., 1]
         # sqrt(|d(u, v)/dA| / A) dA of the module docstring of optics.waves.diffraction, with A the face's area
@@ -401,7 +409,7 @@ class MonitorBeams:
         return PupilField(u, v, phase, amplitude, self.wavelength).scaled_by(rays.size)
 
     def _require_on_ccd(self, channel: Channel, place: np.ndarray) -> None:
-        """Raise BeamMissedError when the middle of a spot (S, 2), pixels from the middle, is outside its CCD."""
+        """Raise BeamMissedError if the centre of a spot (S, 2), in pixels from the CCD's centre, is outside its CCD."""
         half = 0.5 * (np.array(self.shape) - 1)
         beyond = np.linalg.norm(np.maximum(np.abs(place) - half, 0.0), axis=-1)
         if np.any(beyond > 0.0):
@@ -415,12 +423,12 @@ class MonitorBeams:
 
     @cached_property
     def focus(self) -> SpotFocus:
-        """How sharp the unperturbed instrument's spots are.
+        """Sharpness of the unperturbed instrument's spots.
 
         Raises
         ------
         BeamMissedError, AimError
-            As ``rays``.
+            Light is lost, see ``rays``.
         """
         rays, weight = self.coarse.rays([{}]), self.coarse.nodes.weight
         paths = eikonal(rays.position, rays.direction, rays.path, np.zeros(3))
@@ -439,21 +447,19 @@ class MonitorBeams:
         return SpotFocus(error / self.wavelength, defocus)
 
     def grid(self, axis: int, margin: int = 0) -> Grid:
-        """Pixel centres of the rows (0) or columns (1) on the chip, from the CCD's centre, in nominal metres."""
+        """Return the pixel centres of the rows (0) or columns (1), in nominal metres from the CCD's centre."""
         n = self.shape[axis]
         return Grid(-(0.5 * (n - 1) + margin) * self.pitch, self.pitch, n + 2 * margin)
 
     def axis(self, axis: int) -> np.ndarray:
-        """Detector coordinate of the pixel centres of all rows (0) or columns (1), metres from the CCD's centre."""
+        """Return the detector coordinates of all rows (0) or columns (1), in metres from the CCD's centre."""
         return self.grid(axis).points()
 
 
 def _area_ratio(
     u: np.ndarray, v: np.ndarray, series: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Determinant d(u, v)/d(x, y) of maps (..., N) by a series, and the largest rest beside it, of the beam's
-    aperture, (...,).
-    """
+    """Return the determinant d(u, v)/d(x, y) of maps (..., N) by a series, and its relative residual (...,)."""
     solve, basis, dx, dy = series
     a, b = product(u, solve.T), product(v, solve.T)
     ratio = product(a, dx.T) * product(b, dy.T) - product(a, dy.T) * product(b, dx.T)

@@ -1,16 +1,16 @@
-"""Derivatives of the monitor's spots and images by motions of any body, in forward and in reverse mode.
+"""Derivatives of the monitor's spots by motions of any body, and the motion models of the estimators.
 
-A spot is the mean of its rays at the area CCD. Two backward passes (row and column) through the monitor's sequence
-give its derivative by the numbers of every surface and by the direction in which each ray starts. That direction is
-chosen so that the ray meets its node of the return face, hit(direction, numbers) = node. So by the implicit function
-theorem the passes go on, through the sequence from pinhole to return face, with the weights
+A spot is the mean of its rays at the area CCD. In reverse mode, two backward passes (row and column) through the
+monitor's sequence give its derivative by the numbers of every surface and by the launch direction of each ray. That
+direction is such that the ray hits its node of the return face, hit(direction, numbers) = node. By the implicit
+function theorem the passes therefore continue through the sequence from pinhole to return face with the weights
 
     w = -(d hit / d direction)^-T  dS / d direction.
 
 The numbers of the surfaces follow the motions by the complex step in the rigid-body tree. The cost hardly depends on
-how many motions there are; forward mode (``twin.monitor.monitor_derivative``) traces all rays once for each of them.
+the number of motions; forward mode traces all rays once for each of them.
 
-The states that the monitor's readings stand for, traced again: what they do to spots and cameras exactly.
+Estimators that retrace states use the exact spot shifts and camera changes of the motions that they estimate.
 """
 
 from __future__ import annotations
@@ -46,20 +46,20 @@ from twin.monitor.truth import LineSight, trace_truth, truth_jacobian
 
 
 def _size_steps(placed: PlacedBodies, bodies: Sequence[str]) -> np.ndarray:
-    """Derivative of the sizes of C bodies by the steps of M states, (C, M)."""
+    """Return the derivative of the sizes of C bodies by the steps of M states, (C, M)."""
     return np.stack([placed.scale[:, placed.index[body]].imag for body in bodies]) / COMPLEX_STEP
 
 
 def ray_tangents(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> tuple[RayTangents, np.ndarray]:
-    """Push motions forward through the traced path, about the unperturbed instrument; rays stay on their nodes.
+    """Propagate motions through the trace about the unperturbed instrument, with rays fixed to their nodes.
+
+    The motions of the bodies are differentiated by a complex step in the rigid-body tree, the trace by Dr.Jit.
 
     Returns
     -------
-    tuple[RayTangents, np.ndarray]
-        Derivatives for C channels x M motions (channel-major), in each CCD's frame, per radian, metre or unit, and
+    tuple of (RayTangents, ndarray)
+        Derivatives for C channels x M motions (channel-major), in each CCD's frame, per radian, metre or unit; and
         those of the CCDs' sizes, (C*M,).
-
-    The motions of the bodies are differentiated by a complex step in the rigid-body tree, the trace by Dr.Jit.
     """
     states, steps = _of_one_structure(path, pivot_states(motions)), [motion.step for motion in motions]
     placed = path.instrument.assembly.place(states, steps)
@@ -85,8 +85,9 @@ def ray_tangents(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> tup
 
 
 def _of_one_structure(path: MonitorBeams, states: list[State]) -> list[State]:
-    """These states in one structure: the first of them names the highest figure term of every mirror, with amplitude 0.
-    All derivatives by motions then share one kernel, whose compilation takes most of the time.
+    """Return the states with the same structure, so that all derivatives by motions share one compiled kernel.
+
+    The first state gets the highest figure term of every mirror, with amplitude 0.
     """
     if not states:
         return states
@@ -101,24 +102,24 @@ def _of_one_structure(path: MonitorBeams, states: list[State]) -> list[State]:
 def hit_slopes(
     backend: Backend, systems: SystemBatch, position: np.ndarray, direction: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Exact derivative of where rays meet the last element by the directions in which they start.
+    """Return the exact derivative of where rays hit the last element by their launch directions.
 
     Parameters
     ----------
     backend : Backend
-        Where to trace.
+        Backend of the ray trace.
     systems : SystemBatch
         B systems that carry no derivative.
-    position : np.ndarray
-        Launch points, world, (B, N, 3), metres.
-    direction : np.ndarray
-        Unit directions, (B, N, 3).
+    position : (B, N, 3) ndarray
+        Launch points in the world frame, in metres.
+    direction : (B, N, 3) ndarray
+        Unit directions.
 
     Returns
     -------
-    tuple[np.ndarray, np.ndarray]
-        Two unit vectors square to each direction, (B, N, 2, 3), and d(hit x, y)/d(turn toward each), (B, N, 2, 2),
-        metres per radian.
+    tuple of ndarray
+        Two unit vectors perpendicular to each direction, (B, N, 2, 3), and d(hit x, y)/d(rotation toward each), (B, N,
+        2, 2), in metres per radian.
     """
     axes = transverse_axes(direction, np.broadcast_to([0.0, 1.0, 0.0], direction.shape))
     place, heading = np.repeat(position, 2, axis=1), np.repeat(direction, 2, axis=1)
@@ -127,21 +128,21 @@ def hit_slopes(
 
 
 def spot_jacobian(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> np.ndarray:
-    """Derivative of every spot's position by elementary motions.
+    """Return the derivative of every spot's position by elementary motions, in forward mode.
 
     The position is the mean of the rays over the aperture, which is the energy centroid of the diffraction image.
 
     Parameters
     ----------
     path : MonitorBeams
-        The monitor.
-    motions : Sequence[ElementaryMotion]
+        Beams of the monitor.
+    motions : sequence of ElementaryMotion
         M elementary motions.
 
     Returns
     -------
-    np.ndarray
-        (C, 2, M): row and column, pixels per radian, metre or unit.
+    (C, 2, M) ndarray
+        Row and column, in pixels per radian, metre or unit.
     """
     tangents, sizes = ray_tangents(path.coarse, motions)
     place = tangents.traced.numpy()[0]
@@ -152,35 +153,35 @@ def spot_jacobian(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> np
 
 
 CHUNK = 1 << 17
-"""Rays, of all channels together, that go back through the trace at once: what they need is about 0.3 GB."""
+"""Rays of all channels together that are traced back at once: they need about 0.3 GB."""
 
 
 def spot_gradient(
     path: MonitorBeams, motions: Sequence[ElementaryMotion], about: State | None = None, chunk: int = CHUNK
 ) -> np.ndarray:
-    """Derivative of every spot's position by elementary motions, as ``twin.monitor.monitor_derivative.spot_jacobian``.
+    """Return the derivative of every spot's position by elementary motions, as `spot_jacobian`, in reverse mode.
 
     Parameters
     ----------
     path : MonitorBeams
-        The monitor; all of its nodes are traced (``path.coarse`` is enough for the mean of a smooth spot).
-    motions : Sequence[ElementaryMotion]
+        Beams of the monitor; all of its nodes are traced (``path.coarse`` is enough for the mean of a smooth spot).
+    motions : sequence of ElementaryMotion
         M elementary motions.
     about : State | None
-        The state at which to differentiate, by default the unperturbed instrument. A motion is added to the component
-        of that name: the rotation vector's, the shift's, the scale's or the figure's.
+        State at which to differentiate; None for the unperturbed instrument. A motion is added to the component of that
+        name: the rotation vector's, the shift's, the scale's or the figure's.
     chunk : int
-        Rays of all channels together that are traced back at once; bounds the memory.
+        Rays of all channels together that are traced back at once, to limit memory.
 
     Returns
     -------
-    np.ndarray
-        (C, 2, M): row and column, pixels per radian, metre or unit.
+    (C, 2, M) ndarray
+        Row and column, in pixels per radian, metre or unit.
 
     Raises
     ------
     ValueError
-        a motion has another pivot than the state's motion of that body.
+        A motion has another pivot than the state's motion of that body.
     AimError
         In the state ``about`` a beam does not reach its return face.
     """
@@ -233,7 +234,7 @@ _Tangents = list[dict[Path, np.ndarray]]
 
 
 def _dot(tangents: _Tangents, slopes: Sequence[Mapping[Path, np.ndarray]]) -> np.ndarray:
-    """Sum over numbers of slope (C, 2) times derivative by the motions: (C, 2, M)."""
+    """Return the sum over numbers of slope (C, 2) times derivative by the motions, (C, 2, M)."""
     parts = [
         slope[name].reshape(len(table), 2)[:, :, None] * table[:, None]
         for own, slope in zip(tangents, slopes, strict=True)
@@ -250,7 +251,7 @@ def _numbers(
     placed: PlacedBodies,
     steps: Sequence[tuple[str, str, int]],
 ) -> tuple[SystemBatch, _Tangents]:
-    """The numbers of a sequence of all channels, each twice (for row and column), and their derivatives."""
+    """Return the numbers of a sequence of all channels, each twice (for row and column), and their derivatives."""
     assembly = path.instrument.assembly
     names = [f"{channel.key}/{sequence}" for channel in path.channels]
     systems = assemble(assembly, names, [middle])
@@ -262,7 +263,7 @@ def _numbers(
 
 
 def _named(motion: ElementaryMotion, about: State) -> State:
-    """The state ``about`` in which the motion's body names its pivot and, with zero amplitude, its figure term."""
+    """Return the state ``about`` with the pivot and (at zero amplitude) the figure term of the motion's body."""
     start = about.get(motion.body)
     if start is None:
         return {**about, **motion.state(0.0)}
@@ -276,7 +277,7 @@ def _named(motion: ElementaryMotion, about: State) -> State:
 
 
 def _union(states: Sequence[State], about: State) -> State:
-    """``about`` with every figure term that some state names, so that all have the same structure."""
+    """Return ``about`` with every figure term of any state, so that all have the same structure."""
     figures: dict[str, dict[int, float]] = {}
     for state in states:
         for body, motion in state.items():
@@ -286,7 +287,7 @@ def _union(states: Sequence[State], about: State) -> State:
 
 
 def _aimed(path: MonitorBeams, about: State) -> tuple[np.ndarray, np.ndarray]:
-    """Launch points and directions (C, N, 3) of the rays that meet the nodes of the return faces in the state."""
+    """Return launch points and directions (C, N, 3) of the rays that hit the nodes of the return faces in the state."""
     nominal = path.nominal
     start = np.broadcast_to(nominal.position, nominal.direction.shape)
     if not about:
@@ -302,35 +303,37 @@ def _aimed(path: MonitorBeams, about: State) -> tuple[np.ndarray, np.ndarray]:
 
 
 STEPS = {"temperature": 0.1, "gradient": 0.1, "index_gradient": 1e-6, "radius": 1e-5, "conic": 1e-5, "index": 1e-6}
-"""Half steps of the central differences, SI: spots move by some tenths of a pixel, where they are linear to 1e-6."""
+"""Half steps of the central differences, in SI units: spots move by some tenths of a pixel, where they are linear to
+1e-6.
+"""
 
 
 def disturbances_of(
     stated: StatedMotions, path: MonitorPath, thermal: ThermalModel, instrument: Instrument, backend: Backend
 ) -> Disturbances:
-    """Stated motions with their derivatives, as the analysis takes them.
+    """Return the motions of a prior with their derivatives, for the analysis.
 
-    Rigid motions, growth and figures are differentiated by automatic differentiation as all others of this program
-    are; temperatures and gradients of indices by central differences of the traced spots, since they reach light by
-    many bodies at once, and so are radii, conic constants and indices, which few files state.
+    Rigid motions, scale and figures are differentiated by automatic differentiation. Temperatures and index gradients
+    affect light through many bodies at once, and radii, conic constants and indices are rare in priors; all of these
+    use central differences of the traced spots.
 
     Parameters
     ----------
     stated : StatedMotions
-        The motions.
+        Motions of the prior.
     path : MonitorPath
-        The monitor's light.
+        Optical path of the monitor.
     thermal : ThermalModel
-        Of the instrument.
+        Thermal model of the instrument.
     instrument : Instrument
-        nominal.
+        Nominal instrument.
     backend : Backend
-        Where to trace.
+        Backend of the ray trace.
 
     Raises
     ------
     AimError, BeamMissedError
-        a step of a temperature loses the light.
+        A step of a temperature loses the light.
     """
     spots = np.empty((2 * len(path.channels), len(stated.components)))
     parameters = np.empty((4 * len(instrument.cameras), len(stated.components)))
@@ -360,20 +363,21 @@ def disturbances_of(
 
 
 def _elementary(component: Component) -> ElementaryMotion:
+    """Return the elementary motion of a component."""
     return ElementaryMotion(component.body, component.kind, component.axis, component.pivot, component.name)
 
 
 def single_states(components: Sequence[Component], amounts: np.ndarray, thermal: ThermalModel) -> list[State]:
-    """M states, in each of which one component alone has its amount.
+    """Return M states, each with the amount of one component.
 
     Parameters
     ----------
-    components : Sequence[Component]
-        M of them.
-    amounts : np.ndarray
-        (M,), SI.
+    components : sequence of Component
+        M components.
+    amounts : (M,) ndarray
+        Amounts, in SI units.
     thermal : ThermalModel
-        Of the instrument.
+        Thermal model of the instrument.
     """
     warm = np.array([c.kind in STEPS for c in components], bool)
     heat = [c for c in components if c.kind in STEPS]
@@ -388,7 +392,7 @@ def single_states(components: Sequence[Component], amounts: np.ndarray, thermal:
 def _by_differences(
     components: Sequence[Component], path: MonitorPath, thermal: ThermalModel, instrument: Instrument, backend: Backend
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of spots (2 C, M), px, and parameters (4 K, M) per SI unit."""
+    """Return derivatives of spots (2 C, M), px, and parameters (4 K, M), per SI unit, by central differences."""
     steps = np.array([STEPS[c.kind] for c in components])
     # all bodies have a temperature of their own in every state, as in states that are drawn, so that none inherits one
     states = states_of(np.concatenate([np.diag(steps), np.diag(-steps)]), components, thermal)
@@ -401,38 +405,39 @@ def _by_differences(
 
 
 SMALL: Mapping[str, float] = {"rotate": 1e-6, "shift": 1e-6, "scale": 1e-6, "figure": 1e-8}
-"""Steps of what is rigid, of growth and of figures, SI, where two derivatives are compared that are taken alike."""
+"""Steps of rigid motions, scale and figures, in SI units, for the comparison of two derivatives with the same steps."""
 
 
 def derivative_changes(
     stated: StatedMotions, path: MonitorPath, sight: LineSight, thermal: ThermalModel, built: Sequence[State]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """By how much the derivatives of ``disturbances_of`` are others in instruments that are not built as designed.
+    """Return the differences of the derivatives of ``disturbances_of`` between instruments as built and as designed.
 
-    Both are one-sided differences of exact traces with the same steps, so that what is wrong with each cancels.
+    Both are one-sided differences of exact traces with the same steps, so that their truncation errors cancel.
 
     Parameters
     ----------
     stated : StatedMotions
-        The motions, M of them; they act about an instrument that is built otherwise.
+        M motions of the prior, about an instrument as built.
     path : MonitorPath
-        The monitor's light, D spot coordinates.
+        Optical path of the monitor, D spot coordinates.
     sight : LineSight
-        Of the K line CCDs.
+        Lines of sight of the K line CCDs.
     thermal : ThermalModel
-        Of the instrument.
-    built : Sequence[State]
-        Z states.
+        Thermal model of the instrument.
+    built : sequence of State
+        Z states as built.
 
     Returns
     -------
-    tuple[np.ndarray, np.ndarray]
-        Of spots, px, (Z, D, M), and of parameters, (Z, 4 K, M), for one standard deviation each.
+    tuple of ndarray
+        Differences for spots, (Z, D, M), in pixels, and for parameters, (Z, 4 K, M), per standard deviation of each
+        motion.
 
     Raises
     ------
     AimError, BeamMissedError
-        The light of one is lost.
+        The light of a state is lost.
     """
     components = stated.components
     steps = np.array([{**STEPS, **SMALL}[c.kind] for c in components])
@@ -441,7 +446,7 @@ def derivative_changes(
     roots = {name: f"{BASE}/{name}" for name in path.instrument.cameras}
 
     def reached(state: State) -> set[str]:
-        """Cameras of whose spots' or lines' light something moves."""
+        """Return the cameras whose spots' or lines' light a state affects."""
         inside = {name for name, root in roots.items() if any(f"{body}/".startswith(f"{root}/") for body in state)}
         return inside | set(path.moved_cameras(state))
 
@@ -468,6 +473,7 @@ def derivative_changes(
 
 
 def _law(law: TimeLawSpec) -> TimeLaw:
+    """Return the time law of a specification."""
     return TimeLaw(
         law.kind == "white",
         law.drift,
@@ -482,12 +488,13 @@ def _law(law: TimeLawSpec) -> TimeLaw:
 
 
 NEAR = 3.0
-"""Shift of a spot, px, up to which stated motions are taken as linear. What is not linear is a product of two motions:
-a shift s by one times an angle by the other, s over the distance of the spots, some 10 000 px. For 3 px that is 1e-3
-px, the noise of a spot, while sigmas of a statement are tens of times larger; the few motions of `model` are traced
-again in every state."""
+"""Shift of a spot, in pixels, up to which the motions of the prior are treated as linear. The leading nonlinear term is
+a product of two motions: a shift s by one times an angle by the other, s over the distance of the spots, some 10 000
+px. For 3 px that is 1e-3 px, the noise of a spot, while sigmas of a prior are tens of times larger; the few motions
+of `model` are retraced in every state.
+"""
 LOST = (PhysicalError, ArithmeticError)
-"""What says that a state cannot be traced."""
+"""Exceptions of a state that cannot be traced."""
 
 
 def motion_models(
@@ -498,22 +505,29 @@ def motion_models(
     stated: StatedMotions | None,
     disturbances: Disturbances | None,
 ) -> dict[str, MotionModel]:
-    """Estimator -> the motions by which it reads: the line families of all cameras, and what is stated to move.
+    """Return the motion model of each estimator that retraces.
+
+    The models are the line families of all cameras, and the motions of the prior.
 
     Parameters
     ----------
     path : MonitorPath
-        The monitor's light.
+        Optical path of the monitor.
     sight : LineSight
-        What the cameras see.
-    cameras : Mapping[str, CameraCalibration]
-        Their calibration, in the order of the spots.
+        Lines of sight of the cameras.
+    cameras : mapping of str to CameraCalibration
+        Calibration of the cameras, in the order of the spots.
     thermal : ThermalModel
-        Of the instrument.
+        Thermal model of the instrument.
     stated : StatedMotions | None
-        What moves, None for nothing.
+        Motions of the prior; None for none.
     disturbances : Disturbances | None
-        The same with its derivatives.
+        The same motions with their derivatives.
+
+    Returns
+    -------
+    dict of str to MotionModel
+        Estimator -> motion model.
     """
     trace = partial(_traced, path, sight)
     out = {"model": _of_families(cameras, trace)}
@@ -529,12 +543,12 @@ def motion_models(
 
 
 def _stated_states(stated: StatedMotions, thermal: ThermalModel, amounts: np.ndarray) -> list[State]:
-    """The states of stated amounts (S, P), standard deviations."""
+    """Return the states of the prior's amounts (S, P), in standard deviations."""
     return states_of(amounts * stated.sigma, stated.components, thermal)
 
 
 def _of_families(cameras: Mapping[str, CameraCalibration], trace: Callable[[Sequence[State]], Retraced]) -> MotionModel:
-    """Each camera's four motions of paper 001."""
+    """Return the motion model of each camera's four motions of paper 001."""
     families = {name: line_family(name) for name in cameras}
     own, count = _spots_of(cameras), sum(map(len, families.values()))
     spots, parameters = np.zeros((own[-1].stop, count)), np.zeros((4 * len(cameras), count))
@@ -546,13 +560,13 @@ def _of_families(cameras: Mapping[str, CameraCalibration], trace: Callable[[Sequ
 
 
 def _spots_of(cameras: Mapping[str, CameraCalibration]) -> list[slice]:
-    """Where the coordinates of each camera's spots stand among all."""
+    """Return the slice of each camera's spot coordinates among all."""
     ends = np.cumsum([0, *(2 * len(camera.channels) for camera in cameras.values())]).tolist()
     return [slice(a, b) for a, b in pairwise(ends)]
 
 
 def _family_amounts(cameras: Mapping[str, CameraCalibration], noise: np.ndarray) -> np.ndarray:
-    """Covariance of the shifts (S, D, D), px^2 -> gain of the cameras' own motions, (S, P, D)."""
+    """Return the gain of the cameras' own motions, (S, P, D), for covariances of the shifts (S, D, D), in px^2."""
     own = _spots_of(cameras)
     out = np.zeros((len(noise), 4 * len(cameras), own[-1].stop))
     for k, (camera, at) in enumerate(zip(cameras.values(), own, strict=True)):
@@ -562,7 +576,7 @@ def _family_amounts(cameras: Mapping[str, CameraCalibration], noise: np.ndarray)
 
 
 def _together(motions: Sequence[ElementaryMotion], amounts: np.ndarray) -> list[State]:
-    """The states in which motions of some bodies, all about one pivot of each, have some amounts (S, P), SI."""
+    """Return the states of amounts (S, P), in SI units, of motions that have one pivot for each body."""
     states: list[State] = []
     for row in amounts.tolist():
         out: dict[str, Motion] = {}
@@ -575,7 +589,7 @@ def _together(motions: Sequence[ElementaryMotion], amounts: np.ndarray) -> list[
 
 
 def _traced(path: MonitorPath, sight: LineSight, states: Sequence[State]) -> Retraced:
-    """What S states do; NaN for one whose light is lost."""
+    """Return the effects of S states; NaN for a state whose light is lost."""
     try:
         return traced_states(path, sight, states)
     except LOST:
@@ -586,21 +600,21 @@ def _traced(path: MonitorPath, sight: LineSight, states: Sequence[State]) -> Ret
 
 
 def traced_states(path: MonitorPath, sight: LineSight, states: Sequence[State]) -> Retraced:
-    """Means of the rays on the area CCDs against those at rest, and what the line CCDs see.
+    """Return the spot shifts and the changes of the cameras in S states, by an exact trace.
 
     Parameters
     ----------
     path : MonitorPath
-        The monitor's light.
+        Optical path of the monitor.
     sight : LineSight
-        What the cameras see.
-    states : Sequence[State]
+        Lines of sight of the cameras.
+    states : sequence of State
         S states.
 
     Raises
     ------
     AimError, BeamMissedError
-        Light of one of them is lost.
+        The light of a state is lost.
     """
     placed = path.instrument.assembly.place(states)
     shifts = np.moveaxis(path.coarse_trace(states, placed).place - path.place_at_rest, 1, 0).reshape(len(states), -1)

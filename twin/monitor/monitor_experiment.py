@@ -1,6 +1,4 @@
-"""The monitoring experiment: perturb the instrument, render what its area CCDs record, and let the analysis recover
-it.
-"""
+"""Monitoring experiment: perturb the instrument, render the images of its area CCDs, and recover the perturbation."""
 
 from __future__ import annotations
 
@@ -54,7 +52,7 @@ from twin.monitor.truth import LineSight, Truth, ground_geometry, truth_jacobian
 from twin.sensors.area_detector import EmvaDetector, FixedPattern
 
 TEMPLATE_MARGIN = 40
-"""Pixels by which the calibrated spot shape is larger than the CCD, so that it can be shifted over it."""
+"""Margin of the calibrated spot shape beyond the CCD, in pixels, so that it can be shifted over the CCD."""
 
 _CALIBRATED = (
     "instrument",
@@ -67,30 +65,30 @@ _CALIBRATED = (
     "calibration",
     "ground",
 )
-"""Attributes of an experiment that depend on its instrument and detectors alone, and are kept on disk."""
+"""Attributes of an experiment that depend on its instrument and detectors only, and are cached on disk."""
 
 
 @shows("resolved.instrument.name", "resolved.instrument.cameras")
 class MonitorExperiment:
-    """An instrument with its detectors and its nominal calibration; whatever is derived is worked out once, on demand.
+    """Instrument with its detectors and nominal calibration; derived data are computed once, on demand.
 
-    Of an instrument without a monitor there are states, their truth and the cameras' images; whatever is about spots
-    raises InputError.
+    An instrument without a monitor has states, their truth and the cameras' images; attributes about spots raise
+    InputError.
 
     Parameters
     ----------
     resolved
-        The job with everything it names; its perturbation is not used here.
+        Job with everything it names; its perturbation is not used here.
     backend
-        Where to trace.
+        Backend of the ray trace.
     free_beams
-        As of ``build_instrument``.
+        See ``build_instrument``.
 
     Raises
     ------
     InputError
-        a part that cannot be where it is, area CCDs that do not sample the spots, or whose images need more memory than
-        there is.
+        A part is in an impossible position, area CCDs do not sample the spots, or their images need more memory than
+        available.
     """
 
     def __init__(self, resolved: ResolvedJob, backend: Backend, free_beams: bool = True) -> None:
@@ -113,31 +111,32 @@ class MonitorExperiment:
         self._patterns: dict[int | tuple[int, ...], FixedPattern] = {}
 
     def _keep(self) -> None:
-        """Keep what is calibrated for the processes to come."""
+        """Cache the calibration for later processes."""
         self._entry.write({name: vars(self)[name] for name in _CALIBRATED if name in vars(self)})
 
     @property
     def monitored(self) -> bool:
-        """Whether the instrument has a monitor."""
+        """True if the instrument has a monitor."""
         return self.resolved.instrument.monitor is not None
 
     @cached_property
     def exposure(self) -> float:
-        """Of a frame of the area CCDs, seconds."""
+        """Exposure time of a frame of the area CCDs, in seconds."""
         return self.resolved.instrument.autocollimator.area_ccd.exposure
 
     @cached_property
     def detector(self) -> EmvaDetector:
-        """The area CCDs."""
+        """Model of the area CCDs."""
         return EmvaDetector.from_sheet(self.resolved.area_detector, self.exposure)
 
     @cached_property
     def path(self) -> MonitorPath:
-        """The way of the monitor's light."""
+        """Optical path of the monitor."""
         self.resolved.instrument.autocollimator  # noqa: B018 - says so where there is none
         return MonitorPath(self.instrument, self.backend)
 
     def _require_sampled(self) -> None:
+        """Raise InputError if the pixels do not sample the spots."""
         try:
             self.path.response  # noqa: B018 - fitted before anything is traced
         except UnsampledImageError as error:
@@ -146,17 +145,17 @@ class MonitorExperiment:
             raise self.resolved.instrument.error(problem, key, allowed=error.remedy) from error
 
     def size(self, frames: int = 1, times: int = 0, pictures: int = 0) -> MonitorSize:
-        """Numbers that decide how much memory a job of this instrument takes; arguments as of ``MonitorSize``."""
+        """Return the numbers that determine the memory of a job; arguments as for ``MonitorSize``."""
         phase = self.path.node_classes.phase_per_pixel
         return MonitorSize(len(self.path.channels), *self.path.shape, phase, frames, times, pictures)
 
     def stating(self, resolved: ResolvedJob) -> MonitorExperiment:
-        """Experiment on the same instrument, with everything computed for it, under the prior of another job.
+        """Return an experiment on the same instrument with the prior of another job, sharing everything computed.
 
         Parameters
         ----------
         resolved : ResolvedJob
-            The job; its instrument, cameras and detector must be this one's.
+            Job whose instrument, cameras and detector are those of this experiment.
         """
         other = copy(self)
         other.resolved = resolved
@@ -165,12 +164,12 @@ class MonitorExperiment:
         return other
 
     def with_instrument(self, instrument: Instrument) -> MonitorExperiment:
-        """Return an experiment on another instrument with the same detectors, of which nothing is calibrated yet.
+        """Return an uncalibrated experiment on another instrument with the same detectors.
 
         Parameters
         ----------
         instrument : Instrument
-            May differ from what the job's files describe, so its calibration is not kept on disk.
+            Instrument, which may differ from the job's files; its calibration is therefore not cached on disk.
         """
         other = copy(self)
         for name in (*_CALIBRATED, "stated", "disturbances", "motion_models", "thermal"):
@@ -182,61 +181,64 @@ class MonitorExperiment:
 
     @cached_property
     def wide_photons(self) -> np.ndarray:
-        """Expected photons of the unperturbed instrument with the template's margin, (C, rows + 2m, columns + 2m).
+        """Expected photons of the unperturbed instrument with the template's margin m, (C, rows + 2m, columns + 2m).
 
-        In double precision: rounding to single makes noise that the template's factors would have to follow.
+        They are in double precision: rounding to single precision adds noise that the template's factors would have to
+        follow.
         """
         return self.path.expected_photons([{}], margin=TEMPLATE_MARGIN, single=False)[0]
 
     @cached_property
     def thermal(self) -> ThermalModel:
-        """What temperatures do to the instrument."""
+        """Thermal model of the instrument."""
         return ThermalModel(self.instrument)
 
     def state(self, job: JobSpec, progress: Callable[[str], None] = lambda path: None) -> State:
-        """The perturbed state that a job describes.
+        """Return the perturbed state that a job describes.
 
         Parameters
         ----------
         job : JobSpec
-            Its perturbation, checked by ``scenes.specs.job.checked_nodes``.
-        progress : Callable[[str], None]
+            Job with a perturbation checked by ``scenes.specs.job.checked_nodes``.
+        progress : callable
             Called with the path of each body whose thermo-elastic solution begins.
 
         Raises
         ------
         InputError
-            a temperature at or below 0 K, or one at which a glass's index is not known.
+            A temperature is at or below 0 K, or outside the range in which a glass's index is known.
         """
         return job_state(job, self.thermal, progress, self.motions(job), self.heated(job))
 
     def motions(self, job: JobSpec, time: int | None = None) -> State:
-        """The state that a job describes without its ``fields``: ``motions_of`` on top of its bodies' deformations.
+        """Return the state that a job describes without its ``fields``.
+
+        It is ``motions_of`` on top of the deformations of the bodies.
 
         Raises
         ------
         InputError
-            a table of nodes that does not describe its body.
+            A table of nodes does not describe its body.
         """
         return on_deformed(self.instrument, self.deformed(job), motions_of(job, time), self.heated(job))
 
     def fields(self, job: JobSpec, time: int | None = None) -> dict[str, Temperature]:
-        """Linear temperatures of a job's bodies, those of its tables added, at time number ``time`` of its course.
+        """Return the linear temperatures of a job's bodies at time number ``time``, including those of tables.
 
         Raises
         ------
         InputError
-            a table of temperatures that does not describe its body.
+            A table of temperatures does not describe its body.
         """
         return with_heat(job.fields(time), self.heated(job))
 
     def heated(self, job: JobSpec) -> Mapping[str, HeatedBody]:
-        """Body -> what the table of temperatures is that warms it; kept, since many states may have the same.
+        """Return body -> its table of temperatures; results are stored, since many states may share them.
 
         Raises
         ------
         InputError
-            a table that does not describe its body.
+            A table does not describe its body.
         """
         out = {}
         for path, what in job.perturb.items():
@@ -250,12 +252,12 @@ class MonitorExperiment:
         return out
 
     def deformed(self, job: JobSpec) -> Mapping[str, NodalDeformation]:
-        """Body -> what the table of nodes is that deforms it; kept, since many states may have the same.
+        """Return body -> its deformation from a table of nodes; results are stored, since many states may share them.
 
         Raises
         ------
         InputError
-            a table that does not describe its body.
+            A table does not describe its body.
         """
         out = {}
         for path, what in job.perturb.items():
@@ -279,7 +281,7 @@ class MonitorExperiment:
         Raises
         ------
         BeamMissedError, AimError
-            They do not come to their CCDs, or cannot be worked out.
+            The light does not reach the CCDs, or the spots cannot be computed.
         """
         focus = self.path.focus
         self.nominal_truth  # noqa: B018 - the line's light, too, has to arrive
@@ -293,12 +295,12 @@ class MonitorExperiment:
 
     @cached_property
     def sight(self) -> LineSight:
-        """What the line CCDs see."""
+        """Lines of sight of the line CCDs."""
         return LineSight(self.instrument, self.backend)
 
     @cached_property
     def _truth_by_family(self) -> dict[str, np.ndarray]:
-        """Camera -> (4, 4): its true parameters per unit of the four motions of its own line family."""
+        """Camera -> (4, 4) true parameters per unit of the four motions of its line family."""
         names = list(self.instrument.cameras)
         motions = [motion for name in names for motion in line_family(name)]
         every = truth_jacobian(self.instrument, self.backend, motions)
@@ -306,7 +308,7 @@ class MonitorExperiment:
 
     @cached_property
     def cameras(self) -> dict[str, CameraCalibration]:
-        """What is calibrated of every camera without an image: geometry and Jacobians of the nominal instrument."""
+        """Calibration of every camera without images: geometry and Jacobians of the nominal instrument."""
         families = {name: line_family(name) for name in self.instrument.cameras}
         spots = spot_jacobian(self.path, [motion for family in families.values() for motion in family])
         cameras = {}
@@ -324,7 +326,7 @@ class MonitorExperiment:
 
     @cached_property
     def calibration(self) -> MonitorCalibration:
-        """What the analysis may know: geometry, Jacobians and spot shapes of the nominal instrument."""
+        """Calibration available to the analysis: geometry, Jacobians and spot shapes of the nominal instrument."""
         photons = self.wide_photons
         with one_blas_thread():  # several threads of a small decomposition wait for each other
             template = SpotTemplate.stack([self._template(image) for image in photons])
@@ -340,23 +342,23 @@ class MonitorExperiment:
 
     @cached_property
     def ground(self) -> GroundGeometry | None:
-        """How a pair of known altitude sees the ground; None for other instruments.
+        """Ground geometry of a pair of known altitude; None for other instruments.
 
         Raises
         ------
         InputError
-            Its rays do not meet on the ground.
+            The rays of the pair do not intersect on the ground.
         """
         return ground_geometry(self.instrument, self.nominal_truth.principal_distance)
 
     @cached_property
     def stated(self) -> StatedMotions | None:
-        """What the job states to move, component by component; None for nothing.
+        """Motions of the job's prior, by component; None without a prior.
 
         Raises
         ------
         InputError
-            a body that the instrument does not have, or that cannot move or be warmed so.
+            The prior names a body that the instrument does not have, or that cannot move or be heated in this way.
         """
         stated = stated_motions(self.resolved, self.instrument)
         if stated is not None:
@@ -365,8 +367,9 @@ class MonitorExperiment:
 
     @cached_property
     def disturbances(self) -> Disturbances | None:
-        """The prior with its effect on spots and cameras, for the analysis; None without a prior. Raises InputError as
-        `stated`.
+        """Prior with its derivatives for the analysis; None without a prior.
+
+        Raises the InputError of `stated`.
         """
         stated = self.stated
         if stated is None:
@@ -377,12 +380,12 @@ class MonitorExperiment:
 
     @cached_property
     def motion_models(self) -> Mapping[str, MotionModel]:
-        """Estimator -> the motions by which it reads, to be traced again. Raises InputError as `stated`."""
+        """Estimator -> motion model for retracing. Raises the InputError of `stated`."""
         stated, known = self.stated, self.disturbances
         return motion_models(self.path, self.sight, self.cameras, self.thermal, stated, known)
 
     def geometry(self, camera: str) -> MonitorGeometry:
-        """Calibrated numbers for the formulas: principal distance, plate scale across the line, distortion, L, pixel.
+        """Return the calibrated numbers of the formulas: principal distance, plate scale, distortion, L, pixel pitch.
 
         The papers leave alpha and beta of their cos^2 undefined; they are taken as the field angles of the area CCDs.
         """
@@ -401,13 +404,14 @@ class MonitorExperiment:
         )
 
     def _template(self, image: np.ndarray) -> SpotTemplate:
-        """Calibrated shape of one spot; its centre is the energy centroid of the core (above 5% of the peak)."""
+        """Return the calibrated shape of a spot, centred on the energy centroid of its core (above 5 % of the peak)."""
         row, column = center_of_mass(np.where(image > 0.05 * image.max(), image, 0.0))
         return SpotTemplate.from_image(image, float(row), float(column), self.path.shape)
 
     def pattern(self, seed: int | Sequence[int]) -> FixedPattern:
-        """PRNU and DSNU of all area CCDs, (C, rows, columns); the same before and after. Those of several seeds one
-        after the other, (seeds, C, rows, columns).
+        """Return PRNU and DSNU of all area CCDs, (C, rows, columns), the same before and after.
+
+        Several seeds give (seeds, C, rows, columns).
         """
         key = tuple(seed) if isinstance(seed, Sequence) else seed
         found = self._patterns.get(key)
@@ -418,22 +422,23 @@ class MonitorExperiment:
         return found
 
     def _drawn_pattern(self, seed: int | tuple[int, ...]) -> FixedPattern:
+        """Draw PRNU and DSNU of all area CCDs."""
         if isinstance(seed, tuple):
             every = [self._drawn_pattern(one) for one in seed]
             return FixedPattern(np.stack([one.gain for one in every]), np.stack([one.offset_e for one in every]))
         return self.detector.fixed_pattern((len(self.path.channels), *self.path.shape), stream(seed, 0))
 
     def frames_before(self, frames: int, seed: int | Sequence[int], stray: np.ndarray | float = 0.0) -> np.ndarray:
-        """Frames of the nominal state with the given stray photons, uint16 (C, frames, rows, columns).
+        """Return frames of the nominal state with stray light, uint16 (C, frames, rows, columns).
 
         Parameters
         ----------
         frames : int
-            Of each CCD.
-        seed : int | Sequence[int]
-            Of CCDs and noise. Of several seeds the frames of each, (seeds, C, frames, rows, columns).
-        stray : np.ndarray | float
-            Photons beside those of the spots.
+            Number of frames of each CCD.
+        seed : int | sequence of int
+            Seed of the CCDs and the noise; several seeds give (seeds, C, frames, rows, columns).
+        stray : ndarray | float
+            Photons added to those of the spots.
         """
         photons = self.nominal_photons + stray
         if not isinstance(seed, Sequence):
@@ -444,19 +449,19 @@ class MonitorExperiment:
     def frames_after(
         self, photons: np.ndarray, frames: int, seed: int | Sequence[int], first: int | np.ndarray = 0
     ) -> np.ndarray:
-        """Frames of perturbed states, uint16 (S, C, frames, rows, columns).
+        """Return frames of perturbed states, uint16 (S, C, frames, rows, columns).
 
         Parameters
         ----------
-        photons : np.ndarray
-            Expected photons per pixel and frame, (S, C, rows, columns).
+        photons : (S, C, rows, columns) ndarray
+            Expected photons per pixel and frame.
         frames : int
-            Per state.
-        seed : int | Sequence[int]
-            As for ``frames_before``, or one for each state; state number first + s draws from a stream of its own, so
-            that the frames of a state do not depend on how a series is cut into pieces.
-        first : int | np.ndarray
-            Number of the first state, or of each, (S,).
+            Number of frames per state.
+        seed : int | sequence of int
+            Seed as in ``frames_before``, or one for each state. State number first + s draws from its own stream, so
+            that its frames do not depend on how a series is divided.
+        first : int | (S,) ndarray
+            Number of the first state, or of each state.
         """
         numbers = first if isinstance(first, np.ndarray) else first + np.arange(len(photons))
         seeds = seed if isinstance(seed, Sequence) else [seed] * len(photons)
@@ -464,5 +469,5 @@ class MonitorExperiment:
         return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, own)
 
     def expected_frames(self, photons: np.ndarray) -> np.ndarray:
-        """Noise-free, unrounded grey values of a uniform detector, same shape as ``photons``."""
+        """Return noise-free, unrounded grey values of a uniform detector, with the shape of ``photons``."""
         return self.detector.expected_dn(photons, self.exposure)

@@ -1,8 +1,8 @@
-"""What a monitor's images and their measurement take of the memory, told before anything is rendered.
+"""Memory of a monitor's images and their measurement, estimated before anything is rendered.
 
-Bytes are counted where they lie: so many for each pixel of a spot, each traced ray, each recorded frame. How many there
-are follows from the instrument alone; of its optics only the aperture of the returned beam matters, by which the nodes
-of the pupil grow with the square of the CCD's diagonal.
+Each pixel of a spot, each traced ray and each recorded frame takes a fixed number of bytes. Their numbers follow from
+the instrument alone; of its optics only the aperture of the returned beam matters, with which the nodes of the pupil
+grow as the square of the CCD's diagonal.
 """
 
 from __future__ import annotations
@@ -18,37 +18,37 @@ from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import KeyPath
 from scenes.yaml.spec import Spec
 from twin.framework import memory
-from twin.framework.frame_store import IN_MEMORY, kept_bytes
+from twin.framework.frame_store import IN_MEMORY, resident_bytes
 from twin.framework.memory import STARTED, Lowered, amount_text
 from twin.monitor.image_sampling import NodeClasses
 from twin.sensors.area_detector import EmvaDetector
 
 CHUNK = 25
-"""States rendered at once, to bound memory; fewer when their frames are large."""
+"""Largest number of states rendered at once, to limit memory; fewer if their frames are large."""
 LARGEST_FRAMES = 200_000_000
-"""Pixels of all frames that are exposed at once."""
+"""Largest number of pixels of all frames that are exposed at once."""
 
 
 def largest_piece(each: int) -> int:
-    """How many states of a series are rendered at once.
+    """Return the number of states of a series that are rendered at once.
 
     Parameters
     ----------
     each : int
-        Pixels of all frames of one.
+        Pixels of all frames of one state.
     """
     return max(1, min(CHUNK, LARGEST_FRAMES // each))
 
 
 def pieces(count: int, each: int) -> Iterator[slice]:
-    """States of a series whose frames are worked on at once.
+    """Yield slices of the states of a series whose frames are processed at once.
 
     Parameters
     ----------
     count : int
-        states.
+        Number of states.
     each : int
-        Pixels of all frames of one.
+        Pixels of all frames of one state.
     """
     size = largest_piece(each)
     for start in range(0, count, size):
@@ -56,40 +56,40 @@ def pieces(count: int, each: int) -> Iterator[slice]:
 
 
 DRAWN = 410e6
-"""Memory of a job while it is drawn and written, which is most of the memory of a small one; bytes."""
+"""Memory of drawing and writing a job, in bytes; for small jobs it is most of the memory."""
 _PIXEL = 380.0
 """Bytes per pixel of a spot's image during the measurement and the analysis of its limits: photons 24, fixed pattern
 16, mean frames and maps of the fits before and after 64, images and maps of a state of the prior 85, the current fit
 190.
 """
 _RAY = 600.0
-"""Bytes per traced ray, with its derivatives, its aiming and the polynomials of the pupil at its node."""
+"""Bytes per traced ray, with its derivatives, aiming data and pupil polynomials at its node."""
 GREY = 2.0
 """Bytes per pixel of a recorded frame."""
 _OF_COURSE = 6.0
 """Bytes per pixel and time of a course: expected photons in single precision, and a first frame."""
 WRITTEN = 60.0
-"""Bytes per pixel of a spot's image while it is drawn and written: photons, their file, means."""
+"""Bytes per pixel of a spot's image for drawing and writing: photons, their file, means."""
 _OF_STATE = 24.0
-"""Bytes per pixel of each state that is rendered at once: photons, and the effect of their noise on the spot."""
+"""Bytes per pixel of each state rendered at once: photons, and the effect of their noise on the spot."""
 
 
 @dataclass(frozen=True)
 class MonitorSize:
-    """Numbers that decide what a monitor takes.
+    """Numbers that determine the memory of a monitor's job.
 
     Attributes
     ----------
     spots : int
-        Channels of all cameras.
+        Number of channels of all cameras.
     rows, columns : int
-        Of an area CCD.
+        Size of an area CCD, in pixels.
     phase : float
-        From the middle to the edge of the pupil for one pixel, radians.
+        Phase from the centre to the edge of the pupil, in radians per pixel.
     frames : int
-        Of each state.
+        Number of frames of each state.
     times : int
-        Of a course, 0 for none.
+        Number of times of a course, 0 for none.
     pictures : int
         Pixels of the frames of all other images.
     """
@@ -104,16 +104,16 @@ class MonitorSize:
 
     @classmethod
     def stated(cls, resolved: ResolvedJob, frames: int, times: int = 0, pictures: int = 0) -> MonitorSize:
-        """What the files of an instrument say, before it is built.
+        """Return the size according to an instrument's files, before it is built.
 
         Parameters
         ----------
         resolved : ResolvedJob
-            The job.
+            Job.
         frames : int
-            Of each state.
+            Number of frames of each state.
         times : int
-            Of a course, 0 for none.
+            Number of times of a course, 0 for none.
         pictures : int
             Pixels of the frames of all other images.
 
@@ -131,16 +131,16 @@ class MonitorSize:
 
     @property
     def rays(self) -> int:
-        """Number of rays of sharp spots of all channels, wherever they are on their CCDs."""
+        """Number of rays for sharp spots of all channels, anywhere on their CCDs."""
         return self.spots * NodeClasses(self.phase, (0.5 * self.rows, 0.5 * self.columns)).sharp_count
 
     def parts(self, detector: EmvaDetector) -> Mapping[str, float]:
-        """What the CCDs, frames, times and other pictures take, bytes.
+        """Return the memory of the CCDs, frames, times and other pictures, in bytes.
 
         Parameters
         ----------
         detector : EmvaDetector
-            Of the area CCDs.
+            Model of the area CCDs.
         """
         image = self.rows * self.columns
         every, frames = self.spots * image, self.frames
@@ -148,54 +148,54 @@ class MonitorSize:
         threads = min(cores(), 8, self.spots * states)  # that expose images
         return {
             "ccd": every * (_PIXEL + (states - 1) * _OF_STATE) + self.rays * _RAY,
-            "frames": kept_bytes(every * frames * GREY)
-            + kept_bytes(states * every * frames * GREY)
+            "frames": resident_bytes(every * frames * GREY)
+            + resident_bytes(states * every * frames * GREY)
             + detector.exposing_bytes(frames, image, threads),
             "times": self.times * every * _OF_COURSE,
             "pictures": self.pictures * GREY,
         }
 
     def bytes(self, detector: EmvaDetector) -> float:
-        """Memory of all parts together, in addition to the imported program.
+        """Return the memory of all parts, in bytes, in addition to the imported program.
 
         Parameters
         ----------
         detector : EmvaDetector
-            Of the area CCDs.
+            Model of the area CCDs.
         """
         parts = self.parts(detector)
         every = self.spots * self.rows * self.columns
         stack = every * self.frames * GREY
-        written = every * WRITTEN + 2.0 * kept_bytes(stack)
-        written += stack / self.spots if stack <= IN_MEMORY else kept_bytes(stack)
+        written = every * WRITTEN + 2.0 * resident_bytes(stack)
+        written += stack / self.spots if stack <= IN_MEMORY else resident_bytes(stack)
         return max(STARTED + sum(parts.values()), DRAWN + written + parts["times"] + parts["pictures"])
 
 
 def require_memory(resolved: ResolvedJob, size: MonitorSize, detector: EmvaDetector) -> None:
-    """See whether a job fits into the memory that is free.
+    """Raise InputError if a job does not fit into the free memory.
 
     Parameters
     ----------
     resolved : ResolvedJob
-        The job, for what its files say of its numbers.
+        Job, with the numbers of its files.
     size : MonitorSize
-        Of it.
+        Size of the job.
     detector : EmvaDetector
-        Of its area CCDs.
+        Model of its area CCDs.
 
     Raises
     ------
     InputError
-        It does not; at the key of what takes most, with the number that would fit.
+        The job does not fit; the error is at the key that needs most memory, with the number that would fit.
     """
     parts = size.parts(detector)
     worst = max(parts, key=lambda name: parts[name])
     what, lower = _lowered(resolved, size, worst, detector)
-    memory.require_memory(lower, started=0.0, of_it=f"{amount_text(parts[worst])} of it {what}")
+    memory.require_memory(lower, started=0.0, shares=f"{amount_text(parts[worst])} of it {what}")
 
 
 def _lowered(resolved: ResolvedJob, size: MonitorSize, part: str, detector: EmvaDetector) -> tuple[str, Lowered]:
-    """What one of the ``parts`` is for, in words, and the number that decides it."""
+    """Return a description of one of the ``parts``, and the number that determines it."""
     job, rows, columns, frames = resolved.job, size.rows, size.columns, size.frames
     owner: Spec = job
     least = 1

@@ -1,9 +1,8 @@
-"""The monitor's light: from every pinhole through the camera to the return face and back onto the pixels of the area
-CCD.
+"""Optical path of the monitor: from each pinhole through the camera to the return face and back to the area CCD.
 
 The matrix Fourier transform of a traced beam gives its image on the CCD's own pixels (``optics.waves.diffraction``);
-the pinhole is an incoherent disk imaged at unit scale. Every image is made with as many rays as it needs, and checked
-(``image_sampling``).
+the pinhole is an incoherent disk imaged at unit magnification. Every image uses as many rays as it needs and is
+checked (``image_sampling``).
 """
 
 from __future__ import annotations
@@ -35,33 +34,34 @@ from twin.monitor.image_sampling import (
 from twin.monitor.monitor_beams import CcdRays, CoarseTrace, MonitorBeams
 
 _MOST_RAYS = 400_000
-"""Traced at once, to bound memory: blurred spots need many."""
+"""Largest number of rays traced at once, to limit memory: blurred spots need many."""
 
 WIDEST = 1.1
-"""Growth of the beams' aperture that the filter of the pixels still follows (to 3e-6 of the peak), and step to the next
-one."""
+"""Growth of the beams' aperture up to which the pixel filter is accurate (to 3e-6 of the peak), and ratio of one filter
+to the next.
+"""
 
 
 class MonitorPath(MonitorBeams):
-    """Traces and images the monitor channels of one instrument.
+    """Ray trace and images of the monitor channels of one instrument.
 
     Parameters
     ----------
     instrument
-        The instrument.
+        Instrument.
     backend
-        Where to trace.
+        Backend of the ray trace.
     nodes
-        Pupil quadrature, then used for all states and not checked; by default one that is right to 1e-6 of the peak for
+        Pupil quadrature for all states, without check. By default a quadrature that is accurate to 1e-6 of the peak for
         the unperturbed instrument's spots anywhere in the last of ``SPOT_RANGES`` of the CCD, out to the far corner,
         and for images those of ``class_beams``.
     cameras
-        Whose channels; None for all. Numbers of a channel do not depend on which others there are.
+        Cameras whose channels are traced; None for all. Values of a channel do not depend on the other channels.
 
     Attributes
     ----------
     checked
-        What the checks of all images found that it has given.
+        Checks of all images so far.
     """
 
     def __init__(
@@ -88,12 +88,14 @@ class MonitorPath(MonitorBeams):
 
     @property
     def nodes(self) -> PupilNodes:
-        """Pupil quadrature of the unperturbed instrument's spots, wherever on their CCDs.
+        """Pupil quadrature for the unperturbed instrument's spots, anywhere on their CCDs.
 
         Raises
         ------
         BeamMissedError, AimError
-            As ``rays``; UncertainImageError: no quadrature would do.
+            Light is lost, see ``rays``.
+        UncertainImageError
+            No quadrature is sufficient.
         """
         if self._nodes is None:
             self._nodes = self.node_classes.nodes(self._own_class)
@@ -101,13 +103,14 @@ class MonitorPath(MonitorBeams):
 
     @cached_property
     def _own_class(self) -> int:
+        """Class of nodes of the unperturbed instrument."""
         known = self.coarse_trace([{}])
         far = np.broadcast_to((1.0 - 1e-9) * SPOT_RANGES[-1] * 0.5 * np.array(self.shape), known.place.shape)
         number = int(self.node_classes.class_of(far, 0, known.blur, known.aperture / self.numerical_aperture)[0])
         return self._require_class(number, known, 0)
 
     def class_beams(self, number: int) -> MonitorBeams:
-        """Beams with as many nodes as a class of spots needs."""
+        """Return beams with the number of nodes of a class."""
         if not self._sized or number == self._own_class:
             return self
         if number not in self._class_beams:
@@ -115,12 +118,12 @@ class MonitorPath(MonitorBeams):
         return self._class_beams[number]
 
     def class_of(self, known: CoarseTrace, margin: int = 0) -> np.ndarray:
-        """Number of the class of nodes that is right for all spots of each state, (S,), as far as a few rays can tell.
+        """Return the class of nodes that suffices for all spots of each state, (S,), as estimated from a few rays.
 
         Parameters
         ----------
         known : CoarseTrace
-            Of the states.
+            Coarse trace of the states.
         margin : int
             Extra pixels rendered on every side of the CCD.
         """
@@ -132,7 +135,7 @@ class MonitorPath(MonitorBeams):
         return self.node_classes.class_of(place, margin, known.blur, widening)
 
     def _require_class(self, number: int, known: CoarseTrace, state: int) -> int:
-        """The number of a class, if there is one. Raises UncertainImageError for a spot that is blurred too much."""
+        """Return the number of a class if it exists. Raises UncertainImageError for a spot that is blurred too much."""
         if number >= len(self.node_classes.reached):
             worst = int(np.argmax(known.blur[:, state]))
             raise UncertainImageError(
@@ -145,18 +148,19 @@ class MonitorPath(MonitorBeams):
 
     @property
     def response(self) -> PixelResponse:
-        """What pixel and pinhole do to the unperturbed instrument's images; a pinhole is taken to grow with the CCD
-        beside it.
+        """Response of pixel and pinhole for the unperturbed instrument.
+
+        A pinhole is assumed to expand with the CCD beside it.
 
         Raises
         ------
         UnsampledImageError
-            The pixels are too coarse or the pinhole is too wide for them.
+            The pixels are too coarse, or the pinhole is too wide for them.
         """
         return self._response(0)
 
     def _response(self, wider: int) -> PixelResponse:
-        """Likewise for beams wider by some steps of ``WIDEST``."""
+        """Return the response for beams that are wider by some steps of ``WIDEST``."""
         if wider not in self._responses:
             pinhole = self.instrument.spec.autocollimator.reticle.pinhole
             cutoff = 2.0 * self.numerical_aperture * WIDEST**wider / self.wavelength
@@ -164,12 +168,12 @@ class MonitorPath(MonitorBeams):
         return self._responses[wider]
 
     def _response_of(self, known: CoarseTrace) -> PixelResponse:
-        """What pixel and pinhole do to the images of some states.
+        """Return the response of pixel and pinhole for the images of some states.
 
         Raises
         ------
         UncertainImageError
-            They are too fine for the pixels.
+            The images are too fine for the pixels.
         """
         widening = max(float(np.max(known.aperture)) / self.numerical_aperture, 1.0)
         try:
@@ -181,23 +185,23 @@ class MonitorPath(MonitorBeams):
     def expected_photons(
         self, states: Sequence[State], margin: int = 0, chunk: int = 32, single: bool = True
     ) -> np.ndarray:
-        """Expected photons per pixel and frame.
+        """Return the expected photons per pixel and frame.
 
         Parameters
         ----------
-        states : Sequence[State]
+        states : sequence of State
             S states.
         margin : int
             Extra pixels rendered on every side of the CCD.
         chunk : int
-            States done at once, to bound memory.
+            Number of states rendered at once, to limit memory.
         single : bool
-            In single precision, see ``optics.waves.diffraction.image``.
+            True for single precision, see ``optics.waves.diffraction.image``.
 
         Returns
         -------
-        np.ndarray
-            (S, C, rows + 2 margin, columns + 2 margin).
+        (S, C, rows + 2 margin, columns + 2 margin) ndarray
+            Expected photons.
         """
         out = np.empty((len(states), len(self.channels), self.shape[0] + 2 * margin, self.shape[1] + 2 * margin))
         for piece, photons in self.iterate_photons(states, margin, chunk, single):
@@ -207,7 +211,7 @@ class MonitorPath(MonitorBeams):
     def iterate_photons(
         self, states: Sequence[State], margin: int = 0, chunk: int = 32, single: bool = True
     ) -> Iterator[tuple[slice, np.ndarray]]:
-        """Like ``expected_photons``, piece by piece: yields (slice of the states, photons)."""
+        """Yield ``expected_photons`` piece by piece: (slice of the states, photons)."""
         for start in range(0, len(states), chunk):
             some = states[start : start + chunk]
             with one_blas_thread():
@@ -215,23 +219,24 @@ class MonitorPath(MonitorBeams):
             yield slice(start, start + len(some)), photons
 
     def photons_of(self, state: State, placed: PlacedBodies | None = None, single: bool = False) -> np.ndarray:
-        """Expected photons per pixel and frame of one state, (C, rows, columns).
+        """Return the expected photons per pixel and frame of one state, (C, rows, columns).
 
-        The same as ``expected_photons``, to the bit; channels of cameras whose bodies all stay are rendered once.
+        They equal ``expected_photons`` to the last bit; channels of cameras without moved bodies are rendered only
+        once.
 
         Parameters
         ----------
         state : State
-            The state.
+            State to render.
         placed : PlacedBodies | None
-            Its bodies, when already placed.
+            Bodies of the state, if already placed.
         single : bool
-            In single precision, see ``optics.waves.diffraction.image``.
+            True for single precision, see ``optics.waves.diffraction.image``.
 
         Raises
         ------
         BeamMissedError, AimError
-            As ``rays``.
+            Light is lost, see ``rays``.
         """
         with one_blas_thread():
             placed = self.instrument.assembly.place([state]) if placed is None else placed
@@ -252,14 +257,14 @@ class MonitorPath(MonitorBeams):
             return self._render([state], 0, single, self.coarse_trace([state], placed))[0][0]
 
     def moved_cameras(self, state: State, placed: PlacedBodies | None = None) -> tuple[str, ...]:
-        """Cameras of whose channels' light some body is moved or otherwise changed.
+        """Return the cameras whose channels' light is affected by a moved or changed body.
 
         Parameters
         ----------
         state : State
-            The state.
+            State of the instrument.
         placed : PlacedBodies | None
-            Its bodies, when already placed.
+            Bodies of the state, if already placed.
         """
         assembly = self.instrument.assembly
         touched = changed_bodies(assembly, [state], assembly.place([state]) if placed is None else placed)
@@ -267,7 +272,7 @@ class MonitorPath(MonitorBeams):
 
     @cached_property
     def _bodies(self) -> dict[str, set[str]]:
-        """Camera -> bodies that the light of its channels meets or passes."""
+        """Camera -> bodies that the light of its channels hits or passes."""
         assembly = self.instrument.assembly
         out: dict[str, set[str]] = {name: set() for name in self.cameras}
         for channel in self.channels:
@@ -281,14 +286,14 @@ class MonitorPath(MonitorBeams):
         return out
 
     def _of_cameras(self, names: tuple[str, ...]) -> MonitorPath:
-        """The path of these cameras alone."""
+        """Return the path of these cameras alone."""
         if names not in self._parts:
             self._parts[names] = MonitorPath(self.instrument, self.backend, None if self._sized else self.nodes, names)
             self._parts[names].checked = self.checked
         return self._parts[names]
 
     def _at_rest(self, single: bool) -> tuple[np.ndarray, int]:
-        """Photons of the unperturbed instrument (C, rows, columns), and the number of their class."""
+        """Return the photons of the unperturbed instrument (C, rows, columns), and their class."""
         if single not in self._rested:
             photons, number = self._render([{}], 0, single)
             self._rested[single] = photons[0], int(number[0])
@@ -297,13 +302,17 @@ class MonitorPath(MonitorBeams):
     def _render(
         self, states: Sequence[State], margin: int, single: bool, coarse: CoarseTrace | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Expected photons (S, C, rows + 2 margin, columns + 2 margin), each state with the nodes of its class, and
-        these classes, (S,).
+        """Return the expected photons, each state with the nodes of its class, and these classes.
+
+        Returns
+        -------
+        tuple of ndarray
+            Photons (S, C, rows + 2 margin, columns + 2 margin), and classes (S,).
 
         Raises
         ------
         UncertainImageError
-            An image is not right whatever the nodes.
+            An image cannot be computed accurately with any nodes.
         """
         coarse = self.coarse_trace(states) if coarse is None else coarse
         for channel, place, aperture in zip(self.channels, coarse.place, coarse.aperture, strict=True):
@@ -327,15 +336,15 @@ class MonitorPath(MonitorBeams):
     def _images(
         self, states: Sequence[State], known: CoarseTrace, number: int, margin: int, single: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Expected photons of states with the nodes of a class, (S, C, ...), and the class that each asks for, (S,).
+        """Return photons of states with the nodes of a class, (S, C, ...), and the class that each needs, (S,).
 
-        A larger class where two rules disagree. The last one for a beam that is cut: at its edge each rule has an
-        error of its own, and two may agree by chance.
+        States for which two rules disagree need a larger class. A vignetted beam gets the last class: each rule has its
+        own error at the beam's edge, and two may agree by chance.
 
         Raises
         ------
         UncertainImageError
-            An image is not right with the most nodes, or its light is not that of its rays.
+            An image is inaccurate even with the most nodes, or its light does not equal that of its rays.
         """
         beams, response = self.class_beams(number), self._response_of(known)
         y, x = (self.grid(axis, margin + response.reach) for axis in (0, 1))
@@ -362,7 +371,7 @@ class MonitorPath(MonitorBeams):
         return np.swapaxes(photons, 0, 1), wanted
 
     def _require_alike(self, difference: np.ndarray, rays: CcdRays) -> None:
-        """Raise UncertainImageError where two rules differ too much (C, S), of the peaks."""
+        """Raise UncertainImageError if the difference (C, S) of two rules, relative to the peaks, is too large."""
         channel, state = np.unravel_index(np.argmax(difference), difference.shape)
         if difference[channel, state] > WRONG:
             lost = 1.0 - float(np.mean(rays.valid[channel * difference.shape[1] + state]))
@@ -380,8 +389,12 @@ class MonitorPath(MonitorBeams):
     def _require_energy(
         self, images: np.ndarray, rays: CcdRays, share: np.ndarray, margin: int, known_bad: np.ndarray
     ) -> np.ndarray:
-        """Raise UncertainImageError where the light of images (C*S, R, C) is not that of their rays; by how much it is
-        beyond what is allowed, (C*S,).
+        """Raise UncertainImageError if the light of images (C*S, R, C) does not equal that of their rays.
+
+        Returns
+        -------
+        (C*S,) ndarray
+            Light beyond the allowed range.
         """
         half = 0.5 * np.array(self.shape) + margin
         wings = np.full(len(images), WINGS * self.wavelength / (2.0 * np.pi * self.numerical_aperture * self.pitch))
@@ -400,20 +413,21 @@ class MonitorPath(MonitorBeams):
 
     @property
     def light_per_pixel(self) -> np.ndarray:
-        """Photons per frame times the pixel's area, m^2, (C,): what turns an image of unit power into photons per
-        pixel.
+        """Factor from an image of unit power to photons per pixel and frame, (C,), in m^2.
+
+        It is photons per frame times the pixel's area.
         """
         return np.array([channel.photons * self.pitch**2 for channel in self.channels])
 
 
 class _OnSpots(MonitorBeams):
-    """Beams whose positions count from the middle of their own spot, wherever it stands."""
+    """Beams whose positions count from the centre of their own spot, wherever it is."""
 
     def _with(self, nodes: PupilNodes) -> MonitorBeams:
         return _OnSpots(self.instrument, self.backend, nodes, self.cameras)
 
     def _require_on_ccd(self, channel: Channel, place: np.ndarray) -> None:
-        """A CCD that is set to its spot has it."""
+        """Accept every spot, since its CCD is centred on it."""
 
     def rays(self, states: Sequence[State], coarse: CoarseTrace | None = None) -> CcdRays:
         rays = super().rays(states, coarse)
@@ -423,10 +437,11 @@ class _OnSpots(MonitorBeams):
 
 
 class SpotPath(_OnSpots, MonitorPath):
-    """Images of a monitor whose area CCDs have been set, when the instrument was built, so that every spot stands in
-    the middle of its own: for spots of instruments that are not built as designed.
+    """Optical path of a monitor whose area CCDs were centred on their spots when the instrument was built.
+
+    It serves spots of instruments that are not built as designed.
     """
 
     def class_of(self, known: CoarseTrace, margin: int = 0) -> np.ndarray:
-        """Number of the class of nodes that is right for all spots of each state, in the middle, (S,)."""
+        """Return the class of nodes that suffices for all spots of each state at the centres of their CCDs, (S,)."""
         return super().class_of(replace(known, place=np.zeros_like(known.place)), margin)

@@ -1,4 +1,4 @@
-"""Elementary motions of an instrument's bodies, and the families of them that the monitor is judged by."""
+"""Elementary motions of an instrument's bodies, and the families of motions used to evaluate the monitor."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from scenes.specs.instrument import BASE, CENTRAL_PRISM
 _UNITS = {"rotate": ("arcsec", ARCSEC), "shift": ("um", 1e-6), "scale": ("ppm", 1e-6), "figure": ("nm", 1e-9)}
 _AXES = "XYZ"
 FIGURE_TERMS = {4: "power", 5: "astigmatism", 6: "astigmatism", 7: "coma", 8: "coma"}
-"""Figure terms in the tables, by Noll index."""
+"""Noll index of the figure terms in the tables -> name."""
 
 
 @dataclass(frozen=True)
 class ElementaryMotion:
-    """One component of the motion of one body.
+    """Component of the motion of one body.
 
     Attributes
     ----------
     body : str
-        Its path.
+        Path of the body.
     kind : str
         ``rotate``, ``shift``, ``scale`` or ``figure``.
     axis : int
-        0, 1, 2 of the body's own frame (0 for a scale); the Noll index of a figure term.
+        Axis 0, 1, 2 of the body's own frame (0 for a scale); the Noll index of a figure term.
     pivot : str
-        Point that a rotation or a scale leaves in place.
+        Fixed point of a rotation or a scale.
     label : str
         Short name for tables.
     """
@@ -43,21 +43,21 @@ class ElementaryMotion:
 
     @property
     def unit(self) -> str:
-        """Name of the table unit: arcsec, um, ppm or nm."""
+        """Unit in tables: arcsec, um, ppm or nm."""
         return _UNITS[self.kind][0]
 
     @property
     def unit_size(self) -> float:
-        """The table unit in SI."""
+        """Size of the table unit, in SI units."""
         return _UNITS[self.kind][1]
 
     @property
     def step(self) -> tuple[str, str, int]:
-        """The derivative that ``Assembly.place`` takes."""
+        """Step for the derivative in ``Assembly.place``."""
         return self.body, self.kind, self.axis
 
     def motion(self, amount: float) -> Motion:
-        """The motion of this size, SI."""
+        """Return the motion of this amount, in SI units."""
         along = triple(amount if self.axis == a else 0.0 for a in range(3))
         match self.kind:
             case "rotate":
@@ -72,16 +72,16 @@ class ElementaryMotion:
                 raise ValueError(f"a motion is a rotate, shift, scale or figure, not a {self.kind!r}")
 
     def state(self, amount: float) -> State:
-        """The state in which only this motion of the given size, SI, is applied."""
+        """Return the state with only this motion of the given amount, in SI units."""
         return {self.body: self.motion(amount)}
 
 
 def line_family(camera: str) -> tuple[ElementaryMotion, ...]:
-    """The four motions of paper 001's own derivation: the line CCD shifted along X and Y and turned about Z, the
-    optics scaled.
+    """Return the four motions for which paper 001 derives its formulas.
 
-    The scale grows mirrors and spacings together and keeps the focal plane at focus, with detectors of unchanged
-    size: a change of the principal distance and of nothing else.
+    They are the line CCD shifted along X and Y and rotated about Z, and the optics scaled. The scale enlarges mirrors
+    and spacings together and keeps the focal plane in focus, with detectors of unchanged size: it changes the principal
+    distance and nothing else.
     """
     plane = f"{BASE}/{camera}/focal_plane"
     return (
@@ -93,8 +93,10 @@ def line_family(camera: str) -> tuple[ElementaryMotion, ...]:
 
 
 def other_motions(instrument: Instrument, camera: str) -> tuple[ElementaryMotion, ...]:
-    """All other motions that can reach this camera's spots: focal plane, each mirror and its low figure terms, the
-    camera, the reference.
+    """Return all other motions that can affect this camera's spots.
+
+    They are motions of the focal plane, of each mirror with its low-order figure terms, of the camera, and of the
+    reference.
     """
     model = instrument.cameras[camera]
     root = f"{BASE}/{camera}"
@@ -115,10 +117,11 @@ def other_motions(instrument: Instrument, camera: str) -> tuple[ElementaryMotion
 
 
 def _six(body: str, name: str, pivot: str) -> list[ElementaryMotion]:
+    """Return the three shifts and three rotations of a body."""
     shifts = [ElementaryMotion(body, "shift", a, pivot, f"{name} along {_AXES[a]}") for a in range(3)]
     return shifts + [ElementaryMotion(body, "rotate", a, pivot, f"{name} about {_AXES[a]}") for a in range(3)]
 
 
 def pivot_states(motions: Sequence[ElementaryMotion]) -> list[State]:
-    """Unperturbed states that name each motion's pivot and figure term, for derivatives about it."""
+    """Return unperturbed states with each motion's pivot and figure term, for derivatives about them."""
     return [m.state(0.0) for m in motions]

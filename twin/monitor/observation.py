@@ -1,7 +1,7 @@
-"""One observation: states of an instrument are traced, rendered, exposed and recovered.
+"""Observation of states of an instrument: trace, render, expose and recover them.
 
-Whatever asks for images of states takes this way: the main job, courses, studies, the live twin, error budgets, random
-states. What differs from use to use is said by an `Observing`.
+The main job, courses, studies, the live twin, error budgets and random states all use it; their differences are in
+`Observing`.
 """
 
 from __future__ import annotations
@@ -26,38 +26,38 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import Truth
 
 LOST = (AimError, BeamMissedError)
-"""What says that the light of a state is lost."""
+"""Exceptions of a state whose light is lost."""
 
 Record: TypeAlias = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray | MeasuredSpots, np.ndarray]]
-"""Exposes the detectors, by random streams of its own. From expected photons (S, C, rows, columns) and numbers (S,) of
-states to what is recorded before, (C, frames, rows, columns) for all states or (S, C, frames, rows, columns), or spots
-before that are measured already; and after, (S, C, frames, rows, columns).
+"""Function that exposes the detectors, with its own random streams. From expected photons (S, C, rows, columns) and
+state numbers (S,) it returns the frames before, (C, frames, rows, columns) for all states or (S, C, frames, rows,
+columns), or already measured spots before; and the frames after, (S, C, frames, rows, columns).
 """
 
 
 @dataclass(frozen=True)
 class Observing:
-    """How states are observed.
+    """Options of an observation.
 
     Attributes
     ----------
     record : Record
         Exposes the detectors.
     centroid : str
-        As of ``analysis.monitor.recovery.recover_monitor``.
+        Centroid method, see ``analysis.monitor.recovery.recover_monitor``.
     chunk : int
-        States that are done at once; the last digits of a state depend on which they are.
+        Number of states processed at once; the last digits of a state depend on the others in its chunk.
     single : bool
-        Render in single precision.
-    leave : Callable[[int, str], None] | None
-        Told of each state that is lost, by its number, and why: its light does not arrive, or a spot cannot be
-        measured. It is then left out; with None the error is raised.
+        True to render in single precision.
+    leave : callable | None
+        Called with number and reason of each state that is omitted because its light does not arrive or a spot cannot
+        be measured; None to raise the error instead.
     stated : bool
-        Know what the experiment states to move, and trace its motions again; else there is noise alone.
+        True to use the experiment's prior and retrace its motions; False for noise alone.
     keep_parts : bool
-        Of the noise, which are large.
+        True to return the parts of the noise, which are large.
     frames : int | None
-        Of which each recorded image is the mean; None where frames are recorded one by one.
+        Number of frames averaged into each recorded image; None if frames are recorded one by one.
     """
 
     record: Record
@@ -73,18 +73,18 @@ class Observing:
 @shows()
 @dataclass(frozen=True, eq=False)
 class Light:
-    """What comes of S states to the area CCDs.
+    """Light of S states on the area CCDs.
 
     Attributes
     ----------
-    numbers : np.ndarray
-        (S,) of the states.
+    numbers : (S,) ndarray of int
+        Numbers of the states.
     placed : PlacedBodies
-        Their bodies.
+        Bodies of the states.
     truth : Truth
-        Of them.
-    photons : np.ndarray
-        Expected photons per pixel and frame, (S, C, rows, columns).
+        True changes of the cameras.
+    photons : (S, C, rows, columns) ndarray
+        Expected photons per pixel and frame.
     """
 
     numbers: np.ndarray
@@ -96,18 +96,18 @@ class Light:
 @shows()
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What S states do and what their images say.
+    """True changes of S states, and their recovery from images.
 
     Attributes
     ----------
     light : Light
-        Of all states that were recorded.
-    measured : np.ndarray
-        (S,) which of these could be measured.
-    after : np.ndarray
-        What was recorded of all of ``light``, as of `Record`.
+        Light of all states that were recorded.
+    measured : ndarray of int
+        Indices of the states that could be measured.
+    after : ndarray
+        Frames of all states of ``light``, as returned by `Record`.
     recovery : Recovery
-        Of those that were measured.
+        Recovered changes of the measured states.
     """
 
     light: Light
@@ -117,12 +117,12 @@ class Observation:
 
     @property
     def numbers(self) -> np.ndarray:
-        """(S,) of the states that were measured."""
+        """Numbers of the measured states."""
         return self.light.numbers[self.measured]
 
     @property
     def truth(self) -> Truth:
-        """Truth of the states that were measured."""
+        """True changes of the measured states."""
         return self.light.truth.at(self.measured)
 
 
@@ -137,25 +137,25 @@ def observe(
     Parameters
     ----------
     experiment : MonitorExperiment
-        The instrument.
-    states : Sequence[State]
-        To be observed.
+        Experiment with the instrument.
+    states : sequence of State
+        States to observe.
     how : Observing
-        The policies.
-    numbers : Sequence[int] | np.ndarray | None
-        Of the states, by which random streams are chosen; None to count from 0.
+        Options.
+    numbers : (S,) array_like of int | None
+        Numbers of the states, which select random streams; None to count from 0.
 
     Yields
     ------
     Observation
-        Observations of ``how.chunk`` states, without those that are left out; none of a piece that is lost as a whole.
+        Observations of ``how.chunk`` states without the omitted ones; nothing for a chunk without any measured state.
 
     Raises
     ------
     BeamMissedError, AimError
-        Light is lost on its way, or a spot is not on its CCD.
+        Light is lost, or a spot is not on its CCD.
     SpotError
-        a spot cannot be measured.
+        A spot cannot be measured.
     """
     every = np.arange(len(states)) if numbers is None else np.asarray(numbers)
     for first in range(0, len(states), how.chunk):
@@ -190,20 +190,20 @@ def light_of(
     Parameters
     ----------
     experiment : MonitorExperiment
-        The instrument.
-    states : Sequence[State]
+        Experiment with the instrument.
+    states : sequence of State
         S states.
-    numbers : np.ndarray
-        (S,) of these.
+    numbers : (S,) ndarray of int
+        Numbers of the states.
     single : bool
-        Render in single precision.
-    photons : np.ndarray | None
-        (S, C, rows, columns) of the states, where they are rendered already.
+        True to render in single precision.
+    photons : (S, C, rows, columns) ndarray | None
+        Expected photons, if already rendered.
 
     Raises
     ------
     BeamMissedError, AimError
-        Light is lost on its way, or a spot is not on its CCD.
+        Light is lost, or a spot is not on its CCD.
     """
     with one_blas_thread(), one_kernel_thread():
         placed = experiment.instrument.assembly.place(states)
@@ -216,7 +216,7 @@ def light_of(
 
 
 def why_lost(experiment: MonitorExperiment, state: State) -> str:
-    """Where the light of a state is lost; empty where it is not."""
+    """Return why the light of a state is lost; empty if it is not."""
     try:
         light_of(experiment, [state], np.zeros(1, int))
     except LOST as error:
@@ -225,21 +225,21 @@ def why_lost(experiment: MonitorExperiment, state: State) -> str:
 
 
 def read(experiment: MonitorExperiment, light: Light, how: Observing) -> Observation | None:
-    """Expose and recover states; None where all are left out since their spots cannot be measured.
+    """Expose and recover states; None if no state can be measured.
 
     Parameters
     ----------
     experiment : MonitorExperiment
-        The instrument.
+        Experiment with the instrument.
     light : Light
-        Of the states.
+        Light of the states.
     how : Observing
-        The policies.
+        Options.
 
     Raises
     ------
     SpotError
-        a spot cannot be measured.
+        A spot cannot be measured.
     """
     before, after = how.record(light.photons, light.numbers)
     images, count = after, how.frames
@@ -282,36 +282,36 @@ def read(experiment: MonitorExperiment, light: Light, how: Observing) -> Observa
 
 
 def one_detector(experiment: MonitorExperiment, frames: int, seed: int, stray: np.ndarray | float = 0.0) -> Record:
-    """Every state is exposed by the same detectors, against one nominal measurement.
+    """Return a `Record` that exposes every state with the same detectors, against one nominal measurement.
 
     Parameters
     ----------
     experiment : MonitorExperiment
-        The instrument.
+        Experiment with the instrument.
     frames : int
-        Of each exposure.
+        Number of frames of each exposure.
     seed : int
-        Of the detectors and of all noise; each state has a stream of its own.
-    stray : np.ndarray | float
-        Photons beside those of the nominal spots.
+        Seed of the detectors and all noise; each state has its own stream.
+    stray : ndarray | float
+        Photons added to those of the nominal spots.
     """
     before = experiment.frames_before(frames, seed, stray)
     return lambda photons, numbers: (before, experiment.frames_after(photons, frames, seed, numbers))
 
 
 class StateReader:
-    """Reads states of an instrument that is built and calibrated once.
+    """Observation of single states with an instrument that is built and calibrated once.
 
     Parameters
     ----------
     experiment
-        The instrument, with its job's stated disturbances.
+        Experiment with the instrument and its job's prior.
     frames
-        Of each exposure.
+        Number of frames of each exposure.
     seed
-        Of all noise.
+        Seed of all noise.
     centroid
-        As of ``analysis.monitor.recovery.recover_monitor``.
+        Centroid method, see ``analysis.monitor.recovery.recover_monitor``.
     """
 
     def __init__(self, experiment: MonitorExperiment, frames: int, seed: int, centroid: str = "ml") -> None:
@@ -337,21 +337,21 @@ class StateReader:
         Parameters
         ----------
         state : State
-            Body -> motion, as of ``MonitorExperiment.state``.
+            Body -> motion, as returned by ``MonitorExperiment.state``.
         noise : bool
-            Expose frames; else the expected images, (1, C, rows, columns), are measured, and sigmas are those that the
-            noise of the frames would give.
+            True to expose frames. False to measure the expected images, (1, C, rows, columns); sigmas are those that
+            the noise of the frames would cause.
         number : int
-            Of the state, each of which has a random stream of its own; of a course that of the time.
+            Number of the state, which selects its random stream; for a course, the number of the time.
         single : bool
-            Render in single precision, as all times of a course are.
+            True to render in single precision, as for all times of a course.
 
         Raises
         ------
         BeamMissedError, AimError
-            Light is lost on its way, or a spot is not on its CCD; where, is in the message.
+            Light is lost, or a spot is not on its CCD; the message says where.
         SpotError
-            a spot cannot be measured.
+            A spot cannot be measured.
         """
         experiment = self.experiment
 

@@ -1,7 +1,7 @@
-"""The table of readings of one or several states: what every estimator reads of every change, its sigmas and the truth.
+"""Table of readings of states: the value, sigmas and truth of every change by every estimator.
 
 The table is made once for a state or a course. JSON files, the terminal, reports, CSV tables, scripts, studies and the
-live page are views of it. What is read is declared in `analysis.monitor.parameters`.
+live page are views of it. The parameters are declared in `analysis.monitor.parameters`.
 """
 
 from __future__ import annotations
@@ -27,29 +27,28 @@ from twin.monitor.truth import Truth
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """What one estimator reads of one change: a row of the table, in the parameter's unit.
+    """Reading of one change by one estimator: a row of the table, in the parameter's unit.
 
-    Numbers are arrays over the states (S,), or floats of one state. Over a course as a whole they are root mean
-    squares.
+    Numbers are arrays over the states (S,), or floats of one state. For a whole course they are root mean squares.
 
     Attributes
     ----------
     group : str
-        The camera, or the group of what two cameras read together.
+        Camera, or group of what two cameras read together.
     parameter : Parameter
-        Which change.
+        Parameter that changes.
     estimator : str
-        Who reads it.
+        Name of the estimator.
     true : Any
-        By the exact trace; NaN of a measurement.
+        True change from the exact trace; NaN for a measurement.
     value : Any
-        What is read.
+        Value of the reading.
     error : Any
-        Value minus true.
+        Value minus true change.
     sigma : Any
         Total standard deviation of the error.
     noise : Any
-        Of it what the noise of the images does.
+        Standard deviation from the noise of the images alone.
     """
 
     group: str
@@ -63,24 +62,24 @@ class Reading:
 
     @property
     def camera(self) -> str:
-        """Whose change it is; empty for what two cameras read together."""
+        """Camera of the change; empty for what two cameras read together."""
         return "" if self.group in (ANGLE_GROUP, GROUND_GROUP) else self.group
 
     @property
     def where(self) -> str:
-        """The camera; ``both`` for the angle between two, ``ground`` for errors on the ground."""
+        """Camera; ``both`` for the angle between two cameras, ``ground`` for errors on the ground."""
         return {ANGLE_GROUP: "both"}.get(self.group, self.group)
 
     @property
     def name(self) -> str:
-        """How sentences call it: ``Δα of forward``."""
+        """Name in sentences: ``Δα of forward``."""
         if self.group == GROUND_GROUP:
             return f"{self.parameter.symbol} on the ground"
         return f"{self.parameter.symbol} of {self.camera}" if self.camera else self.parameter.symbol
 
     @property
     def ratio(self) -> float:
-        """Error in sigmas; without noise it is infinite unless it is rounding, of what is not read NaN."""
+        """Error in sigmas; without noise, infinite unless it is rounding error; NaN for a missing reading."""
         if self.sigma > 0.0 or math.isnan(self.sigma):
             return float(self.error / self.sigma)
         return 0.0 if abs(self.error) < SAME else math.copysign(math.inf, self.error)
@@ -92,43 +91,43 @@ class Reading:
 
     @property
     def far(self) -> bool:
-        """Whether reports mark its error."""
+        """True if reports mark the error."""
         return abs(self.ratio) > FAR
 
     def shown(self, value: float, sign: bool = False) -> str:
-        """A number of this reading with the digits that its sigma deserves.
+        """Format a number of this reading with the digits that its sigma justifies.
 
         Parameters
         ----------
         value : float
-            The number, in the parameter's unit.
+            Number in the parameter's unit.
         sign : bool
-            Whether a plus is written.
+            True to write a plus sign.
         """
         return fixed(value, decimals_for(self.sigma), sign)
 
     @property
     def read(self) -> str:
-        """Value, sigma and unit."""
+        """Value, sigma and unit as text."""
         return f"{self.shown(self.value)} ± {self.shown(self.sigma)} {self.parameter.unit}"
 
     def place(self, nested: dict[str, Any]) -> dict[str, Any]:
-        """Its group in JSON files as `ReadingTable.groups` nests them, which is made if it is not there.
+        """Return the reading's group in JSON files as `ReadingTable.groups` nests them; it is added if missing.
 
         Parameters
         ----------
-        nested : dict[str, Any]
-            Groups, with ``cameras`` among them.
+        nested : dict
+            Groups, including ``cameras``.
         """
         return nested["cameras"].setdefault(self.camera, {}) if self.camera else nested.setdefault(self.group, {})
 
     def each(self, of: Callable[[Any], Any]) -> Reading:
-        """Row of the same reading with its numbers replaced.
+        """Return the reading with a function applied to its numbers.
 
         Parameters
         ----------
-        of : Callable[[Any], Any]
-            Array of a number over the states -> what takes its place.
+        of : callable
+            Function of a number's array over the states.
         """
         numbers = of(self.true), of(self.value), of(self.error), of(self.sigma), of(self.noise)
         return Reading(self.group, self.parameter, self.estimator, *numbers)
@@ -136,15 +135,15 @@ class Reading:
 
 @dataclass(frozen=True, eq=False)
 class ReadingTable:
-    """All readings of S states.
+    """Readings of S states.
 
     Attributes
     ----------
-    rows : tuple[Reading, ...]
-        Group by group, of each change by change, of each estimator by estimator.
-    left : Mapping[str, Mapping[str, Any]]
-        Estimator -> what correcting by its readings leaves on the ground, RMS over the line, (S,): further keys of its
-        group in files.
+    rows : tuple of Reading
+        Readings, ordered by group, change and estimator.
+    left : mapping
+        Estimator -> residual ground errors after a correction by its readings, RMS over the line, (S,): further keys of
+        its group in files.
     """
 
     rows: tuple[Reading, ...]
@@ -155,12 +154,12 @@ class ReadingTable:
         return iter(self.rows)
 
     def at(self, state: int) -> ReadingTable:
-        """The table of one state, whose numbers are floats.
+        """Return the table of one state, whose numbers are floats.
 
         Parameters
         ----------
         state : int
-            Its number.
+            Number of the state.
         """
         left = {e: {key: float(value[state]) for key, value in own.items()} for e, own in self.left.items()}
         return ReadingTable(tuple(row.each(lambda number: float(number[state])) for row in self.rows), left)
@@ -172,45 +171,46 @@ class ReadingTable:
         return ReadingTable(tuple(row for row in rows if row.group != GROUND_GROUP), {})
 
     def of(self, estimator: str) -> tuple[Reading, ...]:
-        """Return the rows of what one estimator reads.
+        """Return the rows of one estimator's readings.
 
         Parameters
         ----------
         estimator : str
-            Its name.
+            Name of the estimator.
         """
         return tuple(row for row in self.rows if row.estimator == estimator and not np.all(np.isnan(row.sigma)))
 
     def by_change(self) -> list[list[Reading]]:
-        """For each change the rows of all estimators."""
+        """Return the rows of all estimators for each change."""
         out: dict[tuple[str, str], list[Reading]] = {}
         for row in self.rows:
             out.setdefault((row.group, row.parameter.key), []).append(row)
         return list(out.values())
 
     def row(self, group: str, key: str, estimator: str) -> Reading:
-        """One row.
+        """Return one row.
 
         Parameters
         ----------
         group : str
-            Of the change.
+            Group of the change.
         key : str
-            Of the change.
+            Key of the change.
         estimator : str
-            Who reads it.
+            Name of the estimator.
         """
         wanted = (group, key, estimator)
         return next(row for row in self.rows if (row.group, row.parameter.key, row.estimator) == wanted)
 
     def groups(self, truth: str = "") -> dict[str, Any]:
-        """The table as JSON files nest it: ``cameras`` by name, ``intersection_angle`` and ``ground``; in each the
-        estimators with their numbers.
+        """Return the table as JSON files nest it.
+
+        The groups are ``cameras`` by name, ``intersection_angle`` and ``ground``, each by estimator.
 
         Parameters
         ----------
         truth : str
-            Key under which the true changes stand beside the estimators; empty to leave them out.
+            Key of the true changes beside the estimators; empty to omit them.
         """
         out: dict[str, Any] = {"cameras": {}}
         for row in self.rows:
@@ -225,7 +225,7 @@ class ReadingTable:
         return out
 
     def true(self) -> dict[str, Any]:
-        """The true changes as JSON files nest them: as `groups`, without estimators."""
+        """Return the true changes as JSON files nest them: as `groups`, without estimators."""
         out: dict[str, Any] = {"cameras": {}}
         for row in self.rows:
             group = row.place(out)
@@ -235,12 +235,12 @@ class ReadingTable:
 
     @staticmethod
     def joined(parts: Sequence[ReadingTable]) -> ReadingTable:
-        """One table of the states of several.
+        """Return one table of the states of several tables.
 
         Parameters
         ----------
-        parts : Sequence[ReadingTable]
-            With the same rows.
+        parts : sequence of ReadingTable
+            Tables with the same rows.
         """
         names = ("true", "value", "error", "sigma", "noise")
         rows = tuple(
@@ -255,7 +255,7 @@ class ReadingTable:
 
 
 def plain(number: Any) -> Any:
-    """A float or nested lists, as JSON holds them; a negative zero becomes a plain one, NaN None."""
+    """Return a float or nested lists, as JSON holds them; negative zero becomes zero, NaN becomes None."""
     if isinstance(number, float):
         return None if math.isnan(number) else number + 0.0
     return [plain(one) for one in np.asarray(number).tolist()]
@@ -268,20 +268,20 @@ def reading_table(
     ground: GroundGeometry | None = None,
     prior: Disturbances | None = None,
 ) -> ReadingTable:
-    """The table of what was estimated. Of a change that no motion of the prior makes there is no posterior: NaN.
+    """Return the table of estimates; a change that no motion of the prior causes has no posterior, NaN.
 
     Parameters
     ----------
     found : Estimates | Recovery
-        By all estimators.
-    cameras : Mapping[str, CameraCalibration]
-        What is calibrated of each.
+        Estimates of all estimators.
+    cameras : mapping of str to CameraCalibration
+        Calibration of each camera.
     truth : Truth | None
-        Of the same states; None of a measurement.
+        True changes of the same states; None for a measurement.
     ground : GroundGeometry | None
-        How a pair of known altitude sees the ground, for the truth there.
+        Ground geometry of a pair of known altitude, for the true ground errors.
     prior : Disturbances | None
-        On which the estimators rest that need one; None for none.
+        Prior of the estimators that need one; None for none.
     """
     rows: list[Reading] = []
     fixed_changes = frozenset() if prior is None else unchanged_quantities(prior, cameras, ground)
@@ -289,7 +289,7 @@ def reading_table(
     def add(
         group: str, which: Iterable[Parameter], true: np.ndarray | None, read: Mapping[str, Sequence[np.ndarray]]
     ) -> None:
-        """Rows of numbers (S, P)."""
+        """Append rows from arrays of numbers (S, P)."""
         for k, parameter in enumerate(which):
             for estimator, (values, sigmas, noises) in read.items():
                 value = values[:, k]
@@ -332,5 +332,5 @@ def reading_table(
 
 
 def _sigma(made_of: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """(S, P) standard deviations of combinations (P, 4) of parameters with covariances (S, 4, 4)."""
+    """Return (S, P) standard deviations of combinations (P, 4) of parameters with covariances (S, 4, 4)."""
     return np.asarray(np.sqrt(np.einsum("pi,sij,pj->sp", made_of, covariance, made_of)))

@@ -1,7 +1,7 @@
-"""A monitor's error budget by its mechanisms: random states of each cause, rendered, measured, and turned into angles.
+"""Error budget of a monitor by mechanism: random states of each cause, rendered, measured and converted to angles.
 
-The first line is the noise of the centroid, each of the others one cause of a disturbances file. A line is the error of
-one spot's position as an angle, displacement / principal distance, and 3 sigma: three times the rms over random states,
+The first line is the noise of the centroid; each other line is one cause of a disturbances file. A line is the error of
+one spot's position as an angle, displacement / principal distance, at 3 sigma: three times the rms over random states,
 all spots and both axes.
 """
 
@@ -28,10 +28,10 @@ from twin.monitor.observation import Observing, observe, one_detector
 from twin.monitor.truth import Truth
 
 _CENTROID = "centroid"
-"""The line that nothing causes but the noise of the image."""
+"""Name of the line for the noise of the image alone."""
 
 ALLOWED = 0.1 * ARCSEC
-"""Error of one line that the inverse view asks for, 3 sigma, radians."""
+"""Error of one line for which the allowed input is computed, 3 sigma, in radians."""
 _SEARCH_STEPS = 4
 
 _PARAMETER_FIELDS = ("d_alpha_rad", "d_beta_rad", "d_gamma_rad", "d_f_m")
@@ -41,22 +41,24 @@ Progress = Callable[[float, str], None]
 
 @dataclass(frozen=True)
 class BudgetLine:
-    """One line as simulated.
+    """Simulated line of the budget.
 
     Attributes
     ----------
     name : str
         CENTROID or a cause.
     three_sigma : float
-        Three times the rms of a spot's angle error per axis, radians.
+        Three times the rms of a spot's angle error per axis, in radians.
     sigma : float
-        Standard deviation of ``three_sigma``, radians.
-    by_axis : tuple[float, float]
-        The same for the spots' rows (along Y) and columns (along X), radians.
-    value, unit : float
-        The input, 3 sigma; 1 "times stated" where a cause's components have several.
+        Standard deviation of ``three_sigma``, in radians.
+    by_axis : tuple of float
+        Three times the rms for the spots' rows (along Y) and columns (along X), in radians.
+    value : float
+        Input of the line, 3 sigma; 1 if the components of a cause have different sigmas.
+    unit : str
+        Unit of the input; "times stated" if the components of a cause have different sigmas.
     allowed : float
-        Input at which the line would be 0.1 arcsec, in the unit of ``value``.
+        Input for an error of 0.1 arcsec, in the unit of ``value``.
     """
 
     name: str
@@ -70,16 +72,16 @@ class BudgetLine:
 
 @dataclass(frozen=True, eq=False)
 class Together:
-    """All causes at once, T trials.
+    """Errors of all causes together, from T trials.
 
     Attributes
     ----------
-    spot : tuple[float, float]
-        Three sigma of a spot's angle error per axis and its standard deviation, radians.
-    parameters : Mapping[str, Mapping[str, tuple[float, float]]]
-        Estimator -> parameter -> (three sigma, its standard deviation) of reading - truth, radians and metres, over
-        trials and both cameras. Where the focal plane's temperature changes the camera itself, which it does as its
-        line CCD grows, the reading of that is no error.
+    spot : tuple of float
+        Three sigma of a spot's angle error per axis and its standard deviation, in radians.
+    parameters : mapping
+        Estimator -> parameter -> (three sigma, its standard deviation) of reading - truth, in radians and metres, over
+        trials and both cameras. A change of the camera itself by the focal plane's temperature (its line CCD expands)
+        is not an error of the reading.
     """
 
     spot: tuple[float, float]
@@ -87,24 +89,24 @@ class Together:
 
 
 class ErrorBudget:
-    """Simulates an error budget.
+    """Simulation of an error budget.
 
     Parameters
     ----------
     spec
-        Its inputs.
+        Inputs of the budget.
     resolved
-        a job on its instrument without perturbation, with its disturbances (``resolve_budget``); the budget's light and
+        Job on the instrument without perturbation, with its disturbances (``resolve_budget``); the budget's light and
         angle errors are applied here.
     backend
-        Where to trace.
+        Backend of the ray trace.
     seed
-        Of all random numbers.
+        Seed of all random numbers.
 
     Raises
     ------
     InputError
-        The disturbances are not of this instrument, or one of their causes is called as a line that is there anyway.
+        The disturbances are not of this instrument, or one of their causes has the name of a fixed line.
     """
 
     def __init__(self, spec: ErrorBudgetSpec, resolved: ResolvedJob, backend: Backend, seed: int) -> None:
@@ -122,7 +124,7 @@ class ErrorBudget:
 
     @property
     def causes(self) -> tuple[str, ...]:
-        """What moves or warms, in the order of the file; causes that are zero left out."""
+        """Causes in the order of the file, without those that are zero."""
         return tuple(dict.fromkeys(c.cause for c in self.stated.components))
 
     @property
@@ -132,7 +134,7 @@ class ErrorBudget:
 
     @cached_property
     def radians_per_pixel(self) -> float:
-        """Pixel over principal distance: the unit of a spot's angle error."""
+        """Angle error of a spot per pixel of displacement: pixel pitch over principal distance."""
         distances = list(self.experiment.nominal_truth.principal_distance.values())
         return self.experiment.path.pitch / float(np.mean(distances))
 
@@ -142,7 +144,7 @@ class ErrorBudget:
         Raises
         ------
         ValueError
-            No such line.
+            There is no such line.
         """
         if name == _CENTROID:
             return self._centroid_line()
@@ -153,7 +155,7 @@ class ErrorBudget:
         return self._line(name, _shifts(self.experiment, states), value, unit)
 
     def input_of(self, cause: str) -> tuple[float, str]:
-        """A cause's input, 3 sigma, and its unit. Raises ValueError if there is no such cause."""
+        """Return a cause's input, 3 sigma, and its unit. Raises ValueError if there is no such cause."""
         components = self.stated.of_causes((cause,)).components
         if not components:
             raise ValueError(f"error budget: no cause {cause!r}; there are {', '.join(self.causes)}")
@@ -163,14 +165,14 @@ class ErrorBudget:
         return 3.0 * first.sigma / first.unit_size, first.unit
 
     def states(self, causes: Sequence[str], trials: int, stream: int) -> list[State]:
-        """Random states in which these causes act, each by itself.
+        """Return random states of some causes, drawn independently.
 
         Parameters
         ----------
-        causes : Sequence[str]
-            which.
+        causes : sequence of str
+            Causes that act.
         trials : int
-            How many.
+            Number of states.
         stream : int
             Number of the random stream.
         """
@@ -180,12 +182,12 @@ class ErrorBudget:
         return states_of(amounts, stated.components, self.experiment.thermal)
 
     def grown_focal_planes(self, warmer: float) -> tuple[float, float]:
-        """True change of d_f when every focal plane is warmer, and what paper 001, eq. (7) reads, metres.
+        """Return the true d_f of warmer focal planes and its reading by paper 001, eq. (7), in metres.
 
         Parameters
         ----------
         warmer : float
-            By how much, kelvin.
+            Temperature change, in kelvin.
         """
         experiment, change = self.experiment, Temperature(warmer)
         names = list(experiment.instrument.cameras)
@@ -196,7 +198,7 @@ class ErrorBudget:
         return float(true), float(coefficients("paper_single", geometry)[3] @ shift)
 
     def halved_glass(self, slope: float) -> tuple[float, float, float]:
-        """What halving the 180-deg prisms' glass does to the line of their temperature gradient.
+        """Compare the spots' response to a temperature gradient before and after halving the 180-deg prisms' glass.
 
         The rhomboids take over half of the transfer. The same gradients across the prism, once along its y and once
         along its z, act on both instruments.
@@ -204,12 +206,13 @@ class ErrorBudget:
         Parameters
         ----------
         slope : float
-            Of the temperature, K/m.
+            Temperature gradient, in K/m.
 
         Returns
         -------
-        tuple[float, float, float]
-            Glass path before and after, metres (mean over the channels), and the ratio of the rms spot displacements.
+        tuple of float
+            Glass path before and after, in metres (mean over the channels), and the ratio of the rms spot
+            displacements.
         """
         whole = self.experiment
         monitor = whole.instrument.spec.autocollimator
@@ -233,7 +236,7 @@ class ErrorBudget:
         return glass[0], glass[1], rms[1] / rms[0]
 
     def _transfers(self) -> list[np.ndarray]:
-        """From the middle of the entering to that of the leaving footprint of every 180-deg prism, in its frame."""
+        """Return the vectors from the entry to the exit footprint of every 180-deg prism, in its frame."""
         tree = self.experiment.instrument.assembly.tree
         out = []
         for channel in self.experiment.instrument.channels:
@@ -242,9 +245,10 @@ class ErrorBudget:
         return out
 
     def _centroid_line(self) -> BudgetLine:
-        """Scatter of the energy centroid in single frames, and the light at which it is 0.1 arcsec.
+        """Return the line of the energy centroid in single frames, with the light at which it is 0.1 arcsec.
 
-        Between shot noise and read noise the scatter follows no power of the light: the allowed light is searched for.
+        Between shot noise and read noise the scatter is no power law of the light, so the allowed light is searched
+        for.
         """
         scatter = self._centroid_scatter(1.0)
         target = np.log(ALLOWED / (3.0 * self.radians_per_pixel))
@@ -257,7 +261,7 @@ class ErrorBudget:
         return self._line(_CENTROID, scatter, light, "photons per frame", light * float(np.exp(share[-1])))
 
     def _centroid_scatter(self, light: float) -> np.ndarray:
-        """Energy centroids of single frames about their mean, px, (frames, C, 2), at a share of the light."""
+        """Return energy centroids of single frames about their mean, px, (frames, C, 2), at a fraction of the light."""
         count = max(self.spec.trials, 2)
         setup, stream = self.experiment, np.random.SeedSequence(self.seed, spawn_key=(8,))
         pattern = setup.pattern(self.seed)
@@ -270,7 +274,7 @@ class ErrorBudget:
         return np.asarray((position - position.mean(axis=0)) * np.sqrt(count / (count - 1.0)))
 
     def _line(self, name: str, shifts: np.ndarray, value: float, unit: str, allowed: float | None = None) -> BudgetLine:
-        """Statistics of spot displacements (S, C, 2), px; a line without ``allowed`` is proportional to its input."""
+        """Return the line of spot displacements (S, C, 2), px; without ``allowed`` it is proportional to its input."""
         angle = self.radians_per_pixel * shifts
         three_sigma, sigma = _three_sigma(angle)
         axes = 3.0 * np.sqrt(np.mean(angle**2, axis=(0, 1)))
@@ -278,7 +282,7 @@ class ErrorBudget:
         return BudgetLine(name, three_sigma, sigma, (float(axes[0]), float(axes[1])), value, unit, float(allowed))
 
     def together(self, progress: Progress = lambda fraction, text: None) -> Together:
-        """All causes at once, through noisy images and every estimator, each measurement the mean of ``frames``."""
+        """Simulate all causes together through noisy images and every estimator, with the mean of ``frames``."""
         progress(0.0, "all causes: states")
         states = self.states(self.causes, self.spec.all_together, len(self.lines))
         record = one_detector(self.experiment, self.spec.frames, self.seed)
@@ -297,7 +301,7 @@ class ErrorBudget:
 
 
 def _shifts(experiment: MonitorExperiment, states: Sequence[State]) -> np.ndarray:
-    """Measured displacement of every spot in noise-free images, px, (S, C, 2): row, column."""
+    """Return the measured displacement of every spot in noise-free images, (S, C, 2), row and column in pixels."""
     before = experiment.expected_frames(experiment.nominal_photons)
 
     def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -308,7 +312,7 @@ def _shifts(experiment: MonitorExperiment, states: Sequence[State]) -> np.ndarra
 
 
 def _three_sigma(values: np.ndarray) -> tuple[float, float]:
-    """Three times the rms of values (S, ...) about zero, and its standard deviation from the scatter between states."""
+    """Return three times the rms of values (S, ...) about zero, and its standard deviation between states."""
     square = np.mean(values.reshape(len(values), -1) ** 2, axis=1)
     mean = float(np.mean(square))
     spread = float(np.std(square, ddof=1)) / np.sqrt(len(square))

@@ -1,4 +1,4 @@
-"""A course: the state at each time, what the monitor records and what the analysis makes of it."""
+"""Course of an instrument: the state at each time, the monitor's images, and their analysis."""
 
 from __future__ import annotations
 
@@ -33,45 +33,47 @@ from twin.monitor.observation import LOST, Observing, observe, one_detector, why
 from twin.monitor.reading_table import ReadingTable, reading_table
 
 LARGEST_SERIES = 200_000_000
-"""Pixels of one image per time and channel, which are kept: about 1.2 GB."""
+"""Largest number of pixels of one image per time and channel, which stay in memory: about 1.2 GB."""
 
 
 @dataclass(frozen=True, eq=False)
 class TimeSeries:
-    """What a course of T times gave.
+    """Results of a course of T times.
 
     Attributes
     ----------
-    times : np.ndarray
-        (T,) seconds.
-    temperatures : Mapping[str, tuple[Temperature, ...]]
-        Node path -> its change of temperature at each time, perturbation included.
-    motions : Mapping[str, tuple[Motion, ...]]
-        Node path -> its motion at each time, perturbation included; of the nodes that the course moves.
+    times : (T,) ndarray
+        Times, in seconds.
+    temperatures : mapping
+        Node path -> its temperature change at each time, perturbation included.
+    motions : mapping
+        Node path -> its motion at each time, perturbation included, for the nodes that the course moves.
     shown : int
         Number of the time that the rest of the run shows in full.
     angle : float
-        Between two cameras in the nominal state, radians; NaN unless there are two.
+        Angle between two cameras in the nominal state, in radians; NaN unless there are two.
     readings : ReadingTable
-        True changes and what is read of them at all times, against one nominal measurement.
+        True changes and readings at all times, against one nominal measurement.
     smoothed : SmoothedCourse | None
-        All measurements together; None where nothing is stated to move.
-    shift : np.ndarray
-        (T, 2 C) of the spots, in their order, px; shift_covariance: (T, 2 C, 2 C), px^2.
-    photons : np.ndarray
-        Expected photons per pixel and frame, float32 (T, C, rows, columns).
-    shown_photons : np.ndarray
-        Those of the time that is shown, as they were exposed, (C, rows, columns).
-    frames : np.ndarray
-        The first frame of each time, uint16 (T, C, rows, columns).
-    warnings : tuple[str, ...]
-        What the user should know.
+        Estimates from all measurements together; None without a prior.
+    shift : (T, 2 C) ndarray
+        Shifts of the spots, in their order, in pixels.
+    shift_covariance : (T, 2 C, 2 C) ndarray
+        Covariance of the shifts, in px^2.
+    photons : (T, C, rows, columns) ndarray of float32
+        Expected photons per pixel and frame.
+    shown_photons : (C, rows, columns) ndarray
+        Expected photons of the time that is shown, as they were exposed.
+    frames : (T, C, rows, columns) ndarray of uint16
+        First frame of each time.
+    warnings : tuple of str
+        Warnings for the user.
     evidence : SpotEvidence
-        What the fits of all spots say.
-    curvature : Mapping[str, Curvature]
-        Estimator -> whether its motions are small enough to be linear, at all times.
-    agrees : np.ndarray
-        (T,) whether the shifts of each time agree with the prior; the false-alarm rate is that of all times.
+        Goodness of fit of all spots.
+    curvature : mapping of str to Curvature
+        Estimator -> test of the linearity of its motions, at all times.
+    agrees : (T,) ndarray of bool
+        True where the shifts agree with the prior; the false-alarm rate is that of all times together.
     """
 
     times: np.ndarray
@@ -93,20 +95,20 @@ class TimeSeries:
 
     @property
     def sigma_holds(self) -> np.ndarray:
-        """Return (T,) whether spots and readings of each time are as their sigmas take them to be; at no time where all
-        of them together contradict the prior or its time laws.
+        """Validity of the sigmas at each time, (T,): spots and readings agree with their assumptions.
+
+        It is False at all times if the measurements together contradict the prior or its time laws.
         """
         agrees = self.agrees & (self.smoothed is None or self.smoothed.consistency.agrees)
         return agrees & np.all([self.evidence.holds, *(found.holds for found in self.curvature.values())], axis=0)
 
     def doubts(self, spots: Sequence[str]) -> tuple[str, ...]:
-        """Where sigma does not hold, and which readings were worked out anew since they are not linear; sentences
-        without their end.
+        """Return statements on invalid sigmas and on readings recomputed because of nonlinearity, without full stops.
 
         Parameters
         ----------
-        spots : Sequence[str]
-            Their names.
+        spots : sequence of str
+            Names of the spots.
         """
         out = [] if self.smoothed is None else list(self.smoothed.contradiction)
         told = self.evidence.course_doubt([moment(time) for time in self.times.tolist()], spots)
@@ -128,12 +130,15 @@ class TimeSeries:
         return tuple(out)
 
     def to_dict(self) -> dict[str, Any]:
-        """Contents of course.json: as truth.json and recovered.json, with a list over the times for each number."""
+        """Return the contents of course.json.
+
+        They are those of truth.json and recovered.json, with a list over the times for each number.
+        """
         numbers: dict[str, Any] = COURSE(self)
         return numbers
 
     def group(self, name: str) -> dict[str, Any] | None:
-        """A group of readings as course.json has it, filtered and smoothed ones included; None where there is none.
+        """Return a group of readings as in course.json, including filtered and smoothed ones; None if there is none.
 
         Parameters
         ----------
@@ -147,6 +152,7 @@ class TimeSeries:
 
 
 def _angle(course: TimeSeries) -> dict[str, Any] | None:
+    """Return the readings of the intersection angle with its nominal value, or None."""
     found = course.group("intersection_angle")
     return None if found is None else {"nominal_deg": float(np.degrees(course.angle))} | found
 
@@ -166,10 +172,12 @@ _MOTIONS: Record[Sequence[Motion]] = Record(
 
 
 def _agreement(course: TimeSeries) -> dict[str, Any] | None:
+    """Return the consistency test of the whole course, or None."""
     return None if course.smoothed is None else course.smoothed.to_dict()
 
 
 def _between(course: TimeSeries) -> dict[str, Any] | None:
+    """Return the smoothed changes between the times of the course, or None."""
     return course.smoothed.between_dict() if course.smoothed and len(course.smoothed.times) else None
 
 
@@ -189,19 +197,19 @@ COURSE: Record[TimeSeries] = Record(
 
 
 def series_states(experiment: MonitorExperiment, job: JobSpec) -> list[State]:
-    """The state at each time of a job's course.
+    """Return the state at each time of a job's course.
 
     Parameters
     ----------
     experiment : MonitorExperiment
-        The instrument.
+        Experiment with the instrument.
     job : JobSpec
-        With a course, checked by ``scenes.specs.job.checked_nodes``.
+        Job with a course, checked by ``scenes.specs.job.checked_nodes``.
 
     Raises
     ------
     InputError
-        a temperature at or below 0 K at some time, or one at which a glass's index is not known.
+        At some time a temperature is at or below 0 K, or outside the range in which a glass's index is known.
     """
     course = _course(job)
     out = []
@@ -229,12 +237,12 @@ def run_series(
     Parameters
     ----------
     experiment : MonitorExperiment
-        The instrument.
+        Experiment with the instrument.
     resolved : ResolvedJob
-        a job with a course; its frames and seed are used.
-    states : Sequence[State]
-        Of ``series_states``.
-    advance : Callable[[int], None]
+        Job with a course; its frames and seed are used.
+    states : sequence of State
+        States from ``series_states``.
+    advance : callable
         Called with the number of times that are done, first with 0.
 
     Raises
@@ -316,7 +324,7 @@ def run_series(
 
 
 def too_large(job: JobSpec, k: int, reason: str) -> InputError:
-    """What to say when the state at time number ``k`` cannot be rendered."""
+    """Return the error about the state at time number ``k``, which cannot be rendered."""
     course = _course(job)
     given = {"temperature": list(course.temperature), "motion": list(course.motion)}
     parts = {name: f"{name}s of {', '.join(nodes)}" for name, nodes in given.items() if nodes}
@@ -329,17 +337,19 @@ def too_large(job: JobSpec, k: int, reason: str) -> InputError:
 
 
 def _course(job: JobSpec) -> CourseSpec:
+    """Return the course of a job."""
     assert job.course is not None
     return job.course
 
 
 MIN_LIGHT = 0.5
-"""Share of the nominal light on a CCD below which the user is warned."""
+"""Fraction of the nominal light on a CCD below which the user is warned."""
 
 
 def _warnings(
     experiment: MonitorExperiment, course: CourseSpec, saturated: np.ndarray, share: np.ndarray
 ) -> tuple[str, ...]:
+    """Return warnings about saturated pixels and lost light."""
     out = []
     for i, channel in enumerate(experiment.path.channels):
         bad = np.flatnonzero(saturated[:, i])
@@ -358,31 +368,37 @@ def _warnings(
 
 
 _AS_GOOD = 3.0
-"""Difference of log ratios, a factor 20 of likelihood, below which the spots do not tell two bodies apart."""
+"""Difference of log likelihood ratios, a factor 20 of likelihood, below which the spots do not discriminate two bodies.
+"""
 MOST_BETWEEN, LARGEST_BETWEEN = 7, 400
 """Times between two of a course, and in all, at which it is smoothed, too."""
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothedCourse:
-    """What all measurements of a course say together, by the laws in time of what is stated to move.
+    """Estimates from all measurements of a course together, by the time laws of the prior.
 
     Attributes
     ----------
     name : str
-        Of the stated disturbances.
+        Name of the prior.
     changes : ReadingTable
-        At all times of the course, by the estimators `filtered`, from the measurements up to each time, and `smoothed`,
-        from all.
-    times : np.ndarray
-        (F,) between those of the course, seconds; between: the changes there, likewise.
-    innovations : np.ndarray
-        (T,) chi-square of each measurement against what those before it say; each: its degrees of freedom.
+        Changes at all times of the course, by the estimators `filtered` (from the measurements up to each time) and
+        `smoothed` (from all).
+    times : (F,) ndarray
+        Times between those of the course, in seconds.
+    between : ReadingTable
+        Changes at these times.
+    innovations : (T,) ndarray
+        Chi-square of each measurement against its prediction from those before.
+    each : int
+        Degrees of freedom of each innovation.
     consistency : Consistency
-        Chi-square of the whole series.
-    jumps : tuple[Jump, ...] | None
-        That were found; None where nothing is stated to jump; jump_false_alarm: chance that a series without any has
-        one.
+        Chi-square test of the whole series.
+    jumps : tuple of Jump | None
+        Detected jumps; None if the prior has no jumps.
+    jump_false_alarm : float
+        Probability that a jump is detected in a series without any.
     """
 
     name: str
@@ -396,13 +412,14 @@ class SmoothedCourse:
     jump_false_alarm: float = FALSE_ALARM
 
     def jump_texts(self) -> tuple[str, ...]:
-        """What jumped, when and how far; sentences without their end."""
+        """Return body, time and size of each jump, as sentences without full stop."""
         return tuple(jump_text(one) for one in self.jumps or ())
 
     @property
     def contradiction(self) -> tuple[str, ...]:
-        """Return a warning if all measurements contradict the prior or its time laws: each may agree with what moves,
-        and all of them not with how it goes on in time.
+        """Warning if all measurements together contradict the prior or its time laws.
+
+        Each measurement may agree with the prior, while all of them contradict its evolution in time.
         """
         found = self.consistency
         if found.agrees:
@@ -414,11 +431,11 @@ class SmoothedCourse:
         )
 
     def between_dict(self) -> dict[str, Any]:
-        """Filtered and smoothed changes between the times of the course, as course.json has those at its times."""
+        """Return the changes between the times of the course as course.json has those at its times."""
         return {"times_s": self.times.tolist(), **self.between.groups()}
 
     def to_dict(self) -> dict[str, Any]:
-        """Do the measurements agree with what is stated?"""
+        """Return the consistency test of the measurements with the prior, as plain data."""
         found = self.consistency
         searched: dict[str, Any] = {}
         if self.jumps is not None:
@@ -438,12 +455,12 @@ class SmoothedCourse:
 
 
 def jump_text(one: Jump) -> str:
-    """What jumped, when and how far; a sentence without its end.
+    """Return body, time and size of a jump, as a sentence without full stop.
 
     Parameters
     ----------
     one : Jump
-        a jump that was found.
+        Detected jump.
     """
     body = one.body
     sizes = ", ".join(
@@ -459,18 +476,18 @@ def jump_text(one: Jump) -> str:
 
 
 class CourseSmoother:
-    """Collects shifts and noise of all measurements, then reads them together.
+    """Collector of the shifts and noise of all measurements, which are then smoothed together.
 
     Parameters
     ----------
     stated
-        What moves, and how it goes on in time; None for nothing, of which nothing is smoothed.
+        Prior with its time laws; without it (None) nothing is smoothed.
     cameras
-        What is calibrated of each.
+        Calibration of each camera.
     ground
-        Of a pair whose altitude is known, else None.
+        Ground geometry of a pair of known altitude, else None.
     times
-        Of the measurements, seconds, in order.
+        Times of the measurements, in seconds, ascending.
     """
 
     def __init__(
@@ -486,12 +503,12 @@ class CourseSmoother:
         self._noise: SeriesNoise | None = None
 
     def add(self, found: Recovery) -> Recovery:
-        """Take what is needed of some states, and give them back without the maps.
+        """Store shifts and noise of some states, and return the recovery without the noise maps.
 
         Parameters
         ----------
         found : Recovery
-            The next states, with the parts of their noise.
+            Recovery of the next states, with the parts of their noise.
         """
         if found.parts is None:
             return found
@@ -499,16 +516,16 @@ class CourseSmoother:
         return found.at(slice(None))
 
     def take(self, shift: np.ndarray, before: NoiseParts, after: NoiseParts) -> None:
-        """Take the shifts and the noise of states that were measured elsewhere.
+        """Store the shifts and the noise of states that were measured elsewhere.
 
         Parameters
         ----------
-        shift : np.ndarray
-            (S, 2 C) after - before of the next states, px.
+        shift : (S, 2 C) ndarray
+            Shifts (after - before) of the next states, in pixels.
         before : NoiseParts
             Noise of the C spots before, the same at every call.
         after : NoiseParts
-            Of the S C spots after, state by state.
+            Noise of the S C spots after, state by state.
         """
         if self._noise is None:
             self._noise = SeriesNoise(before, window_of(shift.shape[1]))
@@ -516,7 +533,7 @@ class CourseSmoother:
         self._shifts.append(shift)
 
     def smoothed(self) -> SmoothedCourse | None:
-        """Smoothed course of all states that were taken; None without a prior, and for a single time."""
+        """Return the smoothed course of all stored states; None without a prior, and for a single time."""
         stated, noise, times = self._stated, self._noise, self._times
         if stated is None or noise is None or len(times) < 2:
             return None

@@ -1,4 +1,4 @@
-"""The truth about a perturbed instrument, by exact chief rays in the base frame; no formula of the papers enters."""
+"""True changes of a perturbed instrument, by exact chief rays in the base frame; no formula of the papers is used."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from scenes.specs.instrument import BASE
 from twin.monitor.motions import ElementaryMotion
 
 LINE_POINTS = 41
-"""Points of the line CCD over which roll and principal distance are taken."""
+"""Number of points of the line CCD from which roll and principal distance are determined."""
 
 ACROSS = np.array([0.0, 1.0, 0.0])
-"""Near which, in the world, the first transverse axis of a chief ray is taken."""
+"""Direction in the world near which the first transverse axis of a chief ray is taken."""
 
 
 @shows("cameras", "principal_distance", "angle [deg]", "angle_change [arcsec]", "lines")
@@ -34,16 +34,16 @@ class Truth:
 
     Attributes
     ----------
-    cameras : dict[str, LineChange]
+    cameras : dict of str to LineChange
         Camera -> changes, arrays of shape (S,).
-    principal_distance : dict[str, float]
-        Camera -> nominal principal distance, metres.
+    principal_distance : dict of str to float
+        Camera -> nominal principal distance, in metres.
     angle : float
-        Angle between the two lines of sight in the nominal state, radians (NaN unless there are two cameras).
-    angle_change : np.ndarray
-        Its change, (S,), radians.
-    lines : np.ndarray
-        Lines of sight in the base frame, unit vectors (cameras, 1 + S, 3); entry 0 is the nominal one.
+        Angle between the two lines of sight in the nominal state, in radians (NaN unless there are two cameras).
+    angle_change : (S,) ndarray
+        Change of this angle, in radians.
+    lines : (cameras, 1 + S, 3) ndarray
+        Lines of sight in the base frame, unit vectors; entry 0 is the nominal one.
     """
 
     cameras: dict[str, LineChange]
@@ -53,12 +53,12 @@ class Truth:
     lines: np.ndarray
 
     def at(self, states: slice | np.ndarray) -> Truth:
-        """The truth of some of the states.
+        """Return the true changes of some of the states.
 
         Parameters
         ----------
-        states : slice | np.ndarray
-            which.
+        states : slice | ndarray
+            Indices of the states.
         """
         each = [field.name for field in fields(LineChange) if field.name != "nominal_distance"]
         cameras = {
@@ -69,55 +69,57 @@ class Truth:
         return replace(self, cameras=cameras, angle_change=self.angle_change[states], lines=lines)
 
     def vector(self, camera: str) -> np.ndarray:
-        """(S, 4) true d_alpha, d_beta, d_gamma (rad) and d_f (m) of a camera.
+        """Return the true d_alpha, d_beta, d_gamma (rad) and d_f (m) of a camera, (S, 4).
 
         Parameters
         ----------
         camera : str
-            Its name.
+            Name of the camera.
         """
         return self.cameras[camera].vector
 
     def ground_error(self, geometry: GroundGeometry) -> np.ndarray:
-        """Errors (S, 3) along the track, across it and up of points that are located by the nominal cameras, metres.
+        """Return the errors (S, 3) of ground points located with the nominal cameras, in metres.
+
+        The components are along track, across track and up.
 
         Parameters
         ----------
         geometry : GroundGeometry
-            Of the pair over the ground.
+            Geometry of the pair over the ground.
         """
         lines = np.moveaxis(self.lines, 0, 1)
         return geometry.found(lines[1:], lines[:1])
 
 
 def half_fields(instrument: Instrument, distance: Mapping[str, float]) -> dict[str, float]:
-    """Camera -> tangent of half the field along its line CCD.
+    """Return camera -> tangent of half the field along its line CCD.
 
     Parameters
     ----------
     instrument : Instrument
-        The instrument.
-    distance : Mapping[str, float]
-        Camera -> principal distance, metres.
+        Instrument.
+    distance : mapping of str to float
+        Camera -> principal distance, in metres.
     """
     lines = {name: model.spec.line for name, model in instrument.cameras.items()}
     return {name: 0.5 * line.pixels * line.pitch / distance[name] for name, line in lines.items()}
 
 
 def ground_geometry(instrument: Instrument, distance: Mapping[str, float]) -> GroundGeometry | None:
-    """How a pair of known altitude sees the ground; None for other instruments.
+    """Return the ground geometry of a pair of known altitude; None for other instruments.
 
     Parameters
     ----------
     instrument : Instrument
-        The instrument.
-    distance : Mapping[str, float]
-        Camera -> principal distance, metres.
+        Instrument.
+    distance : mapping of str to float
+        Camera -> principal distance, in metres.
 
     Raises
     ------
     InputError
-        The rays of the two do not meet on the ground.
+        The rays of the pair do not intersect on the ground.
     """
     spec, names = instrument.spec, list(instrument.cameras)
     if spec.altitude is None or len(names) != 2:
@@ -133,28 +135,28 @@ def ground_geometry(instrument: Instrument, distance: Mapping[str, float]) -> Gr
 
 
 def line_points(instrument: Instrument, camera: str) -> np.ndarray:
-    """Where along camera Y the points of the nominal line CCD lie, (LINE_POINTS,), metres."""
+    """Return the positions along camera Y of the points of the nominal line CCD, (LINE_POINTS,), in metres."""
     line = instrument.cameras[camera].spec.line
     half = 0.5 * line.pixels * line.pitch
     return np.linspace(-half, half, LINE_POINTS)
 
 
 def line_in_world(instrument: Instrument, camera: str, placed: PlacedBodies) -> np.ndarray:
-    """The points of the line CCD in the world, (S, LINE_POINTS, 3), metres; complex where ``placed`` is."""
+    """Return the points of the line CCD in the world, (S, LINE_POINTS, 3), in metres; complex if ``placed`` is."""
     position = line_points(instrument, camera)
     line = np.stack([np.zeros_like(position), position, np.zeros_like(position)], axis=-1)
     return points_to_world(placed, line_body(f"{BASE}/{camera}"), line)
 
 
 class LineSight:
-    """Traces what the points of the line CCDs see; of the unperturbed instrument once.
+    """Trace of the lines of sight of the line CCDs' points.
 
     Parameters
     ----------
     instrument
-        The instrument.
+        Instrument; its unperturbed state is traced once.
     backend
-        Where to trace.
+        Backend of the ray trace.
     """
 
     def __init__(self, instrument: Instrument, backend: Backend) -> None:
@@ -162,19 +164,19 @@ class LineSight:
         self.backend = backend
 
     def trace(self, states: Sequence[State], placed: PlacedBodies | None = None) -> np.ndarray:
-        """Object-space directions of the line CCDs' points toward the scene, world, (cameras, S, LINE_POINTS, 3).
+        """Trace directions from the line CCDs' points toward the scene, in the world, (cameras, S, LINE_POINTS, 3).
 
         Parameters
         ----------
-        states : Sequence[State]
+        states : sequence of State
             S states.
         placed : PlacedBodies | None
-            Their bodies, when already placed.
+            Bodies of the states, if already placed.
 
         Raises
         ------
         AimError, BeamMissedError
-            a perturbation moves the image off the mirrors.
+            A perturbation moves the image off the mirrors.
         """
         instrument, names = self.instrument, list(self.instrument.cameras)
         placed = instrument.assembly.place(states) if placed is None else placed
@@ -185,24 +187,24 @@ class LineSight:
         return sight.reshape(len(names), len(states), LINE_POINTS, 3)
 
     def truth(self, states: Sequence[State], placed: PlacedBodies | None = None) -> Truth:
-        """What states do to all cameras.
+        """Return the true changes of all cameras in some states.
 
         Parameters
         ----------
-        states : Sequence[State]
+        states : sequence of State
             S states.
         placed : PlacedBodies | None
-            Their bodies, when already placed.
+            Bodies of the states, if already placed.
 
         Raises
         ------
         AimError, BeamMissedError
-            As `trace`.
+            Light is lost, see `trace`.
         """
         return self.told_by(self.trace(states, placed) if states else self.nominal[:, :0])
 
     def told_by(self, sight: np.ndarray) -> Truth:
-        """What directions of sight (cameras, S, LINE_POINTS, 3) say of S states."""
+        """Return the true changes of S states from directions of sight (cameras, S, LINE_POINTS, 3)."""
         sight = np.concatenate([self.nominal, sight], axis=1)
         cameras: dict[str, LineChange] = {}
         principal: dict[str, float] = {}
@@ -220,20 +222,23 @@ class LineSight:
 
     @cached_property
     def nominal(self) -> np.ndarray:
-        """`trace` of the unperturbed instrument, (cameras, 1, LINE_POINTS, 3)."""
+        """Directions of sight of the unperturbed instrument, (cameras, 1, LINE_POINTS, 3), see `trace`."""
         return self.trace([{}])
 
     @cached_property
     def _aimed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Parameters and Jacobian of the unperturbed instrument's chief rays, from which all others are aimed."""
+        """Aim parameters and Jacobian of the unperturbed instrument's chief rays, from which all others are aimed."""
         to_stop, points, guess = self._from_the_image([{}], self.instrument.assembly.place())
         return aim_chief_rays(self.backend, to_stop, points, guess, ACROSS)[1:]
 
     @cached_property
     def axes(self) -> dict[str, np.ndarray]:
-        """Camera -> nominal X, Y, Z about which its changes count, in the base frame as columns, (3, 3); Z is its
-        nominal line of sight. That of an instrument as built is not the drawn one, and Y is then square to it, as near
-        to the camera's as can be.
+        """Camera -> nominal X, Y, Z of its changes, as columns (3, 3) in the base frame.
+
+        Z is the nominal line of sight.
+
+        The line of sight of an instrument as built differs from the design; Y is then perpendicular to it, as near
+        as possible to the camera's Y.
         """
         own = {name: self.instrument.camera_axes(name) for name in self.instrument.cameras}
         if not self.instrument.as_built:
@@ -244,7 +249,7 @@ class LineSight:
     def _from_the_image(
         self, states: Sequence[State], placed: PlacedBodies
     ) -> tuple[SystemBatch, np.ndarray, np.ndarray]:
-        """Systems to the stops, points of the line CCDs (B, LINE_POINTS, 3), directions from them (B, 1, 3)."""
+        """Return systems to the stops, points of the line CCDs (B, LINE_POINTS, 3), and directions (B, 1, 3)."""
         instrument, names = self.instrument, list(self.instrument.cameras)
         to_stop = assemble(instrument.assembly, [f"{n}/image_to_stop" for n in names], states, placed=placed)
         points = np.concatenate([line_in_world(instrument, name, placed) for name in names])
@@ -253,32 +258,34 @@ class LineSight:
 
 
 def _about(sight: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Axes X, Y, Z as columns, of which Z is a line of sight, and Y as near to ``across`` as can be."""
+    """Return axes X, Y, Z as columns, with Z along a line of sight and Y as near to ``across`` as possible."""
     x = np.cross(across, sight)
     x = x / np.linalg.norm(x)
     return np.stack([x, np.cross(sight, x), sight], axis=-1)
 
 
 def trace_truth(instrument: Instrument, backend: Backend, states: Sequence[State]) -> Truth:
-    """`LineSight.truth`, for one call."""
+    """Return `LineSight.truth` for a single call."""
     return LineSight(instrument, backend).truth(states)
 
 
 _DIFFERENCE = 1e-6
-"""Half step of the central differences (rad, m or relative): truncation and rounding are both below 1e-8 of the
-result."""
+"""Half step of the central differences (rad, m or relative): truncation and rounding errors are both below 1e-8 of the
+result.
+"""
 
 
 def truth_jacobian(
     instrument: Instrument, backend: Backend, motions: Sequence[ElementaryMotion]
 ) -> dict[str, np.ndarray]:
-    """Derivative of the true parameters of every camera by elementary motions, by central differences of the exact
-    trace.
+    """Return the derivatives of the true parameters of every camera by elementary motions.
+
+    They are central differences of the exact trace.
 
     Returns
     -------
-    dict[str, np.ndarray]
-        Camera -> (4, M): d_alpha, d_beta, d_gamma (rad) and d_f (m) per radian, metre or unit of scale.
+    dict of str to (4, M) ndarray
+        Camera -> d_alpha, d_beta, d_gamma (rad) and d_f (m) per radian, metre or unit of scale.
     """
     states = [m.state(_DIFFERENCE) for m in motions] + [m.state(-_DIFFERENCE) for m in motions]
     truth = trace_truth(instrument, backend, states)

@@ -298,7 +298,7 @@ def _required_cells(overview: Overview, quantity: Quantity) -> list[Cell]:
 
 
 def _changed_section(overview: Overview, begin: int, end: int) -> Section:
-    found = [one for one in overview.changed(begin, end) if not one.again]
+    found = [occurrence for occurrence in overview.changed(begin, end) if not occurrence.again]
     lines = tuple(f"{minute_text(one.time)}: {one.text}" for one in found)
     what = f"Between {minute_text(begin)} and {minute_text(end)} UTC.{'' if lines else ' Nothing occurrences.'}"
     shown = (Text("changed", "", "", lines[-MOST_SHOWN:], within=""),) if lines else ()
@@ -307,8 +307,8 @@ def _changed_section(overview: Overview, begin: int, end: int) -> Section:
 
 def _trend_section(history: History, overview: Overview, last: int) -> Section:
     quantities = overview.quantities
-    chosen = [one for one in quantities if overview.required(one) is not None] or list(quantities)[:3]
-    others = [one for one in quantities if one not in chosen]
+    chosen = [quantity for quantity in quantities if overview.required(quantity) is not None] or list(quantities)[:3]
+    others = [quantity for quantity in quantities if quantity not in chosen]
     first = overview.begin
     recent = trend(history, overview, max(first, last - RECENT), last + overview.horizon)
     figures: list[Artefact] = []
@@ -334,7 +334,7 @@ def _figure(name: str, title: str, svg: str) -> SvgFigure:
 def _motion_section(overview: Overview) -> Section | None:
     """Return the motions of bodies that are known best, all causes of a motion together; None without any."""
     found, stated = overview.operation.motions(overview.time), overview.operation.experiment.stated
-    moving = () if stated is None else [one for one in stated.components if one.kind not in HEAT]
+    moving = () if stated is None else [component for component in stated.components if component.kind not in HEAT]
     rows: list[tuple[float, list[Cell]]] = []
     for name, unit in {one.name: one.unit for one in moving}.items():
         own = np.array([label == name for label in found.labels], np.float64)
@@ -357,13 +357,13 @@ def _motion_section(overview: Overview) -> Section | None:
 def _prediction_section(overview: Overview) -> Section:
     told = overview.filter_result
     rows: list[list[Cell]] = []
-    for one in overview.coverages:
-        if one.count:
-            look = "text" if one.holds else "text wrong"
-            interval = f"{100.0 * one.low:.1f} to {100.0 * one.high:.1f}"
-            words = Marked("yes" if one.holds else "no", look=look, key=f"coverage {one.sigmas}")
-            row: list[Cell] = [f"within {one.sigmas}σ", DecimalNumber(100.0 * one.expected, 2)]
-            rows.append([*row, DecimalNumber(100.0 * one.share, 2), interval, one.count, words])
+    for coverage in overview.coverages:
+        if coverage.count:
+            look = "text" if coverage.holds else "text wrong"
+            interval = f"{100.0 * coverage.low:.1f} to {100.0 * coverage.high:.1f}"
+            words = Marked("yes" if coverage.holds else "no", look=look, key=f"coverage {coverage.sigmas}")
+            row: list[Cell] = [f"within {coverage.sigmas}σ", DecimalNumber(100.0 * coverage.expected, 2)]
+            rows.append([*row, DecimalNumber(100.0 * coverage.share, 2), interval, coverage.count, words])
     heads = ("components", "expected [%]", "found [%]", f"interval of {100.0 * CONFIDENCE:.0f} % [%]", "of", "in it")
     caption = (
         "Each reading was predicted from all before it. Its components, made independent and of unit variance, lie "
@@ -390,9 +390,10 @@ def _explained(overview: Overview) -> str:
     if not known:
         return ""
     parts = [
-        f"{100.0 * known[one.name]:.0f} % of that of {name_of(one.name, overview.quantities)}"
-        for one in overview.quantities
-        if known.get(one.name, 0.0) >= 0.005 and (overview.required(one) or not overview.filter_result.requirements)
+        f"{100.0 * known[quantity.name]:.0f} % of that of {name_of(quantity.name, overview.quantities)}"
+        for quantity in overview.quantities
+        if known.get(quantity.name, 0.0) >= 0.005
+        and (overview.required(quantity) or not overview.filter_result.requirements)
     ]
     if not parts:
         return "Temperatures explain nothing of the scatter of what is required"
@@ -466,7 +467,7 @@ def _sensor_section(overview: Overview) -> Section:
 def _alarm_section(overview: Overview) -> Section:
     if not overview.alarms:
         return Section("Alarms", ("No alarm has been raised.",), name="alarms")
-    waiting = {id(one) for one in overview.open_alarms()}
+    waiting = {id(alarm) for alarm in overview.open_alarms()}
     rows: list[list[Cell]] = []
     for one in sorted(overview.alarms, key=lambda one: (id(one) not in waiting, -int(one["time_us"]))):
         known = one["acknowledged"]
@@ -490,7 +491,7 @@ def _left_out_section(history: History, overview: Overview) -> Section:
         [minute_text(time), kind, subject, reason]
         for time, kind, subject, reason in sorted(overview.filter_result.excluded, key=lambda one: -one[0])
     ]
-    refused = [one for one in history.refusals() if not one["taken_since"]]
+    refused = [refusal for refusal in history.refusals() if not refusal["taken_since"]]
     artefacts: list[Artefact] = []
     if rows:
         caption = "In the record, but not used for the estimate. Times are UTC."
@@ -515,7 +516,7 @@ def _warnings(overview: Overview, end: int) -> tuple[str, ...]:
     if waiting:
         count = "one alarm waits" if len(waiting) == 1 else f"{len(waiting)} alarms wait"
         out.append(f"{count} for an acknowledgement; the newest: {waiting[0]['text']}")
-    bad = [one for one in overview.filter_result.sensors if one.state != "ok"]
+    bad = [sensor for sensor in overview.filter_result.sensors if sensor.state != "ok"]
     if bad:
         out.append("sensors that are not in order: " + ", ".join(f"{one.body} ({one.state})" for one in bad))
     return tuple(out)

@@ -236,7 +236,7 @@ def export(
         words = (*ends, *(["--truth"] if truth else []), *extra, "--seed", str(drawn))
         again = (PROGRAM, "export", str(source), *words, *(() if name == "llvm" else ("--backend", name)))
         inputs = (source,) if control is None else (source, control)
-        facts = {"config": read.config, "seed": drawn, "again": again, "given": inputs}
+        facts = {"config": read.config, "seed": drawn, "again": again, "input_paths": inputs}
         return finished(session, "export", shown, numbers, program=PROGRAM, **facts)
 
     stem = source.resolve().name if os.path.isdir(source) else source.stem

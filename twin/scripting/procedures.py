@@ -127,7 +127,7 @@ def perform(
     program, _, command = name.partition(" ")
     called = (f"twin.{program}", started, seconds, backend)
     facts = RunFacts(stated.pop("config"), *called, command=command, checks=shown.checks, **stated)
-    numbers = shown.told(procedure.numbers(run))
+    numbers = shown.with_verdict(procedure.numbers(run))
     return TestResult(name, numbers, shown, setup, run, facts, procedure.kind)
 
 

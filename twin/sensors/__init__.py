@@ -1,1 +1,1 @@
-"""Detectors: photons in, recorded frames out."""
+"""Detectors: conversion of photons to recorded frames."""

@@ -34,7 +34,7 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.spec import Spec
-from twin.framework.frame_store import frame_room, largest_of, let_go
+from twin.framework.frame_store import allocate_frames, largest_of, release_memory
 from twin.framework.random_streams import stream
 from twin.sensors.exposure_kernel import FEWEST, Reading, exposing_bytes, kernels_there
 from twin.sensors.poisson_numbers import poisson_pieces
@@ -333,7 +333,7 @@ class EmvaDetector:
             raise ValueError(
                 f"detector: fixed pattern {pattern.gain.shape} does not fit photons {light.shape}"
             ) from error
-        out = frame_room((*lead, int(frames), height, width))
+        out = allocate_frames((*lead, int(frames), height, width))
         indices = list(np.ndindex(*lead))
         streams = _streams(seed, lead)
         together = self.frames_at_once(int(frames), height * width)
@@ -363,7 +363,7 @@ class EmvaDetector:
             start = 0
             for collected in poisson_pieces(mean_e, int(frames), rng, together):
                 out[index][start : start + together] = self._read_out(collected, shift, (rng, *others))
-                let_go(out)
+                release_memory(out)
                 start += together
 
         if threads == 1 or len(indices) == 1:

@@ -27,7 +27,7 @@ import numpy as np
 
 from optics.numerics.backend import one_kernel_thread
 from optics.numerics.llvm import ensure_llvm
-from twin.framework.frame_store import let_go
+from twin.framework.frame_store import release_memory
 from twin.sensors.poisson_numbers import (
     CELLS_PER_UNIT,
     MOST_IN_TABLE,
@@ -146,7 +146,7 @@ class Reading:
                     following = group.draw(numbers, out[some.start : some.stop, start : start + together], pool)
                     if drawn is not None:
                         drawn.read_out()
-                        let_go(out)
+                        release_memory(out)
                     drawn = following
             if drawn is not None:
                 drawn.read_out()

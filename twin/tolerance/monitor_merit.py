@@ -1,19 +1,19 @@
-"""What the monitor of an instrument that is out of tolerance still knows: variances of its readings.
+"""Merits of a camera that is out of tolerance: their smooth parts, obstruction of its beams, and variances of its
+monitor.
 
-The instrument as it is built and adjusted is where everything is linear: the stated disturbances move spots and cameras
-by the derivatives that they have there, and the images before and after have the noise that they have there. So the
-sigma is that of ``twin.uncertainty`` for that instrument. The gain of the posterior is that of the instrument as it is
-built; other estimators have theirs of the designed one. Area CCDs have been set to their spots when it was built.
+**Monitor.** Everything is linear about the instrument as it is built and adjusted: the disturbances of the prior
+move spots and cameras by the derivatives of that state, and the images before and after have the noise of that
+state. So the sigma is that of ``twin.uncertainty`` for that instrument. The gain of the posterior estimator is that
+of the instrument as built; other estimators use the gain of the nominal instrument. The area CCDs have been set to
+their spots when it was built.
 
-Derivatives change by some 1e-4 within tolerances. What each tolerance and each adjustment changes of them is traced
-once, and what several do together is the sum. The terms of a whole figure error are left out: 10 nm of one change the
-derivatives by less than 1e-5. The noise of every camera is that of its own images. ``MonitorMerit.missed`` tells by how
-much sigmas come out wrong by that.
+The derivatives change by about 1e-4 within tolerances. The change due to each tolerance and each adjustment is
+traced once, and changes of several are added. The terms of a whole figure error are omitted: 10 nm of a term change
+the derivatives by less than 1e-5. The noise of every camera is that of its own images. ``MonitorMerit.missed`` gives
+the resulting error of the sigmas.
 
-Merits of a camera that is out of tolerance: smooth parts of each, and what they come to.
-
-What bodies of an instrument take of the beams of one of its cameras, in many states: prisms, housings, baffles,
-parts of other cameras, each where the state puts it. The camera's own mirrors are its prescription's matter.
+**Obstruction.** Prisms, housings, baffles and parts of other cameras block part of the beams of a camera, each where
+the state puts it. The camera's own mirrors belong to its prescription.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from scenes.models.shadow import TracedBeams
 from scenes.specs.tolerance import MERIT_UNITS, OF_MONITOR, POSTERIOR, MeritSpec, ToleranceSetup
 from scenes.yaml.errors import names_text, unknown
 from scenes.yaml.units import LENGTH
-from twin.framework.artefact import shown_unit
+from twin.framework.artefact import unit_for_reports
 from twin.monitor.crosstalk import estimator_gains
 from twin.monitor.information import built_noise, quantity_rows, spot_noise
 from twin.monitor.monitor_derivative import derivative_changes
@@ -45,32 +45,33 @@ from twin.targets.target_path import TargetPath
 from twin.tolerance.variations import VariedNumber, states_of
 
 ROTATIONS = ("d_alpha", "d_beta", "d_gamma")
+"""Keys of the three rotations of a camera."""
 STEP = 0.1
-"""Share of a compensator's range by which derivatives are differentiated."""
+"""Step of the numerical derivatives by compensators, as a share of their range."""
 
 
 @dataclass(frozen=True, eq=False)
 class MonitorMerit:
-    """The monitor of a budget's instrument.
+    """Monitor of the instrument of a budget, with the merits about its readings.
 
     Attributes
     ----------
     experiment : MonitorExperiment
-        The designed instrument with what is stated to move.
+        Nominal instrument with the disturbances of its prior.
     path : SpotPath
-        Its light, on area CCDs that are set to their spots.
+        Light path of its spots, on area CCDs that are set to their spots.
     images : SpotPath
-        Likewise, of the cameras alone whose spots something moves.
+        Light path of those cameras alone whose spots move.
     stated : Disturbances
-        Disturbances of the designed instrument, as motions that are independent of each other.
-    noise : np.ndarray
-        Of its spots' shifts, (D, D) px^2.
-    changes : tuple[np.ndarray, np.ndarray]
-        Of the derivatives of spots (K, D, M) and parameters (K, 4 J, M) per SI unit of each number that varies and of
-        each compensator.
-    asked : Mapping[str, tuple[np.ndarray, np.ndarray | None]]
-        Name of a merit -> its readings' rows on the parameters, (Q, 4 J), and the gain that reads them; None for the
-        posterior's.
+        Disturbances of the nominal instrument as independent motions.
+    noise : (D, D) ndarray
+        Noise covariance of its spot shifts, px^2.
+    changes : tuple of ndarray
+        Changes of the derivatives of spots (K, D, M) and camera parameters (K, 4 J, M), per SI unit of each varied
+        parameter and compensator.
+    asked : dict
+        Name of a merit -> rows (Q, 4 J) from camera parameters to its readings, and the gain of its estimator; None for
+        the posterior's.
     """
 
     experiment: MonitorExperiment
@@ -90,25 +91,25 @@ class MonitorMerit:
         numbers: Sequence[VariedNumber],
         ranges: np.ndarray,
     ) -> MonitorMerit | None:
-        """That of a budget; None where no merit is about a monitor.
+        """Return the monitor of a budget; None if no merit is about a monitor.
 
         Parameters
         ----------
         setup : ToleranceSetup
-            The budget.
+            Tolerance budget.
         experiment : MonitorExperiment
-            Its designed instrument.
+            Nominal instrument of the budget.
         camera : str
-            That is judged.
-        numbers : Sequence[VariedNumber]
-            K that vary, the compensators last.
-        ranges : np.ndarray
-            Of the compensators, SI, (C,).
+            Name of the camera that the budget evaluates.
+        numbers : sequence of VariedNumber
+            K varied parameters, the compensators last.
+        ranges : (C,) ndarray
+            Ranges of the compensators, SI.
 
         Raises
         ------
         InputError
-            The instrument has no monitor, nothing is stated to move, or there is no such reading.
+            The instrument has no monitor or no disturbances, or there is no such reading or estimator.
         """
         wanted = {name: merit for name, merit in setup.test.merits.items() if merit.kind in OF_MONITOR}
         if not wanted:
@@ -152,19 +153,19 @@ class MonitorMerit:
         return cls(experiment, path, images, stated, noise, (every[0], every[1]), asked)
 
     def variances(self, amounts: np.ndarray, states: Sequence[State]) -> dict[str, np.ndarray]:
-        """Variances of all readings of every merit, (S, Q), SI.
+        """Return the variances (S, Q) of all readings of every merit, SI.
 
         Parameters
         ----------
-        amounts : np.ndarray
-            Of the numbers and the compensators, SI, (S, K).
-        states : Sequence[State]
-            What they add up to, S.
+        amounts : (S, K) ndarray
+            Amounts of the varied parameters and the compensators, SI.
+        states : sequence of State
+            The S states that they add up to.
 
         Raises
         ------
         BeamMissedError, AimError
-            The light of a state does not come to its area CCDs.
+            The light of a state does not reach its area CCDs.
         """
         noise = self._noise(states)
         used = np.flatnonzero(np.any(self.changes[0], axis=(1, 2)) | np.any(self.changes[1], axis=(1, 2)))
@@ -172,7 +173,7 @@ class MonitorMerit:
         return self._read(spots, parameters, noise)
 
     def exact(self, states: Sequence[State]) -> dict[str, np.ndarray]:
-        """The same with derivatives that are traced in every state."""
+        """Return the variances with derivatives that are traced in every state."""
         motions = self.experiment.stated
         assert motions is not None
         known = self.experiment
@@ -182,7 +183,7 @@ class MonitorMerit:
         return self._read(changes[0] @ root, changes[1] @ root, self._noise(states))
 
     def missed(self, amounts: np.ndarray, states: Sequence[State]) -> dict[str, float]:
-        """Name of a merit -> largest relative difference of its sigmas from ``exact``; arguments as ``variances``."""
+        """Return the largest relative error of each merit's sigma against ``exact``; arguments as in ``variances``."""
         near, right = self.variances(amounts, states), self.exact(states)
         return {
             name: float(np.max(np.abs(np.sqrt(near[name].max(axis=1) / right[name].max(axis=1)) - 1.0)))
@@ -190,7 +191,7 @@ class MonitorMerit:
         }
 
     def _noise(self, states: Sequence[State]) -> np.ndarray:
-        """Covariance of the shifts by the noise of images of every state, (S, D, D), px^2."""
+        """Return the covariance of the spot shifts by image noise in every state, (S, D, D), px^2."""
         out = np.tile(self.noise, (len(states), 1, 1))
         keys = [channel.key for channel in self.images.channels]
         own = [2 * k + axis for k, channel in enumerate(self.path.channels) if channel.key in keys for axis in (0, 1)]
@@ -200,7 +201,7 @@ class MonitorMerit:
         return out
 
     def _read(self, spots: np.ndarray, parameters: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
-        """Variances with changes of the derivatives (S, D, M), (S, 4 J, M) and noise (S, D, D)."""
+        """Return the variances for changes of the derivatives (S, D, M), (S, 4 J, M) and noise (S, D, D)."""
         out = {name: np.empty((len(noise), len(rows))) for name, (rows, _) in self.asked.items()}
         for s, own in enumerate(noise):
             stated = replace(
@@ -213,7 +214,7 @@ class MonitorMerit:
 
 
 def _require_monitor(setup: ToleranceSetup, experiment: MonitorExperiment, name: str) -> None:
-    """Raise InputError for an instrument without a monitor, and for a monitor of which nothing is stated to move."""
+    """Raise InputError if the instrument has no monitor, or its monitor no prior on disturbances."""
     test, kind = setup.test, setup.test.merits[name].kind
     if not experiment.monitored:
         allowed = "an instrument with a monitor, such as gf7_pair; or other merits"
@@ -226,7 +227,7 @@ def _require_monitor(setup: ToleranceSetup, experiment: MonitorExperiment, name:
 
 
 def readings_of(merit: MeritSpec, cameras: Sequence[str]) -> tuple[str, ...]:
-    """Which readings a merit is about, the worst of which counts: ``angle``, ``d_alpha`` ... of one camera."""
+    """Return the readings of which a merit takes the worst: ``angle``, or ``d_alpha`` etc. of one camera."""
     if merit.kind == "monitor_focus":
         return ("d_f",)
     if merit.reading is None:
@@ -237,7 +238,7 @@ def readings_of(merit: MeritSpec, cameras: Sequence[str]) -> tuple[str, ...]:
 def _readings(
     setup: ToleranceSetup, experiment: MonitorExperiment, name: str, merit: MeritSpec, camera: str
 ) -> list[str]:
-    """Names of a merit's readings in ``quantity_rows``. Raises InputError where there is no angle."""
+    """Return the names of a merit's readings in ``quantity_rows``; raise InputError where there is no angle."""
     cameras = tuple(experiment.instrument.cameras)
     if merit.reading == "angle" and len(cameras) != 2:
         wrong = f"an angle is between the lines of sight of two cameras, and there are {len(cameras)}"
@@ -247,22 +248,22 @@ def _readings(
 
 @dataclass(frozen=True, eq=False)
 class Merit:
-    """One merit of a budget.
+    """Merit of a tolerance budget.
 
-    Its **parts** change smoothly with small motions, which its value, as the worst of some fields, does not: mean
-    square wavefront errors by field, MTF by field and direction, components of a turn, residual places along the line,
-    shares of a beam by field, variances of readings.
+    The **parts** of a merit change smoothly with small motions; its value, as the worst of several fields, does not.
+    Parts are mean square wavefront errors by field, MTF by field and direction, components of a rotation, residual
+    positions along the line, obstructed shares of a beam by field, or variances of readings.
 
     Attributes
     ----------
     name : str
-        In the file.
+        Name in the file.
     spec : MeritSpec
-        What is asked.
-    fields : np.ndarray
-        Numbers of its fields among those of the bench, (F,).
+        Kind, fields and requirement.
+    fields : (F,) ndarray of int
+        Indices of its fields among those of the bench.
     parts : slice
-        Columns of the bench's parts that are its own.
+        Columns of the bench's parts that belong to it.
     """
 
     name: str
@@ -271,7 +272,7 @@ class Merit:
     parts: slice
 
     def values(self, parts: np.ndarray) -> np.ndarray:
-        """What parts (..., P) of the bench come to, (...,), SI; of a change its size."""
+        """Return the merit (...,) from the bench's parts (..., P), SI; a change counts by its absolute value."""
         own = parts[..., self.parts]
         match self.spec.kind:
             case "wavefront":
@@ -288,18 +289,18 @@ class Merit:
                 return np.asarray(np.max(np.abs(own), axis=-1))
 
     def passes(self, values: np.ndarray) -> np.ndarray:
-        """Whether values meet the requirement; what is not known does not."""
+        """Return True where values meet the requirement; NaN does not."""
         if self.spec.more_is_better:
             return np.asarray(values >= self.spec.requirement)
         return np.asarray(values <= self.spec.requirement)
 
     def margin(self, values: np.ndarray) -> np.ndarray:
-        """How far values are beyond the requirement, in units of it; negative where they meet it."""
+        """Return how far values exceed the requirement, in units of it; negative where they meet it."""
         ratio = values / self.spec.requirement
         return np.asarray(1.0 - ratio if self.spec.more_is_better else ratio - 1.0)
 
     def worse(self, values: np.ndarray, than: float | np.ndarray) -> np.ndarray:
-        """By how much values are worse than another."""
+        """Return by how much values are worse than a reference value."""
         return np.asarray(than - values if self.spec.more_is_better else values - than)
 
 
@@ -310,7 +311,7 @@ AT_FIELDS = ("wavefront", "mtf", "chief_ray", "obstruction")
 
 
 def part_count(spec: MeritSpec, line_points: int, cameras: Sequence[str] = ()) -> int:
-    """Number of a merit's parts."""
+    """Return the number of parts of a merit."""
     match spec.kind:
         case "monitor_angle" | "monitor_focus":
             return len(readings_of(spec, cameras))
@@ -329,16 +330,16 @@ def part_count(spec: MeritSpec, line_points: int, cameras: Sequence[str] = ()) -
 def merits_of(
     specs: dict[str, MeritSpec], line_points: int, cameras: Sequence[str] = ()
 ) -> tuple[tuple[Merit, ...], np.ndarray]:
-    """The merits of a budget, and the fields (F, 2) that any of them has.
+    """Return the merits of a budget and all fields (F, 2) that they use.
 
     Parameters
     ----------
-    specs : dict[str, MeritSpec]
-        By name.
+    specs : dict
+        Specifications by name.
     line_points : int
-        At which distortion is told.
-    cameras : Sequence[str]
-        Of the instrument.
+        Number of points of the line at which distortion is evaluated.
+    cameras : sequence of str
+        Names of the instrument's cameras.
     """
     fields: dict[tuple[float, float], int] = {}
     out, start = [], 0
@@ -352,18 +353,18 @@ def merits_of(
 
 
 def shown_merit(value: float, merit: Merit) -> float | None:
-    """A value in the unit in which people read the merit; None where it is not known."""
+    """Return a value in the unit in which the merit is reported; None if it is not finite."""
     return float(value / merit_unit(merit)[1]) if np.isfinite(value) else None
 
 
 def merit_head(merit: Merit) -> str:
-    """Name of a merit with its unit, for the head of a column."""
+    """Return the name of a merit with its unit, for the head of a column."""
     unit = merit_unit(merit)[0]
-    return f"{merit.name} [{shown_unit(unit)}]" if unit else merit.name
+    return f"{merit.name} [{unit_for_reports(unit)}]" if unit else merit.name
 
 
 def merit_unit(merit: Merit) -> tuple[str, float]:
-    """Unit in which people read a merit, and its size in SI."""
+    """Return the unit in which a merit is reported, and its size in SI."""
     unit = MERIT_UNITS[merit.spec.kind]
     if unit is None:
         return ("waves", 1.0) if merit.spec.kind == "wavefront" else ("", 1.0)
@@ -371,14 +372,15 @@ def merit_unit(merit: Merit) -> tuple[str, float]:
 
 
 KIND = "obstruction"
+"""Kind of the merit that is the obstructed share of a beam."""
 RINGS = 7
-"""Rings of the rays over the stop, as those of an image's quality."""
+"""Number of rings of rays over the stop, as for image quality."""
 AT_ONCE = 40
-"""States traced in one launch, to bound memory."""
+"""Number of states traced in one launch, to bound memory."""
 
 
 def require_bodies(setup: ToleranceSetup, path: TargetPath) -> None:
-    """Raise InputError where a budget asks for an obstruction and nothing can stand in the beams of the camera."""
+    """Raise InputError if a budget asks for an obstruction and no body can block the beams of the camera."""
     for name, merit in setup.test.merits.items():
         if merit.kind == KIND and (path.shadows is None or not path.shadows.casters):
             problem = f"no body of {setup.base.instrument.name} can stand in the beams of {path.name}"
@@ -389,25 +391,25 @@ def require_bodies(setup: ToleranceSetup, path: TargetPath) -> None:
 def obstructed_shares(
     path: TargetPath, states: Sequence[State], directions: np.ndarray, start: np.ndarray
 ) -> np.ndarray:
-    """Share of the stop's area that bodies together take of every beam, (S, F).
+    """Return the share of the stop's area that all bodies together block in every beam, (S, F).
 
     Parameters
     ----------
     path : TargetPath
-        The camera's, with its shadows.
-    states : Sequence[State]
+        Light path of the camera, with its shadows.
+    states : sequence of State
         S states.
-    directions : np.ndarray
-        Of the light, world, (F, 3).
-    start : np.ndarray
-        a point of each beam before the first mirror, world, (F, 3).
+    directions : (F, 3) ndarray
+        Directions of the light in the world frame.
+    start : (F, 3) ndarray
+        A point of each beam before the first mirror, world frame, metres.
 
     Raises
     ------
     AimError, BeamMissedError
         The light of a state is lost.
     UnphysicalError
-        Shadows that cannot be.
+        The shadows are geometrically impossible.
     """
     assert path.shadows is not None
     nodes, fields = quadrature.disk(RINGS), len(directions)

@@ -1,4 +1,4 @@
-"""Report of a tolerance budget: yield first, then what costs most, limits for a loss, and limits chosen anew."""
+"""Report of a tolerance budget: yield, shares of variance, sensitivities, inverse limits, and the allocation of limits."""
 
 from __future__ import annotations
 
@@ -7,7 +7,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from scenes.yaml.units import split_quantity
-from twin.framework.artefact import CameraFile, Cell, OwnDecimals, SvgFigure, Table, decimals_for, plain, shown_unit
+from twin.framework.artefact import (
+    CameraFile,
+    Cell,
+    DecimalNumber,
+    SvgFigure,
+    Table,
+    decimals_for,
+    plain,
+    unit_for_reports,
+)
 from twin.framework.report import Report, Section, answer
 from twin.framework.svg import BLUE, GREY, INK, ORANGE, VERMILION, look, new_figure, plain_axes, shared_legend, to_svg
 from twin.tolerance.merit_models import FARTHEST
@@ -15,16 +24,17 @@ from twin.tolerance.monitor_merit import merit_head, merit_unit, readings_of
 from twin.tolerance.tolerance_run import EXACT, LEVELS, MeritResult, ToleranceRun, Yield
 
 _FEW = 3
-"""Tolerances that the verdict names."""
+"""Number of tolerances that the verdict names."""
 _LITTLE = 0.01
 """Share of every merit's variance below which a tolerance may be loosened."""
 _MOST_CURVES = 6
+"""Largest number of merits that are plotted."""
 _ROUNDING = 1e-7
-"""Share of a compensator's range below which a move is none."""
+"""Share of a compensator's range below which a move is reported as zero."""
 
 
 def tolerance_report(run: ToleranceRun) -> Report:
-    """Report of a tolerance budget."""
+    """Return the report of a tolerance budget."""
     test = run.setup.test
     with look("tolerance"):
         curves = to_svg(_yield_figure(run))
@@ -90,7 +100,7 @@ def tolerance_report(run: ToleranceRun) -> Report:
 
 
 def _light(run: ToleranceRun) -> str:
-    """Wavelengths in which wavefronts and MTFs are told."""
+    """Return the wavelengths of wavefronts and MTFs as text."""
     colours = 1e9 * run.bench.colours
     if len(colours) == 1:
         return f"{colours[0]:.4g} nm"
@@ -117,7 +127,7 @@ def _verdict(run: ToleranceRun) -> str:
 
 
 def _dear(run: ToleranceRun) -> str:
-    """The tolerances that cost most, and what may be loosened."""
+    """Return a sentence with the tolerances that cause most of the variance, and those that could be loosened."""
     worst = _importance(run)
     order = sorted(worst, key=lambda name: -worst[name])
     dear = [f"{name} ({100.0 * worst[name]:.0f} %)" for name in order[:_FEW] if worst[name] > 0.0]
@@ -130,7 +140,7 @@ def _dear(run: ToleranceRun) -> str:
 
 
 def _importance(run: ToleranceRun) -> dict[str, float]:
-    """Entry -> largest share of a merit's variance, of those merits that are not met by every camera with room."""
+    """Return each tolerance's largest share of the variance of a merit, over the merits that not every camera meets."""
     tight = [one for one in run.merits if one.passing.share < 1.0] or list(run.merits)
     return {name: max(one.shares[name] for one in tight) for name in run.bench.entries}
 
@@ -157,12 +167,12 @@ def _further(run: ToleranceRun) -> list[str]:
 
 
 def _scaled(value: float, one: MeritResult, decimals: int | None = None) -> Cell:
-    """A value in the merit's unit, with decimals by its spread."""
+    """Return a value in the merit's unit, with decimals according to its standard deviation."""
     size = merit_unit(one.merit)[1]
     if not np.isfinite(value):
         return None
     places = decimals_for(one.deviation / size, 2, most=5) if decimals is None else decimals
-    return OwnDecimals(value / size, max(places, 1) if merit_unit(one.merit)[0] else max(places, 3))
+    return DecimalNumber(value / size, max(places, 1) if merit_unit(one.merit)[0] else max(places, 3))
 
 
 def _summary(run: ToleranceRun) -> Table:
@@ -252,7 +262,7 @@ def _sensitivity_table(run: ToleranceRun) -> Table:
 
 
 def _number(limit: str | float) -> tuple[float, str]:
-    """Number and unit of a limit as files have it; a pure number has none."""
+    """Return number and unit of a limit in the form of the files; a pure number has an empty unit."""
     parts = split_quantity(limit)
     return (float(limit), "") if parts is None else (float(parts[0]), parts[1])
 
@@ -269,17 +279,17 @@ def _inverse_table(run: ToleranceRun) -> Table:
     for m, result in enumerate(run.merits):
         unit, size = merit_unit(result.merit)
         loss, name = float(run.inverse.losses[m]) / size, result.merit.name
-        heads.append(f"{name}: loss {loss:.3g} {shown_unit(unit)}".rstrip() if np.isfinite(loss) else name)
+        heads.append(f"{name}: loss {loss:.3g} {unit_for_reports(unit)}".rstrip() if np.isfinite(loss) else name)
     return Table("inverse", "Limits for a loss", "In the unit of the limit.", heads, rows)
 
 
 def _unless_rounding(share: float) -> float:
-    """A share of a range, 0 where it is what the adjustment's rounding leaves."""
+    """Return a share of a range, 0 where it is below the rounding of the adjustment."""
     return 0.0 if abs(share) < _ROUNDING else share
 
 
 def _scaled_limit(limit: str | float, share: float) -> str:
-    """A share of a limit, in the limit's own unit."""
+    """Return a multiple of a limit as text in the limit's unit."""
     if isinstance(limit, str):
         number, _, unit = limit.strip().partition(" ")
         return f"{float(number) * share:.3g} {unit}"
@@ -318,7 +328,7 @@ def _allocation_sections(run: ToleranceRun) -> tuple[Section, ...]:
 
 
 def _tol_table(run: ToleranceRun) -> Table:
-    """The TOL table: what a workshop gets."""
+    """Return the table of the limits for the workshop."""
     limits = run.allocation.limits if run.allocation is not None else {}
     rows: list[list[Cell]] = []
     for name, one in run.setup.test.tolerances.items():
@@ -329,7 +339,7 @@ def _tol_table(run: ToleranceRun) -> Table:
 
 
 def _figure_sections(run: ToleranceRun) -> tuple[Section, ...]:
-    """The circles and the clear apertures over which figure errors are."""
+    """Return the section with the circles and clear apertures over which figure errors are defined."""
     if not run.bench.figure_faces:
         return ()
     rows: list[list[Cell]] = []
@@ -392,7 +402,7 @@ def _monitor_sections(run: ToleranceRun) -> tuple[Section, ...]:
 
 
 def _yield_figure(run: ToleranceRun) -> Figure:
-    """Share of cameras that keep a value, merit by merit."""
+    """Plot the cumulative share of cameras against the value of each merit."""
     shown = run.merits[:_MOST_CURVES]
     columns = min(3, len(shown))
     lines = -(-len(shown) // columns)
@@ -426,7 +436,7 @@ def _curve(ax: Axes, run: ToleranceRun, one: MeritResult) -> None:
 
 
 def _share_figure(run: ToleranceRun) -> Figure:
-    """Shares of variance of the tolerances that matter."""
+    """Plot the shares of variance of the most important tolerances."""
     worst = _importance(run)
     order = sorted(worst, key=lambda name: -worst[name])[:12][::-1]
     figure = new_figure(0.9 + 0.32 * len(order))

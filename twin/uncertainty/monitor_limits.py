@@ -55,7 +55,6 @@ Rounding errors of a trace are 1e-10.
 """
 _DRAWS = 100_000
 _STATES = 6
-"""Number of states over which the covariance of a shift is averaged; it varies by some per cent between them."""
 """Number of states over which the covariance of a shift is averaged; it varies by some per cent between states."""
 _PIXELS = 1 << 21
 """Number of pixels of the images of these states that are processed at once."""

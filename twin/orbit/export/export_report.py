@@ -308,7 +308,7 @@ def export_files(run: Export) -> dict[str, bytes]:
             files[names["rpc"]] = line.polynomial.text().encode()
         if line.window.frame is not None:
             note = f"second 0 of its orbit is {run.epoch}"
-            facts = FrameFacts(line.window.name, line.window.pitch, note=note, place=line.polynomial)
+            facts = FrameFacts(line.window.name, line.window.pitch, note=note, georeference=line.polynomial)
             files[names["image"]] = bytes(tiff(line.window.frame[None], facts))
     return files
 

@@ -12,7 +12,7 @@ from matplotlib.image import AxesImage
 
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.framework.artefact import Data, PngFigure, SvgFigure, Table
-from twin.framework.data_files import FrameFacts, MapPlace
+from twin.framework.data_files import FrameFacts, MapGeoreference
 from twin.framework.reference_frames import described
 from twin.framework.report import Report, Section, answer
 from twin.framework.svg import (
@@ -248,7 +248,7 @@ def simulation_report(run: Simulation) -> Report:
 def map_facts(raster: Raster, note: str, heights: bool = False) -> FrameFacts:
     """Return the tags of a map's GeoTIFF."""
     longitude, latitude, *steps = list(GEOREFERENCE(raster).values())[3:]
-    return FrameFacts(note=note, place=MapPlace(longitude, latitude, steps[0], steps[1], heights))
+    return FrameFacts(note=note, georeference=MapGeoreference(longitude, latitude, steps[0], steps[1], heights))
 
 
 def _summary(run: Simulation) -> Table:

@@ -23,7 +23,7 @@ from scenes.specs.course import moment
 from scenes.specs.orbit.monitor import PARAMETERS
 from scenes.yaml.errors import names_text
 from twin.framework import svg
-from twin.framework.artefact import SYMBOLS, CsvFile, SvgFigure, Table, shown_unit, significant
+from twin.framework.artefact import SYMBOLS, CsvFile, SvgFigure, Table, significant, unit_for_reports
 from twin.framework.data_files import csv_table
 from twin.framework.report import Report, Section, answer
 from twin.monitor.time_series import jump_text
@@ -205,7 +205,7 @@ def _positions_figure(run: LoopRun) -> Figure:
             axes.step(minutes, positions(run, corrector.name), where="post", color=colour, lw=1.2, label=corrector.name)
             for number in run.loops[corrector.name].ends:
                 axes.axvline(minutes[number], color=colour, lw=0.8, ls=":")
-        axes.set_ylabel(f"position [{shown_unit(unit)}]")
+        axes.set_ylabel(f"position [{unit_for_reports(unit)}]")
         axes.legend(loc="best", ncols=2)
     return figure
 

@@ -1,4 +1,4 @@
-"""The report of a study with its sections: ``report.html``, the files that it shows and ``statistics.json``."""
+"""Report of a study: ``report.html``, its artefacts and ``statistics.json``."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ from twin.study.runs.setup import PROGRAM
 
 @dataclass(frozen=True, eq=False)
 class StudyReport:
-    """A report.
+    """Report of a study with its files.
 
     Attributes
     ----------
     verdict : str
-        That it begins with.
-    contents : dict[str, bytes]
-        Of its files, by their paths in the study's folder.
-    undrawn : tuple[str, ...]
-        What could not be drawn, a sentence each.
-    warnings : tuple[str, ...]
-        What the user should know.
+        Verdict at the top of the report.
+    contents : dict
+        Contents of its files by their paths in the study's folder.
+    undrawn : tuple of str
+        One sentence for each figure that could not be drawn.
+    warnings : tuple of str
+        Warnings for the user.
     """
 
     verdict: str
@@ -57,21 +57,21 @@ def write_report(
 
     Parameters
     ----------
-    data : xr.Dataset
-        As ``twin.study.study_files.make_dataset`` makes it.
+    data : Dataset
+        Data set of ``twin.study.study_files.make_dataset``.
     plan : Plan
-        The study; ``plan.setup.study.report`` says what is asked for.
+        Plan of the study; ``plan.setup.study.report`` specifies the contents of the report.
     folder : RunFolder
-        Of the study; it is complete but for the manifest, which is written afterwards.
-    files : Sequence[str]
-        Of the data set, in that folder.
-    given : Sequence[str]
-        What is wrong with what the study is given, to be told before all else.
+        Folder of the study, complete but for the manifest, which is written afterwards.
+    files : sequence of str
+        Names of the data files in that folder.
+    given : sequence of str
+        Warnings about the inputs, which precede all others.
 
     Returns
     -------
     StudyReport
-        The verdict that it begins with, and what could not be drawn.
+        The report that was written.
     """
     made = report_files(data, plan.setup.study, files, given)
     for name, content in made.contents.items():
@@ -82,7 +82,7 @@ def write_report(
 def report_files(
     data: xr.Dataset, study: StudySpec, files: Sequence[str] = ("study.nc", "study.csv"), given: Sequence[str] = ()
 ) -> StudyReport:
-    """The report with all its files; arguments as of ``write_report``."""
+    """Return the report with the contents of all its files; arguments as in ``write_report``."""
     found = StudyAnalysis.of(StudyRuns.of(data, study))
     (said, more), runs = words.verdict(found), found.runs
     about = (
@@ -101,19 +101,20 @@ def report_files(
     undrawn = tuple(artefact.note for artefact in report.artefacts if isinstance(artefact, Undrawn))
     report = replace(report, warnings=(*given, *undrawn, *words.warnings(found)))
     contents = {artefact.file: artefact.content() for artefact in report.artefacts if artefact.within is None}
-    contents[STATISTICS] = run_folder.json_text(report.told(study_analysis.STATISTICS(found))).encode()
+    contents[STATISTICS] = run_folder.json_text(report.with_verdict(study_analysis.STATISTICS(found))).encode()
     numbers = page.links((*files, "study.json", STATISTICS, "config.yaml"))
     contents["report.html"] = page.report_page(report, (PROGRAM, "config.yaml"), [("Numbers", numbers)]).encode()
     return StudyReport(said, contents, undrawn, report.warnings)
 
 
 MOST_NAMED = 6
+"""Largest number of values of a factor that are listed."""
 STATISTICS = "statistics.json"
-"""Holds all digits of tables whose cells are texts, which have no file of their own."""
+"""File with all digits of tables whose cells are texts and that have no file of their own."""
 
 
 def _factor_table(runs: StudyRuns) -> Table:
-    """Name, where it acts, distribution and the values that were run."""
+    """Return the table of factors: name, position in the base, distribution and values run."""
     rows: list[list[Cell]] = []
     for factor in runs.factors:
         places = [key_text(place) for place in factor.spec.places]
@@ -150,13 +151,13 @@ def _values(factor: Factor) -> str:
 
 
 MOST_FIGURES = 12
-"""Responses that have figures of their own."""
+"""Largest number of responses with individual figures."""
 MOST_FRONT = 50
-"""Rows of a front in the report; its CSV holds all."""
+"""Largest number of rows of a Pareto front in the report; its CSV file has all."""
 
 
 def sections(found: StudyAnalysis) -> list[Section]:
-    """All sections that have something to show, in the order of the page."""
+    """Return all sections that have contents, in the order of the page."""
     made = (
         _requirements(found),
         _distributions(found),
@@ -171,7 +172,7 @@ def sections(found: StudyAnalysis) -> list[Section]:
 
 
 def _response_table(found: StudyAnalysis) -> Table:
-    """Statistics of the responses and of the stated sigmas."""
+    """Return the statistics of the responses and of their reported sigmas."""
     heads = ("response", "unit", "runs", "mean", "std", "median", "95%", "99.7%", "min", "max")
     rows: list[list[Cell]] = []
     for r in found.runs.everything:
@@ -193,7 +194,7 @@ def _response_table(found: StudyAnalysis) -> Table:
 
 
 def _figure(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> SvgFigure | Undrawn:
-    """A figure; what cannot be drawn must not cost the numbers beside it, and is told in its place."""
+    """Return a figure, or a note in its place if it cannot be drawn, so that the numbers beside it are kept."""
     try:
         with svg.look(f"study-{name}"):
             figure = draw()

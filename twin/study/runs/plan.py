@@ -1,4 +1,4 @@
-"""The table of all runs of a study: which values of its factors every run gets, what follows a factor, and memory."""
+"""Plan of a study: the values of its factors in every run, the values that scale with a factor, and the memory needed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from twin.study.runs.setup import StudySetup
 
 
 def axes_of(study: StudySpec) -> list[tuple[str, ...]]:
-    """Factors that vary independently: each alone, but columns of one table together, row by row."""
+    """Return the groups of factors that vary independently: single factors, or the columns of one table, row by row."""
     groups: dict[str, list[str]] = {}
     for name, factor in study.factors.items():
         key = f"table {factor.table.file}" if factor.table is not None else f"factor {name}"
@@ -29,15 +29,16 @@ def axes_of(study: StudySpec) -> list[tuple[str, ...]]:
 
 
 def levels(factor: FactorSpec) -> int:
-    """Number of values of a factor that can be counted; 0 for a distribution."""
+    """Return the number of values of a factor; 0 for a continuous distribution."""
     return (factor.count or 0) if factor.kind == "range" else len(factor.scalars()) if factor.kind in _LISTS else 0
 
 
 _LISTS = ("values", "table")
+"""Kinds of factors with a list of values."""
 
 
 def run_count(study: StudySpec) -> int:
-    """Number of runs."""
+    """Return the number of runs."""
     if study.design.runs is not None:
         return study.design.runs
     count = 1
@@ -47,10 +48,10 @@ def run_count(study: StudySpec) -> int:
 
 
 def draw(study: StudySpec) -> dict[str, np.ndarray]:
-    """What every run takes of each factor: (runs,) numbers in the factor's unit, or of lists the index of the value.
+    """Return the value of each factor in every run, (runs,): numbers in the factor's unit, or indices into a list.
 
-    The last axis of a grid changes fastest. Distributions are reached by the inverse of their distribution function, so
-    that evenly spread designs stay so.
+    The last axis of a grid changes fastest. Distributions are sampled by the inverse of their distribution function, so
+    that low-discrepancy designs keep their uniformity.
     """
     axes = axes_of(study)
     if study.design.kind == GRID:
@@ -73,7 +74,7 @@ def _level(factor: FactorSpec, place: np.ndarray) -> np.ndarray:
 
 
 def _quantile(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
-    """Values of a factor where its distribution function is ``u``."""
+    """Return the quantiles of a factor at probabilities ``u``."""
     # a bad file of a study is told before scipy is imported
     from scipy.special import ndtr, ndtri
 
@@ -99,12 +100,15 @@ def _quantile(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
 
 
 FAR = 5.0
-"""Limits that all lie further out, in sigmas: there the share of the normal distribution between them has no digits,
-its logarithm does."""
+"""Distance of the nearer limit from the mean, in sigmas, beyond which the truncated normal distribution is computed
+with logarithms.
+
+There the probability between the limits loses its digits.
+"""
 
 
 def _far(a: float, b: float, u: np.ndarray) -> np.ndarray:
-    """Quantiles of a normal distribution of sigma 1 between limits far in one of its tails."""
+    """Return quantiles of a standard normal distribution truncated far in one of its tails."""
     # as in ``_quantile``
     from scipy.special import log_ndtr, ndtri_exp
 
@@ -116,15 +120,15 @@ def _far(a: float, b: float, u: np.ndarray) -> np.ndarray:
 
 
 def quantiles(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
-    """Where the distribution function of a factor of numbers is ``u``; of a list the least of its values where that is
-    reached.
+    """Return the quantiles of a factor of numbers at probabilities ``u``; for a list the smallest value that reaches
+    ``u``.
 
     Parameters
     ----------
     factor : FactorSpec
-        Whose values are numbers.
-    u : np.ndarray
-        Shares between 0 and 1.
+        Factor whose values are numbers.
+    u : ndarray
+        Probabilities between 0 and 1.
     """
     if factor.kind in _LISTS:
         return np.quantile(np.array(factor.numbers().values, np.float64), u, method="inverted_cdf")
@@ -132,42 +136,42 @@ def quantiles(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
 
 
 def extremes(factor: FactorSpec) -> list[float]:
-    """Numbers of a distribution at which the base's limits are tried; the plan's own values matter beside them."""
+    """Return the limits of a bounded distribution, which are validated beside the plan's own values."""
     numbers = factor.numbers().values
     return list(numbers[-2:]) if factor.kind in ("range", "uniform", "truncated") else []
 
 
 @dataclass(frozen=True, eq=False)
 class Scaling:
-    """All values of a study that are scaled; several factors may scale one of them.
+    """Values of the base that scale with factors; several factors may scale one of them.
 
     Attributes
     ----------
-    base : Mapping[KeyPath, tuple[float | int, str]]
-        Place -> number and unit as the base has them; the number is whole where the base's is.
-    ratio : Mapping[KeyPath, np.ndarray]
-        Place -> (runs,) what the number is multiplied by.
+    base : dict
+        Place -> number and unit in the base; an integer where the base has one.
+    ratio : dict
+        Place -> multiplier of the number in every run, (runs,).
     """
 
     base: Mapping[KeyPath, tuple[float | int, str]]
     ratio: Mapping[KeyPath, np.ndarray]
 
     def apply(self, values: dict[KeyPath, Any], run: int) -> None:
-        """Scale what factors have set in a run, and add what they have not, as it stands in the base's tree."""
+        """Scale the values that factors have set in a run, and add scaled values of the base for the others."""
         for place, ratio in self.ratio.items():
             number = number_of(values[place]) if place in values else self.base[place]
             values[place] = scaled(number, float(ratio[run]))
 
 
 def scaled(number: tuple[float | int, str], ratio: float) -> Any:
-    """Number and unit, times a ratio, as they stand in a tree.
+    """Return number and unit times a ratio, in the form of a tree.
 
     Parameters
     ----------
-    number : tuple[float | int, str]
+    number : tuple
         Number and unit, the unit empty for a pure number.
     ratio : float
-        That the number is multiplied by.
+        Multiplier of the number.
     """
     value = number[0] * ratio
     if number[1]:
@@ -177,23 +181,23 @@ def scaled(number: tuple[float | int, str], ratio: float) -> Any:
 
 
 def ratios(factor: FactorSpec, tree: Tree, values: np.ndarray, unit: str) -> dict[KeyPath, np.ndarray]:
-    """What the values that follow a factor are multiplied by: place -> array like ``values``.
+    """Return the multipliers of the values that scale with a factor: place -> array like ``values``.
 
     Parameters
     ----------
     factor : FactorSpec
-        With its ``scales``.
-    tree : Tree
-        Of the base.
-    values : np.ndarray
-        Of the factor.
+        Factor with its ``scales``.
+    tree : dict
+        Tree of the base.
+    values : ndarray
+        Values of the factor.
     unit : str
-        Of them, empty for pure numbers.
+        Unit of the values, empty for pure numbers.
 
     Raises
     ------
     Problem
-        The factor's value in the base is none that anything can be compared with, or a power does not exist.
+        The factor's value in the base is zero or no number, or a power does not exist.
     """
     out = {}
     for k, scale in enumerate(factor.scales):
@@ -207,7 +211,7 @@ def ratios(factor: FactorSpec, tree: Tree, values: np.ndarray, unit: str) -> dic
 
 
 def _nominal(factor: FactorSpec, tree: Tree, unit: str) -> float:
-    """The factor's value in the base, in its own unit; 1 for a factor that is itself the ratio."""
+    """Return the factor's value in the base, in its own unit; 1 for a factor that is itself the ratio."""
     if not factor.places:
         return 1.0
     number = number_at(tree, factor.places[0], unit)
@@ -221,17 +225,17 @@ def number_at(base: Tree, place: KeyPath, unit: str) -> float:
 
     Parameters
     ----------
-    base : Tree
-        The base's own tree, without values of factors.
+    base : dict
+        Tree of the base, without values of factors.
     place : KeyPath
-        Of the factor.
+        Place of the factor.
     unit : str
-        Of the factor's numbers, empty for pure numbers.
+        Unit of the factor's numbers, empty for pure numbers.
 
     Raises
     ------
     Problem
-        The base has no value there, or none of that kind.
+        The base has no value there, or one of another kind.
     """
     try:
         value = leaf(base, place)
@@ -246,14 +250,14 @@ def number_at(base: Tree, place: KeyPath, unit: str) -> float:
 
 
 def number_in(value: Any, unit: str) -> float | None:
-    """The number of a value in a unit; None where it is no number of that kind.
+    """Return the number of a value in a unit; None if it is not a number of that dimension.
 
     Parameters
     ----------
     value : Any
-        As it stands in a tree.
+        Value in a tree.
     unit : str
-        Of the same dimension, empty for pure numbers.
+        Unit, empty for pure numbers.
     """
     parts = split_quantity(value)
     if parts is not None:
@@ -262,12 +266,12 @@ def number_in(value: Any, unit: str) -> float | None:
 
 
 def number_of(value: Any) -> tuple[float | int, str]:
-    """Number and unit of a value of the tree, the unit empty for a pure number.
+    """Return number and unit of a value of the tree, the unit empty for a pure number.
 
     Raises
     ------
     Problem
-        It has none.
+        The value is not a number.
     """
     parts = split_quantity(value)
     if parts is not None:
@@ -284,11 +288,11 @@ class Column:
     Attributes
     ----------
     name : str
-        Of the factor.
+        Name of the factor.
     unit : str
-        Of the numbers; empty for pure numbers and for texts.
-    values : np.ndarray
-        (runs,) float64, int64, bool or text.
+        Unit of the numbers; empty for pure numbers and for texts.
+    values : (runs,) ndarray
+        Values: float64, int64, bool or text.
     """
 
     name: str
@@ -296,7 +300,7 @@ class Column:
     values: np.ndarray
 
     def cell(self, run: int) -> Any:
-        """The value of a run as it stands in the base's tree."""
+        """Return the value in a run in the form of the base's tree."""
         value = self.values[run].item()
         return with_unit(value, self.unit) if self.unit else value
 
@@ -318,12 +322,12 @@ class Plan:
 
     @classmethod
     def of(cls, setup: StudySetup) -> Plan:
-        """The plan of a study.
+        """Return the plan of a study.
 
         Raises
         ------
         InputError
-            a factor takes a value that the base's schema does not allow.
+            A factor takes a value that the base's schema does not allow.
         """
         sampled = draw(setup.study)
         plan = cls(setup, tuple(_column(setup, name, values) for name, values in sampled.items()))
@@ -346,18 +350,18 @@ class Plan:
         return -(-self.runs // self.setup.job.block)
 
     def block(self, number: int) -> range:
-        """Numbers of the runs of a block."""
+        """Return the numbers of the runs of a block."""
         size = self.setup.job.block
         return range(number * size, min((number + 1) * size, self.runs))
 
     @cached_property
     def scaling(self) -> Scaling:
-        """Values of the base that follow factors.
+        """Values of the base that scale with factors.
 
         Raises
         ------
         InputError
-            a value that is no number, or a power that does not exist.
+            A value is not a number, or a power does not exist.
         """
         base: dict[KeyPath, tuple[float | int, str]] = {}
         ratio: dict[KeyPath, np.ndarray] = {}
@@ -381,7 +385,7 @@ class Plan:
 
     @cached_property
     def seeds(self) -> np.ndarray | None:
-        """Seed of every run, (runs,) int64; None when all have the base's."""
+        """Seed of every run, (runs,) int64; None if all runs have the base's."""
         if self.setup.study.noise == "shared":
             return None
         seed = self.setup.study.design.seed
@@ -389,22 +393,22 @@ class Plan:
         return np.array([int(word) >> 1 for word in words], np.int64)
 
     def run(self, number: int) -> Run:
-        """One run."""
+        """Return one run."""
         factors = self.setup.study.factors
         values = {place: c.cell(number) for c in self.columns for place in factors[c.name].places}
         self.scaling.apply(values, number)
         return Run(number, tuple(values.items()), None if self.seeds is None else int(self.seeds[number]))
 
     def check(self) -> None:
-        """Try each factor's smallest and largest value, and every text, in the base, one factor at a time.
+        """Validate each factor's smallest and largest value, and every text, in the base, one factor at a time.
 
-        The schema's limits are intervals, so that what lies between two good values is good. Values that only together
-        cannot be are found when they are run, and fail alone.
+        The schema's limits are intervals, so that values between two valid ones are valid. Combinations that are
+        impossible are found when they are run, and fail individually.
 
         Raises
         ------
         InputError
-            At the factor's line.
+            A value is invalid; the error is placed at the factor's line.
         """
         for column in self.columns:
             factor = self.setup.study.factors[column.name]
@@ -444,7 +448,7 @@ def _column(setup: StudySetup, name: str, sampled: np.ndarray) -> Column:
 
 
 def _like(setup: StudySetup, name: str, sampled: np.ndarray) -> np.ndarray:
-    """Numbers without a unit become whole where the base has a whole number and all of them are."""
+    """Return numbers without a unit as integers if the base has an integer and all of them are whole."""
     factor = setup.study.factors[name]
     node = leaf(setup.tree, factor.places[0]) if factor.places else None
     whole = isinstance(node, int) and not isinstance(node, bool) and factor.unit is None
@@ -452,7 +456,7 @@ def _like(setup: StudySetup, name: str, sampled: np.ndarray) -> np.ndarray:
 
 
 def _telling(column: Column, limits: list[float]) -> list[Any]:
-    """Values of a factor that are tried: all texts and switches, of numbers the smallest and the largest."""
+    """Return the values of a factor that are validated: all texts and switches, smallest and largest number."""
     if column.values.dtype.kind in "US":
         return list(dict.fromkeys(column.values.tolist()))
     if column.values.dtype.kind == "b":
@@ -464,23 +468,22 @@ def _telling(column: Column, limits: list[float]) -> list[Any]:
 
 
 STARTED = 110e6
-"""Memory that a study of any size takes when its report is written, beside the imported program, bytes."""
+"""Memory for writing the report of a study of any size, beside the imported program, bytes."""
 CELL = 120.0
-"""Memory that a number of a run takes as it is computed and kept, in the data set, and in the table of text that
-becomes a file; bytes."""
+"""Memory per number of a run for computation, data set and text table, bytes."""
 _KEPT = 5
-"""Columns of every study: number, failed, message, doubt, seed."""
+"""Number of bookkeeping columns of every study: number, failed, message, doubt, seed."""
 
 
 def study_bytes(setup: StudySetup, runs: int) -> float:
-    """Memory of the process that keeps the results, beside the imported program, bytes.
+    """Return the memory of the process that keeps the results, beside the imported program, bytes.
 
     Parameters
     ----------
     setup : StudySetup
         The study.
     runs : int
-        Of it.
+        Number of runs.
     """
     responses = setup.study.responses.values()
     columns = _KEPT + len(setup.study.factors) + sum(1 + len(one.sigma_keys) for one in responses)
@@ -488,8 +491,9 @@ def study_bytes(setup: StudySetup, runs: int) -> float:
 
 
 def require_study_memory(setup: StudySetup) -> None:
-    """See whether the results of all runs fit into the memory that is free and that the study may use. How long they
-    take a first block of runs tells before the others begin (`twin.study.runs.blocks`).
+    """Raise InputError if the results of all runs exceed the free memory or the limit of the study.
+
+    The computing time is estimated from a first block of runs before the others begin (`twin.study.runs.blocks`).
 
     Parameters
     ----------
@@ -499,9 +503,9 @@ def require_study_memory(setup: StudySetup) -> None:
     Raises
     ------
     InputError
-        They do not; with the number of runs that would.
+        The results do not fit; the error gives the number of runs that would.
     """
     study, runs = setup.study, run_count(setup.study)
     key: KeyPath = ("factors",) if study.design.kind == GRID else ("design", "runs")
     lower = Lowered(study, key, runs, "runs", lambda n: study_bytes(setup, n))
-    require_memory(lower, started=0.0, own=study.limits.bytes, own_key="limits.memory")
+    require_memory(lower, started=0.0, file_limit=study.limits.bytes, limit_key="limits.memory")
