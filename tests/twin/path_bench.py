@@ -129,7 +129,7 @@ def ways_and_search(
     chosen = instrument.channels[channel]
     toward, families = f"{chosen.key}/area_ccd", monitor_families(scenery, instrument)
     source = pinhole(instrument, backend, state or {}, chosen)
-    tracers = [PathTracer(backend, scenery, families, sampling or BALANCED, ways) for ways in (True, False)]
-    assert [tracer.features().ways for tracer in tracers] == [True, False]
+    tracers = [PathTracer(backend, scenery, families, sampling or BALANCED, segments) for segments in (True, False)]
+    assert [tracer.features().segments for tracer in tracers] == [True, False]
     steps = [tracer.nominal_steps(source, toward, paths) for tracer in tracers]
     return Compared([tracer.run(source, paths, 4, keep=True, toward=toward) for tracer in tracers], steps, toward)

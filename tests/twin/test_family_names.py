@@ -2,7 +2,7 @@
 
 import pytest
 
-from twin.path_tracing.path_families import MARKS, Touch, family_name
+from twin.path_tracing.path_families import MARKS, SurfaceEvent, family_name
 
 HERE = "base/forward/monitor/left"
 OUT = (
@@ -20,13 +20,13 @@ GLASS = (f"{HERE}/prism_0/exit", f"{HERE}/prism_0/mirror_a", f"{HERE}/prism_0/en
 EVENTS = sorted(((mark, event) for event, mark in MARKS.items()), key=lambda pair: -len(pair[0]))
 
 
-def family(*names: str) -> tuple[Touch, ...]:
+def family(*names: str) -> tuple[SurfaceEvent, ...]:
     """Events from their texts, the inverse of ``str``."""
     out = []
     for name in names:
         outside, text = name.endswith("!"), name.removesuffix("!")
         mark, event = next((mark, event) for mark, event in EVENTS if text.endswith(mark))
-        out.append(Touch(text.removesuffix(mark), event, outside))
+        out.append(SurfaceEvent(text.removesuffix(mark), event, outside))
         assert str(out[-1]) == name
     return tuple(out)
 
@@ -45,7 +45,7 @@ NOMINAL = family(*OUT, FACET, *OUT[::-1])
         ((*OUT[:2], "board~", *OUT[1::-1]), "diffused by board, without central_prism facet_forward_left"),
         ((*OUT, FACET, *OUT[:1:-1], "backward/M1", *OUT[1::-1]), "off backward M1, on the way back"),
         ((*OUT[:2], *OUT, FACET, *OUT[::-1]), "the nominal surfaces in another order"),
-        ((), "not looked up"),
+        ((), "not identified"),
     ],
 )
 def test_names(names, said) -> None:
@@ -59,8 +59,8 @@ def test_many_reflections_are_counted() -> None:
     window = f"{HERE}/prism_180/window"
     inside = (window, f"{HERE}/prism_180/mirror")
     for count, word in ((2, "double"), (3, "triple"), (4, "4-fold")):
-        way = (*OUT[:4], *(inside * count), *OUT[4:], FACET, *OUT[::-1])
-        said = family_name(family(*way), NOMINAL)
+        path = (*OUT[:4], *(inside * count), *OUT[4:], FACET, *OUT[::-1])
+        said = family_name(family(*path), NOMINAL)
         assert said == f"prism_180 {', '.join(['window'] * count)}: {word}, on the way out"
 
 

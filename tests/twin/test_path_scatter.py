@@ -35,7 +35,7 @@ from tests.optics.bench import unit
 from tests.optics.test_scatter_table import lambert, of_lobe
 from tests.tiers import quick
 from tests.twin.path_bench import facing, flat_mirror, frame, glass_scene, screen, slab
-from twin.path_tracing.importance_sampling import Leaving, TableDraw, spread
+from twin.path_tracing.importance_sampling import OutgoingPaths, TableSampling, sample_bsdf
 from twin.path_tracing.path_families import Event, decode
 from twin.path_tracing.path_result import Family, PathResult
 from twin.path_tracing.source import DiskSource, RaySource, random_streams
@@ -53,7 +53,7 @@ def left(backend, direction, index: float, event: Event, lobe, floor: float, nea
     ``lobe`` is the scattered share and the numbers of the lobe, ``drawn`` a table in place of it.
     """
     vector = backend.Vector3(*(dr.full(backend.Float, float(c), N) for c in direction))
-    leaving = Leaving(
+    leaving = OutgoingPaths(
         vector,
         backend.Vector3(0.0, 0.0, 1.0),
         backend.Float(index),
@@ -66,7 +66,7 @@ def left(backend, direction, index: float, event: Event, lobe, floor: float, nea
     share, shape = backend.Float(lobe[0]), [backend.Float(v) for v in lobe[1]]
     met, some = dr.full(backend.Bool, True, N), None if near is None else backend.Float(near)
     more = () if drawn is None else (drawn,)
-    out, event, weight, _ = spread(
+    out, event, weight, _ = sample_bsdf(
         backend, rng, met, share, lambda active: shape, backend.Float(floor), some, leaving, *more
     )
     return np.stack([c.numpy() for c in out], axis=-1), event.numpy(), weight.numpy()
@@ -205,7 +205,7 @@ def scattered_by_table(backend, finish: Finish, specular: np.ndarray, floor: flo
     assert tables is not None
     every, cosine = dr.full(backend.Bool, True, N), dr.full(backend.Float, float(specular[2]), N)
     marks = tables.of(dr.zeros(backend.UInt, N), every)
-    share, drawn = tables.total(marks, cosine, every), TableDraw(tables, marks, cosine)
+    share, drawn = tables.total(marks, cosine, every), TableSampling(tables, marks, cosine)
     return left(backend, specular, 1.0, Event.REFLECT, (share, (1.0, 2.0, 0.0, 1.0)), floor, 0.5, drawn)
 
 
@@ -327,7 +327,7 @@ PATHS = 200_000
 FLOOR = Sampling(floor=0.3, steps=32)
 
 
-def way(*names: str) -> str:
+def path_text(*names: str) -> str:
     return " ".join(f"glass/{n}" for n in names)
 
 
@@ -349,11 +349,11 @@ def test_ghosts_of_a_plane_parallel_plate(backend, angle: float, coated: Finish)
         r, t = coated.reflectance, coated.transmission
     shift = 2.0 * THICKNESS * np.tan(np.arcsin(np.sin(angle) / INDEX))
     bounce = ("exit", "entry")
-    expected = [("front", way("entry"), r, 0.0)]
+    expected = [("front", path_text("entry"), r, 0.0)]
     for k in range(3):
-        expected.append(("behind", way("entry>", *bounce * k, "exit>"), t * t * r ** (2 * k), k * shift))
+        expected.append(("behind", path_text("entry>", *bounce * k, "exit>"), t * t * r ** (2 * k), k * shift))
         expected.append(
-            ("front", way("entry>", *bounce * k, "exit", "entry>"), t * t * r ** (2 * k + 1), (k + 1) * shift)
+            ("front", path_text("entry>", *bounce * k, "exit", "entry>"), t * t * r ** (2 * k + 1), (k + 1) * shift)
         )
     start = {name: find(result, name, text) for name, text, _, _ in expected[:2]}
     for detector, text, energy, aside in expected:

@@ -27,8 +27,8 @@ from scenes.models.scenery import Detector, Finishes, Scenery, build_scenery, de
 from tests.tiers import quick
 from tests.twin.path_bench import IDEAL, facing, flat_mirror, glass_scene, scene_beam, screen, slab, ways_and_search
 from twin.monitor.monitor_path import MonitorPath
-from twin.path_tracing.clear_ways import ClearWays
-from twin.path_tracing.importance_sampling import LEAST_KEPT, Followed, Thinning, learn
+from twin.path_tracing.clear_ways import ClearSegments
+from twin.path_tracing.importance_sampling import LEAST_SURVIVAL, LearnedRoulette, PathHistory, learn_survival
 from twin.path_tracing.path_families import Event, code, nominal_codes
 from twin.path_tracing.path_result import NOMINAL, PathResult
 from twin.path_tracing.source import DiskSource, RaySource
@@ -138,7 +138,7 @@ def test_impossible_sampling_sources_and_scenes_are_refused(backend) -> None:
     ):
         with pytest.raises(ValueError, match=words):
             make()
-    with pytest.raises(LookupError, match="no path reached far by its nominal way"):
+    with pytest.raises(LookupError, match="no path reached far along its nominal surfaces"):
         empty.nominal("far")
 
 
@@ -282,14 +282,14 @@ MOVED = {
     ids=["gf7_pair", "monitor_pair_perturbed"],
 )
 def test_paths_along_nominal_light_are_those_of_a_search(backend, instrument, name, state, paths, sampling) -> None:
-    """Surface by surface, and of few paths, which are not, on clear ways between surfaces."""
+    """Surface by surface, and of few paths, which are not, on clear segments between surfaces."""
     chosen = instrument(name)
     for channel in (0, 1):
         found = ways_and_search(backend, chosen, build_scenery(chosen, state), paths, sampling, state, channel)
         assert [len(one) for one in found.steps] == [26 if paths == PATHS else 0, 0]
         assert found.runs[0].nominal(found.toward).count > 0.03 * paths
         same(*found.runs)
-        assert [f.touches for f in found.runs[0].families] == [f.touches for f in found.runs[1].families]
+        assert [f.surface_events for f in found.runs[0].families] == [f.surface_events for f in found.runs[1].families]
 
 
 @pytest.mark.parametrize(
@@ -313,9 +313,9 @@ def test_paths_whose_first_surface_is_searched_are_those_of_a_search(backend, gf
     detector = "forward/focal_plane"
     families = {detector: nominal_codes(scenery, gf7_pair.assembly, "forward/imaging")}
     source = DiskSource(*scene_beam(gf7_pair, backend), 0.28)
-    tracers = [PathTracer(backend, scenery, families, ways=ways) for ways in (True, False)]
+    tracers = [PathTracer(backend, scenery, families, segments=segments) for segments in (True, False)]
     steps = tracers[0].nominal_steps(source, detector, PATHS)
-    assert [step.way > 0 for step in steps] == [False, True, True, False]
+    assert [step.segment > 0 for step in steps] == [False, True, True, False]
     runs = [tracer.run(source, PATHS, 2, keep=True) for tracer in tracers]
     assert 0.8 * PATHS < runs[0].nominal(detector).count < PATHS
     same(*runs)
@@ -378,7 +378,7 @@ def weights(run: PathResult) -> dict[tuple[int, int, int], float]:
 
 
 @pytest.mark.second
-def test_thinning_keeps_the_light_and_takes_away_paths(gf7_pair, stray) -> None:
+def test_learned_roulette_keeps_the_light_and_removes_paths(gf7_pair, stray) -> None:
     """Families of the same seeds: what both runs follow is the same, and the rest agrees within its standard error."""
     paths, toward = 4 * PATHS, f"{gf7_pair.channels[0].key}/area_ccd"
     all_of_them, thinned = (stray(sampling, paths, 1, keep=True) for sampling in (ALL, FAINT))
@@ -388,7 +388,7 @@ def test_thinning_keeps_the_light_and_takes_away_paths(gf7_pair, stray) -> None:
     assert len(both) > 0.99 * len(found[0])
     assert len(found[1]) - len(both) < 1e-3 * len(both)  # heavier paths live longer
     assert np.all(gain > 1.0 - 1e-9)
-    assert np.all(gain < 1.0 / LEAST_KEPT + 1e-9)
+    assert np.all(gain < 1.0 / LEAST_SURVIVAL + 1e-9)
     assert 20 < np.sum(gain > 1.0 + 1e-9) < 0.01 * len(both)
     # a direction from a mirror's lobe is now and then the specular one: a 1e-4 of the light at six mirrors, thinned
     assert thinned.nominal(toward).energy == pytest.approx(all_of_them.nominal(toward).energy, rel=1e-5)
@@ -409,46 +409,46 @@ def test_thinning_keeps_the_light_and_takes_away_paths(gf7_pair, stray) -> None:
 @pytest.mark.second
 def test_thinned_paths_do_not_depend_on_the_chunk_and_are_found_again(stray) -> None:
     runs = [stray(FAINT, 2 * PATHS, 3, chunk=chunk) for chunk in (1 << 20, 5000)]
-    named = [{(f.detector, f.kind, f.touches): (f.count, f.energy) for f in run.families} for run in runs]
+    named = [{(f.detector, f.kind, f.surface_events): (f.count, f.energy) for f in run.families} for run in runs]
     assert named[0].keys() == named[1].keys()
-    assert all(touches for _, _, touches in named[0])
+    assert all(surface_events for _, _, surface_events in named[0])
     for key, (count, energy) in named[0].items():
         assert named[1][key] == (count, pytest.approx(energy, rel=1e-9))
 
 
 def test_classes_are_followed_as_often_as_they_are_worth_it() -> None:
-    """Two classes of as many paths: chances go as the square root of squared weights per surface."""
+    """Two classes of as many paths: probabilities go as the square root of squared weights per surface."""
     count = 1000
     passed, turned = np.repeat([3, 7], count), np.ones(2 * count, bool)
     steps = np.repeat([10.0, 40.0], count)
     found = np.arange(count)
     weights = np.where(found % 2 == 0, 2.0, 1.0)  # of every fifth path of a class each
     paths = np.concatenate([np.arange(0, count, 5), count + np.arange(0, count, 5)])
-    done = Followed(passed, turned, steps)
-    known = learn([(done, paths, np.concatenate([weights[:200], weights[:200]]))], 5)
+    done = PathHistory(passed, turned, steps)
+    known = learn_survival([(done, paths, np.concatenate([weights[:200], weights[:200]]))], 5)
     assert (known.first, known.seed) == (2 * count, 5)
-    np.testing.assert_allclose(known.kept[[3, 7]], [1.0, np.sqrt(10.0 / 40.0)], rtol=1e-12)
-    np.testing.assert_array_equal(np.delete(known.kept, [3, 7]), 1.0)  # nothing is known of these
-    one = learn([(done, paths[:200], weights[:200])], 5)
-    assert one.kept[3] == 1.0
-    assert LEAST_KEPT <= one.kept[7] < 0.5
-    nothing = learn([(done, np.empty(0), np.empty(0))], 5)
-    np.testing.assert_array_equal(nothing.kept, 1.0)
+    np.testing.assert_allclose(known.survival[[3, 7]], [1.0, np.sqrt(10.0 / 40.0)], rtol=1e-12)
+    np.testing.assert_array_equal(np.delete(known.survival, [3, 7]), 1.0)  # nothing is known of these
+    one = learn_survival([(done, paths[:200], weights[:200])], 5)
+    assert one.survival[3] == 1.0
+    assert LEAST_SURVIVAL <= one.survival[7] < 0.5
+    nothing = learn_survival([(done, np.empty(0), np.empty(0))], 5)
+    np.testing.assert_array_equal(nothing.survival, 1.0)
 
 
-def test_draws_of_thinning_have_their_chances_and_know_the_seed() -> None:
+def test_survival_draws_have_their_probabilities_and_know_the_seed() -> None:
     numbers = np.arange(100_000)
-    rule, other = (Thinning(np.array([1.0, 0.25]), 10, seed) for seed in (1, 2))
+    rule, other = (LearnedRoulette(np.array([1.0, 0.25]), 10, seed) for seed in (1, 2))
     passed = numbers % 3
-    chances = rule.chances(numbers, passed)
-    assert np.all(chances[:10] == 1.0)
-    np.testing.assert_array_equal(chances[10:], np.array([1.0, 0.25, 1.0])[passed[10:]])
-    drawn = [one.follows(numbers, np.full(len(numbers), 0.25)) for one in (rule, other)]
+    probabilities = rule.survival_probability(numbers, passed)
+    assert np.all(probabilities[:10] == 1.0)
+    np.testing.assert_array_equal(probabilities[10:], np.array([1.0, 0.25, 1.0])[passed[10:]])
+    drawn = [one.survives(numbers, np.full(len(numbers), 0.25)) for one in (rule, other)]
     for some in drawn:
         assert abs(some.mean() - 0.25) < 4.0 * np.sqrt(0.25 * 0.75 / len(numbers))
     both = (drawn[0] & drawn[1]).mean()
     assert abs(both - 0.0625) < 4.0 * np.sqrt(0.0625 / len(numbers))
-    np.testing.assert_array_equal(rule.follows(numbers[::-1], np.full(len(numbers), 0.25)), drawn[0][::-1])
+    np.testing.assert_array_equal(rule.survives(numbers[::-1], np.full(len(numbers), 0.25)), drawn[0][::-1])
 
 
 def same(one: PathResult, other: PathResult) -> None:
@@ -465,19 +465,19 @@ def same(one: PathResult, other: PathResult) -> None:
 
 
 @pytest.mark.second
-def test_light_out_and_back_has_clear_ways_everywhere(gf7_pair) -> None:
-    """From the pinhole to the area CCD there are 25 surfaces: 25 ways between them and the detector, and the first."""
+def test_light_out_and_back_has_clear_segments_everywhere(gf7_pair) -> None:
+    """From the pinhole to the area CCD there are 25 surfaces: 25 segments between them and the detector, and the first."""
     scenery = build_scenery(gf7_pair, {}, IDEAL)
     families = monitor_families(scenery, gf7_pair)
-    found = ClearWays(scenery, families)
-    assert len(found.ways) == 25 * len(families)
-    ends = [way.after for way in found.ways]
+    found = ClearSegments(scenery, families)
+    assert len(found.segments) == 25 * len(families)
+    ends = [segment.after for segment in found.segments]
     assert ends.count(-1) == len(families)  # each is one chain
     assert all(after in (-1, number + 1) for number, after in enumerate(ends))
-    for way in found.ways:
-        surface = scenery.surfaces[way.end.surface]
+    for segment in found.segments:
+        surface = scenery.surfaces[segment.end.surface]
         if not surface.surface.is_plane:  # the box about the curved surface of a camera's mirror holds all of it
-            sides = ConvexHull(way.end.corners).equations
+            sides = ConvexHull(segment.end.corners).equations
             assert np.max(surface.pose.apply(surface.vertices) @ sides[:, :3].T + sides[:, 3]) < 0.0
 
 
@@ -500,13 +500,13 @@ def two_mirrors(*more: tuple[float, float]) -> Scenery:
 def test_only_what_reaches_into_the_hull_is_in_the_way() -> None:
     """Half-way the hull of the squares around both apertures reaches to 15 mm, and the small mirror by 1 mm more."""
     for x, z, clear in ((0.0, 0.1, 0), (0.0158, 0.1, 0), (0.0165, 0.1, 1), (0.0, -0.01, 1), (0.0, 0.21, 1)):
-        found = ClearWays(two_mirrors((x, z)), {"screen": (code(0, Event.REFLECT),)})
-        assert len(found.ways) == clear, (x, z)
+        found = ClearSegments(two_mirrors((x, z)), {"screen": (code(0, Event.REFLECT),)})
+        assert len(found.segments) == clear, (x, z)
 
 
 def test_apertures_that_do_not_face_each_other_have_no_way() -> None:
     """The source's light starts behind the mirror."""
-    found = ClearWays(two_mirrors(), {"screen": (code(0, Event.REFLECT),)})
+    found = ClearSegments(two_mirrors(), {"screen": (code(0, Event.REFLECT),)})
     source = DiskSource.along(np.array([0.0, 0.0, 0.1]), np.array([0.0, 0.0, -1.0]), 0.001)
     assert found.from_source(source.patch) is not None
     away = DiskSource.along(np.array([0.0, 0.0, 0.1]), np.array([0.0, 0.0, 1.0]), 0.001)

@@ -24,7 +24,7 @@ from tests.twin.commands import invoke
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.path_tracing.path_result import GHOST, NOMINAL, STRAY
 from twin.path_tracing.stray_light import (
-    REACH,
+    SPREAD_PX,
     NominalPathLost,
     StrayResult,
     diffraction_spots,
@@ -146,9 +146,9 @@ def test_the_tilt_keeps_ghosts_off_the_spot(experiment, square_prisms):
 @pytest.mark.second
 def test_the_spread_keeps_the_light(experiment):
     spots = diffraction_spots(experiment("gf7_pair"))
-    assert spots.shape[1:] == (2 * REACH + 1, 2 * REACH + 1)
+    assert spots.shape[1:] == (2 * SPREAD_PX + 1, 2 * SPREAD_PX + 1)
     np.testing.assert_allclose(spots.sum(axis=(1, 2)), 1.0, rtol=1e-12)
-    assert np.unravel_index(np.argmax(spots[0]), spots[0].shape) == (REACH, REACH)
+    assert np.unravel_index(np.argmax(spots[0]), spots[0].shape) == (SPREAD_PX, SPREAD_PX)
 
 
 COURSE = "course: {times: [0 s, 60 s], temperature: {base: {change: [0 K, 1 K]}}}"

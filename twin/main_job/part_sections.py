@@ -254,7 +254,7 @@ def stray_section(run: RenderRun) -> Section | None:
             size = f"{significant(one['relative_to_nominal'])} ± {significant(one['relative_to_nominal_sigma'], 1)}"
             numbers = (Marked(text, "", "number") for text in (size, fixed(one["x_um"], 1), fixed(one["y_um"], 1)))
             families.append([channel.key, one["kind"], one["name"], *numbers])
-            surfaces.append([channel.key, one["name"], _way(one["surfaces"]) or "not looked up"])
+            surfaces.append([channel.key, one["name"], _way(one["surfaces"]) or "not identified"])
     keys = [*(one.key for one in FAMILY if one.key != "surfaces"), "surfaces"]
     parts: list[Artefact] = [
         Table(

@@ -1,4 +1,4 @@
-"""Path tracing: what reaches the detectors by other ways than the nominal one, and where the rest of the light goes.
+"""Path tracing: light that reaches the detectors off the nominal path, and the energy balance of all light.
 
-Mitsuba decides what a ray hits, the prescription decides where exactly: every hit is refined in float64.
+Mitsuba finds the surface that a ray hits; the intersection with it is then computed from the prescription in float64.
 """

@@ -1,10 +1,10 @@
-"""Ways that light can take without a search: pairs of clear apertures between which nothing stands.
+"""Clear path segments: pairs of clear apertures with nothing between them, which need no search for the next surface.
 
-Most paths go the way of the light for which an instrument is made. Where no other surface reaches into the convex hull
-of two clear apertures that face each other, a path that leaves the one and meets the other inside its edge has met
-nothing before: the hull holds the whole way. Inside a convex glass body every face is in sight of every other one. So
-the kernel first tries the surfaces that follow in nominal light, there and back, and searches the scene where a path
-misses them. This decides the time that a path takes, and nothing else.
+Most paths follow the light for which an instrument is designed. Where no other surface extends into the convex hull of
+two clear apertures that face each other, a path that leaves the one and meets the other inside its edge has met nothing
+before, since the hull contains the whole segment. Inside a convex glass body every face is visible from every other
+face. The kernel therefore first tries the surfaces that follow in nominal light, in both directions, and searches the
+scene only where a path misses them. This affects computing time alone.
 """
 
 from __future__ import annotations
@@ -22,29 +22,35 @@ from scenes.models.scenery import LEAST_CLEARANCE, Scenery, SceneSurface
 from twin.path_tracing.path_families import decode
 
 FACING = 0.05
-"""Least cosine of a way with the normals of a curved aperture that sees all of another one: three degrees from grazing,
-more than the triangles' normals depart from those of the surface."""
+"""Smallest cosine between a segment and the normals of a curved aperture from which all of another one is visible.
 
-PLACES = 4
-"""Places from which light leaves a surface: two clear apertures, on either side."""
+It is three degrees from grazing, more than the triangles' normals differ from those of the surface.
+"""
+
+EXITS = 4
+"""Number of exits of a surface: two clear apertures, each with two sides."""
 
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """A clear aperture and a box around it.
+    """Clear aperture with a box around it.
 
     Attributes
     ----------
     surface : int
-        Its number, -1 of a source; aperture: which of the surface's.
-    middle : np.ndarray
-        On the surface, world, metres; normal: there, unit, toward +z of the surface.
-    corners : np.ndarray
-        Of the box, world, (8, 3), metres.
-    normals : np.ndarray
-        Of the surface's triangles, world, (T, 3).
-    solid : str | None
-        Glass body, None for none.
+        Index of the surface, -1 for a source.
+    aperture : int
+        Index of the clear aperture of the surface.
+    middle : (3,) ndarray
+        Middle of the aperture on the surface, world frame, metres.
+    normal : (3,) ndarray
+        Unit normal there, toward +z of the surface.
+    corners : (8, 3) ndarray
+        Corners of the box, world frame, metres.
+    normals : (T, 3) ndarray
+        Normals of the surface's triangles, world frame.
+    solid : str or None
+        Glass body of the surface, None for none.
     """
 
     surface: int
@@ -64,58 +70,61 @@ class Patch:
         bounds: tuple[float, float, float, float],
         solid: str | None = None,
     ) -> Patch:
-        """An aperture in the plane z = 0 of a frame; bounds: x_min, x_max, y_min, y_max there."""
+        """Make a patch in the plane z = 0 of a frame; ``bounds`` are x_min, x_max, y_min, y_max there, metres."""
         x0, x1, y0, y1 = bounds
-        room = LEAST_CLEARANCE
-        corners = [[x, y, z] for x in (x0 - room, x1 + room) for y in (y0 - room, y1 + room) for z in (-room, room)]
+        margin = LEAST_CLEARANCE
+        corners = [
+            [x, y, z] for x in (x0 - margin, x1 + margin) for y in (y0 - margin, y1 + margin) for z in (-margin, margin)
+        ]
         middle = pose.apply(np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0]))
         normal = pose.rotation[:, 2]
         return cls(surface, aperture, middle, normal, pose.apply(np.array(corners)), normal[None], solid)
 
     @property
     def radius(self) -> float:
-        """Of the sphere about the middle that holds the box, metres."""
+        """Radius of the sphere about the middle that contains the box, in metres."""
         return float(np.max(np.linalg.norm(self.corners - self.middle, axis=-1)))
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
-    """From a clear aperture to the next one of a family.
+class Segment:
+    """Clear path segment from an aperture to the next one of a family.
 
     Attributes
     ----------
     start : int
-        Number of the surface that light leaves, -1 for the source.
-    place : int
-        From where: 2 * (number of the aperture) + (1 where it leaves toward -z).
+        Index of the surface that light leaves, -1 for the source.
+    exit_side : int
+        Exit of that surface: 2 * (index of the aperture) + (1 where light leaves toward -z).
     end : Patch
-        Where it arrives.
+        Aperture at the end.
     after : int
-        Position in the list of the way that the family takes next, -1 for none, and ``behind``, 1 where that leaves the
-        end toward -z.
+        Index of the family's next segment in the list, -1 for none.
+    behind : int
+        1 where the next segment leaves the end toward -z.
     """
 
     start: int
-    place: int
+    exit_side: int
     end: Patch
     after: int = -1
     behind: int = 0
 
 
-class ClearWays:
-    """The ways along families of paths, up to their detectors, between whose ends nothing stands.
+class ClearSegments:
+    """Clear segments along families of paths, up to their detectors.
 
     Parameters
     ----------
-    scenery
+    scenery : Scenery
         All surfaces.
-    families
+    families : Mapping[str, Sequence[int]]
         Detector -> codes of the events before it.
 
     Attributes
     ----------
-    ways
-        Of all families.
+    segments : list of Segment
+        Segments of all families.
     """
 
     def __init__(self, scenery: Scenery, families: Mapping[str, Sequence[int]]) -> None:
@@ -129,68 +138,74 @@ class ClearWays:
             if part in met:
                 patches[part] += _patches(number, surface)
         self._obstacles = _Obstacles(surfaces)
-        self._lines: dict[str, list[tuple[int, Patch]]] = {}
-        self.ways: list[Way] = []
+        self._apertures: dict[str, list[tuple[int, Patch]]] = {}
+        self.segments: list[Segment] = []
         for name, chain in chains.items():
             line = _shortest([patches[part] for part in chain])
             if line:
-                self._lines[name] = [(-1, line[0]), *self._follow(line)]
+                self._apertures[name] = [(-1, line[0]), *self._follow(line)]
 
     def _follow(self, line: Sequence[Patch]) -> Iterator[tuple[int, Patch]]:
-        """Add the ways of a family; their positions in the list of ways, -1 where there is none, and their ends."""
+        """Add the segments of a family; yield the index of each (-1 if not clear) and the aperture at its end."""
         last = -1
         for start, end in pairwise(line):
-            way = self._between(start, end)
-            if way is not None:
+            segment = self._between(start, end)
+            if segment is not None:
                 if last >= 0:
-                    self.ways[last] = replace(self.ways[last], after=len(self.ways), behind=way.place % 2)
-                self.ways.append(way)
-            last = -1 if way is None else len(self.ways) - 1
+                    self.segments[last] = replace(
+                        self.segments[last], after=len(self.segments), behind=segment.exit_side % 2
+                    )
+                self.segments.append(segment)
+            last = -1 if segment is None else len(self.segments) - 1
             yield last, end
 
-    def line(self, family: str | None = None) -> list[tuple[int, Patch]]:
-        """The apertures that a family meets, up to its detector, each with the position of the way that leads there in
-        the list of ways, -1 for none; empty where nothing is known of it.
+    def apertures(self, family: str | None = None) -> list[tuple[int, Patch]]:
+        """Return the apertures that a family meets, up to its detector, each with the index of the segment before it.
+
+        The index is -1 where that segment is not clear. The list is empty for an unknown family.
 
         Parameters
         ----------
-        family : str | None
-            Its detector, None for the first one.
+        family : str or None
+            Detector of the family, None for the first one.
         """
-        return self._lines.get(family or next(iter(self._lines), ""), [])
+        return self._apertures.get(family or next(iter(self._apertures), ""), [])
 
-    def from_source(self, start: Patch, family: str | None = None) -> Way | None:
-        """The way from a source to the first surface of a family, None where there is none.
+    def from_source(self, start: Patch, family: str | None = None) -> Segment | None:
+        """Return the segment from a source to the first surface of a family, None where it is not clear.
 
         Parameters
         ----------
         start : Patch
-            The source's disk of places.
-        family : str | None
-            Its detector, None for the first one.
+            Emitting disk of the source.
+        family : str or None
+            Detector of the family, None for the first one.
         """
-        line = self.line(family)
-        way = self._between(start, line[0][1]) if line else None
+        line = self.apertures(family)
+        segment = self._between(start, line[0][1]) if line else None
         after = line[1][0] if len(line) > 1 else -1
-        return way if way is None or after < 0 else replace(way, after=after, behind=self.ways[after].place % 2)
+        if segment is None or after < 0:
+            return segment
+        return replace(segment, after=after, behind=self.segments[after].exit_side % 2)
 
-    def _between(self, start: Patch, end: Patch) -> Way | None:
-        """The way from one aperture to another, inside their glass body or in the open."""
+    def _between(self, start: Patch, end: Patch) -> Segment | None:
+        """Return the segment from one aperture to another, in their glass body or in the open; None if not clear."""
         if start.solid is not None and start.solid == end.solid:
-            return None if start.surface == end.surface else Way(start.surface, 2 * start.aperture + 1, end)
+            return None if start.surface == end.surface else Segment(start.surface, 2 * start.aperture + 1, end)
         for behind in (0, 1):
             if behind and (start.solid is not None or start.surface < 0):
                 continue
             sides = (1.0,) if end.solid is not None else (1.0, -1.0)
             if _faces(start, end, 1.0 - 2.0 * behind) and any(_faces(end, start, side) for side in sides):
                 if self._obstacles.leave_clear(start, end):
-                    return Way(start.surface, 2 * start.aperture + behind, end)
+                    return Segment(start.surface, 2 * start.aperture + behind, end)
         return None
 
 
 def _shortest(choices: Sequence[Sequence[Patch]]) -> list[Patch]:
-    """One aperture of each event, so that the line through their middles is the shortest; empty where an event has
-    none. Light takes the shortest way, too.
+    """Choose one aperture of each event so that the line through their middles is shortest, as light does.
+
+    Return an empty list where an event has no aperture.
     """
     if not all(choices):
         return []
@@ -210,7 +225,7 @@ def _shortest(choices: Sequence[Sequence[Patch]]) -> list[Patch]:
 
 
 def _faces(one: Patch, other: Patch, side: float) -> bool:
-    """Whether the side of one aperture sees all of the other one."""
+    """Return True if all of one aperture is visible from the given side of the other."""
     apart = (other.corners[None] - one.corners[:, None]).reshape(-1, 3)
     if len(one.normals) == 1:
         return bool(np.min(side * (apart @ one.normals[0])) > 0.0)
@@ -219,13 +234,15 @@ def _faces(one: Patch, other: Patch, side: float) -> bool:
 
 
 def _patches(number: int, surface: SceneSurface) -> list[Patch]:
-    """The apertures of a surface that lie inside its outline."""
-    inside = [surface.solid is None or _room(surface, aperture) > LEAST_CLEARANCE for aperture in surface.apertures]
+    """Return the apertures of a surface that lie inside its outline."""
+    inside = [
+        surface.solid is None or _edge_distance(surface, aperture) > LEAST_CLEARANCE for aperture in surface.apertures
+    ]
     return [_patch(number, k, surface, a) for k, a in enumerate(surface.apertures) if inside[k]]
 
 
-def _room(face: SceneSurface, aperture: Aperture) -> float:
-    """Least distance of an aperture from the edges of a face, a convex polygon; negative when it reaches beyond."""
+def _edge_distance(face: SceneSurface, aperture: Aperture) -> float:
+    """Return the smallest distance of an aperture from the edges of a convex face; negative where it extends beyond."""
     corners = face.vertices[:, :2]
     along = np.roll(corners, -1, axis=0) - corners
     outward = np.stack([along[:, 1], -along[:, 0]], axis=-1) / np.linalg.norm(along, axis=-1, keepdims=True)
@@ -249,7 +266,7 @@ def _patch(number: int, index: int, surface: SceneSurface, aperture: Aperture) -
     normal = normals.mean(axis=0)
     normal /= np.linalg.norm(normal)
     frame = np.vstack([np.linalg.svd(normal[None])[2][1:], normal])
-    # the triangles reach beyond the aperture, and no farther than the clearance from the surface
+    # the triangles extend beyond the aperture, but depart from the surface by no more than the clearance
     place = (surface.vertices - middle) @ frame.T
     low, high = place.min(axis=0) - surface.clearance, place.max(axis=0) + surface.clearance
     corners = np.array([[a, b, c] for a in (low[0], high[0]) for b in (low[1], high[1]) for c in (low[2], high[2])])
@@ -260,38 +277,39 @@ def _patch(number: int, index: int, surface: SceneSurface, aperture: Aperture) -
 
 
 class _Obstacles:
-    """Triangles of all surfaces, in the world."""
+    """Triangles of all surfaces, in the world frame."""
 
     def __init__(self, surfaces: Sequence[SceneSurface]) -> None:
         corners = [s.pose.apply(s.vertices) for s in surfaces]
         self.first = np.concatenate([[0], np.cumsum([len(c) for c in corners])[:-1]])
         self.corners = np.concatenate(corners)
         self.triangles = [c[s.triangles] for c, s in zip(corners, surfaces, strict=True)]
-        self.room = [s.clearance for s in surfaces]
+        self.margin = [s.clearance for s in surfaces]
         self.solids = [s.solid for s in surfaces]
 
     def leave_clear(self, start: Patch, end: Patch) -> bool:
-        """Whether no other surface reaches into the convex hull of two apertures' boxes. A convex glass body lies
-        behind each of its faces, the way before it.
+        """Return True if no other surface extends into the convex hull of two apertures' boxes.
+
+        A convex glass body lies behind each of its faces, and the segment before it.
         """
         planes = ConvexHull(np.vstack([start.corners, end.corners])).equations
         away = self.corners @ planes[:, :3].T + planes[:, 3]
-        apart = np.any(np.minimum.reduceat(away, self.first, axis=0) > np.asarray(self.room)[:, None], axis=1)
+        apart = np.any(np.minimum.reduceat(away, self.first, axis=0) > np.asarray(self.margin)[:, None], axis=1)
         apart[[n for n in (start.surface, end.surface) if n >= 0]] = True
-        own = {start.solid, end.solid} - {None}
-        apart |= [solid in own for solid in self.solids]
-        return not any(_reaches(self.triangles[i], planes, self.room[i]) for i in np.flatnonzero(~apart))
+        bodies = {start.solid, end.solid} - {None}
+        apart |= [solid in bodies for solid in self.solids]
+        return not any(_reaches(self.triangles[i], planes, self.margin[i]) for i in np.flatnonzero(~apart))
 
 
-def _reaches(triangles: np.ndarray, planes: np.ndarray, room: float) -> bool:
-    """Whether any triangle comes nearer to the inside of all planes than ``room``."""
-    away = triangles @ planes[:, :3].T + planes[:, 3] - room
+def _reaches(triangles: np.ndarray, planes: np.ndarray, margin: float) -> bool:
+    """Return True if any triangle comes closer than ``margin`` to the region inside all planes."""
+    away = triangles @ planes[:, :3].T + planes[:, 3] - margin
     for corners, levels in zip(triangles, away, strict=True):
         if np.any(np.min(levels, axis=0) > 0.0):
             continue
         left = corners
         for plane in planes:
-            left = _cut(left, left @ plane[:3] + plane[3] - room)
+            left = _cut(left, left @ plane[:3] + plane[3] - margin)
             if not len(left):
                 break
         if len(left):
@@ -300,7 +318,7 @@ def _reaches(triangles: np.ndarray, planes: np.ndarray, room: float) -> bool:
 
 
 def _cut(corners: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """What of a convex polygon lies where its levels are not positive."""
+    """Return the part of a convex polygon where its levels are not positive."""
     out = []
     for k, level in enumerate(levels):
         after = (k + 1) % len(levels)

@@ -1,12 +1,12 @@
-"""The loop over a path's surfaces, recorded once as one Dr.Jit kernel; all numbers of the scene enter as arrays.
+"""Loop over the surfaces of a path, recorded once as one Dr.Jit kernel; all numbers of the scene enter as arrays.
 
-In each step a path flies to the next surface (``surface_intersection``), the surface shares its light out, and the path
-goes one of
-the ways that there are. Neighbouring paths are worked on together, in packets of the machine's vectors. A packet takes
-as long as its longest path, and all that any of its paths needs: what only some surfaces need (Newton's method,
-Fresnel's formulas, a lobe, a detector) is computed by packets that need it. Sources let neighbours start alike, and
-paths that leave nominal light (``sequential``) are put beside those that do alike. Putting them together once more,
-after four more steps, would leave 9 percent fewer steps of packets and take as long as it saves, as measured.
+In each step a path is traced to the next surface (``surface_intersection``), the surface divides its light, and the
+path continues in one of the possible directions. Neighbouring paths are processed together, in packets of the machine's
+vectors. A packet takes as long as its longest path, and includes everything that any of its paths needs: what only some
+surfaces need (Newton's method, Fresnel's formulas, a lobe, a detector) is computed only in packets that need it.
+Sources let neighbours start alike, and paths that leave nominal light (``sequential``) are sorted so that neighbours
+behave alike. Sorting once more, after four more steps, would save 9 percent of the packets' steps and cost as much, as
+measured.
 """
 
 from __future__ import annotations
@@ -19,51 +19,51 @@ from optics.materials import fresnel_scatter
 from optics.numerics.backend import Backend
 from twin.path_tracing import clear_ways
 from twin.path_tracing import tables as layout
-from twin.path_tracing.importance_sampling import Leaving, TableDraw, spread
+from twin.path_tracing.importance_sampling import OutgoingPaths, TableSampling, sample_bsdf
 from twin.path_tracing.path_families import BITS, FACTOR, OUTSIDE, START, Event
-from twin.path_tracing.path_result import Arrival, Sinks, record
-from twin.path_tracing.surface_intersection import Flight, Place, locate, next_surface
+from twin.path_tracing.path_result import Accumulators, Arrival, record
+from twin.path_tracing.surface_intersection import Flight, Intersection, locate, next_surface
 
 STEP_BACK = 1e-5
-"""How far behind a triangle that is passed over the search goes on, metres."""
+"""Distance behind a skipped triangle at which the search continues, in metres."""
 
 STRAY, UNLIKELY, GONE = 1, 2, 8
-"""Bits of a path's history: scattered or diffused somewhere; unit of the number of unlikely ways that it has gone, at
-most two; escaped to infinity. A path with none of them goes the way of its neighbours."""
+"""Bits of a path's history: scattered or diffused somewhere; unit of the number of unlikely directions taken, at most
+two; escaped to infinity. A path with none of them is coherent with its neighbours."""
 
 
 @dataclass(frozen=True)
 class Features:
-    """What decides the kernel's code.
+    """Features of a scene and its sampling that determine the kernel's code.
 
     Attributes
     ----------
     form : layout.SurfaceForm
-        What the surfaces' shapes consist of.
-    ways : bool
-        There are clear ways.
+        Components of the surfaces' shapes.
     glass : bool
         There are glass bodies.
     branching : bool
-        Some finish does more than one thing with light that goes on.
+        Some finish does more than one thing with light that continues.
+    segments : bool
+        There are clear segments.
     bare : bool
-        Some glass is bare.
+        Some glass is uncoated.
     measured : bool
-        Some finish has a table, of its coating or of its scattering.
+        Some finish has a table of its coating or its scattering.
     roulette : bool
-        Weak paths are ended at random.
+        Paths of low weight are ended at random.
     near : bool
         Some scattered directions are drawn close to the specular one.
     keep_nominal : bool
         Detections of the nominal family are recorded as well.
     log : bool
-        The events of every path are written down.
+        The events of every path are recorded.
     """
 
     form: layout.SurfaceForm
     glass: bool
     branching: bool
-    ways: bool = False
+    segments: bool = False
     bare: bool = False
     measured: bool = False
     roulette: bool = False
@@ -74,19 +74,19 @@ class Features:
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Numbers of one launch as opaque arrays of width 1.
+    """Limits of one launch, as opaque arrays of width 1.
 
     Attributes
     ----------
     steps : Any
         Largest number of steps.
-    room : Any
-        Of the records.
+    capacity : Any
+        Number of detections that can be recorded.
     floors : Sequence[Any]
-        Smallest probability of going each of the ways that there are, after none, one, and more unlikely ways; 0: as
-        the power goes.
+        Smallest probability of each possible direction after none, one, and more unlikely ones; 0: proportional to
+        power.
     scatter_floors : Sequence[Any]
-        Likewise of drawing a direction from a scatter lobe.
+        Smallest probability of drawing a direction from a scatter lobe, likewise.
     near : Any
         Share of these directions that are drawn close to the specular one.
     weak : Any
@@ -94,7 +94,7 @@ class Limits:
     """
 
     steps: Any
-    room: Any
+    capacity: Any
     floors: Sequence[Any]
     scatter_floors: Sequence[Any]
     near: Any
@@ -103,30 +103,30 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Launch:
-    """Paths at their start, or some surfaces after it. Neighbours should be alike.
+    """Paths at their start, or after some surfaces. Neighbours should be alike.
 
     Attributes
     ----------
     position, direction : Any
-        ``Vector3``.
+        Position, metres, and unit direction, ``Vector3``.
     weight : Any
-        power.
+        Power of the path.
     path : Any
         Number of the path.
     rng : Any
-        Its random generator.
-    way : Any
-        Number of the way that it is on, 0 for none.
+        Random generator of the path.
+    segment : Any
+        Row of the clear segment that it is on, 0 for none.
     length : Any
         Optical path so far, metres.
     body : Any
-        Glass body that it is in, 0 for none.
+        Number of the glass body that it is in, 0 for none.
     ahead : Any
-        How far ahead the search for the next surface starts, metres.
+        Distance ahead at which the search for the next surface starts, metres.
     signature : Any
-        Of its events so far.
+        Signature of its events so far.
     steps : Any
-        How many these are.
+        Number of these events.
     """
 
     position: Any
@@ -134,7 +134,7 @@ class Launch:
     weight: Any
     path: Any
     rng: Any
-    way: Any = 0
+    segment: Any = 0
     length: Any = 0.0
     body: Any = 0
     ahead: Any = 0.0
@@ -144,7 +144,7 @@ class Launch:
 
 @dataclass(frozen=True, eq=False)
 class PreparedScene:
-    """What the kernel works with: array types, Mitsuba with its variant set, triangles and tables of one scene."""
+    """Scene for the kernel: array types, Mitsuba with its variant set, triangles and tables."""
 
     backend: Backend
     mi: Any
@@ -152,15 +152,17 @@ class PreparedScene:
     tables: layout.SceneTables
 
 
-def follow(prepared: PreparedScene, features: Features, limits: Limits, launch: Launch, sinks: Sinks) -> Any:
-    """Follow all paths to their end; nothing is evaluated yet.
+def follow(
+    prepared: PreparedScene, features: Features, limits: Limits, launch: Launch, accumulators: Accumulators
+) -> Any:
+    """Trace all paths to their end; nothing is evaluated yet.
 
-    The weight that escapes to infinity and the weight still under way at the step limit go to the sinks as well.
+    The weight that escapes to infinity and the weight still under way at the step limit are accumulated as well.
 
     Returns
     -------
     Any
-        Steps that each path has taken from its start on.
+        Number of steps of each path from its start.
     """
     import drjit as dr
 
@@ -173,26 +175,26 @@ def follow(prepared: PreparedScene, features: Features, limits: Limits, launch: 
         dr.zeros(backend.Float, n) + launch.length,
         dr.zeros(backend.UInt, n) + launch.body,
         dr.zeros(backend.Float, n) + launch.ahead,
-        dr.zeros(backend.UInt, n) + launch.way,
+        dr.zeros(backend.UInt, n) + launch.segment,
         dr.zeros(dr.uint64_array_t(backend.Float), n) + launch.signature,
-        dr.zeros(backend.UInt, n),  # what has happened to it, in bits
+        dr.zeros(backend.UInt, n),  # history, in bits
         dr.zeros(backend.UInt, n) + launch.steps,
         dr.full(backend.Bool, True, n),
         launch.rng,
     )
-    labels = "position direction weight length body ahead way signature history steps active rng".split()
-    body = _step(prepared, features, limits, launch.path, sinks)
+    labels = "position direction weight length body ahead segment signature history steps active rng".split()
+    body = _step(prepared, features, limits, launch.path, accumulators)
     out = dr.while_loop(state, lambda *s: s[10], body, labels=labels, label="paths", mode="symbolic")
     escaped = out[8] & GONE != 0
-    dr.scatter_add(sinks.left, out[2], backend.UInt(0), escaped)
-    dr.scatter_add(sinks.left, out[2], backend.UInt(1), ~escaped & (out[2] > 0.0))
+    dr.scatter_add(accumulators.left, out[2], backend.UInt(0), escaped)
+    dr.scatter_add(accumulators.left, out[2], backend.UInt(1), ~escaped & (out[2] > 0.0))
     return out[9]
 
 
 def _step(
-    prepared: PreparedScene, features: Features, limits: Limits, path: Any, sinks: Sinks
+    prepared: PreparedScene, features: Features, limits: Limits, path: Any, accumulators: Accumulators
 ) -> Callable[..., tuple[Any, ...]]:
-    """The loop's body: one step of every path."""
+    """Return the loop's body: one step of every path."""
     import drjit as dr
 
     backend, tables = prepared.backend, prepared.tables
@@ -201,28 +203,32 @@ def _step(
     glass = features.glass
 
     def body(*state: Any) -> tuple[Any, ...]:
-        p, d, weight, length, medium, ahead, way, signature, history, steps, active, rng = state
+        p, d, weight, length, medium, ahead, segment, signature, history, steps, active, rng = state
         inside = active & (medium != 0) if glass else active & False
-        flight = Flight(p, d, medium if glass else None, ahead, active, history == 0, way, features.ways)
-        found = next_surface(backend, prepared.mi, prepared.scene, tables, flight)
-        surface = found.surface
-        history = dr.select(active & ~found.hit, history | GONE, history)
-        active = found.hit
-        place = locate(backend, tables, features.form, replace(flight, active=active), found.near, surface)
+        flight = Flight(p, d, medium if glass else None, ahead, active, history == 0, segment, features.segments)
+        following = next_surface(backend, prepared.mi, prepared.scene, tables, flight)
+        surface = following.surface
+        history = dr.select(active & ~following.hit, history | GONE, history)
+        active = following.hit
+        place = locate(backend, tables, features.form, replace(flight, active=active), following.near, surface)
         front = place.cosine < 0.0
         clear, kind = place.clear, place.kind
-        # what is there only by rounding and faceting
+        # surfaces that are hit only because of rounding or faceting are skipped
         skip = ~clear & (kind & layout.Kind.ENDS != 0)
         again = place.distance <= 0.5 * ahead
         if glass:
             skip |= (again | (~front & (kind & layout.Kind.SOLID != 0))) & ~inside
         else:
             skip |= again
-        passed = found.near + STEP_BACK
+        passed = following.near + STEP_BACK
         wrong: Any = None
-        if features.ways:
-            arrives = place.exact & (place.distance > 0.0) & dr.select(found.way[1] & 2 == 0, place.first, place.second)
-            wrong = found.tried & (skip | ~arrives)
+        if features.segments:
+            arrives = (
+                place.exact
+                & (place.distance > 0.0)
+                & dr.select(following.segment[1] & 2 == 0, place.first, place.second)
+            )
+            wrong = following.expected & (skip | ~arrives)
             skip |= wrong
             passed = dr.select(wrong, ahead, passed)
         met = active & ~skip
@@ -232,18 +238,20 @@ def _step(
         p = dr.fma(d, flown, p)
         length = dr.fma(flown, before, length)
 
-        # how the light is shared out
+        # division of the light
         row = layout.ROWS_PER_SURFACE * surface + dr.select(clear, dr.select(front, UInt(0), 1), 2)
         shared = shares(prepared, features, row, met, place, inside, before)
-        going_on = shared.going_on
-        stays = shared.stays(weight)
-        dr.scatter_add(sinks.absorbed, stays, row, met & (stays > 0.0))
+        continuing = shared.continuing
+        absorbed = shared.absorbed(weight)
+        dr.scatter_add(accumulators.absorbed, absorbed, row, met & (absorbed > 0.0))
         stray = history & STRAY != 0
-        arrival = Arrival(place.x, place.y, stays, length, signature, stray, path)
-        record(backend, tables, sinks, limits.room, kind, met & front & clear, arrival, features.keep_nominal)
+        arrival = Arrival(place.x, place.y, absorbed, length, signature, stray, path)
+        record(
+            backend, tables, accumulators, limits.capacity, kind, met & front & clear, arrival, features.keep_nominal
+        )
 
-        # which way this path goes
-        turned = dr.fma(place.normal, -2.0 * place.cosine, d)
+        # direction in which the path continues
+        outgoing = dr.fma(place.normal, -2.0 * place.cosine, d)
         event = UInt(0) + 0 * surface
         if features.branching:
             unlikely = history // UNLIKELY & 3
@@ -259,52 +267,52 @@ def _step(
                 ratio = shared.ratio
                 cosine_after = dr.copysign(shared.bent, place.cosine)
                 refracted = dr.fma(place.normal, cosine_after - ratio * place.cosine, ratio * d)
-                turned = dr.select(through, refracted, turned)
+                outgoing = dr.select(through, refracted, outgoing)
                 own = kind >> layout.Kind.BODY_SHIFT & layout.Kind.BODY_MASK
                 medium = dr.select(met & through, dr.select(inside, 0, own), medium)
                 out_index = dr.select(medium != 0, place.row[layout.INDEX], 1.0)
-            leaving = Leaving(turned, place.normal, out_index, event, onward, place.cosine, diffusing)
-            drawn = TableDraw(tables.measured, shared.marks, dr.abs(place.cosine)) if shared.marks else None
+            leaving = OutgoingPaths(outgoing, place.normal, out_index, event, onward, place.cosine, diffusing)
+            drawn = TableSampling(tables.measured, shared.marks, dr.abs(place.cosine)) if shared.marks else None
             scatter_floor = _by_number(unlikely, limits.scatter_floors)
             near_share = limits.near if features.near else None
             lobe = tables.lobe(row)
-            turned, event, onward, rng = spread(
+            outgoing, event, onward, rng = sample_bsdf(
                 backend, rng, met, shared.scattered, lobe, scatter_floor, near_share, leaving, drawn
             )
             spreading = event >= int(Event.DIFFUSE)
-            # light that is scattered goes on as its power does
+            # after scattering, directions are drawn in proportion to power
             more = dr.select(chosen.unlikely, UInt(UNLIKELY), 0)
             more = dr.select(unlikely < 2, more, 0)
             history = dr.select(met, dr.select(spreading, STRAY + 2 * UNLIKELY, history + more), history)
         else:
-            onward = weight * going_on
-        if features.ways:
-            behind = dr.dot(turned, place.normal) < 0.0
-            a, b, c, e = place.row[layout.WAYS : layout.WAYS + clear_ways.PLACES]
-            way = UInt(dr.select(place.first, dr.select(behind, b, a), dr.select(behind, e, c)))
-            goes_on = found.tried & (behind == (found.way[1] & 1 != 0))
-            way = dr.select(met & clear, dr.select(goes_on, found.way[0], way), 0)
-        d = dr.select(met, turned, d)
+            onward = weight * continuing
+        if features.segments:
+            behind = dr.dot(outgoing, place.normal) < 0.0
+            a, b, c, e = place.row[layout.SEGMENTS : layout.SEGMENTS + clear_ways.EXITS]
+            segment = UInt(dr.select(place.first, dr.select(behind, b, a), dr.select(behind, e, c)))
+            goes_on = following.expected & (behind == (following.segment[1] & 1 != 0))
+            segment = dr.select(met & clear, dr.select(goes_on, following.segment[0], segment), 0)
+        d = dr.select(met, outgoing, d)
         weight = dr.select(met, onward, weight)
         code = UInt(place.row[layout.PART]) << BITS | (event + dr.select(clear, UInt(0), OUTSIDE))
         signature = dr.select(met, (signature ^ UInt64(code)) * UInt64(FACTOR), signature)
         if features.log:
-            dr.scatter(sinks.log, dr.select(met, code, 0), path * limits.steps + steps, active)
-        # a path that has met nothing yet where it was thought to tries again
-        steps = steps + (dr.select(wrong, UInt(0), 1) if features.ways else 1)
+            dr.scatter(accumulators.log, dr.select(met, code, 0), path * limits.steps + steps, active)
+        # a path that missed the end of its clear segment searches from the same position
+        steps = steps + (dr.select(wrong, UInt(0), 1) if features.segments else 1)
         active &= (weight > 0.0) & (steps < limits.steps)
         if features.roulette:
             weak = active & met & (weight < limits.weak)
             survives = rng.next_float64(weak) * limits.weak < weight
             weight = dr.select(weak, dr.select(survives, limits.weak, 0.0), weight)
             active &= ~weak | survives
-        return p, d, weight, length, medium, ahead, way, signature, history, steps, active, rng
+        return p, d, weight, length, medium, ahead, segment, signature, history, steps, active, rng
 
     return body
 
 
 def _by_number(number: Any, values: Sequence[Any]) -> Any:
-    """The value after none, one, and more."""
+    """Return the value after none, one, and more."""
     import drjit as dr
 
     return dr.select(number == 0, values[0], dr.select(number == 1, values[1], values[2]))
@@ -312,19 +320,19 @@ def _by_number(number: Any, values: Sequence[Any]) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Shares:
-    """What becomes of light that meets a surface: Dr.Jit arrays.
+    """Division of the light that meets a surface, as Dr.Jit arrays.
 
     Attributes
     ----------
     reflected, transmitted, diffused : Any
-        shares.
+        Shares of the light.
     scattered : Any
-        Share of what is reflected or transmitted for which a scattered direction is drawn.
+        Share of the reflected or transmitted light for which a scattered direction is drawn.
     ratio, bent : Any
         Refractive index before over that behind, and cosine of the angle of refraction, 0 for total reflection; None
-        where there is no glass.
+        without glass.
     marks : Sequence[Any]
-        Of measured finishes.
+        Marks of measured finishes, see ``tables.MARKS``.
     """
 
     reflected: Any
@@ -336,29 +344,29 @@ class Shares:
     marks: Sequence[Any]
 
     @property
-    def going_on(self) -> Any:
-        """Share that is not absorbed."""
+    def continuing(self) -> Any:
+        """Share of the light that is not absorbed."""
         return self.reflected + self.transmitted + self.diffused
 
-    def stays(self, weight: Any) -> Any:
-        """Absorbed part of a weight."""
+    def absorbed(self, weight: Any) -> Any:
+        """Return the absorbed part of a weight."""
         import drjit as dr
 
-        return dr.select(self.going_on < 1.0 - 1e-15, weight * (1.0 - self.going_on), 0.0)
+        return dr.select(self.continuing < 1.0 - 1e-15, weight * (1.0 - self.continuing), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """Which way paths go at a surface: Dr.Jit arrays.
+    """Directions that paths take at a surface, as Dr.Jit arrays.
 
     Attributes
     ----------
     reflecting, through, diffusing : Any
-        masks.
+        Masks of the paths.
     weight : Any
-        With which they go on.
+        Weight with which they continue.
     unlikely : Any
-        Whether a floor made the way more likely than its share of the light.
+        True where a floor made the direction more likely than its share of the light.
     """
 
     reflecting: Any
@@ -369,28 +377,28 @@ class Choice:
 
 
 def choose(shared: Shares, weight: Any, floor: Any, rng: Any, met: Any) -> Choice:
-    """Draw which way paths go that are at a surface, each by its share of the light and at least by ``floor``."""
+    """Draw the direction of paths at a surface, each with its share of the light and at least ``floor``."""
     import drjit as dr
 
-    going_on = shared.going_on
-    whole = dr.select(going_on > 0.0, 1.0 / going_on, 0.0)
+    continuing = shared.continuing
+    whole = dr.select(continuing > 0.0, 1.0 / continuing, 0.0)
     parts = (shared.reflected, shared.transmitted, shared.diffused)
     chances = [dr.select(s > 0.0, dr.maximum(s * whole, floor), 0.0) for s in parts]
-    every = chances[0] + chances[1] + chances[2]
-    u = rng.next_float64(met) * every
+    total = chances[0] + chances[1] + chances[2]
+    u = rng.next_float64(met) * total
     reflecting = u < chances[0]
     through = ~reflecting & (u < chances[0] + chances[1])
     diffusing = ~reflecting & ~through & (chances[2] > 0.0)
     share = dr.select(reflecting, parts[0], dr.select(through, parts[1], parts[2]))
     chance = dr.select(reflecting, chances[0], dr.select(through, chances[1], chances[2]))
-    onward = dr.select(chance > 0.0, weight * share * every / chance, 0.0)
+    onward = dr.select(chance > 0.0, weight * share * total / chance, 0.0)
     return Choice(reflecting, through, diffusing, onward, share * whole < floor)
 
 
 def shares(
-    prepared: PreparedScene, features: Features, row: Any, met: Any, place: Place, inside: Any, before: Any
+    prepared: PreparedScene, features: Features, row: Any, met: Any, place: Intersection, inside: Any, before: Any
 ) -> Shares:
-    """Look the finish of each path's row up."""
+    """Return how the finish of each path's row divides the light."""
     import drjit as dr
 
     tables, glass = prepared.tables, features.glass
@@ -407,7 +415,7 @@ def shares(
     if features.measured:
         assert tables.measured is not None
         marks = tables.measured.of(row, met)
-        # a coating is measured from the side of air
+        # coatings are measured from the side of air
         coat = tables.measured.shares(marks, dr.select(inside, bent, incidence) if glass else incidence, met)
         reflected = dr.select(marks[0] > 0.5, coat[0], reflected)
         transmitted = dr.select(marks[0] > 0.5, coat[1], transmitted)
@@ -419,17 +427,17 @@ def shares(
         reflected = dr.select(bare, 0.0, reflected)
         total = bent <= 0.0
         opaque = ~bare & (transmitted <= 0.0)
-        # beyond the critical angle all is reflected, of bare glass, too
+        # beyond the critical angle all light is reflected, by bare glass as well
         transmitted = dr.select(total, 0.0, transmitted)
         reflected = dr.select(total & ~opaque, 1.0, reflected)
         if features.bare:
-            some = met & bare & ~total
+            uncoated = met & bare & ~total
 
             def fresnel(reflected: Any, transmitted: Any) -> tuple[Any, Any]:
                 plain = fresnel_scatter.reflectance(incidence, before, after)
-                return dr.select(some, plain, reflected), dr.select(some, 1.0 - plain, transmitted)
+                return dr.select(uncoated, plain, reflected), dr.select(uncoated, 1.0 - plain, transmitted)
 
             reflected, transmitted = dr.if_stmt(
-                (reflected, transmitted), some, fresnel, lambda *same: same, label="fresnel", mode="symbolic"
+                (reflected, transmitted), uncoated, fresnel, lambda *same: same, label="fresnel", mode="symbolic"
             )
     return Shares(reflected, transmitted, diffused, scattered, ratio, bent, marks)

@@ -1,4 +1,4 @@
-"""What happens to a path at a surface, and the families of paths that met the same surfaces."""
+"""Events of a path at surfaces, and families of paths that met the same surfaces in the same order."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scenes.models.scenery import Scenery
 
 
 class Event(IntEnum):
-    """What a path did at a surface; from ``DIFFUSE`` on it is stray light."""
+    """Event of a path at a surface; from ``DIFFUSE`` on it is stray light."""
 
     REFLECT = 0
     TRANSMIT = 1
@@ -24,7 +24,7 @@ class Event(IntEnum):
 
 
 OUTSIDE = 8
-"""Added to the event when it happens outside a face's clear apertures."""
+"""Number added to the event where it happens outside a face's clear apertures."""
 
 BITS = 4
 START = 0xCBF29CE484222325
@@ -33,18 +33,18 @@ _WORD = (1 << 64) - 1
 
 
 def code(part: int, event: Event, outside: bool = False) -> int:
-    """One event as a number: the part's number and what happened."""
+    """Return an event as a number: the index of the part and the kind of event."""
     return (part + 1) << BITS | (int(event) + (OUTSIDE if outside else 0))
 
 
 def decode(number: int) -> tuple[int, Event, bool]:
-    """Part, event and whether it was outside the clear apertures; the inverse of ``code``."""
+    """Return part, event and True if outside the clear apertures; the inverse of ``code``."""
     event = number & (1 << BITS) - 1
     return (number >> BITS) - 1, Event(event % OUTSIDE), event >= OUTSIDE
 
 
 def signature(codes: Iterable[int]) -> int:
-    """Signature of a list of events: the FNV-1a hash of their codes, as the kernel works it out.
+    """Return the signature of a list of events: the FNV-1a hash of their codes, as the kernel computes it.
 
     Two different families of a run of a thousand share a signature with a probability of 3e-14.
     """
@@ -55,26 +55,26 @@ def signature(codes: Iterable[int]) -> int:
 
 
 MARKS = {Event.REFLECT: "", Event.TRANSMIT: ">", Event.DIFFUSE: "~", Event.SCATTER: "*", Event.SCATTER_THROUGH: ">*"}
-"""What follows a part's name in a family's text: nothing for a reflection."""
+"""Mark after a part's name in the text of a family; a reflection has none."""
 
 
 @dataclass(frozen=True)
-class Touch:
-    """One event of a family: the part, what happened, and whether outside the clear apertures of its elements."""
+class SurfaceEvent:
+    """Event of a family: the part, the kind of event, and True if outside the clear apertures of its elements."""
 
     part: str
     event: Event
     outside: bool = False
 
     def __str__(self) -> str:
-        """The part's name and a mark: ``>`` through, ``~`` diffused, ``*`` scattered, ``!`` outside the aperture."""
+        """Return the part's name and its mark: ``>`` through, ``~`` diffused, ``*`` scattered, ``!`` outside."""
         return f"{self.part}{MARKS[self.event]}{'!' if self.outside else ''}"
 
 
 def nominal_codes(scenery: Scenery, assembly: Assembly, sequence: str) -> tuple[int, ...]:
-    """Codes of the events along a sequence of the assembly, up to the detector at its end.
+    """Return the codes of the events along a sequence of the assembly, up to the detector at its end.
 
-    Elements that only mark a place are left out.
+    Elements that only mark a position are omitted.
 
     Raises
     ------
@@ -98,14 +98,14 @@ def nominal_codes(scenery: Scenery, assembly: Assembly, sequence: str) -> tuple[
     return tuple(out)
 
 
-def touches(scenery: Scenery, codes: tuple[int, ...]) -> tuple[Touch, ...]:
-    """Events in words."""
+def surface_events(scenery: Scenery, codes: tuple[int, ...]) -> tuple[SurfaceEvent, ...]:
+    """Return the events of codes."""
     parts = scenery.parts
-    return tuple(Touch(parts[part], event, outside) for part, event, outside in map(decode, codes))
+    return tuple(SurfaceEvent(parts[part], event, outside) for part, event, outside in map(decode, codes))
 
 
 _COUNTS = {1: "single", 2: "double", 3: "triple"}
-_SAID = {
+_VERBS = {
     Event.DIFFUSE: "diffused by",
     Event.SCATTER: "scattered by",
     Event.SCATTER_THROUGH: "scattered through",
@@ -114,58 +114,58 @@ _SAID = {
 }
 
 
-def family_name(family: tuple[Touch, ...], nominal: tuple[Touch, ...]) -> str:
-    """How a family differs from the nominal one, in a few words: ``prism_0 exit, entry: double, on the way back``.
+def family_name(family: tuple[SurfaceEvent, ...], nominal: tuple[SurfaceEvent, ...]) -> str:
+    """Return how a family differs from the nominal one: ``prism_0 exit, entry: double, on the way back``.
 
-    First come the reflections at faces that nominal light passes, and how many they are, then what is scattered and
-    what else is met, then on which side of the nominal turning point it happens, or that this is not reached.
+    The text has the reflections at faces that nominal light passes and their number, then scattering and other events,
+    then the side of the nominal turning point on which they happen, or that the turning point is not reached.
 
     Parameters
     ----------
-    family : tuple[Touch, ...]
-        Its events in order; empty when nobody looked them up.
-    nominal : tuple[Touch, ...]
-        Those of the nominal family of the same detector.
+    family : tuple of SurfaceEvent
+        Events of the family in order; empty if they are not known.
+    nominal : tuple of SurfaceEvent
+        Events of the nominal family of the same detector.
     """
     if not family:
-        return "not looked up"
-    usual = {(touch.part, touch.event) for touch in nominal}
-    parts = {touch.part for touch in nominal}
-    ghosts, others, places = [], [], []
-    for place, touch in enumerate(family):
-        name = _short(touch.part, nominal)
-        known = (touch.part, touch.event) in usual
-        if known and not touch.outside:
+        return "not identified"
+    usual = {(hit.part, hit.event) for hit in nominal}
+    parts = {hit.part for hit in nominal}
+    ghosts, others, positions = [], [], []
+    for position, hit in enumerate(family):
+        name = _short(hit.part, nominal)
+        known = (hit.part, hit.event) in usual
+        if known and not hit.outside:
             continue
-        places.append(place)
-        if touch.event == Event.REFLECT and touch.part in parts and not known:
-            ghosts.append(name + " outside its aperture" * touch.outside)
+        positions.append(position)
+        if hit.event == Event.REFLECT and hit.part in parts and not known:
+            ghosts.append(name + " outside its aperture" * hit.outside)
         else:
-            others.append(f"{_SAID[touch.event]} {name}" + " outside its aperture" * touch.outside)
-    said = []
+            others.append(f"{_VERBS[hit.event]} {name}" + " outside its aperture" * hit.outside)
+    words = []
     if ghosts:
-        said.append(f"{_joined(ghosts)}: {_COUNTS.get(len(ghosts), f'{len(ghosts)}-fold')}")
-    said += dict.fromkeys(others)
-    if not said:
+        words.append(f"{_joined(ghosts)}: {_COUNTS.get(len(ghosts), f'{len(ghosts)}-fold')}")
+    words += dict.fromkeys(others)
+    if not words:
         return "the nominal surfaces in another order"
-    # light comes back from the one surface that the nominal way meets in its middle
+    # light returns at the surface in the middle of the nominal path
     turn = nominal[len(nominal) // 2].part
-    turns = [place for place, touch in enumerate(family) if touch.part == turn]
+    turns = [position for position, hit in enumerate(family) if hit.part == turn]
     if not turns:
-        said.append(f"without {_short(turn, nominal)}")
-    elif places[-1] < turns[0]:
-        said.append("on the way out")
-    elif places[0] > turns[-1]:
-        said.append("on the way back")
-    return ", ".join(said)
+        words.append(f"without {_short(turn, nominal)}")
+    elif positions[-1] < turns[0]:
+        words.append("on the way out")
+    elif positions[0] > turns[-1]:
+        words.append("on the way back")
+    return ", ".join(words)
 
 
-def _short(part: str, nominal: tuple[Touch, ...]) -> str:
-    """A part's name without what the nominal way's own parts have in common: ``prism_0 exit``, ``M1``."""
-    own = {touch.part.rpartition("/")[0] for touch in nominal}
+def _short(part: str, nominal: tuple[SurfaceEvent, ...]) -> str:
+    """Return a part's name without the path that the nominal parts share: ``prism_0 exit``, ``M1``."""
+    holders = {hit.part.rpartition("/")[0] for hit in nominal}
     camera = nominal[0].part.partition("/")[0] + "/"
-    for holder in sorted(own, key=len, reverse=True):
-        # a channel's bodies stand below base/<camera>/monitor/<channel>/, mirrors of a frame one level deeper
+    for holder in sorted(holders, key=len, reverse=True):
+        # a channel's bodies are below base/<camera>/monitor/<channel>/, mirrors of a frame one level deeper
         steps = holder.split("/")
         channel = "/".join(steps[:4] if steps[2:3] == ["monitor"] else steps[:-1]) + "/"
         if "/" in holder and part.startswith(channel):
@@ -175,7 +175,7 @@ def _short(part: str, nominal: tuple[Touch, ...]) -> str:
 
 
 def _joined(names: list[str]) -> str:
-    """``prism_0 exit, entry``: the body once, where the same one follows."""
+    """Return names as a list that names a repeated body once: ``prism_0 exit, entry``."""
     out: list[str] = []
     last = ""
     for name in names:

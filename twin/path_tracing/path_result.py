@@ -1,5 +1,6 @@
-"""What comes out of a path-traced run: families of paths at the detectors, images, and where all the light went; the
-arrays that the kernel writes to, and how the launches of a run are added up.
+"""Result of a path-traced run: families of paths at the detectors, images, and the energy balance.
+
+The module also has the arrays that the kernel writes to, and the sum over the launches of a run.
 """
 
 from __future__ import annotations
@@ -12,22 +13,22 @@ import numpy as np
 
 from optics.numerics.backend import Backend
 from scenes.models.scenery import Scenery
-from twin.path_tracing.path_families import Touch
+from twin.path_tracing.path_families import SurfaceEvent
 from twin.path_tracing.tables import NOMINAL_SUMS, ROWS_PER_SURFACE, Kind, SceneTables
 
 NOMINAL, GHOST, STRAY = range(3)
 CLASSES = 3
-"""What a detected path was: of the nominal family, of another one without scattering, scattered somewhere."""
+"""Number of classes of detected paths: nominal family, another family without scattering, scattered somewhere."""
 
 
 @dataclass(frozen=True, eq=False)
-class Sinks:
-    """Targets of a launch.
+class Accumulators:
+    """Arrays that a launch adds to.
 
     Attributes
     ----------
     absorbed : Any
-        (rows of finishes,) weight, detected light included.
+        (rows of finishes,) absorbed weight, detected light included.
     left : Any
         (3,) weight escaped to infinity, weight still under way at the step limit, weight at the start.
     sums : Any
@@ -35,13 +36,13 @@ class Sinks:
     images : Any
         (CLASSES * pixels of all detectors) weight.
     counter : Any
-        (1,) number of records asked for.
-    records : dict[str, Any]
-        ``signature``, ``path``, ``detector``, ``x``, ``y``, ``weight``, ``length``, ``kind``, each (room,).
+        (1,) number of detections to record.
+    records : dict of str to Any
+        ``signature``, ``path``, ``detector``, ``x``, ``y``, ``weight``, ``length``, ``kind``, each (capacity,).
     log : Any
         (paths * steps) code of every event, or None.
-    room : int
-        Of the records.
+    capacity : int
+        Number of detections that can be recorded.
     """
 
     absorbed: Any
@@ -51,32 +52,34 @@ class Sinks:
     counter: Any
     records: dict[str, Any]
     log: Any
-    room: int
+    capacity: int
 
     @property
     def arrays(self) -> list[Any]:
-        """Everything that a launch writes to."""
+        """All arrays that a launch writes to."""
         out = [self.absorbed, self.left, self.sums, self.images, self.counter, *self.records.values()]
         return out if self.log is None else [*out, self.log]
 
 
-def make_sinks(backend: Backend, rows: int, detectors: int, pixels: int, room: int, log: int = 0) -> Sinks:
-    """Empty targets; ``log`` is the number of events of all paths together, 0 for none."""
+def make_accumulators(
+    backend: Backend, rows: int, detectors: int, pixels: int, capacity: int, log: int = 0
+) -> Accumulators:
+    """Return empty accumulators; ``log`` is the number of events of all paths together, 0 for no log."""
     import drjit as dr
 
     Float, UInt = backend.Float, backend.UInt
     UInt64 = dr.uint64_array_t(Float)
     kinds = {"signature": UInt64, **dict.fromkeys(("path", "detector", "kind"), UInt)}
     kinds |= dict.fromkeys(("x", "y", "weight", "length"), Float)
-    out = Sinks(
+    out = Accumulators(
         dr.zeros(Float, rows),
         dr.zeros(Float, 3),
         dr.zeros(Float, max(detectors, 1) * NOMINAL_SUMS),
         dr.zeros(Float, max(CLASSES * pixels, 1)),
         dr.zeros(UInt, 1),
-        {name: dr.zeros(kind, room) for name, kind in kinds.items()},
+        {name: dr.zeros(kind, capacity) for name, kind in kinds.items()},
         dr.zeros(UInt, log) if log else None,
-        room,
+        capacity,
     )
     dr.make_opaque(out.arrays)
     return out
@@ -84,7 +87,7 @@ def make_sinks(backend: Backend, rows: int, detectors: int, pixels: int, room: i
 
 @dataclass(frozen=True, eq=False)
 class Arrival:
-    """Light that arrives at surfaces: place in the surface's x, y, absorbed weight, and the path so far."""
+    """Light that arrives at surfaces: position in the surface's x, y, absorbed weight, and the path so far."""
 
     x: Any
     y: Any
@@ -98,14 +101,14 @@ class Arrival:
 def record(
     backend: Backend,
     tables: SceneTables,
-    sinks: Sinks,
-    room: Any,
+    accumulators: Accumulators,
+    capacity: Any,
     kind: Any,
     active: Any,
     at: Arrival,
     keep_nominal: bool,
 ) -> None:
-    """Add what detectors detect: to their images, to the sums of the nominal family, to the records."""
+    """Add detections to the detectors' images, to the sums of the nominal family, and to the records."""
     import drjit as dr
 
     Float, UInt = backend.Float, backend.UInt
@@ -121,18 +124,18 @@ def record(
         row = dr.floor(dr.fma(at.y, grid[1], 0.5 * grid[3]))
         on_grid = detected & (column >= 0.0) & (column < grid[2]) & (row >= 0.0) & (row < grid[3])
         pixel = UInt(dr.select(on_grid, dr.fma(row, grid[2], column) + grid[4], 0.0))
-        dr.scatter_add(sinks.images, at.weight, what * tables.pixels + pixel, on_grid)
+        dr.scatter_add(accumulators.images, at.weight, what * tables.pixels + pixel, on_grid)
         first = NOMINAL_SUMS * number
         wx, wy = at.weight * at.x, at.weight * at.y
         for k, value in enumerate((Float(1.0), at.weight, at.weight * at.weight, wx, wy, wx * at.x, wy * at.y)):
-            dr.scatter_add(sinks.sums, value, first + k, nominal)
+            dr.scatter_add(accumulators.sums, value, first + k, nominal)
         wanted = detected if keep_nominal else detected & ~nominal
-        slot = dr.scatter_inc(sinks.counter, UInt(0), wanted)
-        fits = wanted & (slot < room)
+        slot = dr.scatter_inc(accumulators.counter, UInt(0), wanted)
+        fits = wanted & (slot < capacity)
         values = {name: getattr(at, name) for name in ("signature", "path", "x", "y", "weight", "length")}
         values |= {"detector": number, "kind": what}
         for name, value in values.items():
-            dr.scatter(sinks.records[name], value, slot, fits)
+            dr.scatter(accumulators.records[name], value, slot, fits)
         return (unused,)
 
     dr.if_stmt((UInt(0),), detected, write, lambda unused: (unused,), label="record", mode="symbolic")
@@ -140,28 +143,30 @@ def record(
 
 @dataclass(frozen=True)
 class Family:
-    """All paths that reached a detector by the same events in the same order.
+    """Paths that reached a detector by the same events in the same order.
 
     Attributes
     ----------
     detector : str
-        Its name.
-    touches : tuple[Touch, ...]
-        The events before it; empty when it was not looked up.
+        Name of the detector.
+    surface_events : tuple of SurfaceEvent
+        Events before it; empty if they were not looked up.
     kind : str
-        ``nominal``, ``ghost`` (another way without scattering) or ``stray`` (scattered or diffused somewhere).
+        ``nominal``, ``ghost`` (other surfaces without scattering) or ``stray`` (scattered or diffused somewhere).
     energy : float
-        Detected share of the emitted power; error: its standard error.
+        Detected share of the emitted power.
+    error : float
+        Standard error of the energy.
     count : int
-        paths.
-    centroid : tuple[float, float]
-        x, y in the detector's frame, metres.
-    rms : tuple[float, float]
-        Root-mean-square size along x and y about the centroid, metres.
+        Number of paths.
+    centroid : (float, float)
+        Centroid x, y in the detector's frame, metres.
+    rms : (float, float)
+        RMS size along x and y about the centroid, metres.
     """
 
     detector: str
-    touches: tuple[Touch, ...]
+    surface_events: tuple[SurfaceEvent, ...]
     kind: str
     energy: float
     error: float
@@ -171,8 +176,8 @@ class Family:
 
     @property
     def text(self) -> str:
-        """The family in one line."""
-        return " ".join(str(t) for t in self.touches) or "(not looked up)"
+        """Events of the family in one line."""
+        return " ".join(str(t) for t in self.surface_events) or "(not identified)"
 
 
 KINDS = {NOMINAL: "nominal", GHOST: "ghost", STRAY: "stray"}
@@ -180,16 +185,20 @@ KINDS = {NOMINAL: "nominal", GHOST: "ghost", STRAY: "stray"}
 
 @dataclass(frozen=True)
 class Balance:
-    """Where the emitted power went.
+    """Energy balance of the emitted power.
 
     Attributes
     ----------
     emitted : float
         Sum of the paths' weights at their start.
     absorbed : Mapping[str, float]
-        Part -> power absorbed in it; detected: detector -> power detected.
+        Part -> power absorbed in it.
+    detected : Mapping[str, float]
+        Detector -> power detected.
     escaped : float
-        To infinity; under_way: still on its way at the step limit.
+        Power that escaped to infinity.
+    under_way : float
+        Power of paths that reached the step limit.
     """
 
     emitted: float
@@ -200,25 +209,31 @@ class Balance:
 
     @property
     def error(self) -> float:
-        """What is missing, relative to the emitted power; exactly 0 up to rounding unless roulette or floors are on."""
+        """Missing power relative to the emitted power; 0 up to rounding unless roulette or floors are used."""
         total = sum(self.absorbed.values()) + sum(self.detected.values()) + self.escaped + self.under_way
         return float(total / self.emitted - 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Single detections: arrays of one entry each.
+    """Single detections, as arrays with an entry for each.
 
     Attributes
     ----------
-    path : np.ndarray
-        Number of the path; detector: index of the detector.
-    place : np.ndarray
-        (N, 2) x, y in the detector's frame, metres.
-    weight : np.ndarray
-        Detected power; length: optical path, metres.
-    signature : np.ndarray
-        Of the family; kind: ``NOMINAL``, ``GHOST`` or ``STRAY``.
+    path : ndarray
+        Number of the path.
+    detector : ndarray
+        Index of the detector.
+    place : (N, 2) ndarray
+        Position x, y in the detector's frame, metres.
+    weight : ndarray
+        Detected power.
+    length : ndarray
+        Optical path, metres.
+    signature : ndarray
+        Signature of the family.
+    kind : ndarray
+        ``NOMINAL``, ``GHOST`` or ``STRAY``.
     """
 
     path: np.ndarray
@@ -232,20 +247,20 @@ class Detections:
 
 @dataclass(frozen=True, eq=False)
 class PathResult:
-    """Outcome of a run, in shares of the emitted power.
+    """Result of a run, in shares of the emitted power.
 
     Attributes
     ----------
-    families : tuple[Family, ...]
-        By falling energy; nominal families first.
-    images : Mapping[str, np.ndarray]
-        Detector -> (3, rows, columns) power per pixel: nominal, ghost, stray.
+    families : tuple of Family
+        Families by falling energy; nominal families first.
+    images : Mapping[str, (3, rows, columns) ndarray]
+        Detector -> power per pixel: nominal, ghost, stray.
     balance : Balance
-        Of the power.
+        Energy balance.
     paths : int
-        Number traced.
+        Number of traced paths.
     detections : Detections
-        Single detections that were kept: all but the nominal families', or all.
+        Single detections that were kept: all except the nominal families', or all.
     """
 
     families: tuple[Family, ...]
@@ -255,30 +270,30 @@ class PathResult:
     detections: Detections
 
     def of(self, detector: str, kind: str) -> tuple[Family, ...]:
-        """Families of one kind at one detector, by falling energy."""
+        """Return the families of one kind at one detector, by falling energy."""
         return tuple(f for f in self.families if f.detector == detector and f.kind == kind)
 
     def nominal(self, detector: str) -> Family:
-        """The nominal family of a detector.
+        """Return the nominal family of a detector.
 
         Raises
         ------
         LookupError
-            No path came to it by the nominal way.
+            No path reached the detector along its nominal surfaces.
         """
-        found = self.of(detector, "nominal")
-        if not found:
-            raise LookupError(f"no path reached {detector} by its nominal way")
-        return found[0]
+        families = self.of(detector, "nominal")
+        if not families:
+            raise LookupError(f"no path reached {detector} along its nominal surfaces")
+        return families[0]
 
 
 SUMS = 7
-"""Count, weight, its square, weighted x, y, x^2, y^2."""
+"""Number of sums of a family: count, weight, its square, weighted x, y, x^2, y^2."""
 
 
 @dataclass(frozen=True)
 class Key:
-    """A family before it is looked up: index of the detector, signature, kind."""
+    """Key of a family whose events are not looked up yet: index of the detector, signature, kind."""
 
     detector: int
     signature: int
@@ -286,16 +301,16 @@ class Key:
 
 
 class Collector:
-    """Adds up what launches have written; one per run.
+    """Sum over the launches of a run.
 
     Parameters
     ----------
-    scenery
-        The scene.
-    nominal
+    scenery : Scenery
+        Scene.
+    nominal : Sequence[int]
         Signature of the nominal family of each detector, 0 for none.
-    keep
-        Whether to keep single detections.
+    keep : bool
+        Keep single detections.
     """
 
     def __init__(self, scenery: Scenery, nominal: Sequence[int], keep: bool = False) -> None:
@@ -311,21 +326,21 @@ class Collector:
         self.paths = 0
         self._kept: list[dict[str, np.ndarray]] = []
 
-    def add(self, sinks: Sinks, emitted: float, paths: int) -> tuple[np.ndarray, np.ndarray]:
-        """Add one launch; returns path numbers and weights of what was detected off the nominal families."""
-        self.absorbed += sinks.absorbed.numpy().reshape(self.absorbed.shape)
-        self.left += sinks.left.numpy()
+    def add(self, accumulators: Accumulators, emitted: float, paths: int) -> tuple[np.ndarray, np.ndarray]:
+        """Add a launch; return path numbers and weights of detections off the nominal families."""
+        self.absorbed += accumulators.absorbed.numpy().reshape(self.absorbed.shape)
+        self.left += accumulators.left.numpy()
         if self.images.size:
-            self.images += sinks.images.numpy().reshape(self.images.shape)
+            self.images += accumulators.images.numpy().reshape(self.images.shape)
         self.emitted += emitted
         self.paths += paths
-        sums = sinks.sums.numpy().reshape(-1, NOMINAL_SUMS)
+        sums = accumulators.sums.numpy().reshape(-1, NOMINAL_SUMS)
         for detector, signature in enumerate(self.nominal):
             if sums[detector, 0] > 0.0:
                 self._put(Key(detector, signature, NOMINAL), sums[detector, :SUMS], -1)
-        count = int(sinks.counter.numpy()[0])
-        records = {name: array.numpy()[:count] for name, array in sinks.records.items()}
-        # threads write in any order
+        count = int(accumulators.counter.numpy()[0])
+        records = {name: array.numpy()[:count] for name, array in accumulators.records.items()}
+        # threads write records in random order
         order = np.lexsort((records["length"], records["path"]))
         records = {name: values[order] for name, values in records.items()}
         if self.keep:
@@ -340,7 +355,7 @@ class Collector:
         self.examples.setdefault(key, example)
 
     def _sort_in(self, r: dict[str, np.ndarray]) -> None:
-        """Add detections off the nominal families to the sums of theirs."""
+        """Add detections off the nominal families to the sums of their families."""
         label = np.stack([r["signature"], r["detector"].astype(np.uint64), r["kind"].astype(np.uint64)], axis=-1)
         keys, first, family = np.unique(label, axis=0, return_index=True, return_inverse=True)
         family = family.ravel()
@@ -351,12 +366,12 @@ class Collector:
             self._put(Key(detector, signature, kind), sums[k], int(r["path"][first[k]]))
 
     def strongest(self, most: int) -> list[Key]:
-        """The families that carry most energy and whose ways are not known beforehand."""
+        """Return the families with most energy whose events are not known beforehand."""
         keys = [k for k in self.sums if k.kind != NOMINAL]
         return sorted(keys, key=lambda k: -self.sums[k][1])[:most]
 
-    def result(self, ways: dict[Key, tuple[Touch, ...]]) -> PathResult:
-        """The run's outcome; ``ways`` names the events of the families that were looked up."""
+    def result(self, family_events: dict[Key, tuple[SurfaceEvent, ...]]) -> PathResult:
+        """Return the result of the run; ``family_events`` has the events of the families that were looked up."""
         surfaces, detectors = self.scenery.surfaces, self.scenery.detectors
         absorbed: dict[str, float] = {}
         detected = {d.name: 0.0 for d in detectors}
@@ -368,24 +383,24 @@ class Collector:
             if stays:
                 absorbed[surface.part] = absorbed.get(surface.part, 0.0) + stays
         images = {}
-        place = 0
+        first = 0
         for d in detectors:
             size = d.columns * d.rows
-            images[d.name] = self.images[:, place : place + size].reshape(CLASSES, *d.shape)
-            place += size
+            images[d.name] = self.images[:, first : first + size].reshape(CLASSES, *d.shape)
+            first += size
         balance = Balance(self.emitted, absorbed, detected, float(self.left[0]), float(self.left[1]))
-        families = [self._family(key, ways.get(key, ())) for key in self.sums]
+        families = [self._family(key, family_events.get(key, ())) for key in self.sums]
         families.sort(key=lambda f: (f.kind != "nominal", -f.energy))
         return PathResult(tuple(families), images, balance, self.paths, self._detections())
 
-    def _family(self, key: Key, way: tuple[Touch, ...]) -> Family:
+    def _family(self, key: Key, events: tuple[SurfaceEvent, ...]) -> Family:
         count, w, w2, wx, wy, wxx, wyy = self.sums[key].tolist()
         x, y = wx / w, wy / w
         rms = tuple(float(np.sqrt(max(second / w - mean * mean, 0.0))) for second, mean in ((wxx, x), (wyy, y)))
-        # of a sum of independent weights, most of them 0
+        # standard error of a sum of independent weights, most of them 0
         error = float(np.sqrt(max(w2 - w * w / self.paths, 0.0)))
         name = self.scenery.detectors[key.detector].name
-        return Family(name, way, KINDS[key.kind], w, error, round(count), (x, y), (rms[0], rms[1]))
+        return Family(name, events, KINDS[key.kind], w, error, round(count), (x, y), (rms[0], rms[1]))
 
     def _detections(self) -> Detections:
         def joined(name: str) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Light sources of the path tracer: evenly lit pinholes, collimated beams, and rays given one by one."""
+"""Light sources of the path tracer: uniform pinholes, collimated beams, and lists of rays."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ from twin.path_tracing.kernel import Launch
 
 @dataclass(frozen=True, eq=False)
 class DiskSource:
-    """Rays from an even disk of places into an even disk of direction cosines about an axis.
+    """Rays from a uniform disk of positions into a uniform disk of direction cosines about an axis.
 
-    Its radiance is constant, so that power goes as the solid angle times the cosine with the axis (Lambert). Where
-    much of the cone is of little interest, part of the paths can be aimed into a narrower cone inside it; every path
-    then carries the weight (density of the wide cone) / (density it was drawn with), so that the expected power of
+    Its radiance is constant, so that power is proportional to the solid angle times the cosine with the axis (Lambert).
+    Where much of the cone is of little interest, part of the paths can be aimed into a narrower cone inside it; every
+    path then carries the weight (density of the wide cone) / (density it was drawn with), so that the expected power of
     every direction stays the same. All weights add up to 1 on average.
 
     Attributes
     ----------
-    centre : np.ndarray
-        Of the disk of places, world, metres, (3,).
-    axis : np.ndarray
-        Of the cone, unit, (3,).
-    across : np.ndarray
-        Two unit vectors square to the axis, (2, 3); the disk of places lies in their plane.
+    centre : (3,) ndarray
+        Centre of the disk of positions, world frame, metres.
+    axis : (3,) ndarray
+        Axis of the cone, unit vector.
+    across : (2, 3) ndarray
+        Two unit vectors perpendicular to the axis; the disk of positions lies in their plane.
     radius : float
-        Of the disk of places, metres.
+        Radius of the disk of positions, metres.
     cone : float
-        Sine of the cone's half angle; 0 is a collimated beam.
-    narrow : tuple[float, float, float] | None
-        Centre in the plane of ``across`` and radius of the narrow cone, direction cosines; within the wide.
+        Sine of the cone's half-angle; 0 is a collimated beam.
+    narrow : tuple of (float, float, float) or None
+        Centre, in the plane of ``across``, and radius of the narrow cone, direction cosines; inside the wide cone.
     share : float
-        Of the paths that are aimed into the narrow cone.
+        Share of the paths that are aimed into the narrow cone.
     """
 
     centre: np.ndarray
@@ -64,22 +64,22 @@ class DiskSource:
 
     @classmethod
     def along(cls, centre: np.ndarray, axis: np.ndarray, radius: float, cone: float = 0.0) -> DiskSource:
-        """A source with any two axes across."""
+        """Make a source with an arbitrary pair of transverse axes."""
         axis = np.asarray(axis, np.float64) / np.linalg.norm(axis)
         helper = np.eye(3)[np.argmin(np.abs(axis))]
         return cls(np.asarray(centre, np.float64), axis, transverse_axes(axis, helper), radius, cone)
 
     def aimed_at(self, directions: np.ndarray, room: float = 1.05, share: float = 0.5) -> DiskSource:
-        """Give the source a narrow cone around given directions (N, 3).
+        """Return the source with a narrow cone around given directions (N, 3).
 
         Parameters
         ----------
-        directions : np.ndarray
+        directions : (N, 3) ndarray
             Unit vectors.
         room : float
             Radius of the narrow cone relative to the smallest one about their middle.
         share : float
-            Of the paths that go there.
+            Share of the paths aimed into it.
         """
         place = np.asarray(directions) @ self.across.T
         middle = 0.5 * (place.min(axis=0) + place.max(axis=0))
@@ -88,14 +88,14 @@ class DiskSource:
 
     @property
     def patch(self) -> Patch:
-        """Where its light starts."""
+        """Emitting disk."""
         pose = Pose(np.column_stack([*self.across, self.axis]), self.centre)
         r = self.radius
         return Patch.flat(-1, 0, pose, (-r, r, -r, r))
 
     @property
     def numbers(self) -> np.ndarray:
-        """What the kernel takes, (20,)."""
+        """Numbers for the kernel, (20,)."""
         x, y, r = self.narrow or (0.0, 0.0, self.cone)
         share = self.share if self.narrow else 0.0
         gain = (self.cone / r) ** 2 if r > 0.0 else 1.0
@@ -105,7 +105,7 @@ class DiskSource:
 
 @dataclass(frozen=True, eq=False)
 class RaySource:
-    """Rays given one by one: world positions (N, 3), metres, unit directions (N, 3), weights (N,)."""
+    """List of rays: world positions (N, 3), metres, unit directions (N, 3), weights (N,)."""
 
     position: np.ndarray
     direction: np.ndarray
@@ -113,7 +113,7 @@ class RaySource:
 
     @classmethod
     def even(cls, position: np.ndarray, direction: np.ndarray) -> RaySource:
-        """Rays of equal weight 1/N; positions and directions broadcastable to each other."""
+        """Make rays of equal weight 1/N; positions and directions are broadcast to each other."""
         position, direction = np.broadcast_arrays(np.asarray(position, np.float64), np.asarray(direction, np.float64))
         return cls(position, direction, np.full(len(position), 1.0 / len(position)))
 
@@ -121,20 +121,25 @@ class RaySource:
 Source = DiskSource | RaySource
 
 BLOCK = 32
-"""Neighbouring paths that start alike: into the same small part of the same cone. They are traced together, mostly meet
-the same surfaces and end together. The blocks fill the cones evenly, from a random place on, so that every path by
-itself has any direction with its density in the cone."""
+"""Number of neighbouring paths that start alike, in the same small part of the same cone.
+
+They are traced together, and mostly meet the same surfaces and end together. The blocks fill the cones evenly, from a
+random start, so that each path has any direction with its density in the cone.
+"""
 
 _STEPS = (0.7548776662466927, 0.5698402909980532)
-"""From a block to the next, of the radius squared and of the angle: Roberts's sequence of the plastic number, "The
-unreasonable effectiveness of quasirandom sequences" (2018), which fills the unit square evenly at any length."""
+"""Steps from a block to the next, of the radius squared and of the angle.
+
+They are those of Roberts's sequence of the plastic number, "The unreasonable effectiveness of quasirandom sequences"
+(2018), which fills the unit square evenly at any length.
+"""
 
 _CELL = (1.0 / 16.0, 1.0 / 64.0)
 """Range of the radius squared and of the angle in a block."""
 
 
 def random_streams(backend: Backend, numbers: Any, seed: int) -> Any:
-    """A random generator with one stream per path, set by the seed and the path's number alone."""
+    """Return a random generator with one stream per path, set by the seed and the path's number alone."""
     import drjit as dr
 
     module = import_module(f"drjit.{backend.name}.ad")
@@ -150,20 +155,20 @@ def random_streams(backend: Backend, numbers: Any, seed: int) -> Any:
 
 
 def start(backend: Backend, source: Source, chosen: np.ndarray, total: int, seed: int) -> Launch:
-    """Light at the start of some paths of a run.
+    """Return the light at the start of some paths of a run.
 
     Parameters
     ----------
     backend : Backend
-        Where to trace.
+        Backend that traces the paths.
     source : Source
-        Where the paths start.
-    chosen : np.ndarray
-        Their numbers in the run, (N,).
+        Source of the paths.
+    chosen : (N,) ndarray
+        Numbers of the paths in the run.
     total : int
-        Paths of the run.
+        Number of paths of the run.
     seed : int
-        Of the random numbers.
+        Seed of the random numbers.
     """
     numbers = backend.opaque(chosen, backend.UInt)
     if isinstance(source, DiskSource):
@@ -178,7 +183,7 @@ def start(backend: Backend, source: Source, chosen: np.ndarray, total: int, seed
 
 
 def _drawn(backend: Backend, source: DiskSource, numbers: Any, total: int, seed: int) -> Launch:
-    """Draw the paths of the given numbers (``UInt``) of a run of ``total`` paths."""
+    """Draw the paths of given numbers (``UInt``) of a run of ``total`` paths."""
     import drjit as dr
 
     rng = random_streams(backend, numbers, seed)
@@ -192,14 +197,14 @@ def _drawn(backend: Backend, source: DiskSource, numbers: Any, total: int, seed:
     def fraction(value: Any) -> Any:
         return value - dr.floor(value)
 
-    def apart() -> tuple[Any, Any]:
+    def independent() -> tuple[Any, Any]:
         return rng.next_float64(), rng.next_float64()
 
-    def alike() -> tuple[Any, Any]:
+    def stratified() -> tuple[Any, Any]:
         return tuple(fraction(dr.fma(block, _STEPS[k], shift[k]) + _CELL[k] * rng.next_float64()) for k in range(2))
 
-    # the directions of neighbours are alike; of a collimated beam their places
-    first_two, last_two = (apart(), alike()) if source.cone > 0.0 else (alike(), apart())
+    # neighbours have similar directions; in a collimated beam, similar positions
+    first_two, last_two = (independent(), stratified()) if source.cone > 0.0 else (stratified(), independent())
     r, turn = radius * dr.sqrt(first_two[0]), 2.0 * dr.pi * first_two[1]
     sine, cosine = dr.sincos(turn)
     position = centre + (r * cosine) * first + (r * sine) * second
@@ -216,7 +221,7 @@ def _drawn(backend: Backend, source: DiskSource, numbers: Any, total: int, seed:
 
 
 def pieces(total: int, size: int, cut: int = 0) -> Iterator[tuple[int, int]]:
-    """First number and count of launches of at most ``size`` paths, of which none goes across ``cut``."""
+    """Yield first number and count of launches of at most ``size`` paths, none of which extends across ``cut``."""
     for begin, end in ((0, cut), (cut, total)):
         for first in range(begin, end, size):
             yield first, min(size, end - first)

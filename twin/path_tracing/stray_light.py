@@ -1,10 +1,10 @@
-"""Ghosts and stray light on the area CCDs, added to the wave path's images.
+"""Ghosts and stray light on the area CCDs, which are added to the diffraction images of the spots.
 
-The wave path's image (``twin.monitor.monitor_path``) holds the nominal family exactly. Every pinhole's light is
-path-traced through the whole instrument, and the surfaces that a path met tell the nominal family from all others, so
-that nothing is counted twice. The other light is geometric rays in pixels. It went through apertures of the same size
-as the nominal spot's, and is spread by the nominal spot's diffraction image before it is added. Its interference with
-the nominal light is left out.
+The spot's diffraction image (``twin.monitor.monitor_path``) holds the nominal family exactly. The light of every
+pinhole is path-traced through the whole instrument, and the surfaces that a path met distinguish the nominal family
+from all others, so that nothing is counted twice. The other light consists of geometric rays in pixels. It passed
+apertures of the same size as those of the nominal spot, and is convolved with the nominal spot's diffraction image
+before it is added. Its interference with the nominal light is neglected.
 """
 
 from __future__ import annotations
@@ -28,21 +28,24 @@ from twin.framework.record import Quantity, Record
 from twin.monitor.monitor_beams import Aimed
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath
-from twin.path_tracing.path_families import Event, Touch, family_name, nominal_codes
+from twin.path_tracing.path_families import Event, SurfaceEvent, family_name, nominal_codes
 from twin.path_tracing.path_result import NOMINAL, Balance, Family, PathResult
 from twin.path_tracing.source import DiskSource
 from twin.path_tracing.tracer import CHUNK, FAINT, PathTracer, Progress, Sampling
 
-CONE_ROOM = 1.25
-"""Half angle of the source's cone relative to that of the pupil seen from the focal plane."""
+CONE_MARGIN = 1.25
+"""Half-angle of the source's cone relative to that of the pupil seen from the focal plane."""
 
 AIM_RINGS = 6
-NARROW_ROOM = 1.2
-"""Room around the rays to the outermost of these rings of the return face: they end 3 % inside its edge."""
+NARROW_MARGIN = 1.2
+"""Radius of the narrow cone relative to that of the rays to the outermost of ``AIM_RINGS`` on the return face.
+
+The rays end 3 % inside its edge.
+"""
 
 
 class NominalPathLost(PhysicalError, RuntimeError):
-    """No path reached an area CCD by its nominal way, so that nothing can be normalised."""
+    """No path reached an area CCD along its nominal surfaces, so that nothing can be normalised."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +54,11 @@ class StrayResult:
 
     Attributes
     ----------
-    photons : Mapping[str, np.ndarray]
-        Area CCD (``<camera>/<channel>/area_ccd``) -> (rows, columns) expected photons per pixel and frame from all
-        traced sources, without the nominal families.
+    photons : Mapping[str, (rows, columns) ndarray]
+        Area CCD (``<camera>/<channel>/area_ccd``) -> expected photons per pixel and frame from all traced sources,
+        without the nominal families.
     runs : Mapping[str, PathResult]
-        Channel -> all that its source's light did.
+        Channel -> result for its source.
     photons_per_power : Mapping[str, float]
         Channel -> photons per frame for a detected share 1 of the source's power.
     """
@@ -65,37 +68,39 @@ class StrayResult:
     photons_per_power: Mapping[str, float]
 
     def relative(self, channel: str) -> list[ListedFamily]:
-        """Families of a channel's source at any detector, the strongest first."""
+        """Return the families of a channel's source at any detector, the strongest first."""
         run = self.runs[channel]
         nominal = run.nominal(f"{channel}/area_ccd")
         others = [(family, family.energy / nominal.energy) for family in run.families if family.kind != "nominal"]
         others.sort(key=lambda one: -one[1])
-        # a path of the one is none of the other: the covariance of their energies is -1 / paths of the product
-        own = (nominal.error / nominal.energy) ** 2 + 2.0 / run.paths
-        sigmas = [share * float(np.sqrt((family.error / family.energy) ** 2 + own)) for family, share in others]
-        return [ListedFamily(*one, sigma, nominal.touches) for one, sigma in zip(others, sigmas, strict=True)]
+        # a path belongs to one family only: the covariance of two energies is -1 / paths times their product
+        relative_variance = (nominal.error / nominal.energy) ** 2 + 2.0 / run.paths
+        sigmas = [
+            share * float(np.sqrt((family.error / family.energy) ** 2 + relative_variance)) for family, share in others
+        ]
+        return [ListedFamily(*one, sigma, nominal.surface_events) for one, sigma in zip(others, sigmas, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
 class ListedFamily:
-    """A family beside the nominal one of its source.
+    """Family with its light relative to the nominal family of its source.
 
     Attributes
     ----------
     family : Family
-        which.
+        Family of paths.
     share : float
         Its light over that of the nominal family at the source's own area CCD.
     sigma : float
-        Of this share, by the number of paths.
-    nominal : tuple[Touch, ...]
+        Standard deviation of this share, by the number of paths.
+    nominal : tuple of SurfaceEvent
         Events of the nominal family.
     """
 
     family: Family
     share: float
     sigma: float
-    nominal: tuple[Touch, ...]
+    nominal: tuple[SurfaceEvent, ...]
 
 
 def pinhole(
@@ -106,44 +111,44 @@ def pinhole(
     cone: float | None = None,
     aimed: Aimed | None = None,
 ) -> DiskSource:
-    """The light source of a channel: its pinhole, evenly lit into a cone that covers the camera's pupil.
+    """Return the light source of a channel: its pinhole, which emits evenly into a cone that covers the camera's pupil.
 
     Half of the paths are aimed at the return face.
 
     Parameters
     ----------
     instrument : Instrument
-        The instrument.
+        Instrument.
     backend : Backend
-        Where to aim.
+        Backend that aims the rays.
     state : State
-        What is perturbed.
+        Perturbed state.
     channel : Channel
-        Which channel.
-    cone : float | None
-        Sine of the cone's half angle; by default that of the pupil with ``CONE_ROOM``.
-    aimed : Aimed | None
-        All channels' nominal rays to the return faces, by default worked out here.
+        Channel of the pinhole.
+    cone : float or None
+        Sine of the cone's half-angle; by default that of the pupil times ``CONE_MARGIN``.
+    aimed : Aimed or None
+        All channels' nominal rays to the return faces, computed here by default.
     """
     placed = instrument.assembly.place([state])
     model = instrument.cameras[channel.camera]
     if cone is None:
-        cone = CONE_ROOM * 0.5 * model.spec.entrance_pupil / model.line_principal_distance
-    place = placed.pose(channel.reticle_body).translation
+        cone = CONE_MARGIN * 0.5 * model.spec.entrance_pupil / model.line_principal_distance
+    position = placed.pose(channel.reticle_body).translation
     axis = instrument.toward_optics(placed, channel.camera)[0]
     radius = 0.5 * instrument.spec.autocollimator.reticle.pinhole * float(placed.size(channel.reticle_body)[0])
     aimed = aimed or _nominal_rays(instrument, backend)
     number = instrument.channels.index(channel)
-    return DiskSource.along(place, axis, radius, cone).aimed_at(aimed.direction[number], NARROW_ROOM)
+    return DiskSource.along(position, axis, radius, cone).aimed_at(aimed.direction[number], NARROW_MARGIN)
 
 
 def _nominal_rays(instrument: Instrument, backend: Backend) -> Aimed:
-    """Rays from every pinhole to its return face in the unperturbed instrument."""
+    """Return the rays from every pinhole to its return face in the unperturbed instrument."""
     return MonitorPath(instrument, backend, quadrature.disk(AIM_RINGS)).nominal
 
 
 def monitor_families(scenery: Scenery, instrument: Instrument) -> dict[str, tuple[int, ...]]:
-    """Area CCD -> events of its nominal family."""
+    """Return area CCD -> codes of the events of its nominal family."""
     return {
         f"{c.key}/area_ccd": nominal_codes(scenery, instrument.assembly, f"{c.key}/monitor")
         for c in instrument.channels
@@ -169,36 +174,36 @@ def trace_stray(
     Parameters
     ----------
     instrument : Instrument
-        The instrument.
+        Instrument.
     backend : Backend
-        Where to trace.
+        Backend that traces the paths.
     state : State
-        What is perturbed.
+        Perturbed state.
     paths : int
-        Of every channel.
+        Number of paths of every channel.
     seed : int
-        Of the random numbers; the channels' are independent of each other.
-    channels : Sequence[Channel] | None
-        Which sources shine; by default all.
-    finishes : Finishes | None
-        What surfaces do with light.
+        Seed of the random numbers, which are independent between channels.
+    channels : Sequence[Channel] or None
+        Channels whose sources emit; all by default.
+    finishes : Finishes or None
+        Finishes of the surfaces.
     baffles : Iterable[Plate]
-        What else stands there.
+        Baffles of the scene.
     sampling : Sampling
-        How paths are drawn.
-    cone : float | None
-        Sine of the half angle into which the pinholes shine, see ``pinhole``.
+        Sampling of the paths.
+    cone : float or None
+        Sine of the half-angle into which the pinholes emit, see ``pinhole``.
     chunk : int
-        Paths of one launch.
-    progress : Progress | None
-        Told the paths done, of all channels together.
+        Number of paths of one launch.
+    progress : Progress or None
+        Called with the number of paths done, of all channels together.
 
     Raises
     ------
     NominalPathLost
         Too few paths, or the perturbation moves a beam off.
     """
-    chosen = tuple(instrument.channels if channels is None else channels)
+    sources = tuple(instrument.channels if channels is None else channels)
     scenery = build_scenery(instrument, state, finishes, baffles)
     tracer = PathTracer(backend, scenery, monitor_families(scenery, instrument), sampling)
     aimed = _nominal_rays(instrument, backend)
@@ -206,38 +211,40 @@ def trace_stray(
     photons = {f"{c.key}/area_ccd": np.zeros((ccd.rows, ccd.columns)) for c in instrument.channels}
     runs: dict[str, PathResult] = {}
     scale: dict[str, float] = {}
-    for number, channel in enumerate(chosen):
+    for number, channel in enumerate(sources):
         source = pinhole(instrument, backend, state, channel, cone, aimed)
-        own = int(np.random.SeedSequence([seed, instrument.channels.index(channel)]).generate_state(1)[0])
+        channel_seed = int(np.random.SeedSequence([seed, instrument.channels.index(channel)]).generate_state(1)[0])
 
         def tell(done: int, _: int, before: int = number) -> None:
             if progress is not None:
-                progress(before * paths + done, len(chosen) * paths)
+                progress(before * paths + done, len(sources) * paths)
 
-        run = tracer.run(source, paths, own, chunk=chunk, progress=tell, toward=f"{channel.key}/area_ccd")
-        found = run.of(f"{channel.key}/area_ccd", "nominal")
-        if not found:
+        run = tracer.run(source, paths, channel_seed, chunk=chunk, progress=tell, toward=f"{channel.key}/area_ccd")
+        nominal = run.of(f"{channel.key}/area_ccd", "nominal")
+        if not nominal:
             raise NominalPathLost(
-                f"none of {paths} paths of {channel.key} came back to its area CCD by the nominal way; trace more, or "
+                f"none of {paths} paths of {channel.key} returned to its area CCD along the nominal surfaces; trace more, or "
                 "the perturbation moves the beam off"
             )
         runs[channel.key] = run
-        scale[channel.key] = channel.photons / found[0].energy
+        scale[channel.key] = channel.photons / nominal[0].energy
         for name, light in photons.items():
-            every = run.images[name]
-            light += scale[channel.key] * (every.sum(axis=0) - every[NOMINAL])
+            detector_images = run.images[name]
+            light += scale[channel.key] * (detector_images.sum(axis=0) - detector_images[NOMINAL])
     return StrayResult(photons, runs, scale)
 
 
-REACH = 88
-"""Pixels from the middle of the diffraction image out to which stray light is spread."""
+SPREAD_PX = 88
+"""Half-width of the diffraction image with which stray light is convolved, in pixels."""
 
 FAMILIES = 20
-"""How many families of each source are listed, the strongest first."""
+"""Number of families that are listed for each source, the strongest first."""
 
 GHOSTS = 1e-3
-"""Share of a spot's light above which ghosts on its area CCD are warned of: a pixel of motion reads wrong by 1e-3 px,
-some times the centroid's noise."""
+"""Share of a spot's light above which ghosts on its area CCD cause a warning.
+
+A motion of a pixel is then misread by 1e-3 px, some times the centroid's noise.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,12 +253,12 @@ class StrayLight:
 
     Attributes
     ----------
-    photons : np.ndarray
-        Expected photons per pixel and frame beside the nominal spot, (C, rows, columns).
+    photons : (C, rows, columns) ndarray
+        Expected photons per pixel and frame without the nominal spot.
     traced : StrayResult
-        The path tracer's result.
+        Result of the path tracer.
     paths : int
-        Traced for every source.
+        Number of paths traced for every source.
     """
 
     photons: np.ndarray
@@ -259,11 +266,11 @@ class StrayLight:
     paths: int
 
     def share(self, nominal: np.ndarray) -> np.ndarray:
-        """Stray over nominal light of every area CCD, (C,)."""
+        """Return stray over nominal light of every area CCD, (C,)."""
         return np.asarray(self.photons.sum(axis=(1, 2)) / nominal.sum(axis=(1, 2)))
 
     def to_dict(self) -> dict[str, Any]:
-        """Contents of stray.json: by source, the families at any detector and where the light went."""
+        """Return the contents of stray.json: by source, the families at any detector and the energy balance."""
         sources = {
             name: {"families": [*map(FAMILY, self.traced.relative(name)[:FAMILIES])], "balance": _BALANCE(run.balance)}
             for name, run in self.traced.runs.items()
@@ -275,8 +282,10 @@ FAMILY: Record[ListedFamily] = Record(
     "All paths that reach a detector by the same events in the same order.",
     Quantity("detector", lambda one: one.family.detector, "where the paths end"),
     Quantity("kind", lambda one: one.family.kind, "ghost, or stray where something scatters or diffuses on the way"),
-    Quantity("name", lambda one: family_name(one.family.touches, one.nominal), "in what it differs from nominal light"),
-    Quantity("surfaces", lambda one: list(map(str, one.family.touches)), "in order"),
+    Quantity(
+        "name", lambda one: family_name(one.family.surface_events, one.nominal), "how it differs from nominal light"
+    ),
+    Quantity("surfaces", lambda one: list(map(str, one.family.surface_events)), "in order"),
     Quantity("relative_to_nominal", lambda one: one.share, "its light over that of the source's spot", "share"),
     Quantity("relative_to_nominal_sigma", lambda one: one.sigma, "sigma by the number of paths", "its σ"),
     Quantity("paths", lambda one: one.family.count, "that were traced"),
@@ -309,56 +318,56 @@ def stray_light(
     Parameters
     ----------
     experiment : MonitorExperiment
-        The instrument.
+        Instrument with its monitor.
     state : State
-        What is perturbed.
+        Perturbed state.
     paths : int
-        Of every source.
+        Number of paths of every source.
     seed : int
-        Of the random numbers.
-    progress : Callable[[int, int], None] | None
-        Told the paths done and in all.
-    finishes : Finishes | None
-        What surfaces do with light, None for the built-in ones.
+        Seed of the random numbers.
+    progress : callable or None
+        Called with the number of paths done and of all.
+    finishes : Finishes or None
+        Finishes of the surfaces, None for the built-in ones.
 
     Raises
     ------
     NominalPathLost
         Too few paths, or the perturbation moves a beam off.
     """
-    from scipy.signal import fftconvolve  # takes long, and most jobs trace no stray light
+    from scipy.signal import fftconvolve  # slow to import, and most jobs trace no stray light
 
     instrument = experiment.instrument
     traced = trace_stray(instrument, experiment.backend, state, paths, seed, finishes=finishes, progress=progress)
     spots = diffraction_spots(experiment)
     raw = np.stack([traced.photons[f"{c.key}/area_ccd"] for c in experiment.path.channels])
     spread = np.stack([fftconvolve(light, spot, mode="same") for light, spot in zip(raw, spots, strict=True)])
-    return StrayLight(np.maximum(spread, 0.0), traced, paths)  # the transform leaves rounding below zero
+    return StrayLight(np.maximum(spread, 0.0), traced, paths)  # rounding of the transform may be negative
 
 
 def diffraction_spots(experiment: MonitorExperiment) -> np.ndarray:
-    """Every channel's diffraction image about its middle, of unit sum, (C, 2 REACH + 1, 2 REACH + 1)."""
+    """Return every channel's diffraction image about its middle, (C, n, n) of unit sum, n = 2 SPREAD_PX + 1."""
     path = experiment.path
-    grid = Grid(-REACH * path.pitch, path.pitch, 2 * REACH + 1)
+    grid = Grid(-SPREAD_PX * path.pitch, path.pitch, 2 * SPREAD_PX + 1)
     spots = image(path.fields([{}]), grid, grid, single=True).astype(np.float64)
     return np.asarray(spots / spots.sum(axis=(1, 2), keepdims=True))
 
 
 @dataclass(frozen=True)
 class Ghost:
-    """Ghosts on one area CCD that have more than GHOSTS of its own spot's light.
+    """Ghosts on one area CCD with more than GHOSTS of its spot's light.
 
     Attributes
     ----------
     channel : Channel
-        Whose area CCD it is.
+        Channel of the area CCD.
     source : str
-        Channel that the strongest comes from, ``<camera>/<channel>``.
-    body : str | None
-        Path of the prism that throws it, the first whose face reflects what it should let pass; None where it comes
-        from nothing but nominal surfaces in another order.
+        Channel that the strongest ghost comes from, ``<camera>/<channel>``.
+    body : str or None
+        Path of the prism that causes it, the first with a reflecting face that should transmit; None where the ghost
+        met only nominal surfaces in another order.
     text : str
-        All in words.
+        Warning.
     """
 
     channel: Channel
@@ -368,49 +377,50 @@ class Ghost:
 
 
 def ghost_warnings(experiment: MonitorExperiment, light: StrayLight) -> tuple[str, ...]:
-    """One warning for each area CCD on which ghosts of any source have more than GHOSTS of its own spot's light."""
+    """Return a warning for each area CCD on which ghosts of any source exceed GHOSTS of its spot's light."""
     return tuple(ghost.text for ghost in ghosts(experiment, light))
 
 
-def _thrower(family: Family, usual: tuple[Touch, ...]) -> str | None:
-    known = {(touch.part, touch.event) for touch in usual}
-    for touch in family.touches:
-        prism = prism_of(touch.part)
-        if prism is not None and touch.event == Event.REFLECT and (touch.part, touch.event) not in known:
-            return f"{touch.part.partition(f'/{prism}/')[0]}/{prism}"
+def _reflecting_prism(family: Family, nominal_events: tuple[SurfaceEvent, ...]) -> str | None:
+    """Return the first prism that reflects light of a family at a face that should transmit it."""
+    known = {(hit.part, hit.event) for hit in nominal_events}
+    for hit in family.surface_events:
+        prism = prism_of(hit.part)
+        if prism is not None and hit.event == Event.REFLECT and (hit.part, hit.event) not in known:
+            return f"{hit.part.partition(f'/{prism}/')[0]}/{prism}"
     return None
 
 
 def ghosts(experiment: MonitorExperiment, light: StrayLight) -> tuple[Ghost, ...]:
-    """Area CCDs on which ghosts of any source have more than GHOSTS of their own spot's light.
+    """Return the area CCDs on which ghosts of any source exceed GHOSTS of their spots' light.
 
     Parameters
     ----------
     experiment : MonitorExperiment
-        The monitor.
+        Monitor.
     light : StrayLight
-        traced.
+        Traced stray light.
     """
     out, traced = [], light.traced
     for channel in experiment.path.channels:
         name = f"{channel.key}/area_ccd"
-        own = traced.runs[channel.key].nominal(name)
-        found = [
+        spot = traced.runs[channel.key].nominal(name)
+        ghost_paths = [
             (traced.photons_per_power[source] * family.energy / channel.photons, source, family)
             for source, run in traced.runs.items()
             for family in run.families
             if family.detector == name and family.kind == "ghost"
         ]
-        total = sum(share for share, _, _ in found)
+        total = sum(share for share, _, _ in ghost_paths)
         if total > GHOSTS:
-            share, source, family = max(found, key=lambda one: one[0])
-            off = np.hypot(*np.subtract(family.centroid, own.centroid)) / experiment.path.pitch
-            usual = traced.runs[source].nominal(f"{source}/area_ccd").touches
+            share, source, family = max(ghost_paths, key=lambda one: one[0])
+            off = np.hypot(*np.subtract(family.centroid, spot.centroid)) / experiment.path.pitch
+            nominal_events = traced.runs[source].nominal(f"{source}/area_ccd").surface_events
             text = (
-                f"ghosts on the area CCD of {channel.key} have {100.0 * total:.2g} % of its spot's light and pull the "
-                f"spot by that share of what it moves and they do not; the strongest, {100.0 * share:.2g} %, comes "
-                f"from {source} by {family_name(family.touches, usual)}, {off:.3g} px from the spot: another tilt of "
-                "that prism, or another field, leads it aside"
+                f"ghosts on the area CCD of {channel.key} have {100.0 * total:.2g} % of its spot's light and bias the "
+                f"spot by that share of its motion relative to them; the strongest, {100.0 * share:.2g} %, comes "
+                f"from {source} by {family_name(family.surface_events, nominal_events)}, {off:.3g} px from the spot: tilt that prism "
+                "or change the field to move it away"
             )
-            out.append(Ghost(channel, source, _thrower(family, usual), text))
+            out.append(Ghost(channel, source, _reflecting_prism(family, nominal_events), text))
     return tuple(out)

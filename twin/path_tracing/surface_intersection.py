@@ -1,11 +1,10 @@
-"""Where paths meet the next surface.
+"""Intersections of paths with the next surface.
 
-In the open Mitsuba's ``Scene.ray_intersect_preliminary`` (float32, on triangles) says which surface that is; Newton's
-method then finds the point on the analytic surface in float64. Inside a glass body no triangles are needed: the body is
-convex and its faces are flat, so the next face is the nearest one ahead, exactly, and no path leaks through an edge.
-Back in the open a triangle that only rounding puts there (the surface just left, the inside of a glass face, the rim of
-a mesh beyond a mirror's edge) is passed over, and the flight goes on behind it. Paths start in the open, outside all
-glass.
+In the open, Mitsuba's ``Scene.ray_intersect_preliminary`` (float32, on triangles) finds the surface; Newton's method
+then finds the point on the analytic surface in float64. Inside a glass body no triangles are needed: the body is convex
+and its faces are flat, so the next face is the nearest one ahead, exactly, and no path leaks through an edge. Back in
+the open, a triangle that is hit by rounding only (of the surface just left, the inside of a glass face, the rim of a
+mesh beyond a mirror's edge) is skipped, and the search continues behind it. Paths start in the open, outside all glass.
 """
 
 from __future__ import annotations
@@ -16,14 +15,17 @@ from typing import Any
 from optics.geometry.surface import along, level, newton_step
 from optics.numerics.backend import Backend
 from twin.path_tracing import tables as layout
-from twin.path_tracing.clear_ways import PLACES
+from twin.path_tracing.clear_ways import EXITS
 
 REFINEMENTS = 3
-"""Newton steps from the triangle to the surface: from below a millimetre to 1e-7 and 1e-13 m and to rounding, also at
-grazing incidence."""
+"""Number of Newton steps from the triangle to the surface: from below a millimetre to 1e-7 m, 1e-13 m and to rounding,
+also at grazing incidence.
+"""
 
 EXACT = 1e-12
-"""Largest value of the level function, metres, at which a surface is met: some hundred roundings of ten metres."""
+"""Largest value of the level function, in metres, at which a surface counts as met: some hundred roundings of ten
+metres.
+"""
 
 AHEAD = 1e-12
 """Smallest cosine with its normal at which a face of a glass body is met."""
@@ -31,9 +33,24 @@ AHEAD = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """Paths on their way: ``Vector3`` position and unit direction, number of the glass body that they are in (None in a
-    scene without glass, 0 in the open), how far ahead the search for a surface starts, which of them fly, and which go
-    the way of their neighbours.
+    """Paths between surfaces, as Dr.Jit arrays.
+
+    Attributes
+    ----------
+    position, direction : Any
+        Position, metres, and unit direction, ``Vector3``.
+    body : Any
+        Number of the glass body that they are in: None in a scene without glass, 0 in the open.
+    ahead : Any
+        Distance ahead at which the search for a surface starts, metres.
+    active : Any
+        Mask of the active paths.
+    coherent : Any
+        Mask of the paths that follow their neighbours.
+    segment : Any
+        Row of the clear segment of each path, 0 for none.
+    segments : bool
+        The scene has clear segments.
     """
 
     position: Any
@@ -41,75 +58,78 @@ class Flight:
     body: Any
     ahead: Any
     active: Any
-    together: Any
-    way: Any
-    ways: bool
+    coherent: Any
+    segment: Any
+    segments: bool
 
 
 @dataclass(frozen=True, eq=False)
-class Next:
-    """The surfaces that paths meet next: Dr.Jit arrays.
+class NextSurface:
+    """Surfaces that paths meet next, as Dr.Jit arrays.
 
     Attributes
     ----------
     near : Any
-        About how far it is; surface: its number.
+        Approximate distance, metres.
+    surface : Any
+        Index of the surface.
     hit : Any
-        Which paths meet one.
-    tried : Any
-        Which paths are only thought to meet it, by the way that they take; way: the way after it and where it ends, see
-        ``tables.way_table``.
+        Mask of the paths that meet one.
+    expected : Any
+        Mask of the paths that are only expected to meet it, by their clear segment.
+    segment : list of Any
+        Row of the segment after it, and code of its end, see ``tables.segment_table``.
     """
 
     near: Any
     surface: Any
     hit: Any
-    tried: Any
-    way: list[Any]
+    expected: Any
+    segment: list[Any]
 
 
-def next_surface(backend: Backend, mi: Any, scene: Any, tables: layout.SceneTables, flight: Flight) -> Next:
-    """What paths meet next: the end of a clear way, or what a search finds."""
+def next_surface(backend: Backend, mi: Any, scene: Any, tables: layout.SceneTables, flight: Flight) -> NextSurface:
+    """Return the surfaces that paths meet next: the end of a clear segment, or the result of a search."""
     import drjit as dr
 
     p, d, active = flight.position, flight.direction, flight.active
-    tried: Any = active & False
-    way: list[Any] = []
-    near, surface = 0.0 * p.x, 0 * flight.way
-    if flight.ways:
-        near, tried, way = _end(backend, tables, flight)
-        surface = dr.select(tried, way[1] // PLACES, 0)
-    search = active & ~tried
+    expected: Any = active & False
+    segment: list[Any] = []
+    near, surface = 0.0 * p.x, 0 * flight.segment
+    if flight.segments:
+        near, expected, segment = _end(backend, tables, flight)
+        surface = dr.select(expected, segment[1] // EXITS, 0)
+    search = active & ~expected
     inside = None if flight.body is None else search & (flight.body != 0)
     outside = search if inside is None else search & ~inside
 
     def look(near: Any, surface: Any, hit: Any) -> tuple[Any, Any, Any]:
         ray = mi.Ray3f(mi.Point3f(dr.fma(d, flight.ahead, p)), mi.Vector3f(d))
-        found = scene.ray_intersect_preliminary(ray, coherent=flight.together | ~outside, active=outside)
-        hits = found.is_valid() & outside
-        surface = dr.select(hits, backend.UInt(found.shape_index), surface)
-        return dr.select(outside, backend.Float(found.t) + flight.ahead, near), surface, hit | hits
+        intersection = scene.ray_intersect_preliminary(ray, coherent=flight.coherent | ~outside, active=outside)
+        hits = intersection.is_valid() & outside
+        surface = dr.select(hits, backend.UInt(intersection.shape_index), surface)
+        return dr.select(outside, backend.Float(intersection.t) + flight.ahead, near), surface, hit | hits
 
     near, surface, hit = dr.if_stmt(
-        (near, surface, tried), outside, look, lambda *same: same, label="search", mode="symbolic"
+        (near, surface, expected), outside, look, lambda *same: same, label="search", mode="symbolic"
     )
     if inside is not None:
         t, face = _nearest_face(backend, tables, p, d, flight.body, inside)
         near, surface, hit = dr.select(inside, t, near), dr.select(inside, face, surface), hit | inside
-    return Next(near, surface, hit, tried, way)
+    return NextSurface(near, surface, hit, expected, segment)
 
 
 def _end(backend: Backend, tables: layout.SceneTables, flight: Flight) -> tuple[Any, Any, list[Any]]:
-    """About how far it is to the ends of the ways that paths are on, which paths can meet them, and the ways."""
+    """Return the approximate distance to the ends of segments, which paths can meet them, and the segments."""
     import drjit as dr
 
     p, d = flight.position, flight.direction
-    on_one = flight.active & (flight.way != 0)
-    x, y, z, after, *normal, code = tables.way(flight.way, on_one)
+    on_one = flight.active & (flight.segment != 0)
+    x, y, z, after, *normal, code = tables.segment(flight.segment, on_one)
     v, n = backend.Vector3(x, y, z) - p, backend.Vector3(*normal)
     along = dr.dot(v, d)
     aside = dr.fma(-along, along, dr.dot(v, v))
-    # the normal is as long as the reciprocal of the radius
+    # the length of the normal is the reciprocal of the radius
     possible = on_one & (along > 0.0) & (aside * dr.dot(n, n) < 1.0)
     return dr.dot(v, n) / dr.dot(d, n), possible, [backend.UInt(after), backend.UInt(code)]
 
@@ -117,9 +137,9 @@ def _end(backend: Backend, tables: layout.SceneTables, flight: Flight) -> tuple[
 def _nearest_face(
     backend: Backend, tables: layout.SceneTables, p: Any, d: Any, body: Any, inside: Any
 ) -> tuple[Any, Any]:
-    """Distance to and number of the face through which a path leaves its convex glass body, exactly.
+    """Return distance and index of the face through which a path leaves its convex glass body, exactly.
 
-    The distance may come out negative by a rounding, where a path meets an edge.
+    The distance may be negative by a rounding error, where a path meets an edge.
     """
     import drjit as dr
 
@@ -130,7 +150,7 @@ def _nearest_face(
         nx, ny, nz, offset = tables.plane(first + k, k < count)
         this_toward = dr.fma(nx, d.x, dr.fma(ny, d.y, nz * d.z))
         this_gap = offset - dr.fma(nx, p.x, dr.fma(ny, p.y, nz * p.z))
-        # gap / toward is the distance; both denominators are positive, and only the last distance is divided out
+        # gap / toward is the distance; both denominators are positive, and the division is done once at the end
         nearer = (this_toward > AHEAD) & (this_gap * toward < gap * this_toward)
         gap, toward = dr.select(nearer, this_gap, gap), dr.select(nearer, this_toward, toward)
         return k + 1, gap, toward, dr.select(nearer, first + k, face)
@@ -142,26 +162,26 @@ def _nearest_face(
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
-    """Where paths meet their surfaces: Dr.Jit arrays.
+class Intersection:
+    """Intersections of paths with their surfaces, as Dr.Jit arrays.
 
     Attributes
     ----------
     distance : Any
-        Along the path.
+        Distance along the path, metres.
     x, y : Any
-        In the surface's frame.
+        Coordinates in the surface's frame, metres.
     normal : Any
-        Unit vector in the world, toward +z of the surface.
+        Unit normal in the world frame, toward +z of the surface.
     cosine : Any
-        Of the path's direction with it.
+        Cosine of the path's direction with the normal.
     first, second : Any
-        Whether inside the first and the second clear aperture.
+        True inside the first and the second clear aperture.
     exact : Any
-        Whether the surface is there, to rounding.
+        True where the surface is met, to rounding.
     kind : Any
-        Bits of the surface.
-    row : list[Any]
+        Bits of the surface's kind.
+    row : list of Any
         Numbers of its geometry.
     """
 
@@ -178,29 +198,29 @@ class Place:
 
     @property
     def clear(self) -> Any:
-        """Whether inside the clear apertures."""
+        """True inside the clear apertures."""
         return self.first | self.second
 
 
 def locate(
     backend: Backend, tables: layout.SceneTables, form: layout.SurfaceForm, flight: Flight, near: Any, surface: Any
-) -> Place:
-    """Find exactly where paths meet the surfaces that are about ``near`` away.
+) -> Intersection:
+    """Compute the exact intersection of paths with the surfaces at a distance of about ``near``.
 
     Parameters
     ----------
     backend : Backend
         Array types.
     tables : layout.SceneTables
-        Of the scene.
+        Tables of the scene.
     form : layout.SurfaceForm
-        What its surfaces consist of.
+        Components of its surfaces' shapes.
     flight : Flight
-        The paths; ``active`` are those that meet a surface.
+        Paths; ``active`` are those that meet a surface.
     near : Any
-        About how far it is.
+        Approximate distance, metres.
     surface : Any
-        Its number.
+        Index of the surface.
     """
     import drjit as dr
 
@@ -226,7 +246,7 @@ def locate(
                 s = newton_step(local, toward, s, shape, tables.samples, curved)
             u, v, z = along(local, toward, s)
             value, nx, ny, nz = level(u, v, z, shape, tables.samples, curved)
-            # the conic's other sheet is no surface
+            # the other sheet of the conic is not part of the surface
             value = dr.select(nz > 0.0, value, dr.inf)
             unit = dr.rsqrt(dr.fma(nx, nx, dr.fma(ny, ny, nz * nz)))
             nx, ny, nz = nx * unit, ny * unit, nz * unit
@@ -249,4 +269,4 @@ def locate(
             t, x, y, cosine, normal, rest = refine()
     first, size = layout.APERTURES, layout.APERTURE
     within, again = (layout.within(x, y, g[k : k + size]) for k in (first, first + size))
-    return Place(t, x, y, normal, cosine, within, again, dr.abs(rest) < EXACT, kind, g)
+    return Intersection(t, x, y, normal, cosine, within, again, dr.abs(rest) < EXACT, kind, g)

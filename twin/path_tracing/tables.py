@@ -1,4 +1,4 @@
-"""The prescription's numbers and measured finishes as flat tables in the backend's memory, looked up by each path."""
+"""Numbers of the prescription and measured finishes, as flat tables in the backend's memory that each path reads."""
 
 from __future__ import annotations
 
@@ -14,34 +14,38 @@ from optics.geometry.sag_terms import SagTerm, kinds_of, of_kinds
 from optics.geometry.surface import FigureNumbers, GridNumbers, SurfaceNumbers
 from optics.geometry.zernike import triangle_size
 from optics.materials import fresnel_scatter
-from optics.materials.fresnel_scatter import ScatterSampling, Finish
+from optics.materials.fresnel_scatter import Finish, ScatterSampling
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import leaves
 from scenes.models.scenery import Scenery, SceneSurface
-from twin.path_tracing.clear_ways import PLACES, Way
+from twin.path_tracing.clear_ways import EXITS, Segment
 
 _HEADER = 8
-"""Numbers of a scatter table: rings, sectors, first share, first of the rings' sums, first of the sectors' sums, first
-cosine, first azimuth, 1 where half of the draws are mirrored."""
+"""Count of numbers of a scatter table: rings, sectors, first share, first of the rings' sums, first of the sectors'
+sums, first cosine, first azimuth, 1 where half of the draws are mirrored.
+"""
 MARKS = 4
-"""Numbers of a finish: its coating and its scatter table, each counted from 1 with 0 for none, and 1 where all that it
-reflects is what the table scatters."""
+"""Count of numbers of a finish: its coating and its scatter table, each counted from 1 with 0 for none, and 1 where all
+that it reflects is what the table scatters.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class FinishTables:
-    """Measured finishes of a scene (Dr.Jit arrays).
+    """Measured finishes of a scene, as Dr.Jit arrays.
 
     Attributes
     ----------
     marks : Any
-        (surfaces * 3 * MARKS).
+        (surfaces * 3 * MARKS) marks of the finishes.
     coatings : Any
         (coatings * (STEPS + 1) * 2) reflectance and transmittance.
     headers : Any
-        (scatter tables * _HEADER); numbers: what they point to.
+        (scatter tables * _HEADER) headers.
+    numbers : Any
+        Numbers that the headers point to.
     most_rings, most_sectors : int
-        Of all tables.
+        Largest number of rings and of sectors of all tables.
     """
 
     backend: Backend
@@ -53,11 +57,11 @@ class FinishTables:
     most_sectors: int
 
     def of(self, row: Any, active: Any) -> list[Any]:
-        """The marks of each path's finish."""
+        """Return the marks of each path's finish."""
         return [self._get(self.marks, row * MARKS + k, active) for k in range(MARKS - 1)]
 
     def shares(self, marks: Sequence[Any], cosine: Any, active: Any) -> tuple[Any, Any]:
-        """Reflectance and transmittance of the coatings of paths that have one, by the cosine on the side of air."""
+        """Return reflectance and transmittance of the paths' coatings, by the cosine on the side of air."""
         number, k, w = self._place(marks[0], cosine, fresnel_scatter.COATING_STEPS)
         first = 2 * ((fresnel_scatter.COATING_STEPS + 1) * number + k)
         has = active & (marks[0] > 0.5)
@@ -65,21 +69,21 @@ class FinishTables:
         return (1.0 - w) * low[0] + w * high[0], (1.0 - w) * low[1] + w * high[1]
 
     def total(self, marks: Sequence[Any], cosine: Any, active: Any) -> Any:
-        """Total integrated scatter of the tables of paths that have one."""
+        """Return the total integrated scatter of the tables, for paths that have one."""
         number, k, w = self._place(marks[1], cosine, fresnel_scatter.STEPS)
         has = active & (marks[1] > 0.5)
         first = self._uint(self._get(self.headers, _HEADER * number + 2, has)) + k
         return (1.0 - w) * self._get(self.numbers, first, has) + w * self._get(self.numbers, first + 1, has)
 
     def draw(self, marks: Sequence[Any], cosine: Any, specular: Any, side: Any, u: Sequence[Any], active: Any) -> Any:
-        """A scattered direction of paths whose finish has a table.
+        """Draw a scattered direction for paths whose finish has a table.
 
         Parameters
         ----------
         marks : Sequence[Any]
-            Of their finishes.
+            Marks of their finishes.
         cosine : Any
-            Of incidence.
+            Cosine of the angle of incidence.
         specular : Any
             Unit vector of the specular direction.
         side : Any
@@ -87,7 +91,7 @@ class FinishTables:
         u : Sequence[Any]
             Four random numbers.
         active : Any
-            Which paths.
+            Mask of the paths.
         """
         import drjit as dr
 
@@ -96,7 +100,7 @@ class FinishTables:
         header = [self._get(self.headers, _HEADER * number + n, has) for n in range(_HEADER)]
         rings, sectors, share, ring_sums, sector_sums, cosines, azimuths = (self._uint(v) for v in header[:7])
         low, high = self._get(self.numbers, share + k, has), self._get(self.numbers, share + k + 1, has)
-        # one of the two angles of incidence beside the path's own, by the power that it has there
+        # draw one of the two neighbouring angles of incidence, by its interpolated power
         upper = u[0] * ((1.0 - w) * low + w * high) < w * high
         k = dr.select(upper, k + 1, k)
         ring, along = self._search(ring_sums + k * (rings + 1), rings, self.most_rings, u[1], has)
@@ -106,7 +110,7 @@ class FinishTables:
         p = self._between(azimuths + sector, across, has)
         p = dr.select((header[7] > 0.5) & (u[3] < 0.5), -p, p)
         lean = side - dr.dot(side, specular) * specular
-        # at normal incidence the azimuth starts anywhere
+        # at normal incidence the origin of the azimuth is arbitrary
         other = self.backend.Vector3(
             dr.select(dr.abs(specular.x) < 0.6, 1.0, 0.0), dr.select(dr.abs(specular.x) < 0.6, 0.0, 1.0), 0.0
         )
@@ -120,7 +124,7 @@ class FinishTables:
         return dr.normalize(out - 2.0 * below * side)
 
     def _place(self, mark: Any, cosine: Any, steps: int) -> tuple[Any, Any, Any]:
-        """Number of the table, interval of the angle of incidence and place in it."""
+        """Return the number of the table, the interval of the angle of incidence and the position in it."""
         import drjit as dr
 
         angle = dr.acos(dr.clip(cosine, 0.0, 1.0)) * (2.0 * steps / np.pi)
@@ -128,16 +132,16 @@ class FinishTables:
         return self._uint(dr.maximum(mark, 1.0)) - 1, k, angle - self.backend.Float(k)
 
     def _search(self, first: Any, count: Any, most: int, u: Any, active: Any) -> tuple[Any, Any]:
-        """Cell in whose interval of cumulative shares u lies, and where in it."""
+        """Return the cell whose interval of cumulative shares contains u, and the position in it."""
         import drjit as dr
 
-        found = dr.binary_search(
+        cell = dr.binary_search(
             0,
             most - 1,
             lambda i: (i + 1 < count) & (self._get(self.numbers, first + dr.minimum(i, count - 1) + 1, active) <= u),
         )
-        low, high = self._get(self.numbers, first + found, active), self._get(self.numbers, first + found + 1, active)
-        return found, dr.select(high > low, (u - low) / (high - low), 0.5)
+        low, high = self._get(self.numbers, first + cell, active), self._get(self.numbers, first + cell + 1, active)
+        return cell, dr.select(high > low, (u - low) / (high - low), 0.5)
 
     def _between(self, first: Any, place: Any, active: Any) -> Any:
         low, high = self._get(self.numbers, first, active), self._get(self.numbers, first + 1, active)
@@ -153,16 +157,16 @@ class FinishTables:
 
 
 def measured(finish: Finish) -> bool:
-    """Whether a finish has a table."""
+    """Return True if a finish has a table."""
     return finish.coating is not None or finish.table is not None
 
 
 def upload_finishes(backend: Backend, surfaces: Sequence[SceneSurface]) -> FinishTables | None:
-    """The measured finishes of a scene, None where there are none."""
+    """Upload the measured finishes of a scene; return None if there are none."""
     finishes = [f for s in surfaces for f in (s.front, s.back, s.outside)]
     if not any(measured(f) for f in finishes):
         return None
-    # a coating of glass also says what goes through
+    # a coating of glass has a transmittance as well
     coats = list(dict.fromkeys((f.coating, f.transmission > 0.0) for f in finishes if f.coating is not None))
     tables = list(dict.fromkeys(f.table for f in finishes if f.table is not None))
     marks = np.zeros((len(finishes), MARKS))
@@ -198,40 +202,48 @@ def _header(drawn: ScatterSampling, first: int) -> list[float]:
 BLOCK = 4
 BLOCKS = 8
 ROW = BLOCK * BLOCKS
-"""Numbers of a geometry row: 0-8 rotation world to local, 9-11 its shift, 12 clearance, 13 refractive index behind, 14
-number of the part plus one, 15 reciprocal of the index, 16-25 two clear apertures, 26 bits of the kind, 28-31 rows of
-the first way from each of the surface's places, 0 for none."""
+"""Count of numbers of a geometry row.
 
-CLEARANCE, INDEX, PART, INVERSE, APERTURES, KIND, WAYS = 12, 13, 14, 15, 16, 26, 28
+0-8 rotation world to local, 9-11 its shift, 12 clearance, 13 refractive index behind, 14 index of the part plus one, 15
+reciprocal of the index, 16-25 two clear apertures, 26 bits of the kind, 28-31 rows of the first segment from each of
+the surface's exits, 0 for none.
+"""
+
+CLEARANCE, INDEX, PART, INVERSE, APERTURES, KIND, SEGMENTS = 12, 13, 14, 15, 16, 26, 28
 KINDS = (20, 25, KIND)
-"""Which of them say of which kind something is."""
+"""Indices of the numbers that encode a kind."""
 
 CURVES = 2
-"""Blocks of a curved surface: curvature, conic, A4, A6, A8."""
+"""Number of blocks of a curved surface: curvature, conic, A4, A6, A8."""
 
 APERTURE = 5
-"""Numbers of a clear aperture: four that its shape has, of an ellipse the half axes' reciprocals, and which shape."""
+"""Count of numbers of a clear aperture: four of its shape (for an ellipse the reciprocals of its semi-axes), and the
+kind of shape.
+"""
 RING, RECTANGLE, ELLIPSE = 0.0, 1.0, 2.0
 
 GRID_ROW = 8
 _NO_GRID = (0.0, 0.0, 0.0, 0.0, 4.0, 4.0, 0.0)
-"""Numbers of a grid for surfaces without one: four by four samples of 0, whose 8 x 8 coefficients head the table."""
+"""Numbers of a grid for surfaces without one: four by four samples of 0, whose 8 x 8 coefficients are first in the
+table.
+"""
 
 FINISH_ROW = 8
-"""Numbers of a finish: reflectance (-1 for bare glass), transmission, diffuse, share of the lobe; scale, exponent and
-kind of the lobe, and its area."""
+"""Count of numbers of a finish: reflectance (-1 for bare glass), transmission, diffuse, share of the lobe; scale,
+exponent and kind of the lobe, and its area.
+"""
 ROWS_PER_SURFACE = 3
-"""Finishes of a surface: met from +z, met from -z, outside its clear apertures."""
+"""Number of finishes of a surface: met from +z, met from -z, outside its clear apertures."""
 
-WAY = 8
-"""Numbers of a way."""
+SEGMENT = 8
+"""Count of numbers of a clear segment."""
 
 MOST_EVEN = 3
 MOST_BODIES = 255
 MOST_DETECTORS = 255
 
 NOMINAL_SUMS = 8
-"""Sums of the nominal family per detector, one of them unused."""
+"""Number of sums of the nominal family per detector, one of them unused."""
 
 
 class Kind:
@@ -246,22 +258,22 @@ class Kind:
 
 @dataclass(frozen=True)
 class SurfaceForm:
-    """What the shapes of a scene's surfaces consist of, and with it the kernel's code.
+    """Components of the shapes of a scene's surfaces, which determine the kernel's code.
 
     Attributes
     ----------
     even : int
         Number of aspheric terms.
-    terms : tuple[type[SagTerm], ...]
+    terms : tuple of type[SagTerm]
         Kinds of further terms of the sag.
     figure_order : int
-        Highest order of a polynomial figure, -1 when there is none.
+        Highest order of a polynomial figure, -1 if there is none.
     grid : bool
         Some surface has a figure on a grid.
     flat : bool
         All surfaces are planes without figure.
     mixed : bool
-        Some are and some are not.
+        Some surfaces are planes without figure, and some are not.
     """
 
     even: int
@@ -273,7 +285,7 @@ class SurfaceForm:
 
     @classmethod
     def of(cls, surfaces: Sequence[SceneSurface]) -> SurfaceForm:
-        """What is needed for all of them."""
+        """Return the components that some surfaces need together."""
         shapes = [s.surface for s in surfaces]
         order = max((f.order for s in shapes if (f := s.zernike_figure) is not None), default=-1)
         grid = any(s.grid_figure is not None for s in shapes)
@@ -285,20 +297,22 @@ class SurfaceForm:
 
 @dataclass(frozen=True, eq=False)
 class SceneTables:
-    """Numbers of a scene (Dr.Jit arrays).
+    """Numbers of a scene, as Dr.Jit arrays.
 
     Attributes
     ----------
     rows : Any
-        (surfaces * ROW) geometry; finishes: (surfaces * 3 * FINISH_ROW).
+        (surfaces * ROW) geometry.
     curves : Any
         (surfaces * CURVES * BLOCK) curvature, conic and aspheric terms.
     terms : Any
-        (surfaces * 4 * blocks) numbers of all kinds of further terms; width 1 when there are none.
+        (surfaces * 4 * blocks) numbers of all kinds of further terms; width 1 if there are none.
     figures : Any
-        (surfaces * 4 * blocks) centre and coefficients of polynomial figures; width 1 when there are none.
+        (surfaces * 4 * blocks) centre and coefficients of polynomial figures; width 1 if there are none.
     grids, samples : Any
-        (surfaces * GRID_ROW) numbers of grid figures and the coefficients of all; likewise.
+        (surfaces * GRID_ROW) numbers of grid figures, and the coefficients of all; width 1 if there are none.
+    finishes : Any
+        (surfaces * 3 * FINISH_ROW) finishes.
     planes : Any
         (surfaces * 4) world normal and offset of flat faces.
     body_first, body_faces : Any
@@ -308,11 +322,11 @@ class SceneTables:
     nominal : Any
         (detectors,) signature of the nominal family.
     pixels : Any
-        Of all detectors together.
-    ways : Any
-        ((2 + ways) * WAY) see ``way_table``.
-    measured : FinishTables | None
-        Tables of measured finishes, None where there are none.
+        Number of pixels of all detectors together.
+    segments : Any
+        ((2 + segments) * SEGMENT) clear segments, see ``segment_table``.
+    measured : FinishTables or None
+        Tables of measured finishes, None if there are none.
     """
 
     rows: Any
@@ -328,18 +342,18 @@ class SceneTables:
     detectors: Any
     nominal: Any
     pixels: Any
-    ways: Any
+    segments: Any
     block: Any
     host_rows: np.ndarray
     host_finishes: np.ndarray
     measured: FinishTables | None = None
 
     def geometry(self, surface: Any, active: Any) -> list[Any]:
-        """The row of each path's surface, ``ROW`` numbers."""
+        """Return the geometry row of each path's surface, ``ROW`` numbers."""
         return self._row(self.rows, surface, BLOCKS, active)
 
     def surface(self, number: Any, form: SurfaceForm, active: Any) -> SurfaceNumbers:
-        """The shape of each path's surface."""
+        """Return the shape of each path's surface."""
         c = self._row(self.curves, number, CURVES, active)
         figure = grid = None
         terms: list[SagTerm] = []
@@ -358,24 +372,24 @@ class SceneTables:
         return SurfaceNumbers(c[0], c[1], tuple(c[2 : 2 + form.even]), tuple(terms), figure, grid)
 
     def finish(self, row: Any, active: Any) -> list[Any]:
-        """Reflectance (-1 for bare glass), transmission, diffuse and lobe's share of each path's row."""
+        """Return reflectance (-1 for bare glass), transmission, diffuse and lobe's share of each path's row."""
         return self._row(self.finishes, 2 * row, 1, active)
 
     def lobe(self, row: Any) -> Callable[[Any], list[Any]]:
-        """Looks scale, exponent, kind and area of the lobe of each path's row up, for active paths."""
+        """Return a function that gives scale, exponent, kind and area of the lobe of each active path's row."""
         return lambda active: self._row(self.finishes, 2 * row + 1, 1, active)
 
     def detector(self, number: Any, active: Any) -> list[Any]:
-        """The row of each path's detector."""
+        """Return the row of each path's detector."""
         return self._row(self.detectors, number, 2, active)
 
     def plane(self, surface: Any, active: Any) -> list[Any]:
-        """World normal (3) and offset of a flat face."""
+        """Return world normal (3) and offset of a flat face."""
         return self._row(self.planes, surface, 1, active)
 
-    def way(self, number: Any, active: Any) -> list[Any]:
-        """Where a way ends."""
-        return self._row(self.ways, number, WAY // BLOCK, active)
+    def segment(self, number: Any, active: Any) -> list[Any]:
+        """Return the row of each path's clear segment."""
+        return self._row(self.segments, number, SEGMENT // BLOCK, active)
 
     def _row(self, source: Any, index: Any, blocks: int, active: Any) -> list[Any]:
         import drjit as dr
@@ -387,23 +401,25 @@ class SceneTables:
 
 
 def glass_bodies(surfaces: Sequence[SceneSurface]) -> list[str]:
-    """Glass bodies in the order of their numbers, which count from 1."""
+    """Return the glass bodies in the order of their numbers, which count from 1."""
     return list(dict.fromkeys(s.solid for s in surfaces if s.solid is not None))
 
 
-def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int], ways: Sequence[Way] = ()) -> SceneTables:
-    """Tables of a scene.
+def upload(
+    backend: Backend, scenery: Scenery, nominal: Mapping[str, int], segments: Sequence[Segment] = ()
+) -> SceneTables:
+    """Upload the tables of a scene.
 
     Parameters
     ----------
     backend : Backend
-        Where to.
+        Backend that holds the tables.
     scenery : Scenery
-        The surfaces.
+        Surfaces.
     nominal : Mapping[str, int]
         Detector name -> signature of its nominal family.
-    ways : Sequence[Way]
-        That light can take without a search.
+    segments : Sequence[Segment]
+        Clear segments.
 
     Raises
     ------
@@ -436,19 +452,19 @@ def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int], ways:
             kind[i] |= numbers[s.detector] << Kind.DETECTOR_SHIFT
         finishes[i] = [_finish(finish) for finish in (s.front, s.back, s.outside)]
         rows[i, PART], rows[i, KIND] = parts.index(s.part) + 1, kind[i]
-    for number, way in reversed(list(enumerate(ways))):
-        rows[way.start, WAYS + way.place] = number + 2
+    for number, segment in reversed(list(enumerate(segments))):
+        rows[segment.start, SEGMENTS + segment.exit_side] = number + 2
     first, count = np.zeros(len(bodies) + 1, np.uint32), np.zeros(len(bodies) + 1, np.uint32)
     for b, body in enumerate(bodies):
-        own = [i for i, s in enumerate(surfaces) if s.solid == body]
-        if own != list(range(own[0], own[0] + len(own))):
+        faces = [i for i, s in enumerate(surfaces) if s.solid == body]
+        if faces != list(range(faces[0], faces[0] + len(faces))):
             raise ValueError(f"the faces of {body!r} do not follow each other")
-        first[b + 1], count[b + 1] = own[0], len(own)
+        first[b + 1], count[b + 1] = faces[0], len(faces)
     grids = np.zeros((max(len(detectors), 1), 2 * BLOCK))
-    place = 0
+    first_pixel = 0
     for i, d in enumerate(detectors):
-        grids[i, :5] = [1.0 / d.pitch[0], 1.0 / d.pitch[1], d.columns, d.rows, place]
-        place += d.columns * d.rows
+        grids[i, :5] = [1.0 / d.pitch[0], 1.0 / d.pitch[1], d.columns, d.rows, first_pixel]
+        first_pixel += d.columns * d.rows
     form = SurfaceForm.of(surfaces)
     figures, placements, samples = _figures(surfaces, form)
     signatures = np.array([nominal.get(d.name, 0) for d in detectors] or [0], np.uint64)
@@ -465,8 +481,8 @@ def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int], ways:
         backend.UInt(count),
         backend.opaque(grids),
         dr.uint64_array_t(backend.Float)(signatures),
-        backend.UInt(place),
-        backend.opaque(way_table(ways)),
+        backend.UInt(first_pixel),
+        backend.opaque(segment_table(segments)),
         import_module(f"drjit.{backend.name}.ad").Array4f64,
         rows,
         finishes,
@@ -476,17 +492,20 @@ def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int], ways:
     return out
 
 
-def way_table(ways: Sequence[Way], source: Way | None = None) -> np.ndarray:
-    """Rows of ways, (2 + ways, WAY): none, that of the source, and all others.
+def segment_table(segments: Sequence[Segment], source: Segment | None = None) -> np.ndarray:
+    """Return the rows of clear segments, (2 + segments, SEGMENT): no segment, that of the source, and all others.
 
-    A row is the middle of the aperture at the end and the row of the way after it; and its normal, as long as the
-    reciprocal of its radius, and a number: 4 * surface + 2 * aperture + side to which light leaves for the way after.
+    A row has the middle of the aperture at the end and the row of the next segment; then its normal, scaled to the
+    reciprocal of its radius, and the code 4 * surface + 2 * aperture + side to which light leaves for the next segment.
     """
-    out = np.zeros((2 + len(ways), WAY))
-    for row, way in zip(out[1:], (source, *ways), strict=True):
-        if way is not None:
-            row[:4] = [*way.end.middle, way.after + 2 if way.after >= 0 else 0]
-            row[4:] = [*way.end.normal / way.end.radius, PLACES * way.end.surface + 2 * way.end.aperture + way.behind]
+    out = np.zeros((2 + len(segments), SEGMENT))
+    for row, segment in zip(out[1:], (source, *segments), strict=True):
+        if segment is not None:
+            row[:4] = [*segment.end.middle, segment.after + 2 if segment.after >= 0 else 0]
+            row[4:] = [
+                *segment.end.normal / segment.end.radius,
+                EXITS * segment.end.surface + 2 * segment.end.aperture + segment.behind,
+            ]
     return out
 
 
@@ -496,7 +515,7 @@ def _geometry(s: SceneSurface) -> np.ndarray:
     row[0:9] = inverse.ravel()
     row[9:12] = -inverse @ s.pose.translation
     row[CLEARANCE], row[INDEX], row[INVERSE] = s.clearance, s.index, 1.0 / s.index
-    for k in range(2):  # one alone counts twice
+    for k in range(2):  # a single aperture is stored twice
         start = APERTURES + k * APERTURE
         row[start : start + APERTURE] = _aperture(s.apertures[-k] if s.apertures else None)
     return row
@@ -518,12 +537,12 @@ def _finish(finish: Finish) -> list[float]:
 
 
 def _blocks(numbers: int) -> int:
-    """Blocks that a row of so many numbers takes."""
+    """Return the number of blocks of a row of so many numbers."""
     return -(-numbers // BLOCK)
 
 
 def _terms(surfaces: Sequence[SceneSurface], form: SurfaceForm) -> np.ndarray:
-    """Rows of further terms of the sag, kind by kind."""
+    """Return the rows of further terms of the sag, kind by kind."""
     if not form.terms:
         return np.zeros(1)
     rows = [list(leaves(of_kinds(s.surface.terms, form.terms)).values()) for s in surfaces]
@@ -533,7 +552,7 @@ def _terms(surfaces: Sequence[SceneSurface], form: SurfaceForm) -> np.ndarray:
 
 
 def _figures(surfaces: Sequence[SceneSurface], form: SurfaceForm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of polynomial figures and of grids, and the coefficients of all grids."""
+    """Return the rows of polynomial figures and of grids, and the coefficients of all grids."""
     polynomials, grids, samples = np.zeros(1), np.zeros(1), np.zeros(1)
     if form.figure_order >= 0:
         size = 2 + triangle_size(form.figure_order)
@@ -555,7 +574,7 @@ def _figures(surfaces: Sequence[SceneSurface], form: SurfaceForm) -> tuple[np.nd
 
 
 def _aperture(aperture: Aperture | None) -> tuple[float, ...]:
-    """The numbers that ``within`` reads; nothing is outside of no aperture."""
+    """Return the numbers that ``within`` reads; without an aperture, no point is outside."""
     if aperture is None:
         return (0.0, 0.0, np.inf, 0.0, RING)
     match aperture.numbers():
@@ -572,11 +591,11 @@ def _aperture(aperture: Aperture | None) -> tuple[float, ...]:
 
 
 def within(x: Any, y: Any, a: Sequence[Any]) -> Any:
-    """Inside a clear aperture, whose numbers (``APERTURE`` of a row) may be those of another shape for each path."""
+    """Return True inside a clear aperture; its ``APERTURE`` numbers may describe another shape for each path."""
     import drjit as dr
 
     box = RectangleNumbers(*a[:4]).contains(x, y)
-    # a path that divides waits long; the table has the half axes' reciprocals
+    # divisions are slow, so the table has the reciprocals of the semi-axes
     u, v = (x - a[0]) * a[2], (y - a[1]) * a[3]
     ellipse = dr.fma(u, u, v * v) <= 1.0
     return dr.select(a[4] == RING, RingNumbers(*a[:4]).contains(x, y), dr.select(a[4] == RECTANGLE, box, ellipse))
