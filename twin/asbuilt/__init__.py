@@ -1,1 +1,1 @@
-"""The state of one instrument from everything that was measured on it, and the next move."""
+"""As-built state of an instrument, estimated from all measurements on it, and the next alignment move."""

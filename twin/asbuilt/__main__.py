@@ -1,4 +1,4 @@
-"""``python -m twin.asbuilt``: the state of one instrument from everything that was measured on it."""
+"""Command line program ``python -m twin.asbuilt``: as-built state of an instrument from all measurements on it."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ app = program(cls=unnamed(lambda args: "estimate"), no_args_is_help=True)
 
 @app.callback()
 def main() -> None:
-    """Estimate how one instrument stands against its drawing, from wavefronts, foci, distortion, MTF, monitor spots,
-    lines of sight, temperatures and positions that were measured on it; what follows for its image, and which move of
-    its actuators would improve it.
+    """Estimate the as-built state of an instrument from all measurements on it.
+
+    The measurements are wavefronts, foci, distortion, MTF, monitor spots, lines of sight, temperatures and positions.
+    The state is the position, shape and temperature of its bodies against the drawing. The report predicts the image
+    quality and the actuator move that would improve it.
 
     `python -m twin.asbuilt FILE` is `python -m twin.asbuilt estimate FILE`.
 

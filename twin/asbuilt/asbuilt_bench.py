@@ -1,4 +1,4 @@
-"""One instrument with its prior, what was measured on it and what is asked of it: predictions by exact traces."""
+"""Instrument under estimation with its prior, measurements and requirements: predictions by exact traces."""
 
 from __future__ import annotations
 
@@ -26,42 +26,44 @@ from twin.monitor.truth import line_points
 from twin.tolerance.tolerance_bench import ToleranceBench
 
 STEP = 0.05
-"""Step of the derivatives, in standard deviations of the prior: central differences of the exact trace, whose error is
-of the square of this times the curvature over a standard deviation."""
+"""Step of the central differences by the parameters, in standard deviations of the prior.
+
+The relative error of a derivative is the square of this step times its curvature over a standard deviation.
+"""
 
 _SHARE = 1e-2
 """Step of the derivatives by actuators, as a share of their range."""
 
 
 class AsBuiltBench(Site):
-    """An instrument on which a state is estimated.
+    """Instrument whose state is estimated.
 
     Parameters
     ----------
-    setup
-        What was measured, and the instrument as designed.
-    backend
-        Where to trace.
+    setup : AsBuiltSetup
+        Test with the measurements and the nominal instrument.
+    backend : Backend
+        Array backend of the ray trace.
 
     Attributes
     ----------
-    test
-        The file.
-    camera
-        That is judged.
-    parameters
-        That are estimated.
-    kinds
-        Measurements, in their order.
-    afters
-        Of each the last move that had been made.
-    merits
-        Bench of what is asked.
+    test : AsBuiltSpec
+        Contents of the file.
+    camera : str
+        Name of the camera that is evaluated.
+    parameters : Parameters
+        Estimated parameters.
+    kinds : tuple of MeasuredKind
+        Measurements in the order of the file.
+    afters : tuple of str or None
+        Last move that had been made before each measurement.
+    merits : ToleranceBench
+        Bench of the merits.
 
     Raises
     ------
     InputError
-        Names that do not exist, a prior of nothing, or a camera without light.
+        A name does not exist, the prior has no motion, or the camera has no light.
     """
 
     def __init__(self, setup: AsBuiltSetup, backend: Backend) -> None:
@@ -102,22 +104,22 @@ class AsBuiltBench(Site):
 
     @cached_property
     def candidates(self) -> tuple[MeasuredKind, ...]:
-        """Measurements that could be made."""
+        """Possible further measurements."""
         return self._kinds(self.test.candidates, "candidates")
 
     def beams(self, fields: tuple[tuple[float, float], ...]) -> VariedBeams:
-        """Beams of fields, traced once for all that have the same. Raises as ``VariedBeams``."""
+        """Return the beams of fields, traced once for all measurements with these fields."""
         if fields not in self._beams:
             self._beams[fields] = VariedBeams(self.optics, np.array(fields))
         return self._beams[fields]
 
     @cached_property
     def optics(self) -> CameraOptics:
-        """The camera as designed."""
+        """Nominal camera."""
         return CameraOptics.within(self.experiment.instrument, self.camera, self.backend)
 
     def bench(self, merits: Mapping[str, MeritSpec]) -> ToleranceBench:
-        """A bench on which merits are tried."""
+        """Return a bench on which merits are computed."""
         budget = ToleranceBudgetSpec.model_construct(
             instrument=self.test.instrument,
             camera=self.camera,
@@ -132,12 +134,12 @@ class AsBuiltBench(Site):
     # predictions
 
     def view(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> View:
-        """States of parameters (S, K) after a move."""
+        """Return the states of parameters (S, K) after a move."""
         states: Sequence[State] = self.parameters.states(values, after, further)
         return View(values, states, lambda bodies: self.parameters.temperatures(values, bodies))
 
     def predict(self, values: np.ndarray) -> np.ndarray:
-        """What all measurements would read without errors, (S, D); NaN where the light of a state is lost."""
+        """Return the error-free readings of all measurements, (S, D); NaN where the light of a state is lost."""
         return self._predicted(values, self.kinds, self.afters)
 
     def _predicted(self, values: np.ndarray, kinds: Sequence[MeasuredKind], afters: Sequence[str | None]) -> np.ndarray:
@@ -151,12 +153,12 @@ class AsBuiltBench(Site):
     def slope(
         self, values: np.ndarray, kinds: Sequence[MeasuredKind] | None = None, afters: Sequence[str | None] = ()
     ) -> np.ndarray:
-        """Derivatives (D, K) of the predictions at parameters (K,), by central differences of the exact trace."""
+        """Return the derivatives (D, K) of the predictions at parameters (K,), by central differences."""
         kinds, afters = (self.kinds, self.afters) if kinds is None else (kinds, afters)
         return self._by_parameters(values, lambda moved: self._predicted(moved, kinds, afters))
 
     def _by_parameters(self, values: np.ndarray, work: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """Derivatives (D, K) of what is worked out of states, (S, K) -> (S, D), at parameters (K,)."""
+        """Return the derivatives (D, K) of a function of states, (S, K) -> (S, D), at parameters (K,)."""
         steps = STEP * self.parameters.prior.sigma
         found = work(np.concatenate([values + np.diag(steps), values - np.diag(steps)]))
         ahead, behind = found[: len(steps)], found[len(steps) :]
@@ -165,11 +167,11 @@ class AsBuiltBench(Site):
     # the estimate
 
     def groups(self, data: Sequence[np.ndarray]) -> tuple[MeasuredGroup, ...]:
-        """The measurements with their numbers."""
+        """Return the measurements with their data for the estimate."""
         return tuple(kind.group(values) for kind, values in zip(self.kinds, data, strict=True))
 
     def data(self) -> tuple[np.ndarray, ...]:
-        """What the files hold. Raises InputError: a file that cannot be read, or holds something else."""
+        """Return the contents of the data files; raise InputError if a file is unreadable or holds something else."""
         return tuple(kind.read() for kind in self.kinds)
 
     def estimate(self, data: Sequence[np.ndarray], start: np.ndarray | None = None) -> StateEstimate:
@@ -177,15 +179,15 @@ class AsBuiltBench(Site):
 
         Parameters
         ----------
-        data : Sequence[np.ndarray]
-            Numbers of each measurement.
-        start : np.ndarray | None
-            Parameters from which the steps go.
+        data : sequence of ndarray
+            Data of each measurement.
+        start : ndarray, optional
+            Parameters at which the iteration starts.
 
         Raises
         ------
         InputError
-            Measurements whose errors or light cannot be.
+            Errors or light of a measurement are impossible.
         """
         try:
             return estimate_state(self.parameters.prior, self.groups(data), self.predict, self.slope, start)
@@ -195,14 +197,14 @@ class AsBuiltBench(Site):
     # a drawn instrument
 
     def draw(self, rng: np.random.Generator, law: str) -> np.ndarray:
-        """Parameters (K,) of an instrument of the prior; of components that ``simulate`` states otherwise by that.
+        """Draw the parameters (K,) of an instrument from the prior, or from the prior given under ``simulate``.
 
         Parameters
         ----------
-        rng : np.random.Generator
-            Source of random numbers.
+        rng : Generator
+            Random generator.
         law : str
-            ``normal`` or ``uniform`` with the same covariance.
+            Distribution: ``normal``, or ``uniform`` with the same covariance.
         """
         prior = self.parameters.prior
         covariance = prior.covariance.copy()
@@ -227,12 +229,12 @@ class AsBuiltBench(Site):
         return np.asarray(root @ unit)
 
     def measured(self, true: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-        """What measurements of an instrument of parameters (K,) read, with their errors.
+        """Return simulated readings, with their errors, of an instrument with parameters (K,).
 
         Raises
         ------
         PhysicalError
-            Its light is lost.
+            The light is lost.
         """
         return tuple(
             kind.drawn(kind.predict(self.view(true[None], after))[0], rng)
@@ -247,7 +249,7 @@ class AsBuiltBench(Site):
         return self.parameters.moves[-1] if self.parameters.moves else None
 
     def merit_parts(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> np.ndarray:
-        """Parts of the merits, (S, P), of parameters (S, K); NaN where the light is lost."""
+        """Return the parts of the merits, (S, P), for parameters (S, K); NaN where the light is lost."""
         return where_lit(
             lambda some: self.merits.parts_of(self.parameters.states(values[some], after, of_some(further, some))),
             len(values),
@@ -255,14 +257,20 @@ class AsBuiltBench(Site):
         )
 
     def merit_numbers(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> np.ndarray:
-        """Numbers (S, R) whose squares sum to what a move makes least: of each merit the mean square over its fields
-        or points, in units of its requirement. Raises PhysicalError: the light of some state is lost.
+        """Return residuals (S, R) whose sum of squares a move minimises.
+
+        It is the sum over the merits of the mean square over fields or points, in units of the requirement.
+
+        Raises
+        ------
+        PhysicalError
+            The light of a state is lost.
         """
         return self.merits.numbers_of(self.parameters.states(values, after, further))
 
     @cached_property
     def actuators(self) -> Actuators:
-        """Limits, steps and errors of the next move: what the moves have left of each range."""
+        """Limits, steps and errors of the next move; the limits are what earlier moves have left of each range."""
         specs = tuple(self.test.actuators.values())
         moved = np.sum(self.parameters.wanted, axis=0) if self.parameters.moves else np.zeros(len(specs))
         ranges = np.array([one.range_si for one in specs])
@@ -276,28 +284,28 @@ class AsBuiltBench(Site):
         )
 
     def merit_slope(self, values: np.ndarray, after: str | None) -> np.ndarray:
-        """Derivatives (R, K) of the merits' numbers by the parameters, at parameters (K,)."""
+        """Return the derivatives (R, K) of the merits' residuals with respect to the parameters, at parameters (K,)."""
         return self._by_parameters(values, lambda moved: self.merit_numbers(moved, after))
 
     @cached_property
     def actuator_steps(self) -> np.ndarray:
-        """Steps of the derivatives by the actuators, SI, (C,)."""
+        """Steps of the numerical derivatives by the actuators, SI, (C,)."""
         return _SHARE * np.array([one.range_si or 1.0 for one in self.test.actuators.values()])
 
 
 def where_lit(work: Callable[[slice], np.ndarray], count: int, shape: tuple[int, ...], first: int = 0) -> np.ndarray:
-    """What is worked out of states, (S, *shape), with NaN for each whose light is lost.
+    """Evaluate a function of states, (S, *shape), with NaN for each state whose light is lost.
 
     Parameters
     ----------
-    work : Callable[[slice], np.ndarray]
-        Of which of the states; raises PhysicalError where the light of one is lost.
+    work : callable
+        Function of a slice of the states; raises PhysicalError if the light of any of them is lost.
     count : int
         Number of states.
-    shape : tuple[int, ...]
-        Of what is worked out of one.
+    shape : tuple of int
+        Shape of the result for one state.
     first : int
-        Number of the first state.
+        Index of the first state.
     """
     try:
         return work(slice(first, first + count))
@@ -310,5 +318,5 @@ def where_lit(work: Callable[[slice], np.ndarray], count: int, shape: tuple[int,
 
 
 def of_some(further: np.ndarray | None, some: slice) -> np.ndarray | None:
-    """Moves of some states, where each has its own, (S, C); one for all, (C,), and none stay."""
+    """Return the moves of selected states; a move (C,) common to all states, or None, is returned unchanged."""
     return further if further is None or further.ndim == 1 else further[some]

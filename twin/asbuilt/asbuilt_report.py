@@ -1,6 +1,4 @@
-"""Report of an instrument as built: verdict, merits before and after the measurements, observability, and the next
-move.
-"""
+"""Report of an instrument as built: verdict, merits, observable combinations of motions, and the next move."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The state of one instrument, estimated: what is known and what is not, what follows for the camera, what to do."""
+"""Estimate of an instrument's as-built state: observable combinations, predicted merits, and the next move."""
 
 from __future__ import annotations
 
@@ -28,40 +28,41 @@ from twin.framework.record import Quantity, Record
 from twin.tolerance.monitor_merit import Merit, merit_unit, shown_merit
 
 LEVELS = (0.025, 0.16, 0.5, 0.84, 0.975)
-"""Quantiles that are told."""
+"""Levels of the reported quantiles."""
 WORST_FACTOR = 9.0
-"""Chi-square over degrees of freedom beyond which measurements contradict each other: three standard deviations on the
-average."""
+"""Chi-square per degree of freedom beyond which measurements contradict each other: residuals of three sigma on
+average.
+"""
 _INSTRUMENT, _POSTERIOR, _PRIOR, _MOVE, _MADE = range(5)
 """Random streams."""
 ALONG = tuple((float(x), 0.0) for x in np.linspace(-1.0, 1.0, 11))
-"""Fields over which the wavefront is shown."""
+"""Fields of the plot of the wavefront along the line."""
 _DRAW = 7e4
-"""Bytes of a draw, with its states of the prior, of the posterior and after the next move."""
+"""Memory of one draw with its states of the prior, of the posterior and after the next move, bytes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """One merit of the instrument.
+    """Predicted distribution of a merit of the instrument.
 
     Attributes
     ----------
     merit : Merit
         The merit.
     designed : float
-        Of the instrument as drawn, SI.
-    before : tuple[float, ...]
+        Value of the nominal instrument, SI.
+    before : tuple of float
         Quantiles ``LEVELS`` under the prior alone, SI.
-    now : tuple[float, ...]
-        The same with the measurements.
+    now : tuple of float
+        Quantiles ``LEVELS`` under the posterior, SI.
     meets : float
-        Probability that it meets the requirement.
-    moved : tuple[float, ...]
-        Quantiles after the next move; empty where nothing can be moved.
+        Posterior probability that it meets the requirement.
+    moved : tuple of float
+        Quantiles ``LEVELS`` after the next move, SI; empty without actuators.
     meets_moved : float
-        Probability then; NaN likewise.
+        Probability that it meets the requirement after the move; NaN without actuators.
     true : float
-        Of a drawn instrument, SI; NaN for a real one.
+        True value of a simulated instrument, SI; NaN for a real one.
     """
 
     merit: Merit
@@ -76,31 +77,31 @@ class Standing:
 
 @dataclass(frozen=True, eq=False)
 class AsBuiltRun:
-    """An instrument as it was built.
+    """Estimated as-built state of an instrument and its consequences.
 
     Attributes
     ----------
     setup : AsBuiltSetup
-        What was measured.
+        Test with the measurements.
     bench : AsBuiltBench
         The instrument.
-    data : tuple[np.ndarray, ...]
-        Numbers of each measurement.
+    data : tuple of ndarray
+        Data of each measurement.
     found : StateEstimate
-        The state.
-    known : tuple[Combination, ...]
-        Combinations of motions, the best known first.
-    standings : tuple[Standing, ...]
-        Of the merits.
-    along : tuple[np.ndarray, np.ndarray]
-        Rms wavefront error along the line, waves: designed (F,), and quantiles ``LEVELS`` under the prior, with the
-        measurements and, where something can be moved, after the next move, (2 or 3, 5, F).
-    advice : Advice | None
-        The next move; None where nothing can be moved.
-    true : np.ndarray | None
-        Parameters of a drawn instrument; None of a real one.
-    warnings : tuple[str, ...]
-        What the user should know.
+        Estimated state.
+    known : tuple of Combination
+        Combinations of motions, the best determined first.
+    standings : tuple of Standing
+        Predicted distributions of the merits.
+    along : tuple of ndarray
+        Rms wavefront error along the line, waves: nominal (F,), and quantiles ``LEVELS`` under the prior, the posterior
+        and, with actuators, after the next move, (2 or 3, 5, F).
+    advice : Advice or None
+        Next move; None without actuators.
+    true : ndarray or None
+        Parameters of a simulated instrument; None for a real one.
+    warnings : tuple of str
+        Warnings for the user.
     """
 
     setup: AsBuiltSetup
@@ -118,24 +119,23 @@ class AsBuiltRun:
 def run_asbuilt(
     setup: AsBuiltSetup, backend: Backend, seed: int | None = None, advance: Advance = silent
 ) -> AsBuiltRun:
-    """Estimate the state of an instrument and what follows from it.
+    """Estimate the as-built state of an instrument and its consequences.
 
     Parameters
     ----------
     setup : AsBuiltSetup
-        What was measured.
+        Test with the measurements.
     backend : Backend
-        Where to trace.
-    seed : int | None
-        Of the draws; the file's own by default.
+        Array backend of the ray trace.
+    seed : int, optional
+        Seed of the random draws; the file's by default.
     advance : Advance
-        Shows how far it is.
+        Callback that reports progress.
 
     Raises
     ------
     InputError
-        Names that do not exist, files without data, measurements that contradict each other, or more memory than there
-        is.
+        A name does not exist, a file holds no data, measurements contradict each other, or the memory does not suffice.
     """
     test = setup.test
     seed = test.seed if seed is None else seed
@@ -184,12 +184,9 @@ def _random(seed: int, number: int) -> np.random.Generator:
 
 
 def require_agreement(bench: AsBuiltBench, found: StateEstimate) -> None:
-    """Refuse an estimate that has not settled, or of measurements that contradict each other.
+    """Raise InputError for an estimate that has not converged, or for measurements that contradict each other.
 
-    Raises
-    ------
-    InputError
-        Names the measurement that agrees least with all others.
+    The error is placed at the measurement that agrees least with all others.
     """
     test = bench.test
     if not found.converged:
@@ -235,7 +232,7 @@ def _standing(
 def _along(
     bench: AsBuiltBench, several: Sequence[tuple[np.ndarray, np.ndarray | None]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rms wavefront error along the line, of the design, and quantiles of several sets of states with further moves."""
+    """Return the nominal rms wavefront error along the line, and its quantiles over several sets of states."""
     field = bench.bench({"along": MeritSpec(kind="wavefront", fields=ALONG, at_most=1.0)})
 
     def rms(values: np.ndarray, further: np.ndarray | None) -> np.ndarray:
@@ -318,7 +315,7 @@ def _measured_plain(run: AsBuiltRun) -> dict[str, Any]:
 
 
 def motions(run: AsBuiltRun) -> list[dict[str, Any]]:
-    """Each motion of the prior with its estimate, in units for people."""
+    """Return each motion of the prior with its estimate, in reporting units."""
     out = []
     factor = np.sqrt(run.found.variance_factor)
     for k, one in enumerate(run.bench.parameters.components):
@@ -343,7 +340,7 @@ def _known_plain(run: AsBuiltRun) -> list[dict[str, Any]]:
 
 
 def moves_plain(run: AsBuiltRun, amounts: np.ndarray) -> dict[str, Any]:
-    """Amounts of the actuators (C,) as files have them."""
+    """Return amounts of the actuators (C,) in the form of the files."""
     kinds = [number.kind for number in run.bench.parameters.actuators]
     names = run.bench.parameters.names
     return {name: amount_text(float(a), kind) for name, a, kind in zip(names, amounts, kinds, strict=True)}
@@ -364,7 +361,7 @@ def _advice_plain(run: AsBuiltRun) -> dict[str, Any] | None:
 
 
 def responses(run: AsBuiltRun) -> dict[str, Any] | None:
-    """Response of each actuator that is in doubt over the traced one, with its standard deviation; None for none."""
+    """Return the estimated response of each uncertain actuator, relative to the traced one; None if there is none."""
     start = len(run.bench.parameters.components)
     names = [run.bench.parameters.names[k] for k in run.bench.parameters.gains]
     if not names:

@@ -1,4 +1,4 @@
-"""The files of an instrument as built: the instrument itself, and what is still unknown of it."""
+"""Files of an instrument as built: the instrument itself, and the posterior covariance as disturbances."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from scenes.specs.load import CAMERAS, INSTRUMENTS, is_path, library_names
 from twin.asbuilt.asbuilt_run import AsBuiltRun
 
 POSTERIOR = "posterior"
-"""Name of the file of what is still unknown."""
+"""Name of the file with the posterior covariance."""
 CORRELATION = f"{POSTERIOR}_correlation"
-"""Name of the table of its correlations."""
+"""Name of the table with the correlations of the posterior."""
 
 
 def built_motions(run: AsBuiltRun) -> Mapping[str, Motion]:
-    """Body -> how it stands against the drawing, as estimated, with all moves that were made and without heat."""
+    """Return the estimated motion of each body against the drawing, with all moves but without thermal effects."""
     values = run.found.mean.copy()
     for k, one in enumerate(run.bench.parameters.components):
         if one.kind in HEAT:
@@ -30,7 +30,7 @@ def built_motions(run: AsBuiltRun) -> Mapping[str, Motion]:
 
 
 def instrument_text(run: AsBuiltRun) -> str:
-    """The instrument's file, which names the drawing and how each body stands against it."""
+    """Return the instrument's file, which refers to the drawing and lists the motion of each body against it."""
     test, base = run.setup.test, run.setup.base.instrument.name
     design: str | dict[str, Any] = test.instrument
     if is_path(test.instrument):
@@ -48,9 +48,9 @@ def instrument_text(run: AsBuiltRun) -> str:
 
 
 def unknown(run: AsBuiltRun) -> tuple[list[Component], np.ndarray]:
-    """Components of motions that are still uncertain, with heat left out, and their covariance (C, C), SI.
+    """Return the components of motions that are uncertain, without thermal ones, and their covariance (C, C), SI.
 
-    Errors of moves belong to the components of the bodies that were moved.
+    Errors of moves are added to the components of the bodies that were moved.
     """
     parameters, found = run.bench.parameters, run.found
     components = [one for one in parameters.components if one.kind not in HEAT]
@@ -95,7 +95,7 @@ def unknown(run: AsBuiltRun) -> tuple[list[Component], np.ndarray]:
 
 
 def _pull(run: AsBuiltRun, actuator: int) -> np.ndarray:
-    """Derivatives of how far an actuator has gone by all parameters, (K,)."""
+    """Return the derivatives of an actuator's total travel with respect to all parameters, (K,)."""
     parameters, last = run.bench.parameters, run.bench.last
     count = len(run.found.mean)
     if last is None:
@@ -106,7 +106,7 @@ def _pull(run: AsBuiltRun, actuator: int) -> np.ndarray:
 
 
 def posterior_files(run: AsBuiltRun) -> tuple[str, str | None]:
-    """Text of the disturbances file of what is still unknown, and of the table of correlations beside it, if any."""
+    """Return the text of the disturbances file of the posterior, and of its table of correlations, if any."""
     components, covariance = unknown(run)
     kinds = ", ".join(kind.name for kind in run.bench.kinds)
     spec = joint_disturbances(

@@ -1,4 +1,4 @@
-"""Kinds of measurement: what each reads of an instrument in a state, its errors, and its data.
+"""Kinds of measurements on an instrument: prediction for a state, error model, and data.
 
 A new kind is a class here, an entry of ``KINDS`` and its keys in ``scenes.specs.asbuilt.MeasurementsSpec``.
 """
@@ -32,27 +32,27 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.tolerance.tolerance_bench import ToleranceBench
 
 UNKNOWN_FOCUS = 50e-6
-"""Standard deviation of where a free focus of a drawn measurement stands, metres; results do not depend on it."""
+"""Standard deviation of the free focus of a simulated measurement, metres; results do not depend on it."""
 UNKNOWN_ZERO = 20.0 * ARCSEC
-"""Likewise of the zero of angles, radians."""
+"""Standard deviation of the free zero of angles of a simulated measurement, radians."""
 UNKNOWN_FRAME = 100e-6
-"""Likewise of the frame of a measuring machine, metres and radians."""
+"""Standard deviation of the free frame of a simulated measuring machine, metres and radians."""
 _LINE_DEGREE = 7
-"""Degree of the polynomial in the tangent that follows the places of images along a line to 1e-10 m."""
+"""Degree of the polynomial in the tangent that fits image positions along a line to 1e-10 m."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """States at the time of a measurement.
+    """States of the instrument at the time of a measurement.
 
     Attributes
     ----------
-    values : np.ndarray
-        Parameters, (S, K).
-    states : Sequence[State]
-        The instrument, S.
-    warmth : Any
-        Bodies -> temperatures above nominal, (S, bodies).
+    values : (S, K) ndarray
+        Parameters.
+    states : sequence of State
+        S states of the instrument.
+    warmth : callable
+        Function from names of bodies to temperatures above nominal, (S, bodies), kelvin.
     """
 
     values: np.ndarray
@@ -61,7 +61,7 @@ class View:
 
 
 class Site(ABC):
-    """What a kind of measurement may know: the instrument, and nothing of its state."""
+    """Interface to the instrument for the kinds of measurements; it does not expose the instrument's state."""
 
     test: specs.AsBuiltSpec
     experiment: MonitorExperiment
@@ -70,38 +70,38 @@ class Site(ABC):
 
     @abstractmethod
     def beams(self, fields: tuple[tuple[float, float], ...]) -> VariedBeams:
-        """Beams of fields, traced once for all that have the same."""
+        """Return the beams of fields, traced once for all measurements with these fields."""
 
     @abstractmethod
     def bench(self, merits: Mapping[str, MeritSpec]) -> ToleranceBench:
-        """A bench on which merits are tried."""
+        """Return a bench on which merits are computed."""
 
 
 class MeasuredKind(ABC):
-    """One measurement.
+    """Measurement on an instrument; base class of all kinds.
 
     Parameters
     ----------
-    site
-        The instrument.
-    name
-        Of the measurement.
-    spec
-        What the file says of it.
-    key
-        where.
+    site : Site
+        Interface to the instrument.
+    name : str
+        Name of the measurement.
+    spec : Spec
+        Specification in the file.
+    key : tuple of str
+        Position of the specification in the file.
 
     Attributes
     ----------
-    labels : tuple[str, ...]
-        Of its numbers, (D,).
-    blocks : tuple[str, ...]
-        What one gross error would spoil together, (D,).
+    labels : tuple of str
+        Labels of its readings, (D,).
+    blocks : tuple of str
+        Group of each reading that one gross error would affect together, (D,).
     """
 
     kind: ClassVar[str]
     shown: ClassVar[tuple[str, float]]
-    """Unit of its numbers for people, and its size in SI."""
+    """Unit in which its readings are reported, and its size in SI."""
 
     def __init__(self, site: Site, name: str, spec: Any, key: tuple[str, ...]) -> None:
         self.site, self.name, self.spec, self.key = site, name, spec, key
@@ -112,29 +112,34 @@ class MeasuredKind(ABC):
 
     @abstractmethod
     def prepare(self) -> None:
-        """Work out what does not change from state to state."""
+        """Compute what all states share."""
 
     labels: tuple[str, ...]
     blocks: tuple[str, ...]
 
     @abstractmethod
     def predict(self, view: View) -> np.ndarray:
-        """What it would read without errors, (S, D). Raises PhysicalError: the light of some state is lost."""
+        """Return the error-free readings, (S, D); raise PhysicalError if the light of a state is lost."""
 
     @abstractmethod
     def covariance(self) -> np.ndarray:
-        """Of its errors, (D, D)."""
+        """Return the covariance of the random errors, (D, D)."""
 
     def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Columns (D, B), standard deviations (B,), infinite where free, and those of drawn ones (B,)."""
+        """Return the design matrix (D, B) of systematic errors, and their standard deviations (B,).
+
+        The first standard deviations are for the estimate, the second ones for simulated data.
+
+        A free bias has an infinite standard deviation in the estimate.
+        """
         return np.zeros((len(self.labels), 0)), np.zeros(0), np.zeros(0)
 
     @abstractmethod
     def read(self) -> np.ndarray:
-        """The data, (D,), SI. Raises InputError: a file that does not hold them."""
+        """Return the data, (D,), SI; raise InputError if a file does not hold them."""
 
     def group(self, values: np.ndarray) -> MeasuredGroup:
-        """The measurement with numbers (D,) for the estimate."""
+        """Return the measurement with data (D,) for the estimate."""
         columns, sigmas, _ = self.biases()
         used = sigmas > 0.0
         return MeasuredGroup(
@@ -142,33 +147,33 @@ class MeasuredKind(ABC):
         )
 
     def drawn(self, true: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Numbers (D,) with random errors and biases."""
+        """Return readings (D,) with simulated random errors and biases added to the true ones."""
         columns, _, typical = self.biases()
         noise = np.linalg.cholesky(self.covariance()) @ rng.standard_normal(len(true))
         return np.asarray(true + noise + columns @ (typical * rng.standard_normal(len(typical))))
 
     def file(self, key: str, value: str, what: str) -> Path:
-        """A file that the measurement names."""
+        """Return the path of a file that the measurement names."""
         return Path(self.spec.file_at((key,), value, Path(self.site.test.source.file).parent, what))
 
     def wrong(self, text: str, key: str, allowed: str | None = None, found: str | None = None) -> InputError:
-        """An error at a key of the measurement."""
+        """Return an error at a key of the measurement."""
         return InputError(self.spec.issue(Problem(text, found, allowed), (key,)))
 
 
 def field_text(field: tuple[float, float]) -> str:
-    """A field as tables have it."""
+    """Return a field as text for tables."""
     return f"({field[0]:g}, {field[1]:g})"
 
 
 class WavefrontReadings(MeasuredKind):
-    """Zernike terms of wavefronts at fields, metres rms, orthonormal over the light."""
+    """Zernike terms of wavefronts at fields, metres rms, orthonormal over the illuminated pupil."""
 
     kind = "wavefronts"
     shown = ("nm", 1e-9)
 
     def prepare(self) -> None:
-        """Beams, and matrices from optical paths to terms."""
+        """Trace the beams and compute the matrices from optical paths to Zernike terms."""
         spec = self.spec
         self.beams = self.site.beams(spec.fields)
         terms = spec.numbers
@@ -177,16 +182,16 @@ class WavefrontReadings(MeasuredKind):
         self.blocks = tuple(f"field {field_text(field)}" for field in spec.fields for _ in terms)
 
     def predict(self, view: View) -> np.ndarray:
-        """Terms, field after field."""
+        """Return the terms, field after field."""
         paths = self.beams.light(view.states).paths
         return np.asarray(np.einsum("ftn,sfn->sft", self.rows, paths).reshape(len(view.states), -1))
 
     def covariance(self) -> np.ndarray:
-        """Alike for all terms."""
+        """Return the same variance for all terms, without correlation."""
         return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
 
     def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The interferometer's focus at each field, and a reference error of each term that all fields share."""
+        """Return the interferometer's focus at each field, and a reference error of each term common to all fields."""
         fields, terms, _ = self.rows.shape
         columns, sigmas, typical = [], [], []
         free = self.spec.focus == specs.FREE
@@ -206,7 +211,7 @@ class WavefrontReadings(MeasuredKind):
         return table, np.array(sigmas), np.array(typical)
 
     def read(self) -> np.ndarray:
-        """Coefficients of files."""
+        """Return the coefficients of the files."""
         return np.asarray(read_coefficients(self).ravel())
 
 
@@ -217,7 +222,7 @@ class FocusReadings(MeasuredKind):
     shown = ("um", 1e-6)
 
     def prepare(self) -> None:
-        """Beams, and rows from optical paths to best focus."""
+        """Trace the beams and compute the rows from optical paths to best focus."""
         self.fields = self.spec.fields if self.spec.fields is not None else self._from_file[0]
         self.beams = self.site.beams(self.fields)
         self.rows = self.beams.focus_rows()
@@ -225,17 +230,17 @@ class FocusReadings(MeasuredKind):
         self.blocks = tuple(f"field {text}" for text in self.labels)
 
     def predict(self, view: View) -> np.ndarray:
-        """Of each field."""
+        """Return the best focus of each field."""
         paths = self.beams.light(view.states).paths
         return np.asarray(np.einsum("fn,sfn->sf", self.rows, paths))
 
     def covariance(self) -> np.ndarray:
-        """With the error that all have in common."""
+        """Return the covariance with the error that all fields have in common."""
         count = len(self.labels)
         return np.asarray(self.spec.sigma**2 * np.eye(count) + self.spec.common**2)
 
     def read(self) -> np.ndarray:
-        """Values of the file of the test, or of focus.json."""
+        """Return the values of the test's file, or of focus.json."""
         return np.array(self.spec.values if self.spec.values is not None else self._from_file[1])
 
     @cached_property
@@ -255,13 +260,13 @@ class FocusReadings(MeasuredKind):
 
 
 class MtfReadings(MeasuredKind):
-    """MTF of the optics at fields: of each along the line and along the track."""
+    """MTF of the optics at fields, each along the line and along the track."""
 
     kind = "mtf"
     shown = ("", 1.0)
 
     def prepare(self) -> None:
-        """A bench with this MTF as its merit."""
+        """Set up a bench with this MTF as its merit."""
         spec = self.spec
         asked = MeritSpec(kind="mtf", fields=spec.fields, frequency=spec.frequency, at_least=0.0)
         self.tried = self.site.bench({self.name: asked})
@@ -269,26 +274,26 @@ class MtfReadings(MeasuredKind):
         self.blocks = tuple(f"field {field_text(field)}" for field in spec.fields for _ in range(2))
 
     def predict(self, view: View) -> np.ndarray:
-        """Of each field and direction."""
+        """Return the MTF of each field and direction."""
         return self.tried.parts_of(view.states)
 
     def covariance(self) -> np.ndarray:
-        """Alike for all."""
+        """Return the same variance for all readings, without correlation."""
         return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
 
     def read(self) -> np.ndarray:
-        """Values of the file of the test."""
+        """Return the values of the test's file."""
         return np.stack([self.spec.along_line, self.spec.along_track], axis=-1).ravel()
 
 
 class DistortionReadings(MeasuredKind):
-    """Places of images along the line at known angles, metres."""
+    """Image positions along the line at known angles, metres."""
 
     kind = "distortion"
     shown = ("um", 1e-6)
 
     def prepare(self) -> None:
-        """Angles, and where the designed camera images them."""
+        """Read the angles and compute the positions at which the nominal camera images them."""
         site = self.site
         self.axes = site.experiment.instrument.camera_axes(site.camera)
         self.number = list(site.experiment.instrument.cameras).index(site.camera)
@@ -318,7 +323,7 @@ class DistortionReadings(MeasuredKind):
         return line_tangents(sight, self.line, self.axes)[2]
 
     def predict(self, view: View) -> np.ndarray:
-        """By a polynomial through the points of the line."""
+        """Return the positions by a polynomial through the traced points of the line."""
         seen = self._tangents(view.states)
         size = np.max(np.abs(seen), axis=1, keepdims=True)
         table = (seen / size)[..., None] ** np.arange(1, _LINE_DEGREE + 1)
@@ -327,15 +332,15 @@ class DistortionReadings(MeasuredKind):
         return np.asarray(np.squeeze(asked @ terms, -1))
 
     def covariance(self) -> np.ndarray:
-        """Independent."""
+        """Return independent variances."""
         return np.diag(self.sigmas**2)
 
     def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The zero of the angles."""
+        """Return the free zero of the angles."""
         return (self.focal * (1.0 + self.tangents**2))[:, None], np.array([np.inf]), np.array([UNKNOWN_ZERO])
 
     def read(self) -> np.ndarray:
-        """Places of the file."""
+        """Return the positions of the file."""
         return np.array(self.values)
 
     @cached_property
@@ -356,13 +361,13 @@ class DistortionReadings(MeasuredKind):
 
 
 class SpotReadings(MeasuredKind):
-    """Spots of the monitor against where the design has them, pixels."""
+    """Monitor spots relative to their nominal positions, pixels."""
 
     kind = "spots"
     shown = ("px", 1.0)
 
     def prepare(self) -> None:
-        """The monitor's beams."""
+        """Set up the monitor's beams."""
         experiment = self.site.experiment
         if not experiment.monitored:
             raise InputError(
@@ -380,15 +385,15 @@ class SpotReadings(MeasuredKind):
         return self.path.mean_spots(states).reshape(len(states), -1)
 
     def predict(self, view: View) -> np.ndarray:
-        """Energy centroids, as means of rays."""
+        """Return the energy centroids as means of rays."""
         return self._places(view.states) - self.nominal
 
     def covariance(self) -> np.ndarray:
-        """Alike for all."""
+        """Return the same variance for all coordinates, without correlation."""
         return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
 
     def read(self) -> np.ndarray:
-        """Places of the file, less those of the design."""
+        """Return the positions of the file minus the nominal ones."""
         path = self.file("file", self.spec.file, "a CSV file, or the recovered.json of a run")
         found = self._recovered(path) if path.suffix.lower() == ".json" else self._table(path)
         out = []
@@ -429,13 +434,13 @@ class SpotReadings(MeasuredKind):
 
 
 class SightReadings(MeasuredKind):
-    """Turns of the line of sight, radians, and the change of the principal distance, metres."""
+    """Rotations of the line of sight, radians, and change of the principal distance, metres."""
 
     kind = "sight"
     shown = ("", 1.0)
 
     def prepare(self) -> None:
-        """Which of them were measured."""
+        """Select the measured quantities."""
         names = ("alpha", "beta", "gamma", "principal_distance")
         self.which = [names.index(name) for name in self.spec.measured]
         self.labels = self.blocks = self.spec.measured
@@ -443,18 +448,18 @@ class SightReadings(MeasuredKind):
             raise self.wrong("errors that depend on each other altogether", "correlation", "a positive definite matrix")
 
     def predict(self, view: View) -> np.ndarray:
-        """By exact chief rays."""
+        """Return the changes by exact chief rays."""
         truth = self.site.experiment.sight.truth(list(view.states))
         return np.asarray(truth.vector(self.site.camera)[:, self.which])
 
     def covariance(self) -> np.ndarray:
-        """With the correlation that is stated."""
+        """Return the covariance with the specified correlation."""
         sigma = np.array([getattr(self.spec, f"sigma_{name}") for name in self.spec.measured])
         rows = self.spec.correlation
         return np.asarray(np.diag(sigma**2) if rows is None else np.array(rows) * np.outer(sigma, sigma))
 
     def read(self) -> np.ndarray:
-        """Values of the file of the test."""
+        """Return the values of the test's file."""
         return np.array([getattr(self.spec, name) for name in self.spec.measured])
 
 
@@ -465,20 +470,20 @@ class TemperatureReadings(MeasuredKind):
     shown = ("K", 1.0)
 
     def prepare(self) -> None:
-        """Full names of the bodies."""
+        """Resolve the full names of the bodies."""
         self.bodies = named_bodies(self)
         self.labels = self.blocks = self.bodies
 
     def predict(self, view: View) -> np.ndarray:
-        """Of the state's own temperatures."""
+        """Return the temperatures of the state."""
         return np.asarray(view.warmth(self.bodies))
 
     def covariance(self) -> np.ndarray:
-        """With the error that all have in common."""
+        """Return the covariance with the error that all readings have in common."""
         return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)) + self.spec.common**2)
 
     def read(self) -> np.ndarray:
-        """Values of the file of the test."""
+        """Return the values of the test's file."""
         return np.array(self.spec.values)
 
 
@@ -489,7 +494,7 @@ class PositionReadings(MeasuredKind):
     shown = ("um", 1e-6)
 
     def prepare(self) -> None:
-        """Where the bodies stand by the drawing."""
+        """Compute the nominal positions of the bodies."""
         self.bodies = named_bodies(self)
         self.labels = tuple(f"{body} {axis}" for body in self.bodies for axis in "xyz")
         self.blocks = tuple(body for body in self.bodies for _ in range(3))
@@ -503,15 +508,15 @@ class PositionReadings(MeasuredKind):
         return np.asarray(np.einsum("sji,sbj->sbi", placed.rotation[:, root], away).real)
 
     def predict(self, view: View) -> np.ndarray:
-        """Against the drawing."""
+        """Return the displacements against the drawing."""
         return np.asarray((self._places(view.states) - self.nominal).reshape(len(view.states), -1))
 
     def covariance(self) -> np.ndarray:
-        """Alike for all."""
+        """Return the same variance for all coordinates, without correlation."""
         return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
 
     def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Shift and turn of the measuring machine's frame."""
+        """Return shift and rotation of the measuring machine's frame."""
         if self.spec.frame != specs.FREE:
             return super().biases()
         shifts = np.tile(np.eye(3), (len(self.bodies), 1))
@@ -520,7 +525,7 @@ class PositionReadings(MeasuredKind):
         return columns, np.full(6, np.inf), np.full(6, UNKNOWN_FRAME)
 
     def read(self) -> np.ndarray:
-        """Values of the file of the test."""
+        """Return the values of the test's file."""
         return np.array(self.spec.values).ravel()
 
 
@@ -539,11 +544,11 @@ KINDS: Mapping[str, type[MeasuredKind]] = FrozenMap(
         )
     }
 )
-"""Key of ``measurements`` -> its class."""
+"""Class of each kind of measurement, by its key under ``measurements``."""
 
 
 def named_bodies(one: MeasuredKind) -> tuple[str, ...]:
-    """Full paths of the bodies that a measurement names. Raises InputError: no such body, or several."""
+    """Return the full paths of a measurement's bodies; raise InputError if a name is unknown or ambiguous."""
     nodes = one.site.experiment.instrument.nodes
     out = []
     for k, name in enumerate(one.spec.bodies):
@@ -555,7 +560,7 @@ def named_bodies(one: MeasuredKind) -> tuple[str, ...]:
 
 
 def read_json(one: MeasuredKind, path: Path) -> Any:
-    """Contents of a JSON file. Raises InputError: it is none."""
+    """Return the contents of a JSON file; raise InputError if it is not one."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""The next move of an instrument and its worth: expected merits under the posterior, and simulated alignments."""
+"""Next move of an instrument: expected merits under the posterior, and the benefit of further measurements."""
 
 from __future__ import annotations
 
@@ -10,25 +10,24 @@ from analysis.instrument_state.state_estimate import NextMove, StateEstimate, be
 from twin.asbuilt.asbuilt_bench import AsBuiltBench, of_some, where_lit
 
 MOST_ROUNDS = 3
-"""Times that a move is sought about the state that the last one leads to."""
+"""Largest number of times that the optimum move is computed about the state to which the previous one leads."""
 
 
 @dataclass(frozen=True, eq=False)
 class Advice:
-    """What to do next.
+    """Recommended next move and its expected benefit.
 
     Attributes
     ----------
     move : NextMove
-        Of the actuators.
+        Move of the actuators.
     before, after : float
-        Expected merit without a move and after it: the mean over the posterior of the sum of squares of all merits in
-        units of their requirements, by exact traces.
+        Expected merit without and with the move: the posterior mean of the sum of squares of all merits in units of
+        their requirements, by exact traces.
     ignorance : float
-        The part of it that is due to what is not known of the state and could be mended if it were.
-    worth : dict[str, float]
-        Name of a measurement that could be made -> by how much it is expected to lower the merit after the move that
-        follows from it.
+        Part of the merit that is due to the uncertainty of the state and could be corrected if the state were known.
+    worth : dict
+        Name of a possible measurement -> expected reduction of the merit after the move that follows from it.
     """
 
     move: NextMove
@@ -39,15 +38,15 @@ class Advice:
 
 
 def wanted_move(bench: AsBuiltBench, mean: np.ndarray, after: str | None) -> NextMove:
-    """The move that makes the expected merit least, about where it leads to.
+    """Return the move that minimises the expected merit, linearised about the state to which it leads.
 
     Parameters
     ----------
     bench : AsBuiltBench
-        With actuators.
-    mean : np.ndarray
-        Parameters as estimated, (K,).
-    after : str | None
+        Bench with actuators.
+    mean : (K,) ndarray
+        Estimated parameters.
+    after : str, optional
         Name of the last move that was made.
 
     Raises
@@ -72,7 +71,7 @@ def wanted_move(bench: AsBuiltBench, mean: np.ndarray, after: str | None) -> Nex
 def _about(
     bench: AsBuiltBench, mean: np.ndarray, after: str | None, amounts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of the merit (R,) after a move, and their derivatives by the actuators (R, C)."""
+    """Return the residuals of the merits (R,) after a move, and their derivatives by the actuators (R, C)."""
     count = len(amounts)
     steps = np.diag(bench.actuator_steps)
     moves = np.concatenate([amounts[None], amounts + steps, amounts - steps])
@@ -81,18 +80,18 @@ def _about(
 
 
 def advice(bench: AsBuiltBench, found: StateEstimate, draws: np.ndarray, rng: np.random.Generator) -> Advice:
-    """The next move, its effect over the posterior, and what measurements would be worth before it.
+    """Return the next move, its effect over the posterior, and the expected benefit of measurements before it.
 
     Parameters
     ----------
     bench : AsBuiltBench
-        With actuators.
+        Bench with actuators.
     found : StateEstimate
-        The state.
-    draws : np.ndarray
-        States of the posterior, (S, K).
-    rng : np.random.Generator
-        Source of the errors of the move.
+        Estimated state.
+    draws : (S, K) ndarray
+        States drawn from the posterior.
+    rng : Generator
+        Random generator of the errors of the move.
 
     Raises
     ------
@@ -120,7 +119,7 @@ def advice(bench: AsBuiltBench, found: StateEstimate, draws: np.ndarray, rng: np
 def expected(
     bench: AsBuiltBench, values: np.ndarray, after: str | None, further: np.ndarray | None = None
 ) -> np.ndarray:
-    """Merits of states (S,), the sum of squares in units of the requirements; NaN where the light is lost."""
+    """Return the merits of states (S,), sums of squares in units of the requirements; NaN where the light is lost."""
     return where_lit(
         lambda some: np.sum(bench.merit_numbers(values[some], after, of_some(further, some)) ** 2, axis=1),
         len(values),

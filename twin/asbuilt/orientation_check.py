@@ -1,4 +1,4 @@
-"""``camtwin asbuilt check``: which way round measured wavefronts lie, as far as the data tell it."""
+"""Command ``camtwin asbuilt check``: orientation and sign of measured wavefronts, as far as the data determine them."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, Section, answer
 
 FREE_FOCUS = 100.0 * UNKNOWN_FOCUS
-"""Standard deviation that stands for a focus that is free, metres."""
+"""Standard deviation that represents a free focus, metres."""
 ANOTHER, NONE = 3, 4
 """Exit codes: another reading than the stated one explains the data; none does."""
 
 
 @dataclass(frozen=True, eq=False)
 class OrientationCheck:
-    """All readings of measured wavefronts that share their terms.
+    """Comparison of all sixteen orientations of measured wavefronts that share their Zernike terms.
 
     Attributes
     ----------
     setup : AsBuiltSetup
-        What was measured.
-    names : tuple[str, ...]
-        Of the measurements.
+        Test with the measurements.
+    names : tuple of str
+        Names of the measurements.
     stated : Orientation
-        How the file of the test says that they lie.
+        Orientation specified in the file of the test.
     evidence : OrientationEvidence
-        Of every reading.
+        Chi-square and evidence of every orientation.
     """
 
     setup: AsBuiltSetup
@@ -50,7 +50,7 @@ class OrientationCheck:
 
     @property
     def code(self) -> int:
-        """Exit code: 0 where the stated reading is not excluded."""
+        """Exit code: 0 if the specified orientation is not excluded."""
         if not self.evidence.allowed:
             return NONE
         return 0 if self.stated in self.evidence.indistinguishable else ANOTHER
@@ -59,23 +59,23 @@ class OrientationCheck:
 def run_check(
     setup: AsBuiltSetup, backend: Backend, seed: int | None = None, advance: Advance = silent
 ) -> OrientationCheck:
-    """Try all sixteen ways in which the wavefronts of a test may lie.
+    """Compare all sixteen orientations in which the wavefronts of a test may have been recorded.
 
     Parameters
     ----------
     setup : AsBuiltSetup
-        What was measured; moves that were made are known, and what they do shows best which way round it is.
+        Test with the measurements; known moves made between them discriminate best between orientations.
     backend : Backend
-        Where to trace.
-    seed : int | None
-        Of a drawn instrument's errors.
+        Array backend of the ray trace.
+    seed : int, optional
+        Seed of a simulated instrument's errors.
     advance : Advance
-        Shows how far it is.
+        Callback that reports progress.
 
     Raises
     ------
     InputError
-        No measured wavefronts, or wavefronts with several terms or orientations.
+        There are no measured wavefronts, or they differ in their terms or orientations.
     """
     test = setup.test
     advance("readings", 0, 1)
@@ -122,7 +122,7 @@ def run_check(
 def _lit(
     bench: AsBuiltBench, values: np.ndarray, kinds: Sequence[MeasuredKind], afters: Sequence[str | None]
 ) -> list[np.ndarray]:
-    """Numbers that each measurement of a state reads without errors. Raises InputError: the light is lost."""
+    """Return the error-free readings of each measurement in a state; raise InputError if the light is lost."""
     out = []
     for kind, after in zip(kinds, afters, strict=True):
         try:
@@ -162,7 +162,7 @@ ORIENTATION: Record[OrientationCheck] = Record(
 
 
 def check_report(check: OrientationCheck) -> Report:
-    """Report of a check of orientations."""
+    """Return the report of a check of orientations."""
     told, more = answer(*_words(check))
     found = check.evidence
     rows: list[list[Cell]] = [

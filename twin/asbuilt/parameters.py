@@ -1,7 +1,7 @@
-"""What is estimated of an instrument: the motions of its prior, and what its actuators made of each move.
+"""Parameters of an as-built estimate: the motions of the prior, and response and errors of the actuators.
 
-A parameter vector holds the components of the prior, then one gain error for each actuator whose response is in doubt,
-then one error for each actuator of each move. A state at a time is the sum of the components and of all moves until
+A parameter vector holds the components of the prior, then one gain error for each actuator whose response is uncertain,
+then one error for each actuator of each move. The state at a time is the sum of the components and of all moves until
 then.
 """
 
@@ -27,32 +27,32 @@ from twin.tolerance.variations import BodyMove, VariedNumber, actuator_number, h
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """All that is estimated.
+    """Parameters of an as-built estimate.
 
     Attributes
     ----------
     stated : StatedMotions
-        The prior's components, M.
-    words : tuple[str, ...]
-        What each is called, with the shortest name of its body, (M,).
-    numbers : tuple[VariedNumber, ...]
-        What one SI unit of each component does.
-    actuators : tuple[VariedNumber, ...]
-        What one SI unit of each actuator does, C.
-    names : tuple[str, ...]
-        Of the actuators.
-    gains : tuple[int, ...]
-        Numbers of the actuators whose response is in doubt.
-    gain_sigmas : np.ndarray
-        Of those, shares.
-    moves : tuple[str, ...]
+        Components of the prior, M.
+    words : tuple of str
+        Description of each component with the shortest name of its body, (M,).
+    numbers : tuple of VariedNumber
+        Effect of one SI unit of each component.
+    actuators : tuple of VariedNumber
+        Effect of one SI unit of each actuator, C.
+    names : tuple of str
+        Names of the actuators.
+    gains : tuple of int
+        Indices of the actuators whose response is uncertain.
+    gain_sigmas : ndarray
+        Standard deviations of their responses, relative.
+    moves : tuple of str
         Names of the moves.
-    wanted : np.ndarray
-        What each move was meant to be, (J, C), SI.
-    errors : tuple[tuple[int, int], ...]
-        (move, actuator) of each error of a move.
-    error_sigmas : np.ndarray
-        Of those, SI.
+    wanted : (J, C) ndarray
+        Commanded amount of each move, SI.
+    errors : tuple of tuple
+        Indices (move, actuator) of each error of a move.
+    error_sigmas : ndarray
+        Standard deviations of these errors, SI.
     """
 
     stated: StatedMotions
@@ -69,12 +69,12 @@ class Parameters:
 
     @classmethod
     def of(cls, test: AsBuiltSpec, stated: StatedMotions, instrument: Instrument, thermal: ThermalModel) -> Parameters:
-        """Parameters of a test.
+        """Return the parameters of a test.
 
         Raises
         ------
         InputError
-            An actuator of a body that is not there, or that does not move so.
+            The body of an actuator does not exist or does not allow its motion.
         """
         actuators = tuple(actuator_number(test, instrument, thermal, name, one) for name, one in test.actuators.items())
         names = tuple(test.actuators)
@@ -117,7 +117,7 @@ class Parameters:
 
     @property
     def prior(self) -> StatePrior:
-        """Of all parameters."""
+        """Prior of all parameters."""
         count, rest = len(self.components), np.concatenate([self.gain_sigmas, self.error_sigmas])
         covariance = np.zeros((count + len(rest), count + len(rest)))
         covariance[:count, :count] = self.stated.covariance
@@ -125,14 +125,14 @@ class Parameters:
         return StatePrior.of(self.labels, covariance)
 
     def moved(self, values: np.ndarray, after: str | None) -> np.ndarray:
-        """What the actuators have come to in states of parameters (S, K), (S, C), SI.
+        """Return the total travel of the actuators for parameters (S, K), (S, C), SI.
 
         Parameters
         ----------
-        values : np.ndarray
-            The parameters.
-        after : str | None
-            Name of the last move that was made; None for none.
+        values : (S, K) ndarray
+            Parameters.
+        after : str, optional
+            Name of the last move that was made; None before the first.
         """
         out = np.zeros((len(values), len(self.names)))
         if after is None or not self.moves:
@@ -146,23 +146,23 @@ class Parameters:
         return out
 
     def gain(self, values: np.ndarray) -> np.ndarray:
-        """Response of each actuator over the traced one, (S, C)."""
+        """Return the ratio of each actuator's response to the traced one, (S, C)."""
         out = np.ones((len(values), len(self.names)))
         start = len(self.components)
         out[:, list(self.gains)] += values[:, start : start + len(self.gains)]
         return out
 
     def states(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> list[State]:
-        """States of the instrument.
+        """Return the states of the instrument.
 
         Parameters
         ----------
-        values : np.ndarray
-            Parameters, (S, K).
-        after : str | None
-            Name of the last move that was made; None for none.
-        further : np.ndarray | None
-            What is moved beyond that, as it is meant, (C,) or (S, C), SI.
+        values : (S, K) ndarray
+            Parameters.
+        after : str, optional
+            Name of the last move that was made; None before the first.
+        further : (C,) or (S, C) ndarray, optional
+            Commanded amounts of a further move, SI.
         """
         moved = self.moved(values, after)
         if further is not None:
@@ -171,7 +171,10 @@ class Parameters:
         return states_of((*self.numbers, *self.actuators), amounts)
 
     def temperatures(self, values: np.ndarray, bodies: Sequence[str]) -> np.ndarray:
-        """Temperatures of bodies above nominal, (S, bodies), kelvin: their own, or of what carries them."""
+        """Return the temperatures of bodies above nominal, (S, bodies), kelvin.
+
+        A body without its own temperature has that of the nearest body that carries it.
+        """
         out = np.zeros((len(values), len(bodies)))
         own = {component.body for component in self.components if component.kind == "temperature"}
         for b, body in enumerate(bodies):
@@ -190,16 +193,16 @@ def _upward(path: str) -> list[str]:
 def component_numbers(
     components: Sequence[Component], instrument: Instrument, thermal: ThermalModel
 ) -> tuple[VariedNumber, ...]:
-    """What one SI unit of each component of a prior does, heat to the first order about none.
+    """Return the effect of one SI unit of each component of a prior, thermal ones to the first order.
 
     Parameters
     ----------
-    components : Sequence[Component]
-        Of one statement; a body with a temperature of its own does not follow what carries it.
+    components : sequence of Component
+        Components of one prior; a body with its own temperature does not follow the body that carries it.
     instrument : Instrument
-        Whose bodies move.
+        Instrument with the bodies.
     thermal : ThermalModel
-        What heat does to it.
+        Thermal model of the instrument.
     """
     warm = {component.body: Temperature() for component in components if component.kind in HEAT}
     return tuple(

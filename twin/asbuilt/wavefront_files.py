@@ -1,4 +1,4 @@
-"""Coefficients of measured wavefronts from the files that a measurement names, and which way round they lie."""
+"""Zernike coefficients of measured wavefronts from the files of a measurement, brought to the program's orientation."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ TABLES = (".csv", ".tsv")
 
 
 class NamesWavefronts(Protocol):
-    """A measurement that names files of wavefronts.
+    """Measurement that refers to files of wavefronts.
 
     Attributes
     ----------
     spec : Any
-        What the test says of it.
+        Specification of the measurement in the test.
     beams : VariedBeams
-        Of its fields.
+        Beams of its fields.
     """
 
     spec: Any
     beams: VariedBeams
 
     def file(self, key: str, value: str, what: str) -> Path:
-        """A file that it names at a key. Raises InputError: there is none."""
+        """Return the path of a file given under a key; raise InputError if it does not exist."""
 
     def wrong(self, text: str, key: str, allowed: str | None = None, found: str | None = None) -> InputError:
-        """An error at a key of it."""
+        """Return an error at a key of the measurement."""
 
 
 def stated_orientation(one: NamesWavefronts) -> Orientation:
-    """How the file of the test says that maps and coefficients lie. Raises InputError: no such orientation."""
+    """Return the specified orientation of maps and coefficients; raise InputError if its name is unknown."""
     try:
         return Orientation.named(one.spec.orientation, one.spec.sign)
     except ValueError as error:
@@ -49,19 +49,19 @@ def stated_orientation(one: NamesWavefronts) -> Orientation:
 
 
 def read_coefficients(one: NamesWavefronts, orientation: Orientation | None = None) -> np.ndarray:
-    """Zernike terms of every field, metres rms of the wavefront in single pass, (F, T).
+    """Return the Zernike terms of every field, (F, T), metres rms of the wavefront in single pass.
 
     Parameters
     ----------
     one : NamesWavefronts
         The measurement.
-    orientation : Orientation | None
-        How its files lie; as it says by default.
+    orientation : Orientation, optional
+        Orientation of its files; the specified one by default.
 
     Raises
     ------
     InputError
-        a file that is none of a wavefront, has other fields or terms, or too little light.
+        A file holds no wavefront, or has other fields or terms, or too small an illuminated area.
     """
     lies = stated_orientation(one) if orientation is None else orientation
     spec, terms = one.spec, tuple(one.spec.numbers)
@@ -113,7 +113,7 @@ def _of_map(one: NamesWavefronts, number: int, name: str, lies: Orientation) -> 
 
 
 def _less(measured: WavefrontMap, reference: WavefrontMap, one: NamesWavefronts) -> WavefrontMap:
-    """A map without the error of the reference surface."""
+    """Return a map minus the error of the reference surface."""
     if measured.values.shape != reference.values.shape:
         found = f"{reference.values.shape} points, the maps {measured.values.shape}"
         raise one.wrong("the reference has another number of points than the maps", "reference", "the same", found)

@@ -1,1 +1,1 @@
-"""Optimisation of a camera's prescription."""
+"""Optimisation of a camera's prescription, and search for the layout of a monitor."""

@@ -1,4 +1,4 @@
-"""``python -m twin.design``: optimise a camera's prescription, or find the layout of a monitor."""
+"""Command line program ``python -m twin.design``: optimise a camera's prescription, or find the layout of a monitor."""
 
 from __future__ import annotations
 
@@ -22,12 +22,15 @@ from twin.framework.command import add_tests, run_test
 
 
 def _meant(args: Sequence[str]) -> str:
-    """Return the subcommand of the file among the words after the program."""
+    """Return the subcommand for the file among the arguments."""
     return "monitor" if any(_is_layout(word) for word in args if not word.startswith("-")) else "camera"
 
 
 def _is_layout(word: str) -> bool:
-    """Whether a word is the path of a search for a monitor's layout; what is wrong with a file its command says."""
+    """Return True if an argument is the path of a search for a monitor's layout.
+
+    Errors in a file are left to its command.
+    """
     try:
         kind = kind_of(read_yaml(word).data)
     except InputError:
@@ -40,10 +43,12 @@ app = cli.program(cls=cli.unnamed(_meant), no_args_is_help=True)
 
 @app.callback()
 def main() -> None:
-    """Design a camera, or the monitor of a pair. The file says which it is: the subcommand may be left out.
+    """Optimise a camera's prescription, or find the layout of a pair's monitor.
 
-    Examples: `python -m twin.design camera scenes/examples/design_gf7_short.yaml` and
-    `python -m twin.design monitor scenes/examples/design_monitor_two.yaml`
+    The subcommand may be omitted: the file determines it.
+
+    Examples: `python -m twin.design camera scenes/examples/design_gf7_short.yaml` and `python -m twin.design monitor
+    scenes/examples/design_monitor_two.yaml`
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
@@ -62,14 +67,16 @@ def monitor(
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a search that was broken off.")] = False,
 ) -> None:
-    """Find the layout of a pair's monitor: how many beams, where in the pupil, through which prisms; by what their
-    light can know of the cameras under stated disturbances, what they take of the pupil, and what they weigh.
+    """Find the layout of a pair's monitor: number of beams, their positions in the pupil and their prisms.
+
+    Layouts are compared by the accuracy of the cameras' parameters under the specified disturbances, by the obstructed
+    share of the pupil, and by mass.
 
     Example: `python -m twin.design monitor scenes/examples/design_monitor_two.yaml --workers 2`
 
-    The run folder gets the instruments of the best layouts in artefacts/, layouts.json, config.yaml and a report. While
-    it runs, what was tried is kept in OUT.search beside it; with --resume the same command goes on from there. The
-    result depends neither on the number of workers nor on where it was broken off.
+    The run folder gets the instruments of the best layouts in artefacts/, layouts.json, config.yaml and a report.
+    During the run, finished work is kept in OUT.search beside it; with --resume the same command continues from there.
+    The result depends neither on the number of workers nor on interruptions.
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """

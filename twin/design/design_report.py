@@ -1,4 +1,4 @@
-"""Report of an optimised camera: before and after, its layout, the wavefront error over the field, the new file."""
+"""Report of an optimised camera: before and after, its layout, the wavefront error over the field, and the new file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from twin.framework.svg import BLUE, GREY, INK, ORANGE, look, new_figure, plain_
 
 
 def design_report(run: DesignRun) -> Report:
-    """Report of an optimised camera."""
+    """Return the report of an optimised camera."""
     setup, found = run.setup, run.found
     before, after = found.before, found.after
     worst = float(after.errors.max())
@@ -105,7 +105,7 @@ def design_report(run: DesignRun) -> Report:
 
 
 def _start_row(number: int, attempt: Attempt) -> list[str | float]:
-    """A row of the table of starts."""
+    """Return a row of the table of starts."""
     found = attempt.design
     kind = "drawn" if attempt.drawn else "the camera"
     way = "at once" if attempt.steps == 1 else f"in {attempt.steps} steps"
@@ -134,7 +134,7 @@ _BEFORE, _AFTER = GREY, BLUE
 
 
 def _layout_figure(design: Design, start: Prescription) -> Figure:
-    """Beams in the plane of symmetry, before and after, to one scale."""
+    """Plot the beams in the plane of symmetry, before and after, to the same scale."""
     figure = new_figure(4.4)
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
     for one, prescription, title in zip(axes, (start, design.prescription), ("before", "after"), strict=True):
@@ -166,12 +166,12 @@ def _layout(axes: Axes, design: Design, prescription: Prescription) -> None:
 
 
 def _edges(hits: np.ndarray) -> tuple[int, int]:
-    """The rays (N, 2) of a beam that are farthest out in y."""
+    """Return the indices of the rays (N, 2) of a beam with the smallest and the largest y."""
     return int(np.argmin(hits[:, 0])), int(np.argmax(hits[:, 0]))
 
 
 def _error_figure(design: Design) -> Figure:
-    """Wavefront error of every field, before and after."""
+    """Plot the wavefront error of every field, before and after."""
     figure = new_figure(2.9)
     axes = figure.subplots()
     fields = np.degrees(design.merit.beams.fields)

@@ -1,4 +1,4 @@
-"""A camera's prescription optimised with exact Jacobians from several starts: the run, and what design.json says."""
+"""Optimisation of a camera's prescription with exact Jacobians from several starts, and the contents of design.json."""
 
 from __future__ import annotations
 
@@ -33,30 +33,33 @@ from twin.framework.record import Quantity, Record
 
 REMARK = """Prescription frame: z along the parent axis, light enters toward +z, y in the plane of symmetry, x along the
 line CCD. Made by python -m twin.design from {start}: least squares of the wavefront error over the field."""
+"""Comment at the top of the new camera's file."""
 
 
 WORTH = 0.01
-"""Share of the error that a constraint has to be worth, eased by a millimetre, to be spoken of."""
+"""Smallest improvement of the error per millimetre of easing, as a share of the error, for which a constraint is named.
+"""
 
 _KEYS = {"envelope": ("envelope",), "clearance": ("clearance",), "anamorphism": ("anamorphism",)}
-"""Keys of the constraints that can be eased; the principal distance is held by what varies."""
+"""Keys of the constraints that can be eased; the principal distance is held by the variables."""
 _REMEDIES = {"envelope": "a larger envelope", "clearance": "a smaller clearance", "anamorphism": "more anamorphism"}
+"""Advice for each constraint that can be eased."""
 
 
 @dataclass(frozen=True, eq=False)
 class DesignRun:
-    """An optimised camera.
+    """Optimised camera.
 
     Attributes
     ----------
-    setup : camera_design.CameraDesignSetup
-        What its file says.
+    setup : CameraDesignSetup
+        Specification of the design.
     searched : Search
-        What came of every start.
+        Results of all starts.
     text : str
-        The new camera's file.
-    warnings : tuple[str, ...]
-        What its user should know.
+        File of the new camera.
+    warnings : tuple of str
+        Warnings for the user.
     """
 
     setup: camera_design.CameraDesignSetup
@@ -66,21 +69,21 @@ class DesignRun:
 
     @property
     def found(self) -> Design:
-        """The best: prescription before and after."""
+        """Best design: prescription before and after."""
         return self.searched.best
 
 
 def run_design(
     setup: camera_design.CameraDesignSetup, backend: Backend, seed: int = 0, advance: Advance = silent
 ) -> DesignRun:
-    """Optimise the camera; the seed is that of the starts that are drawn.
+    """Optimise the camera; the seed is that of the random starts.
 
     Raises
     ------
     InputError
         The camera passes no light.
     BenchError
-        The constraints cannot be held.
+        The constraints cannot be satisfied.
     """
     test, camera = setup.test, setup.camera
     start, beams = camera_design.prescription_of(camera), camera_design.beams_of(camera)
@@ -132,17 +135,17 @@ def run_design(
 
 
 def _known(of: Callable[[Design], Any]) -> Callable[[Attempt], Any]:
-    """What gives a number of the camera that a start came to, None where it came to none."""
+    """Return a function that gives a number of a start's design, None if the start has none."""
     return lambda attempt: None if attempt.design is None else of(attempt.design)
 
 
 def _pair(of: Callable[[Evaluation], Any]) -> Callable[[DesignRun], Any]:
-    """What gives a number of the camera before and after."""
+    """Return a function that gives a number of the camera before and after."""
     return lambda run: {"before": of(run.found.before), "after": of(run.found.after)}
 
 
 def _chief_rays(run: DesignRun) -> dict[str, np.ndarray]:
-    """Angles of the fields' chief rays from the normal of the focal plane, radians, before and after."""
+    """Return the angles of all chief rays from the normal of the focal plane, radians, before and after."""
     found, merit = run.found, run.found.merit
 
     def angles(prescription: Prescription) -> np.ndarray:
@@ -207,7 +210,7 @@ DESIGN: Record[DesignRun] = Record(
 
 
 def agreement(run: DesignRun) -> str:
-    """Whether other starts end at as good a camera; a sentence."""
+    """Return a sentence on whether other starts end at an equally good camera."""
     searched, count = run.searched, len(run.searched.attempts)
     if count == 1:
         return "A local optimum: from one start it is not known whether there is a better one (starts: 6 tries more)"
@@ -224,7 +227,7 @@ def agreement(run: DesignRun) -> str:
 
 
 def verdict(run: DesignRun) -> str:
-    """Whether the camera has become better, and which constraints keep it from more; one sentence or two."""
+    """Return one or two sentences on whether the camera has improved, and which constraints limit it."""
     found, start, name = run.found, run.setup.camera.name, run.setup.test.name
     across = found.before.distance_across
     errors = f"{rms_error(found.after):.4f} waves rms over the field ({rms_error(found.before):.4f} in {start})"
@@ -238,16 +241,16 @@ def verdict(run: DesignRun) -> str:
 
 
 def _held_text(held: tuple[ActiveConstraint, ...], start: str, across: float) -> str:
-    """Return the dearest constraints, at most three, each with by how much.
+    """Return the constraints that cost most, at most three, each with its cost.
 
     Parameters
     ----------
-    held : tuple[ActiveConstraint, ...]
+    held : tuple of ActiveConstraint
         The constraints.
     start : str
-        Name of the camera that the design starts from.
+        Name of the camera from which the design starts.
     across : float
-        Its principal distance across the line, metres, of which the anamorphism is a share.
+        Its principal distance across the line, metres, to which the anamorphism refers.
     """
     parts = []
     for one in held[:3]:

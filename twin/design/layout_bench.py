@@ -1,8 +1,9 @@
-"""What one beam, and one whole layout, of a monitor's design is worth: built, checked and traced.
+"""Evaluation of single beams and whole layouts of a monitor: they are built, checked and traced.
 
-A beam is first tried alone, four times in a pair as in every layout. What its spots say of the bodies that all beams
-share, and what its own prisms do to them, add up over the beams of a layout, so that thousands of combinations cost no
-trace. The chosen ones are then built as a whole, where facets in one block and prisms beside each other count, too.
+A beam is first evaluated alone, four times in a pair as in every layout. The information of its spots on the bodies
+that all beams share, and the effects of its own prisms, add up over the beams of a layout, so that thousands of
+combinations are compared without a trace. The best ones are then built as a whole, which includes facets in one block
+and adjacent prisms.
 """
 
 from __future__ import annotations
@@ -31,26 +32,29 @@ from twin.monitor.information import Information, ground_of, information_of, qua
 from twin.sensors.area_detector import EmvaDetector
 
 _AROUND = 24
+"""Number of rays on the edge of a beam."""
 EDGE_PX = 10.0
-"""Room that the fit of a spot needs between its middle and the edge of its area CCD, pixels."""
+"""Distance that the fit of a spot needs between its centre and the edge of its area CCD, pixels."""
 FULLEST = 0.9
-"""Largest share of what a pixel can hold that its expected light may fill: the rest is for shot noise and for pixels
-that respond more than others, five standard deviations of both even with a few thousand electrons.
+"""Largest share of a pixel's full-well capacity that its expected light may fill.
+
+The rest is for shot noise and for pixels of higher response, five standard deviations of both even with a few thousand
+electrons.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What the spots of one beam say under one statement of disturbances; D = 8 coordinates, K cameras.
+    """Observation model of the spots of one beam under one prior on disturbances; D = 8 coordinates, K cameras.
 
     Attributes
     ----------
-    shared : np.ndarray
-        (D, M) px by independent unit motions of the bodies that all beams share.
-    own : np.ndarray
-        (D, D) px^2, covariance by the bodies of this beam alone, and by noise.
-    parameters : np.ndarray
-        (4 K, M) of the cameras by the shared motions; the same for all beams.
+    shared : (D, M) ndarray
+        Spot shifts, px, by independent unit motions of the bodies that all beams share.
+    own : (D, D) ndarray
+        Covariance, px^2, by the bodies of this beam alone and by noise.
+    parameters : (4 K, M) ndarray
+        Changes of the cameras' parameters by the shared motions; the same for all beams.
     """
 
     shared: np.ndarray
@@ -60,27 +64,27 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class BeamFacts:
-    """A beam that was tried alone.
+    """Properties of a beam that was evaluated alone.
 
     Attributes
     ----------
-    beam : monitor_layout.Beam
+    beam : Beam
         The beam.
     refused : str
-        Why it cannot stand, empty for one that can; nothing else is then known.
-    seen : Mapping[str, Seen]
-        By the names of the disturbances.
-    taken : np.ndarray
-        Imaging rays that its prisms take, packed bits of (cameras, 3, rays).
+        Reason why it is not feasible, empty if it is; the other attributes are then empty.
+    seen : dict
+        Observation models by the names of the disturbances.
+    taken : ndarray
+        Imaging rays that its prisms block, packed bits of (cameras, 3, rays).
     mass : float
-        Of its prisms, kg.
-    bodies : tuple[np.ndarray, ...]
+        Mass of its prisms, kg.
+    bodies : tuple of ndarray
         Corners (P, 3) of its prisms in the base frame, metres.
-    facets : np.ndarray
-        Of each channel, how far its facet leans along the base's X and Y (tangents) and stands from the apex, metres,
-        (channels, 4).
-    light : np.ndarray
-        Rays of its beams in front of the cameras, segments (N, K, 2, 3), metres.
+    facets : (channels, 4) ndarray
+        For each channel the tilt of its facet along the base's X and Y (tangents) and its position relative to the
+        apex, metres.
+    light : (N, K, 2, 3) ndarray
+        Segments of the rays of its beams in front of the cameras, metres.
     """
 
     beam: monitor_layout.Beam
@@ -100,32 +104,32 @@ class BeamFacts:
 
 @dataclass(frozen=True, eq=False)
 class LayoutFacts:
-    """A layout that was built as a whole.
+    """Properties of a layout that was built as a whole.
 
     Attributes
     ----------
-    beams : monitor_layout.Layout
-        Of it.
+    beams : Layout
+        Beams of the layout.
     refused : str
-        Why it cannot stand, empty for one that can; nothing else is then known.
-    sigmas : Mapping[str, Mapping[str, float]]
-        Disturbances -> quantity -> what is left, SI.
-    before : Mapping[str, Mapping[str, float]]
-        Likewise, without any measurement.
-    shares : Mapping[str, Mapping[str, Mapping[str, float]]]
-        Disturbances -> goal -> cause -> variance that is left, SI.
-    shares_before : Mapping[str, Mapping[str, Mapping[str, float]]]
-        Likewise, without any measurement.
+        Reason why it is not feasible, empty if it is; the other attributes are then empty.
+    sigmas : dict
+        Disturbances -> quantity -> posterior standard deviation, SI.
+    before : dict
+        The same without any measurement.
+    shares : dict
+        Disturbances -> goal -> cause -> posterior variance, SI.
+    shares_before : dict
+        The same without any measurement.
     pupil_share : float
-        Of the imaging pupil that its prisms take.
+        Share of the imaging pupil that its prisms block.
     mass : float
-        Of its prisms, kg.
+        Mass of its prisms, kg.
     glass_path : float
-        Longest way of a beam in glass, one way, metres.
+        Longest path of a beam in glass, one way, metres.
     spot_sigma : float
-        Largest standard deviation of a spot's place, pixels.
-    brightest : np.ndarray
-        How full every spot's brightest pixel is, (C,).
+        Largest prior standard deviation of a spot position, pixels.
+    brightest : (C,) ndarray
+        Filling of every spot's brightest pixel, as a share of its capacity.
     """
 
     beams: monitor_layout.Layout
@@ -142,14 +146,14 @@ class LayoutFacts:
 
 
 class LayoutBench:
-    """Tries beams and layouts of one design.
+    """Bench that evaluates beams and layouts of one design.
 
     Parameters
     ----------
-    setup
+    setup : MonitorDesignSetup
         The design.
-    backend
-        Where to trace.
+    backend : Backend
+        Array backend of the ray trace.
     """
 
     def __init__(self, setup: monitor_layout.MonitorDesignSetup, backend: Backend) -> None:
@@ -157,12 +161,12 @@ class LayoutBench:
 
     @cached_property
     def start(self) -> Instrument:
-        """What the design starts from. Raises InputError where it cannot stand."""
+        """Instrument from which the design starts; raises InputError if it cannot be built."""
         return build_instrument(self.setup.instrument, self.setup.cameras, self.backend)
 
     @cached_property
     def imaging(self) -> monitor_layout.ImagingBeams:
-        """Imaging beams of the cameras, which all layouts have."""
+        """Imaging beams of the cameras, common to all layouts."""
         return monitor_layout.ImagingBeams.of(self.start, self.backend)
 
     @property
@@ -172,20 +176,20 @@ class LayoutBench:
 
     @cached_property
     def rows(self) -> dict[str, np.ndarray]:
-        """Quantity -> rows on the parameters; the same in all layouts, which leave the cameras as they are."""
+        """Rows from the cameras' parameters to each quantity, common to all layouts."""
         return quantity_rows(self.start, ground_of(self.start))
 
     def detector(self, name: str = monitor_layout.AS_STARTED) -> EmvaDetector:
-        """Detector of the area CCD that a beam names."""
+        """Return the detector of the area CCD that a beam names."""
         sheet = self.setup.detectors.get(name, self.setup.detector)
         return EmvaDetector.from_sheet(sheet, self.setup.instrument.autocollimator.area_ccd.exposure)
 
     def goals_of(self, name: str) -> tuple[str, ...]:
-        """Quantities of which a goal's value is the worst: ``d_f`` of every camera."""
+        """Return the quantities whose worst is a goal's value: ``d_f`` of every camera."""
         return tuple(key for key in self.rows if key == name or key.endswith(f"/{name}"))
 
     def boards_apart(self, one: monitor_layout.Beam, other: monitor_layout.Beam) -> bool:
-        """Whether the area CCDs of two beams have room beside each other at an end of every line."""
+        """Return True if the area CCDs of two beams fit beside each other at an end of every line."""
         ccd = monitor_layout.layout_spec(self.setup, (one,)).autocollimator.area_ccd
         return all(
             abs(camera.line_principal_distance * (np.tan(one.field) - np.tan(other.field))) >= ccd.rows * ccd.pitch
@@ -193,7 +197,7 @@ class LayoutBench:
         )
 
     def try_beam(self, beam: monitor_layout.Beam) -> BeamFacts:
-        """A beam alone."""
+        """Evaluate a beam alone."""
         try:
             instrument = build_instrument(
                 monitor_layout.layout_spec(self.setup, (beam,)), self.setup.cameras, self.backend
@@ -216,7 +220,7 @@ class LayoutBench:
         )
 
     def try_layout(self, beams: monitor_layout.Layout) -> LayoutFacts:
-        """A layout as a whole."""
+        """Evaluate a layout as a whole."""
         try:
             instrument = build_instrument(
                 monitor_layout.layout_spec(self.setup, beams), self.setup.cameras, self.backend
@@ -226,23 +230,23 @@ class LayoutBench:
             return LayoutFacts(beams, refused=_reason(error))
 
     def judged(self, beams: monitor_layout.Layout, instrument: Instrument, limited: bool = True) -> LayoutFacts:
-        """What an instrument is worth as a layout.
+        """Return the properties of an instrument as a layout.
 
         Parameters
         ----------
-        beams : monitor_layout.Layout
-            That it has.
+        beams : Layout
+            Beams of the layout.
         instrument : Instrument
-            With them.
+            Instrument with these beams.
         limited : bool
-            Whether it has to keep the design's limits.
+            True if it must satisfy the design's limits.
 
         Raises
         ------
         BeamMissedError, AimError
-            Light does not come to its area CCDs.
+            Light does not reach its area CCDs.
         _OutsideLimitsError
-            It does not keep a limit.
+            It violates a limit.
         """
         share, mass = monitor_layout.pupil_share(self.imaging.taken(instrument)), monitor_layout.prism_mass(instrument)
         if limited:
@@ -267,18 +271,16 @@ class LayoutBench:
     def information(
         self, instrument: Instrument, beam: monitor_layout.Beam, alike: bool = False, single: bool = True
     ) -> dict[str, Information]:
-        """What an instrument's spots know, by the names of the disturbances.
+        """Return the information of an instrument's spots, by the names of the disturbances.
 
         Parameters
         ----------
         instrument : Instrument
-            a layout of this design.
-        beam : monitor_layout.Beam
-            One of it, which names the area CCD.
-        alike : bool
-            As of ``information_of``.
-        single : bool
-            likewise.
+            A layout of this design.
+        beam : Beam
+            One of its beams, which names the area CCD.
+        alike, single : bool
+            See ``information_of``.
         """
         stated = self.setup.disturbances
         found = information_of(
@@ -311,7 +313,7 @@ class LayoutBench:
 
 
 class _OutsideLimitsError(Exception):
-    """A layout does not keep a limit of its design."""
+    """A layout violates a limit of its design."""
 
 
 def _reason(error: Exception) -> str:
@@ -319,7 +321,7 @@ def _reason(error: Exception) -> str:
 
 
 def is_own(body: str) -> bool:
-    """Whether a body belongs to one channel, by its path: prisms, boards, facets."""
+    """Return True if a body belongs to one channel, by its path: prisms, boards, facets."""
     last = body.rpartition("/")[2]
     return any(part.partition("_")[0] in SIDES for part in body.split("/")) or any(
         last.endswith(f"_{side}") for side in SIDES
@@ -335,7 +337,10 @@ def _seen(information: Information) -> Seen:
 
 
 def _light(instrument: Instrument, backend: Backend) -> np.ndarray:
-    """Edge rays of all beams on their way out, in front of the cameras and outside glass, segments (N, K, 2, 3)."""
+    """Return segments (N, K, 2, 3), metres, of the edge rays of all outgoing beams, in front of the cameras.
+
+    Segments inside glass are omitted.
+    """
     angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
     edge = 0.999 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     out = []
@@ -357,15 +362,14 @@ def _facets(instrument: Instrument) -> np.ndarray:
 
 
 def touching(one: BeamFacts, other: BeamFacts) -> bool:
-    """Whether two beams cannot stand together: prisms stand in each other or in the other's light, or one's facet
-    reaches over the edge of the other's.
+    """Return True if two beams are incompatible.
+
+    Their prisms overlap or block the other's light, or a facet extends over the edge of the other's.
 
     Parameters
     ----------
-    one : BeamFacts
-        a beam that was tried alone.
-    other : BeamFacts
-        Another one.
+    one, other : BeamFacts
+        Beams that were evaluated alone.
     """
     # as scenes.models.monitor_chain.facet_places: of two in one corner the one that leans more stands farther out
     away = one.facets - other.facets
@@ -385,14 +389,14 @@ def touching(one: BeamFacts, other: BeamFacts) -> bool:
 
 
 def combined(facts: Sequence[BeamFacts], name: str) -> np.ndarray:
-    """Covariance of the cameras' parameters that several beams together leave, (4 K, 4 K), rad and m.
+    """Return the posterior covariance of the cameras' parameters from several beams together, (4 K, 4 K), rad and m.
 
     Parameters
     ----------
-    facts : Sequence[BeamFacts]
-        Of the beams.
+    facts : sequence of BeamFacts
+        The beams.
     name : str
-        Of the disturbances.
+        Name of the disturbances.
     """
     seen = [one.seen[name] for one in facts]
     shared = np.concatenate([one.shared for one in seen])
@@ -408,13 +412,13 @@ def combined(facts: Sequence[BeamFacts], name: str) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def bench_of(config: str, backend: str) -> LayoutBench:
-    """The bench of a design, of a worker process that keeps it from one piece of work to the next.
+    """Return the bench of a design, kept by a worker process between tasks.
 
     Parameters
     ----------
     config : str
         Text of the design's config.yaml.
     backend : str
-        Where to trace.
+        Array backend of the ray trace.
     """
     return LayoutBench(validate(monitor_layout.MonitorDesignSetup, parse_yaml(config)), load_backend(backend))

@@ -1,20 +1,20 @@
-"""The best layout of a search made better by exact gradients.
+"""Refinement of the best layout of a search by exact gradients.
 
-What is wanted is the least of a largest ratio: of each quantity that is left to what is wanted of it. Such a minimum
-lies where several ratios are equal, and has no gradient of its own. So each step is a linear programme over all ratios
-at once, within a box about the layout and within the ranges of its numbers (Fletcher and Sainz de la Maza, Math.
-Programming 43, 235, 1989); the box grows where the layout that is then built keeps what was promised, and shrinks where
-it does not. Whether bodies have room is asked of every layout that is built. Where they have none, the numbers that no
-goal depends on, most of those that place prisms, are drawn anew a few times to make room for the step; if that does not
-help, its numbers are changed one by one, and those that make the layout better stay.
+The objective is the largest ratio of a standard deviation to its goal. Such a minimax optimum lies where several ratios
+are equal, and is not differentiable. So each step is a linear programme over all ratios at once, within a trust region
+(box) about the layout and within the ranges of its parameters (Fletcher and Sainz de la Maza, Math. Programming 43,
+235, 1989); the box grows if the layout that is then built achieves the predicted improvement, and shrinks if not.
+Collisions of bodies are checked for every layout that is built. Where there are some, parameters on which no goal
+depends, mostly positions of prisms, are drawn again a few times to make room for the step; if that fails, the
+parameters are changed one by one, and changes that improve the layout are kept.
 
-The gradients: where prisms and facets stand is itself found by tracing, so no chain of closed formulas leads from a
-pupil offset to a sigma. Two parts do: the sigma's derivative by the traced derivatives A of the spots and by their
-noise R is exact matrix calculus (``Information.slopes``); A and R, which are smooth in every number of a layout, are
-differentiated by central differences of high order of layouts that are built anew. The stated error has two parts from
-the same layouts: the difference from the next lower order, and a jump within the steps, as where a 180-deg prism is
-exchanged for its mirror image (``monitor_chain``) of a beam in the plane of symmetry. A slope across a jump does not
-exist; its error is as large as itself.
+Gradients: positions of prisms and facets are themselves found by tracing, so there is no closed formula from a pupil
+offset to a sigma. The derivative of sigma with respect to the traced derivatives A of the spots and to their noise R is
+exact matrix calculus (``Information.slopes``). A and R, which are smooth in every parameter of a layout, are
+differentiated by central differences of high order of layouts that are built again. The reported error has two parts
+from the same layouts: the difference from the next lower order, and a jump within the steps, for example where a
+180-deg prism of a beam in the plane of symmetry is exchanged for its mirror image (``monitor_chain``). A derivative
+across a jump does not exist; its error is as large as itself.
 """
 
 from __future__ import annotations
@@ -37,29 +37,31 @@ from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts
 from twin.monitor.information import Information
 
 FIRST_BOX = 0.1
-"""Half of its side at first, relative to the range of each number."""
+"""Initial half-width of the box, relative to the range of each parameter."""
 LEAST_BOX = 2e-3
-"""Half of the box's side below which nothing more is sought."""
+"""Half-width of the box below which the refinement ends."""
 WORTH = 1e-3
-"""Share of the largest ratio that a number has to be worth over its whole range to be moved for its own sake."""
+"""Smallest change of a ratio over a parameter's whole range, relative to the largest ratio, for which the parameter is
+optimised.
+"""
 ROOM, ROOM_STEP = 8, 0.06
 """How often room is sought for a step, and by how much all else is changed then, relative to its range, rms."""
 _KEPT = 0.2  # share of what a step promised that makes it a good one
 _ORDER = 2  # of the differences: right to a per cent, which is all that a step can make use of
 
 Ask = Callable[[str, Sequence[Any]], list[Any]]
-"""Part of the search and items -> what comes of them."""
+"""Function from a part of the search and items to evaluate to their results."""
 
 
 def ratios(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> dict[tuple[str, str], float]:
-    """Disturbances and quantity -> what is left of it over what is wanted, of all goals.
+    """Return the ratio of the standard deviation to its goal, for all disturbances and quantities of the goals.
 
     Parameters
     ----------
-    sigmas : Mapping[str, Mapping[str, float]]
+    sigmas : dict
         Disturbances -> quantity -> sigma, SI.
     bench : LayoutBench
-        Of the design.
+        Bench of the design.
     """
     wanted = bench.setup.test.goal.wanted.items()
     return {
@@ -73,27 +75,27 @@ def ratios(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> dic
 def refined(
     bench: LayoutBench, ask: Ask, part: str, facts: LayoutFacts, steps: int, rng: np.random.Generator
 ) -> list[LayoutFacts]:
-    """Layouts on the way from one to the best near it, each better than the one before.
+    """Return successively better layouts from a starting one to the local optimum.
 
     Parameters
     ----------
     bench : LayoutBench
-        Of the design.
+        Bench of the design.
     ask : Ask
-        For slopes and layouts.
+        Function that evaluates derivatives and layouts.
     part : str
-        Of the search, for the progress.
+        Part of the search, for the progress.
     facts : LayoutFacts
-        Of the layout to begin with, which can stand.
+        Feasible layout at the start.
     steps : int
-        Gradients that are asked for, at most.
-    rng : np.random.Generator
-        Source of all that is drawn to make room.
+        Largest number of gradients.
+    rng : Generator
+        Random generator for making room.
 
     Returns
     -------
-    list[LayoutFacts]
-        At least the first.
+    list of LayoutFacts
+        The starting layout and its improvements.
     """
     way, box = [facts], FIRST_BOX
     every = numbers = numbers_of(bench, facts.beams, _ORDER)
@@ -134,7 +136,7 @@ def _largest(facts: LayoutFacts, bench: LayoutBench) -> float:
 
 
 def _slopes_of(bench: LayoutBench, facts: LayoutFacts, slope: Slope) -> np.ndarray:
-    """Change of every ratio over the whole range of a number, (Q,)."""
+    """Return the linear change of every ratio over the whole range of a parameter, (Q,)."""
     low, high = ranges(bench.setup)[slope.number.name]
     out, goal = [], bench.setup.test.goal.wanted
     for name, key in ratios(facts.sigmas, bench):
@@ -144,13 +146,14 @@ def _slopes_of(bench: LayoutBench, facts: LayoutFacts, slope: Slope) -> np.ndarr
 
 
 def _worth(bench: LayoutBench, facts: LayoutFacts, slope: Slope) -> float:
-    """Largest change of a ratio that a number is worth over its range, relative to the largest ratio."""
+    """Return the largest change of a ratio over a parameter's range, relative to the largest ratio."""
     return float(np.max(np.abs(_slopes_of(bench, facts, slope)))) / _largest(facts, bench)
 
 
 def _step(bench: LayoutBench, facts: LayoutFacts, slopes: Sequence[Slope], box: float) -> tuple[np.ndarray, float]:
-    """Changes of V numbers, relative to their ranges, that make the largest ratio least as far as slopes tell, and by
-    how much it then falls.
+    """Return changes of V parameters that minimise the largest linearised ratio, and the decrease of that ratio.
+
+    The changes are relative to the ranges of the parameters.
     """
     now = np.array(list(ratios(facts.sigmas, bench).values()))
     table = np.stack([_slopes_of(bench, facts, slope) for slope in slopes], axis=1)
@@ -183,7 +186,7 @@ def _moved(bench: LayoutBench, beams: Layout, numbers: Sequence[LayoutNumber], c
 def _with_room(
     bench: LayoutBench, ask: Ask, part: str, beams: Layout, idle: Sequence[LayoutNumber], rng: np.random.Generator
 ) -> LayoutFacts:
-    """The best that stands of a layout with its idle numbers drawn anew; one that is refused where none does."""
+    """Return the best feasible layout with the idle parameters drawn again; a refused one if none is feasible."""
     tried = [_moved(bench, beams, idle, ROOM_STEP * rng.standard_normal(len(idle))) for _ in range(ROOM if idle else 0)]
     found = [facts for facts in ask(f"{part}: room", tried) if not facts.refused]
     return min(found, key=lambda facts: _largest(facts, bench), default=LayoutFacts(beams, refused="no room"))
@@ -192,7 +195,7 @@ def _with_room(
 def _one_by_one(
     bench: LayoutBench, ask: Ask, part: str, facts: LayoutFacts, slopes: Sequence[Slope], change: np.ndarray
 ) -> LayoutFacts:
-    """The best layout that some of a step's changes make, tried in turn, the most promising first."""
+    """Return the layout improved by single changes of a step, tried in turn, the most promising first."""
     worst = int(np.argmax(list(ratios(facts.sigmas, bench).values())))
     gain = [abs(_slopes_of(bench, facts, slope)[worst] * c) for slope, c in zip(slopes, change, strict=True)]
     for k in np.argsort(gain)[::-1]:
@@ -205,33 +208,34 @@ def _one_by_one(
 
 
 STEP = 0.01
-"""Step of a number, relative to the range in which it may vary: A is smooth over all of it, and aimed to 1e-9 of it."""
+"""Step of a parameter relative to its range; A is smooth over the whole range, and rays are aimed to 1e-9 of it."""
 ORDER = 6
-"""Order of the central differences, where nothing else is asked for."""
+"""Default order of the central differences."""
 _WEIGHTS = {2: {1: 1.0 / 2.0}, 4: {1: 8.0 / 12.0, 2: -1.0 / 12.0}, 6: {1: 45.0 / 60.0, 2: -9.0 / 60.0, 3: 1.0 / 60.0}}
 """Order -> weights of central differences by the number of steps (Fornberg, Math. Comp. 51, 699, 1988)."""
 _JUMP = {4: {1: 4.0 / 3.0, 2: -1.0 / 3.0}, 6: {1: 1.5, 2: -0.6, 3: 0.1}}
-"""Order -> weights of f(k h) + f(-k h) - 2 f(0). Their sum is what that tends to with k, extrapolated by even powers:
-nothing of a smooth f. Of a jump J anywhere within the steps it is such a part of J that, over h, it bounds what J does
-to the central difference: J of the first step against 0.62 J, J/2 of the second against 0.13 J, J/10 of the third
-against 0.02 J for order 6.
+"""Order -> weights of f(k h) + f(-k h) - 2 f(0) for the detection of jumps.
+
+Their sum tends to zero for a smooth f, extrapolated by even powers. Of a jump J anywhere within the steps it keeps a
+part that, divided by h, bounds the effect of J on the central difference: J at the first step against 0.62 J, J/2 at
+the second against 0.13 J, J/10 at the third against 0.02 J for order 6.
 """
 
 
 @dataclass(frozen=True)
 class LayoutNumber:
-    """One of the numbers of a layout.
+    """Continuous parameter of a layout.
 
     Attributes
     ----------
     beams : Layout
         The layout.
     beam : int
-        Which of them, counted from 0.
+        Index of the beam, from 0.
     name : str
-        Of the number, one of ``monitor_layout.CONTINUOUS``.
+        Name of the parameter, one of ``monitor_layout.CONTINUOUS``.
     order : int
-        Of the differences, 2, 4 or 6.
+        Order of the differences, 2, 4 or 6.
     """
 
     beams: Layout
@@ -240,14 +244,14 @@ class LayoutNumber:
     order: int = ORDER
 
     def moved(self, bench: LayoutBench, by: float) -> Layout:
-        """The layout with this number changed.
+        """Return the layout with this parameter changed.
 
         Parameters
         ----------
         bench : LayoutBench
-            Of the design.
+            Bench of the design.
         by : float
-            The change, SI.
+            Change, SI.
         """
         own = self.beams[self.beam]
         value = number_of(bench.setup, own, self.name) + by
@@ -256,20 +260,20 @@ class LayoutNumber:
 
 @dataclass(frozen=True, eq=False)
 class Slope:
-    """Derivative of what a layout leaves by one of its numbers.
+    """Derivatives of a layout's standard deviations with respect to one of its parameters.
 
     Attributes
     ----------
     number : LayoutNumber
-        which.
+        The parameter.
     refused : str
-        Why it cannot be told, empty where it can; nothing else is then known.
-    values : Mapping[str, Mapping[str, float]]
-        Disturbances -> quantity -> d(sigma)/d(number), SI.
-    errors : Mapping[str, Mapping[str, float]]
-        Likewise, by how much each may be wrong; empty for differences of second order, below which is none.
-    brightest : np.ndarray
-        Derivative of how full the brightest pixel of each of C spots is, (C,), per SI unit.
+        Reason why they cannot be computed, empty if they can; the other attributes are then empty.
+    values : dict
+        Disturbances -> quantity -> d(sigma)/d(parameter), SI.
+    errors : dict
+        Numerical error of each; empty for differences of second order.
+    brightest : (C,) ndarray
+        Derivatives of the filling of the brightest pixel of each of C spots, per SI unit.
     """
 
     number: LayoutNumber
@@ -280,16 +284,16 @@ class Slope:
 
 
 def numbers_of(bench: LayoutBench, beams: Layout, order: int = ORDER) -> tuple[LayoutNumber, ...]:
-    """All numbers of a layout that may vary.
+    """Return all parameters of a layout that may vary.
 
     Parameters
     ----------
     bench : LayoutBench
-        Of the design.
+        Bench of the design.
     beams : Layout
         The layout.
     order : int
-        Of the differences.
+        Order of the differences.
     """
     names = [name for name, (low, high) in ranges(bench.setup).items() if high > low]
     return tuple(LayoutNumber(beams, k, name, order) for k in range(len(beams)) for name in names)
@@ -297,17 +301,17 @@ def numbers_of(bench: LayoutBench, beams: Layout, order: int = ORDER) -> tuple[L
 
 @lru_cache(maxsize=2)
 def _known_here(bench: LayoutBench, beams: Layout) -> dict[str, Information]:
-    """Result of ``known_of``, kept for the layout at which all numbers are differentiated."""
+    """Return the result of ``known_of``, cached for the layout at which all parameters are differentiated."""
     return known_of(bench, beams)
 
 
 def known_of(bench: LayoutBench, beams: Layout) -> dict[str, Information]:
-    """What a layout's spots know, by the names of the disturbances, whether or not its bodies have room.
+    """Return the information of a layout's spots, by the names of the disturbances, without a check for collisions.
 
     Parameters
     ----------
     bench : LayoutBench
-        Of the design.
+        Bench of the design.
     beams : Layout
         The layout.
 
@@ -316,7 +320,7 @@ def known_of(bench: LayoutBench, beams: Layout) -> dict[str, Information]:
     InputError
         Its prisms or facets cannot be placed.
     BeamMissedError, AimError
-        Light does not come to its area CCDs.
+        Light does not reach its area CCDs.
     """
     spec = layout_spec(bench.setup, beams)
     instrument = build_instrument(spec, bench.setup.cameras, bench.backend, free_beams=False, free_bodies=False)
@@ -324,14 +328,14 @@ def known_of(bench: LayoutBench, beams: Layout) -> dict[str, Information]:
 
 
 def slope_of(bench: LayoutBench, number: LayoutNumber) -> Slope:
-    """Derivative of all sigmas of a layout by one of its numbers.
+    """Return the derivatives of all sigmas of a layout with respect to one of its parameters.
 
     Parameters
     ----------
     bench : LayoutBench
-        Of the design.
+        Bench of the design.
     number : LayoutNumber
-        Of a layout.
+        Parameter of a layout.
     """
     low, high = ranges(bench.setup)[number.name]
     step, high_order, low_order = STEP * (high - low), _WEIGHTS[number.order], _WEIGHTS.get(number.order - 2, {})
@@ -364,7 +368,7 @@ def slope_of(bench: LayoutBench, number: LayoutNumber) -> Slope:
 
 @dataclass(eq=False)
 class _Sum:
-    """Weighted sum of A, of R, and of how full the brightest pixels are."""
+    """Weighted sum of A, of R, and of the filling of the brightest pixels."""
 
     spots: np.ndarray
     noise: np.ndarray

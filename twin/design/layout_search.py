@@ -1,8 +1,10 @@
-"""Search for layouts: beams at random, tried alone; their combinations compared without a trace; the best built as a
-whole; their beams changed and combined anew; the best of all made better by gradients.
+"""Search for monitor layouts.
 
-Everything that is drawn is drawn here, in one order, and results are taken in the order in which they were asked for:
-so the same seed finds the same, however many workers there are and wherever it was broken off.
+Random beams are evaluated alone; their combinations are compared without a trace; the best are built as a whole; their
+beams are varied and combined again; the best layout is refined by gradients.
+
+All random numbers are drawn here in a fixed order, and results are used in the order of the requests. So the same seed
+gives the same result for any number of workers and after any interruption.
 """
 
 from __future__ import annotations
@@ -28,24 +30,24 @@ from twin.framework.journal import Journal
 from twin.framework.procedure import Advance
 
 FIRST_STEP = 0.15
-"""Size of the first change of a beam, relative to the range of each number."""
+"""Size of the first change of a beam, relative to the range of each parameter."""
 _BATCHES = 4  # of layouts that are built until one stands
 KEPT = 2
-"""Layouts of each number of beams whose beams the next round changes."""
+"""Number of layouts, for each number of beams, whose beams are varied in the next round."""
 ALIKE = 0.02
-"""Relative difference of what two searches end with that is taken for none."""
+"""Relative difference of merits below which two searches count as having the same optimum."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A combination of beams that were tried alone.
+    """Combination of beams that were evaluated alone.
 
     Attributes
     ----------
-    beams : tuple[int, ...]
-        Their numbers among all that were tried, rising.
+    beams : tuple of int
+        Indices of the beams in the pool, ascending.
     merit : float
-        What they promise: the largest ratio of what is left to what is wanted.
+        Predicted merit: the largest ratio of a standard deviation to its goal.
     """
 
     beams: tuple[int, ...]
@@ -54,28 +56,28 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """Where one search came to.
+    """Result of one search.
 
     Attributes
     ----------
     name : str
-        Of where it began: the instrument, or ``start 1``.
-    layouts : tuple[LayoutFacts, ...]
-        All that it built as a whole and that can stand, best first.
-    progress : tuple[float, ...]
+        Name of its start: the instrument, or ``start 1``.
+    layouts : tuple of LayoutFacts
+        All feasible layouts that it built as a whole, best first.
+    progress : tuple of float
         Best merit after the first draw and after each round.
-    refined : tuple[float, ...]
-        Merits on the way by gradients; empty for none.
+    refined : tuple of float
+        Merits during the refinement by gradients; empty without one.
     tried : int
-        beams.
+        Number of beams evaluated alone.
     standing : int
-        Of these, that can stand alone.
+        Number of these that are feasible.
     compared : int
-        Combinations whose merit was worked out.
+        Number of combinations whose merit was computed.
     built : int
-        Of these, built as a whole.
-    refused : Mapping[str, int]
-        Why beams and layouts cannot stand, with how many.
+        Number of these that were built as a whole.
+    refused : dict
+        Reason why beams and layouts are not feasible -> their number.
     """
 
     name: str
@@ -91,18 +93,18 @@ class End:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What a search found, with all its starts.
+    """Results of a search from all its starts.
 
     Attributes
     ----------
     start : LayoutFacts
-        The layout of the instrument that it started from.
-    layouts : tuple[LayoutFacts, ...]
-        All that were built as a whole and can stand, best first.
-    ends : tuple[End, ...]
-        Of the search from it, and of those from beams at random.
+        Layout of the instrument from which it started.
+    layouts : tuple of LayoutFacts
+        All feasible layouts that were built as a whole, best first.
+    ends : tuple of End
+        Results of the search from the instrument, and of those from random beams.
     seconds : float
-        That it took.
+        Computing time.
     """
 
     start: LayoutFacts
@@ -112,7 +114,7 @@ class Found:
 
     @property
     def refused(self) -> dict[str, int]:
-        """Why others cannot stand, with how many."""
+        """Reasons why others are not feasible, with their numbers."""
         out: Counter[str] = Counter()
         for end in self.ends:
             out.update(end.refused)
@@ -120,47 +122,49 @@ class Found:
 
     @property
     def beams(self) -> int:
-        """That were tried."""
+        """Number of beams that were evaluated."""
         return sum(end.tried for end in self.ends)
 
     @property
     def standing(self) -> int:
-        """Beams that can stand alone."""
+        """Number of beams that are feasible alone."""
         return sum(end.standing for end in self.ends)
 
     @property
     def compared(self) -> int:
-        """Combinations whose merit was worked out."""
+        """Number of combinations whose merit was computed."""
         return sum(end.compared for end in self.ends)
 
     @property
     def built(self) -> int:
-        """Layouts that were built as a whole."""
+        """Number of layouts that were built as a whole."""
         return sum(end.built for end in self.ends)
 
 
 def merit(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> float:
-    """Largest ratio of what is left to what is wanted, over all disturbances and goals; 1 or less reaches them all.
+    """Return the largest ratio of a standard deviation to its goal; 1 or less reaches all goals.
 
     Parameters
     ----------
-    sigmas : Mapping[str, Mapping[str, float]]
+    sigmas : dict
         Disturbances -> quantity -> sigma, SI.
     bench : LayoutBench
-        Of the design.
+        Bench of the design.
     """
     return max(ratios(sigmas, bench).values())
 
 
 def optima(found: Found, bench: LayoutBench) -> list[list[End]]:
-    """Searches by what they end with: each group's merits lie within ``ALIKE`` of its best, the best group first.
+    """Return the searches grouped by their merits, the best group first.
+
+    The merits of a group lie within ``ALIKE`` of its best.
 
     Parameters
     ----------
     found : Found
-        Of a search; ends without a layout are left out.
+        Results of a search; ends without a layout are omitted.
     bench : LayoutBench
-        Of the design.
+        Bench of the design.
     """
 
     def least(end: End) -> float:
@@ -176,40 +180,40 @@ def optima(found: Found, bench: LayoutBench) -> list[list[End]]:
 
 
 Item = Beam | tuple[Beam, ...] | LayoutNumber
-"""What can be tried."""
+"""Item that can be evaluated: a beam, a layout, or a parameter of a layout for derivatives."""
 
 
 def journal_of(file: Path | None, config: str) -> Journal:
-    """The journal of a search.
+    """Return the journal of a search.
 
     Parameters
     ----------
-    file : Path | None
-        Of the journal, None to keep nothing.
+    file : Path or None
+        File of the journal, None to keep nothing.
     config : str
-        What the search is about.
+        Text that identifies the search.
     """
     return Journal(file, config, "search", (Beam, BeamFacts, LayoutFacts, LayoutNumber, Seen, Slope))
 
 
 class Workers:
-    """Context manager; inside it things can be asked for. Results do not depend on the number of processes.
+    """Context manager for the evaluation of items; the results do not depend on the number of processes.
 
     Parameters
     ----------
-    bench
-        Of the design.
-    count
-        Processes beside this one, 0 for none.
-    journal
-        Keeps what was tried.
-    advance
-        Shows how far it is.
+    bench : LayoutBench
+        Bench of the design.
+    count : int
+        Number of further processes, 0 for none.
+    journal : Journal
+        Journal of finished evaluations.
+    advance : Advance
+        Callback that reports progress.
 
     Raises
     ------
     RunFolderError
-        On entering, the journal is another search's, or cannot be written.
+        On entering: the journal belongs to another search, or cannot be written.
     """
 
     def __init__(self, bench: LayoutBench, count: int, journal: Journal, advance: Advance) -> None:
@@ -231,14 +235,14 @@ class Workers:
         self._open.close()
 
     def ask(self, part: str, items: Sequence[Item]) -> list[Any]:
-        """What comes of every item, in their order; what the journal has is not worked out again.
+        """Return the results of all items in their order; those in the journal are not computed again.
 
         Parameters
         ----------
         part : str
-            Of the search, for the progress.
-        items : Sequence[Item]
-            Beams to be tried alone, layouts to be built, numbers of layouts by which to differentiate.
+            Part of the search, for the progress.
+        items : sequence of Item
+            Beams, layouts, or parameters of layouts.
 
         Raises
         ------
@@ -256,7 +260,7 @@ class Workers:
         return [known[name] for name in names]
 
     def _results(self, items: Mapping[str, Item]) -> Iterator[dict[str, Any]]:
-        """What comes of items by their names, as it comes."""
+        """Yield results of items by their names, as they finish."""
         if self._pool is None:
             for name, item in items.items():
                 yield {name: _answer(self.bench, item)}
@@ -281,20 +285,20 @@ def _answer(bench: LayoutBench, item: Any) -> Any:
 
 
 class Search:
-    """A search at work, with its starts.
+    """Search for layouts with all its starts.
 
     Parameters
     ----------
-    bench
-        Of the design.
-    workers
-        Processes beside this one, 0 for none.
-    seed
-        Of everything drawn.
-    journal
-        File that keeps what was tried, None for none.
-    advance
-        Shows how far it is.
+    bench : LayoutBench
+        Bench of the design.
+    workers : int
+        Number of further processes, 0 for none.
+    seed : int
+        Seed of all random draws.
+    journal : Path or None
+        File that keeps finished evaluations, None for none.
+    advance : Advance
+        Callback that reports progress.
     """
 
     def __init__(self, bench: LayoutBench, workers: int, seed: int, journal: Path | None, advance: Advance) -> None:
@@ -303,7 +307,7 @@ class Search:
         self.workers = Workers(bench, workers, kept, advance)
 
     def run(self) -> Found:
-        """Search."""
+        """Run the searches from all starts."""
         begun, setup = time.monotonic(), self.bench.setup
         beams = start_beams(setup)
         start = self.bench.judged(beams, self.bench.start, limited=False)
@@ -324,15 +328,16 @@ def _promise(one: Candidate) -> tuple[float, tuple[int, ...]]:
 
 
 def spread(level: Sequence[Candidate], width: int) -> list[Candidate]:
-    """So many of ranked layouts: half of them the best, the others evenly over the rest. The best are often much alike,
-    and have room for the same few others.
+    """Return ``width`` of the ranked candidates: half of them the best, the others evenly spaced over the rest.
+
+    The best are often similar and compatible with the same few other beams.
 
     Parameters
     ----------
-    level : Sequence[Candidate]
-        Most promising first.
+    level : sequence of Candidate
+        Candidates, the most promising first.
     width : int
-        How many.
+        Number of candidates.
     """
     best, rest = list(level[: (width + 1) // 2]), level[(width + 1) // 2 :]
     count = min(width - len(best), len(rest))
@@ -340,18 +345,18 @@ def spread(level: Sequence[Candidate], width: int) -> list[Candidate]:
 
 
 class _OneSearch:
-    """A search from one set of beams.
+    """Search from one set of beams.
 
     Parameters
     ----------
-    bench
-        Of the design.
-    ask
-        For beams, layouts and slopes.
-    rng
-        Source of everything drawn.
-    name
-        Of where it begins; empty for the instrument that the design starts from.
+    bench : LayoutBench
+        Bench of the design.
+    ask : Ask
+        Function that evaluates beams, layouts and derivatives.
+    rng : Generator
+        Random generator of all draws.
+    name : str
+        Name of the start; empty for the instrument from which the design starts.
     """
 
     def __init__(self, bench: LayoutBench, ask: Ask, rng: np.random.Generator, name: str) -> None:
@@ -364,7 +369,7 @@ class _OneSearch:
         self.refused: Counter[str] = Counter()
 
     def run(self, beams: Sequence[Beam]) -> End:
-        """Search from these beams, and from as many more at random as the design asks for."""
+        """Search from these beams, supplemented by random ones to the number that the design specifies."""
         spec = self.setup.test.search
         first = [*dict.fromkeys(beams)]
         while len(first) < spec.beams:
@@ -407,14 +412,14 @@ class _OneSearch:
         return sorted(standing, key=lambda one: merit(one.sigmas, self.bench))
 
     def _with_other_ccds(self) -> list[Beam]:
-        """The beams of the best layout with each other area CCD, which only all of them together can have."""
+        """Return the beams of the best layout with each other area CCD, which only all of them together can have."""
         others, standing = self.setup.test.area_ccds or {}, self._standing()
         beams = standing[0].beams if standing else ()
         wanted = [replace(beam, area_ccd=name) for name in others for beam in beams]
         return [beam for beam in wanted if beam not in self.tried]
 
     def _try(self, part: str, beams: Sequence[Beam]) -> None:
-        """Try beams alone; those that stand join the pool."""
+        """Evaluate beams alone; the feasible ones join the pool."""
         self.tried += beams
         for facts in self.ask(part, beams):
             if facts.refused:
@@ -423,7 +428,7 @@ class _OneSearch:
                 self.pool.append(facts)
 
     def _build(self, part: str, count: int) -> None:
-        """Build the most promising layouts that were not built yet, until some stand."""
+        """Build the most promising layouts that have not been built yet, until some are feasible."""
         for _ in range(_BATCHES):
             chosen = self._chosen(count)
             layouts = [tuple(self.pool[k].beam for k in candidate.beams) for candidate in chosen]
@@ -437,17 +442,17 @@ class _OneSearch:
                 break
 
     def _chosen(self, count: int) -> list[Candidate]:
-        """The most promising layouts that were not built yet, in turn of each number of beams, the largest first."""
+        """Return the most promising layouts not built yet, in turn for each number of beams."""
         by_size = [[one for one in some if one.beams not in self.built][:count] for some in reversed(self._ranked())]
         turns = [one for turn in zip_longest(*by_size) for one in turn if one is not None]
         return turns[:count]
 
     def _ranked(self) -> list[list[Candidate]]:
-        """Layouts of one beam, of two, and so on, that may stand, the most promising first: all beams alone, and to the
-        best of each number of beams every further one.
+        """Return layouts of one beam, of two, and so on, the most promising first.
 
-        They are compared before it is asked whether they may stand: that is asked of the most promising ones alone, and
-        a pair whose beams are good together is found though neither is good alone.
+        The best of each number of beams are extended by every further beam. Layouts are compared before their
+        feasibility is checked, which is done for the most promising ones alone; so a pair whose beams complement each
+        other is found though neither is good alone.
         """
         spec, size = self.setup.test, len(self.pool)
         level = sorted((self._candidate((k,)) for k in range(size)), key=_promise)
@@ -483,14 +488,15 @@ class _OneSearch:
         return self._within(beams) and self._fits(beams)
 
     def _alike(self, beams: Sequence[int]) -> bool:
-        """Whether all beams have the same kinds of reflectors, since an instrument's channels are traced together, and
-        the same area CCD.
+        """Return True if all beams have the same kinds of reflectors and the same area CCD.
+
+        The channels of an instrument are traced together, which needs the same kinds of reflectors.
         """
         some = [self.pool[k].beam for k in beams]
         return len({(kinds_of(self.setup, beam), beam.area_ccd) for beam in some}) == 1
 
     def _within(self, beams: Sequence[int]) -> bool:
-        """Whether beams together keep the limits of mass and pupil."""
+        """Return True if beams together satisfy the limits of mass and pupil."""
         limits, facts = self.setup.test.limits, [self.pool[k] for k in beams]
         if limits.mass is not None and sum(one.mass for one in facts) > limits.mass:
             return False
@@ -501,7 +507,7 @@ class _OneSearch:
         return float(np.unpackbits(taken)[: int(np.prod(own))].reshape(own).mean(axis=-1).max()) <= limits.pupil_share
 
     def _fits(self, beams: Sequence[int]) -> bool:
-        """Whether prisms of no two beams stand in each other."""
+        """Return True if the prisms of no two beams overlap."""
         for pair in combinations(beams, 2):
             if pair not in self.apart:
                 one, other = (self.pool[k] for k in pair)
@@ -511,8 +517,9 @@ class _OneSearch:
         return True
 
     def _parents(self) -> list[Beam]:
-        """Beams of the best layouts that stand, of each number of beams: a pair may have to change before it is better
-        than a beam alone.
+        """Return the beams of the best feasible layouts of each number of beams.
+
+        A pair may have to change before it is better than a single beam.
         """
         best = self._standing()
         sizes = sorted({len(one.beams) for one in best})

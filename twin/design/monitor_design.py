@@ -1,4 +1,4 @@
-"""A monitor's layout found: the run, its numbers, the layouts on the front of sigma against pupil and mass."""
+"""Search for a monitor's layout: the run, its numbers, and the layouts on the front of sigma against pupil and mass."""
 
 from __future__ import annotations
 
@@ -23,27 +23,30 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.path_tracing.stray_light import GHOSTS, Ghost, ghosts, stray_light
 
 MOST_POINTS = 6
-"""Layouts that are drawn and written, at most."""
+"""Largest number of layouts that are drawn and written."""
 UNITS = {"angle": ("arcsec", ARCSEC), "d_f": ("um", 1e-6), "height": ("m", 1.0)}
-"""Goal -> unit for people, and that unit in SI."""
+"""Unit in which each goal is reported, and its size in SI."""
 _ASIDE = "other tilts of the prisms in the instrument that it starts from, or other fields"
+"""Advice for a design with ghosts."""
 GOAL_NAMES = {"angle": "intersection angle", "d_f": "principal distance", "height": "height on the ground"}
+"""Name of each goal in reports."""
 REMARK = """Made by python -m twin.design monitor from {start}. What its spots leave, one standard deviation:
 {sigmas}."""
+"""Comment at the top of an instrument's file."""
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A layout that is handed over.
+    """Layout on the front that is written as an instrument.
 
     Attributes
     ----------
     name : str
-        Of its instrument, and of its file.
+        Name of the instrument and of its file.
     facts : LayoutFacts
-        Of it.
+        Properties of the layout.
     text : str
-        The instrument's file.
+        File of the instrument.
     """
 
     name: str
@@ -53,18 +56,18 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class MonitorDesignRun:
-    """A search and what came of it.
+    """Search for a monitor's layout and its results.
 
     Attributes
     ----------
-    setup : monitor_layout.MonitorDesignSetup
+    setup : MonitorDesignSetup
         The design.
     bench : LayoutBench
-        On which layouts were tried.
+        Bench that evaluated the layouts.
     found : Found
-        By the search.
-    points : tuple[Point, ...]
-        On the front of merit, pupil share and mass, the best first; empty where none is as good as the start.
+        Results of the search.
+    points : tuple of Point
+        Layouts on the front of merit, pupil share and mass, the best first.
     """
 
     setup: monitor_layout.MonitorDesignSetup
@@ -73,11 +76,11 @@ class MonitorDesignRun:
     points: tuple[Point, ...]
 
     def worst(self, facts: LayoutFacts, goal: str) -> float:
-        """What a layout leaves of a goal's quantity, the worst over cameras and disturbances, SI."""
+        """Return the worst sigma of a goal's quantity over cameras and disturbances, SI."""
         return max(own[key] for own in facts.sigmas.values() for key in self.bench.goals_of(goal))
 
     def merit(self, facts: LayoutFacts) -> float:
-        """Largest ratio of what is left to what is wanted."""
+        """Return the largest ratio of a standard deviation to its goal."""
         return merit(facts.sigmas, self.bench)
 
 
@@ -93,27 +96,27 @@ def run_monitor_design(
 
     Parameters
     ----------
-    setup : monitor_layout.MonitorDesignSetup
+    setup : MonitorDesignSetup
         The design.
     backend : Backend
-        Where to trace.
+        Array backend of the ray trace.
     seed : int
-        Of all that is drawn.
+        Seed of all random draws.
     advance : Advance
-        Shows how far it is.
+        Callback that reports progress.
     workers : int
-        Processes, 0 for none beside this one; the result is the same.
-    journal : Path | None
-        File that keeps what was tried, to go on with; None for none.
+        Number of further processes, 0 for this one alone; the result is the same.
+    journal : Path, optional
+        File that keeps finished evaluations, from which a search can be resumed; None for none.
 
     Raises
     ------
     InputError
-        The instrument that it starts from cannot stand, or throws ghosts on a spot that are not allowed.
+        The instrument from which it starts is not feasible, or throws ghosts on a spot that are not allowed.
     BenchError
-        No beam and no layout that was tried can stand.
+        No beam or no layout is feasible.
     RunFolderError
-        The journal is another search's, or cannot be written.
+        The journal belongs to another search, or cannot be written.
     """
     bench = LayoutBench(setup, backend)
     _check_start(setup, backend, seed, advance)
@@ -138,12 +141,12 @@ def run_monitor_design(
 
 
 def _check_start(setup: monitor_layout.MonitorDesignSetup, backend: Backend, seed: int, advance: Advance) -> None:
-    """Refuse a start with ghosts, where they are to be traced: every layout has its prisms' tilts.
+    """Raise InputError for a start with ghosts, if they are to be traced, since every layout has its prisms' tilts.
 
     Raises
     ------
     InputError
-        At the tilt of the prism that throws the strongest one.
+        There is a ghost; the error is placed at the tilt of the prism that throws the strongest one.
     """
     spec = setup.instrument
     for ghost in _traced_ghosts(setup, spec, setup.detector, backend, seed, advance):
@@ -156,7 +159,7 @@ def _check_start(setup: monitor_layout.MonitorDesignSetup, backend: Backend, see
 def _ghosts(
     setup: monitor_layout.MonitorDesignSetup, facts: LayoutFacts, backend: Backend, seed: int, advance: Advance
 ) -> tuple[Ghost, ...]:
-    """A layout's ghosts; none where they are not to be traced."""
+    """Return a layout's ghosts; none if they are not to be traced."""
     detector = setup.detectors.get(facts.beams[0].area_ccd, setup.detector)
     return _traced_ghosts(setup, monitor_layout.layout_spec(setup, facts.beams), detector, backend, seed, advance)
 
@@ -190,7 +193,7 @@ def _texts(facts: LayoutFacts, bench: LayoutBench) -> dict[str, str]:
 
 
 def _front(layouts: tuple[LayoutFacts, ...], bench: LayoutBench) -> list[LayoutFacts]:
-    """Layouts than which none is better in merit, pupil share and mass at once; the best and some evenly chosen."""
+    """Return the non-dominated layouts in merit, pupil share and mass, at most ``MOST_POINTS`` with the best."""
 
     def cost(facts: LayoutFacts) -> tuple[float, float, float]:
         return merit(facts.sigmas, bench), facts.pupil_share, facts.mass
@@ -208,7 +211,7 @@ def _front(layouts: tuple[LayoutFacts, ...], bench: LayoutBench) -> list[LayoutF
 
 
 def verdict(run: MonitorDesignRun) -> tuple[str, ...]:
-    """Statements: whether the best layout reaches its goal, at what cost, and what limits it."""
+    """Return the sentences of the verdict: goal reached or not, cost of the best layout, and what limits it."""
     best, start, test = run.points[0].facts, run.found.start, run.setup.test
     parts = []
     for goal, wanted in test.goal.wanted.items():
@@ -231,7 +234,7 @@ def verdict(run: MonitorDesignRun) -> tuple[str, ...]:
 
 
 def _limiting(run: MonitorDesignRun, facts: LayoutFacts) -> tuple[str, float]:
-    """The cause that is most of the variance of the goal that is farthest from being reached, and its share."""
+    """Return the largest cause of the variance of the goal that is farthest from being reached, and its share."""
     wanted = run.setup.test.goal.wanted
     cases = [
         (own[key] / wanted[goal], name, key)
@@ -250,7 +253,7 @@ def _unit(key: str) -> tuple[str, float]:
 
 
 def _by_quantity(values: Mapping[str, Mapping[str, Any]], of: Callable[[Any, float], Any]) -> dict[str, Any]:
-    """Disturbances -> quantity with its unit at the end -> what ``of`` makes of a value and of the unit's size."""
+    """Return disturbances -> quantity with its unit as suffix -> ``of`` applied to a value and the unit's size."""
     return {
         name: {f"{key.replace('/', '_')}_{_unit(key)[0]}": of(value, _unit(key)[1]) for key, value in own.items()}
         for name, own in values.items()
@@ -287,7 +290,7 @@ BEAM: Record[monitor_layout.Beam] = Record(
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """A layout, or where a search came to, with the run that says what is wanted."""
+    """Layout, or end of a search, with the run that holds the goals."""
 
     run: MonitorDesignRun
     of: Any

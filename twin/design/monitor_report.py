@@ -1,4 +1,4 @@
-"""Report of a search for a monitor's layout: the front, what limits each layout, drawings, and the instruments' files."""
+"""Report of a search for a monitor's layout: front, limiting causes, drawings and the instruments' files."""
 
 from __future__ import annotations
 

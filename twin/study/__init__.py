@@ -1,4 +1,4 @@
-"""Design trade studies: a base job run many times with varied values, and what its results say.
+"""Design trade studies: a base job run many times with varied values, and the statistics of its results.
 
 In a script the package itself can be called, ``twin.study(pair, {...}, n=1000)``; see `twin.study.scripted.study`.
 """
@@ -9,7 +9,7 @@ from typing import Any
 
 
 class _Study(ModuleType):
-    """The package, which is also a function: ``python -m twin.study`` and ``twin.study(...)`` have one name."""
+    """Callable package, so that ``python -m twin.study`` and ``twin.study(...)`` have one name."""
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         """See `twin.study.scripted.study`."""

@@ -1,4 +1,4 @@
-"""``python -m twin.study``: design trade studies."""
+"""Command line program ``python -m twin.study``: design trade studies."""
 
 from __future__ import annotations
 
@@ -56,23 +56,23 @@ def main(
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and warnings.")] = False,
     progress_fd: Annotated[int | None, typer.Option("--progress-fd", hidden=True, min=3)] = None,
 ) -> None:
-    """Run a job many times with varied values and keep the numbers that matter.
+    """Run a job many times with varied values and keep the responses.
 
     The study's file names a base job (render, lab ..., orbit ...), the factors that vary in it, a design and the
     responses that are kept; scenes/examples/study_smoke.yaml is a small one.
 
     The folder gets study.nc (netCDF, one dimension `run`), study.csv, study.json, report.html and config.yaml, which
-    can be given in place of the file. The numbers do not depend on the number of workers.
+    can be given in place of the file. The results do not depend on the number of workers.
 
-    While it runs, finished runs are kept in OUT.blocks beside it. A study that was broken off, by Ctrl-C or a power
-    failure, is gone on with by the same command and --resume. With --force the folder that is to be replaced stands
-    until the new study is complete.
+    During the study, finished runs are kept in OUT.blocks beside it. After an interruption, by Ctrl-C or a power
+    failure, the same command with --resume continues it. With --force the folder to be replaced is kept until the new
+    study is complete.
 
-    With --gradient it runs no design: the folder gets the Jacobian at the base's own values, gradient.json and
-    gradient.csv, by automatic differentiation and beside it by differences.
+    With --gradient no design is run: the folder gets the Jacobian at the base's values, gradient.json and gradient.csv,
+    by automatic differentiation and, for comparison, by finite differences.
 
-    Examples: `python -m twin.study scenes/examples/study_smoke.yaml --workers 2` and
-    `python -m twin.study scenes/examples/study_smoke.yaml --gradient`
+    Examples: `python -m twin.study scenes/examples/study_smoke.yaml --workers 2` and `python -m twin.study
+    scenes/examples/study_smoke.yaml --gradient`
 
     Exit codes: 0 success, 2 bad input (nothing is lost), 129, 130 or 143 interrupted, 1 anything else: all runs failed,
     the program did, or a figure could not be drawn.
@@ -120,7 +120,7 @@ def main(
 
 
 def _refuse_with_gradient(errors: Console, options: Mapping[str, object]) -> None:
-    """Refuse options that mean nothing with --gradient."""
+    """Raise an input error for options that have no meaning with --gradient."""
     with cli.explained(errors):
         for name, value in options.items():
             if value is not None:

@@ -1,4 +1,4 @@
-"""A study from a script: ranges in place of numbers in what perturbs an instrument."""
+"""Studies from a script: ranges in place of numbers in the perturbation of an instrument."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from twin.framework.owned_files import scratch
 from twin.study.runs.base_job import Tree
 
 Told = Callable[[int, int], None]
-"""Told the number of runs that are there, and of all."""
+"""Callback that receives the numbers of finished and of all runs."""
 
 _NUMBER = r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 _RANGE = re.compile(rf"\(\s*({_NUMBER})\s*(\.\.|±|\+-)\s*({_NUMBER})\s*\)")
@@ -37,26 +37,26 @@ _FORMS = "'(-5 .. 5) um' for an even spread, '(0 +- 2) um' for a normal one, als
 
 
 class Perturbed(Protocol):
-    """What can be varied: an instrument as `twin.load` gives it."""
+    """Instrument that can be perturbed, as `twin.load` returns it."""
 
     @property
     def resolved(self) -> ResolvedJob:
-        """The job that it stands for."""
+        """Job that the instrument stands for."""
 
     def perturbed(self, perturb: Mapping[str, Mapping[str, Any]]) -> Perturbed:
-        """The instrument with these bodies perturbed. Raises InputError where that cannot be."""
+        """Return the instrument with these bodies perturbed; raise InputError if that is impossible."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """A number that varies.
+    """Number that varies in a study.
 
     Attributes
     ----------
     key : KeyPath
-        Where it stands below ``perturb``.
-    factor : Mapping[str, Any]
-        How it varies, as a study's file says it.
+        Its position below ``perturb``.
+    factor : dict
+        Its distribution, in the form of a study's file.
     """
 
     key: KeyPath
@@ -64,7 +64,7 @@ class Spread:
 
     @property
     def name(self) -> str:
-        """Name of the factor: ``forward_M2_shift_z``."""
+        """Name of the factor, such as ``forward_M2_shift_z``."""
         node, *rest = (str(part) for part in self.key)
         parts = [node.removeprefix("base/").replace("/", "_"), *rest]
         if self.key[1] in ("shift", "rotate") or parts[-2:-1] == ["gradient"]:
@@ -90,42 +90,42 @@ def study(
     Parameters
     ----------
     instrument : Perturbed
-        As it is at the beginning; its other perturbations stay.
-    vary : Mapping[str, Mapping[str, Any] | str]
-        Motion in words -> a range in place of its number, ``{"M2 shift z": "(-5 .. 5) um"}``: an even spread from -5 to
-        5; ``(0 +- 2)`` is a normal one with sigma 2. Or node -> keys of a perturbation with ranges, ``{"M2": {"shift":
-        "0 0 (-5 .. 5) um"}}``.
+        Instrument at the start; its other perturbations stay.
+    vary : dict
+        Motion as text -> range, ``{"M2 shift z": "(-5 .. 5) um"}``: a uniform distribution from -5 to 5; ``(0 +- 2)``
+        is a normal one with sigma 2. Or body -> keys of a perturbation with ranges, ``{"M2": {"shift": "0 0 (-5 .. 5)
+        um"}}``.
     n : int
         Number of runs.
     seed : int
-        Of the design; the noise of each run has a stream of its own.
+        Seed of the design; the noise of each run has an independent random stream.
     design : str
         ``latin_hypercube``, ``sobol`` or ``monte_carlo``.
-    responses : Mapping[str, Mapping[str, Any]] | None
-        Name -> ``{"key": [...], "sigma": [...], "noise": [...]}`` as in a study's file; by default readings of the
-        model and true values of every camera's parameters and of the angle between two cameras.
-    workers : int | None
-        Number of processes; one for each core if not given.
-    out : str | Path | None
-        Folder of the study, with its report, which stays; none is kept if not given.
+    responses : dict, optional
+        Name -> ``{"key": [...], "sigma": [...], "noise": [...]}`` as in a study's file. By default the readings of the
+        model and the true values of every camera's parameters and of the angle between two cameras.
+    workers : int, optional
+        Number of processes; one for each core by default.
+    out : str or Path, optional
+        Folder in which the study with its report is kept; none by default.
     quiet : bool
-        Show neither progress nor warnings.
-    progress : bool | Told
-        Whether a bar is shown on a terminal and in a notebook; or what is told the number of runs that are there and of
-        all, ``progress(done, runs)``, each time that some are.
+        True to show neither progress nor warnings.
+    progress : bool or callable
+        True to show a progress bar on a terminal and in a notebook; or a function ``progress(done, runs)`` that is
+        called whenever runs have finished.
 
     Returns
     -------
-    xr.Dataset
-        A value of every factor and response for each ``run``; runs whose light is lost are ``failed``, with a
+    Dataset
+        Value of every factor and response for each ``run``; runs whose light is lost are ``failed``, with a
         ``message``.
 
     Raises
     ------
     InputError
-        Nothing varies, a range of another form, or what a job's file would not be allowed to say.
+        Nothing varies, a range has another form, or a value is not allowed in a job's file.
     RuntimeError
-        The study could not be completed; the message says why.
+        The study could not be completed; the message gives the reason.
     """
     config = config_text(instrument, vary, n, seed, design, responses)
     with scratch("twin-study") as place:
@@ -143,7 +143,7 @@ def study(
 
 
 def _run(command: list[str], quiet: bool, progress: bool | Told) -> tuple[int, str]:
-    """Run a study's command to its end; its exit code, and what it said where nobody is shown that."""
+    """Run a study's command to its end and return its exit code and, if quiet, its messages."""
     told = progress if callable(progress) else _shown_bar() if progress and not quiet else _silent
     reading, writing = os.pipe()
     with os.fdopen(reading) as lines, tempfile.TemporaryFile("w+") as kept:
@@ -169,12 +169,13 @@ def _run(command: list[str], quiet: bool, progress: bool | Told) -> tuple[int, s
 
 
 def _silent(done: int, runs: int) -> None:
-    """Tell nobody."""
+    """Ignore the progress."""
 
 
 def _shown_bar() -> Told:
-    """A line on stderr that says how far a study is, drawn over the one before: on a terminal and in a notebook's cell;
-    nothing in a file. The command has a bar of its own; this one draws with nothing that a script does not have.
+    """Return a callback that draws a progress bar on stderr, on a terminal or in a notebook; elsewhere a silent one.
+
+    The command has its own progress display; this one needs only what is available in a script.
     """
     stream = sys.stderr
     if not (stream.isatty() or "ipykernel" in sys.modules):
@@ -193,16 +194,17 @@ def _shown_bar() -> Told:
     return told
 
 
-_WIDTH = 30  # of the bar, characters
+_WIDTH = 30
+"""Length of the progress bar, characters."""
 
 
 def tell_through(descriptor: int) -> Told:
-    """Return what writes the numbers into a pipe, a line each time; a reader that is gone ends nothing.
+    """Return a callback that writes the progress into a pipe, one line each time; a closed reader is ignored.
 
     Parameters
     ----------
     descriptor : int
-        Of the pipe, inherited; processes that this one starts do not get it.
+        File descriptor of the inherited pipe; child processes do not inherit it.
     """
     os.set_inheritable(descriptor, False)
 
@@ -221,7 +223,7 @@ def config_text(
     design: str,
     responses: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> str:
-    """The config.yaml of the study; arguments and errors as `study`."""
+    """Return the text of the study's config.yaml; arguments and errors as in `study`."""
     spreads: list[Spread] = []
     middle: dict[str, Any] = {}
     for node, what in _by_node(vary).items():
@@ -244,7 +246,7 @@ def config_text(
 
 
 def _by_node(vary: Mapping[str, Mapping[str, Any] | str]) -> dict[str, dict[str, Any]]:
-    """Node -> keys of its perturbation, of motions in words, too."""
+    """Return the keys of the perturbation by body, with motions given as text expanded."""
     out: dict[str, dict[str, Any]] = {}
     for name, what in vary.items():
         if isinstance(what, Mapping):
@@ -274,12 +276,14 @@ QUALITY = {
     "mtf_line": ("mtf_along_line", "centre"),
     "mtf_track": ("mtf_along_track", "centre"),
 }
-"""Responses about the images of a camera without a monitor, and where quality.json has them."""
+"""Responses about the images of a camera without a monitor, and their keys in quality.json."""
 
 
 def _responses(resolved: ResolvedJob) -> Tree:
-    """Readings of every camera with their sigmas, and true values, by the estimator that a run is judged by; without a
-    monitor true values and image quality.
+    """Return the default responses: readings of every camera with their sigmas, and true values.
+
+    The readings are those of the estimator by which a run is judged. Without a monitor the responses are true values
+    and image quality.
     """
     out: Tree = {}
     if resolved.instrument.monitor is None:
@@ -304,13 +308,13 @@ def _responses(resolved: ResolvedJob) -> Tree:
 
 
 def _with_sigmas(read: Sequence[str]) -> Tree:
-    """A response of a reading of the monitor, with its total sigma and that of noise alone."""
+    """Return the response of a monitor reading, with its total sigma and that of noise alone."""
     *place, key = read
     return {"key": [*read], **{name: [*place, f"{key}{end}"] for name, end in (("sigma", TOTAL), ("noise", NOISE))}}
 
 
 def _taken(value: Any, key: KeyPath, spreads: list[Spread]) -> Any:
-    """The value with the middle of each range in its place; the ranges go to ``spreads``."""
+    """Return the value with each range replaced by its middle; the ranges are appended to ``spreads``."""
     if isinstance(value, Mapping):
         return {name: _taken(part, (*key, name), spreads) for name, part in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):

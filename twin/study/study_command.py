@@ -1,4 +1,4 @@
-"""What ``python -m twin.study`` does between its options and its exit code."""
+"""Body of ``python -m twin.study``: runs a study and writes its folder."""
 
 from __future__ import annotations
 
@@ -18,22 +18,23 @@ from twin.study.runs.plan import Plan, require_study_memory, run_count
 from twin.study.runs.setup import PROGRAM, StudySetup, base_of
 
 START = "start the workers and do the first runs"
+"""Name of the first part of the work in the progress display."""
 
 
 def check_size(setup: StudySetup, confirmed: bool) -> None:
-    """See whether a study may have as many runs as it has.
+    """Raise InputError if a study has more runs than its limit or than fit in memory.
 
     Parameters
     ----------
     setup : StudySetup
         The study.
     confirmed : bool
-        Whether it may have more than its limit.
+        True if the limit of runs may be exceeded.
 
     Raises
     ------
     InputError
-        It may not, or their results do not fit into the memory.
+        The study has too many runs, or their results do not fit in memory.
     """
     limit, runs = setup.study.limits.runs, run_count(setup.study)
     if runs > limit and not confirmed:
@@ -53,27 +54,27 @@ def run_study(
     say: Callable[[str], None],
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Result:
-    """Run what is missing of a study, and write its run folder.
+    """Run the missing runs of a study and write its run folder.
 
     Parameters
     ----------
     setup : StudySetup
         The study.
     session : Session
-        The command at work.
+        Session of the command.
     place : Path
         Folder in which finished blocks are kept.
-    chosen : tuple[int | None, str | None]
+    chosen : tuple
         Number of local processes, None for one per core; address of a running cluster, None for none.
-    say : Callable[[str], None]
-        Told how long it will take.
-    progress : Callable[[int, int], None]
-        Told the number of runs that are there, and of all, beside the session.
+    say : callable
+        Function that receives the estimate of the computing time.
+    progress : callable
+        Function that receives the numbers of finished and of all runs.
 
     Raises
     ------
     InputError, InputErrorText, RunFolderError
-        Bad input.
+        The input is invalid.
     Incomplete
         Not all runs could be done.
     """

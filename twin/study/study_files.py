@@ -1,4 +1,4 @@
-"""The result of a study as a data set with one dimension, ``run``, and the files of its folder."""
+"""Result of a study as a data set with one dimension, ``run``, and the files of its folder."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from twin.study.runs.plan import Plan
 RUN = "run"
 FAILED, MESSAGE, SEED = "failed", "message", "seed"
 DOUBT, MONITOR = "doubt", "render"
-"""A text of every run of this command."""
+"""Variable with the reason why sigma does not hold, and the base command whose runs have it."""
 ROLE = "role"
 """Attribute of every variable: factor, response, sigma or bookkeeping."""
 
 
 def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
-    """Factors, responses, their sigmas, and which runs failed, by run.
+    """Return factors, responses, their sigmas and the failed runs as a data set by run.
 
-    Nothing in it depends on when, where or by how many it was computed. Every variable has the attributes ``units``
-    (empty for pure numbers and texts), ``role`` and, for factors and responses, ``key``, where it stands in the base
-    or in the results.
+    The data set depends neither on the time nor on the workers of the computation. Every variable has the attributes
+    ``units`` (empty for pure numbers and texts), ``role`` and, for factors and responses, ``key``, its position in the
+    base or in the results.
 
     Parameters
     ----------
     plan : Plan
-        The study.
+        Plan of the study.
     result : BlockResult
-        Of all its runs.
+        Results of all runs.
     """
     study = plan.setup.study
     data: dict[str, Any] = {}
@@ -86,7 +86,7 @@ def _path(key: tuple[str | int, ...]) -> str:
 
 
 def _as_table(ending: str, data: xr.Dataset) -> bytes | None:
-    """The data set as a table, a line for each run, with units and descriptions; None where a package is missing."""
+    """Return the data set as a table with a line for each run; None if a package is missing."""
     columns = []
     for name in (RUN, *map(str, data.data_vars)):
         about = data[name].attrs
@@ -105,21 +105,22 @@ _FORMATS: dict[str, Callable[[xr.Dataset], bytes | None]] = {
     **{ending: partial(_as_table, ending) for ending in ("csv", "parquet")},
 }
 FORMATS = ExtensionTable("study_formats", _FORMATS)
-"""Ending of a file of the data set, study.ENDING -> its contents, None where what it needs is not installed. A new one
-is added here.
+"""Suffix of a file study.SUFFIX -> function that makes its contents; None if a package is missing. A new format is
+added here.
 """
 
 
 def summary(data: xr.Dataset, plan: Plan) -> dict[str, Any]:
-    """Contents of study.json, but for the times: of each response mean, standard deviation and quantiles of the runs
-    that did not fail; null where there are none.
+    """Return the contents of study.json without the times: statistics of each response over the runs that did not fail.
+
+    They are mean, standard deviation and quantiles; null where there are no values.
 
     Parameters
     ----------
-    data : xr.Dataset
-        As `make_dataset` makes it.
+    data : Dataset
+        Data set of ``make_dataset``.
     plan : Plan
-        The study.
+        Plan of the study.
     """
     study = plan.setup.study
     failed = data[FAILED].values.astype(bool)
@@ -154,7 +155,7 @@ def _span(values: np.ndarray) -> dict[str, Any]:
 
 
 def _statistics(values: np.ndarray) -> dict[str, Any]:
-    """Over the finite values; std with n - 1; p95 and p997: 95 and 99.7 of 100 runs lie below."""
+    """Return count, mean, standard deviation (n - 1) and the 95 % and 99.7 % quantiles of the finite values."""
     found = describe(values, False)
     return {"count": found.count, **{key: _value(getattr(found, key)) for key in ("mean", "std", "p95", "p997")}}
 
@@ -165,18 +166,18 @@ def _value(estimate: Estimate | None) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """What a study gave.
+    """Results of a study as they are written to its folder.
 
     Attributes
     ----------
-    data : xr.Dataset
-        Of every run, as `make_dataset` makes it.
-    summary : dict[str, Any]
+    data : Dataset
+        Data set of ``make_dataset``.
+    summary : dict
         Contents of study.json.
-    files : tuple[str, ...]
+    files : tuple of str
         Names of the files that hold the data.
-    unwritten : tuple[str, ...]
-        Files that could not be made, a sentence each; the others hold the same.
+    unwritten : tuple of str
+        One sentence for each format that could not be written; the other files hold the same data.
     """
 
     data: xr.Dataset
@@ -186,20 +187,20 @@ class Numbers:
 
 
 def write_data(plan: Plan, result: BlockResult, seconds: float, computed: int, folder: RunFolder) -> Numbers:
-    """Write the data set in all FORMATS, and study.json.
+    """Write the data set in all formats of ``FORMATS``, and study.json.
 
     Parameters
     ----------
     plan : Plan
-        The study.
+        Plan of the study.
     result : BlockResult
-        Of all its runs.
+        Results of all runs.
     seconds : float
-        That this command took for the runs it computed.
+        Time that this command took for the runs it computed.
     computed : int
-        Number of these.
+        Number of runs that this command computed.
     folder : RunFolder
-        Of the study.
+        Folder of the study.
     """
     data = make_dataset(plan, result)
     numbers = reference_frames.described(

@@ -1,4 +1,4 @@
-"""``python -m twin.tolerance``: tolerances of a camera with compensators."""
+"""Command line program ``python -m twin.tolerance``: tolerance budget of a camera with compensators."""
 
 from __future__ import annotations
 
@@ -32,10 +32,12 @@ def main(
     scheduler: cli.Scheduler = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
 ) -> None:
-    """Find out how well a camera has to be made: what each tolerance does after all adjustments, which share of the
-    cameras meets the requirements, and which limits reach a yield at the least cost.
+    """Find out how accurately a camera has to be made.
 
-    The file names a camera or an instrument and says in words what varies, what is adjusted, and what is asked:
+    The program computes the effect of each tolerance after all adjustments, the yield, and the limits that reach a
+    required yield at the least cost.
+
+    The file names a camera or an instrument and lists tolerances, compensators and requirements:
 
         instrument: gf7
 
@@ -45,12 +47,12 @@ def main(
 
         merits: {sharp: {kind: wavefront, at_most: 0.07}}
 
-    Every camera is traced exactly and adjusted by itself; derivatives of the first and the second order stand beside
-    it, with a warning where they would mislead.
+    Every camera of the Monte Carlo run is traced exactly and adjusted individually. Models of the first and the second
+    order are compared with the exact traces; a warning says where they would mislead.
 
     The run folder gets tolerance.json, report.html, config.yaml, tables as CSV and the worst cameras as jobs in
-    artefacts/. While it runs, what is done is kept in OUT.samples beside it; with --resume the same command goes on
-    from there. The numbers depend neither on the number of workers nor on where it was broken off.
+    artefacts/. During the run, finished work is kept in OUT.samples beside it; with --resume the same command continues
+    from there. The results depend neither on the number of workers nor on interruptions.
 
     Example: `python -m twin.tolerance scenes/examples/tolerance_gf7.yaml`
 

@@ -1,9 +1,9 @@
-"""Limits allocated anew: the yield that is asked at the least cost.
+"""Allocation of tolerance limits: the limits that reach a required yield at the least cost.
 
-The same draws serve all limits: with x = scale * u the merits follow from their model to the second order, and the
-yield's quantile of the worst margin has a gradient. Limits move by a bounded factor in each round; then the model is
-made anew, and exact traces of some of the cameras say by how much it is off. A Monte Carlo run of other cameras judges
-what comes out.
+The same random draws serve all limits: with x = scale * u the merits follow from their second-order model, and the
+quantile of the worst margin at the required yield has a gradient. The limits change by a bounded factor in each round.
+Then the model is computed again about the new limits, and exact traces of a part of the cameras give its offset. A
+Monte Carlo run of independent cameras validates the result.
 """
 
 from __future__ import annotations
@@ -24,43 +24,47 @@ from twin.tolerance.samples import Samples, adjustment_errors
 from twin.tolerance.tolerance_bench import ToleranceBench
 
 DRAWS = 2000
-"""Cameras by which limits are chosen."""
+"""Number of cameras (random draws) from which the limits are chosen."""
 CHECKED = 1000
-"""Of these, cameras that are traced in every round."""
+"""Number of these cameras that are traced exactly in every round."""
 ROUNDS = 6
+"""Largest number of rounds."""
 BOUND = 2.0
-"""By which factor a limit may change in a round."""
+"""Largest factor by which a limit may change in a round."""
 _STEPS = 60
+"""Largest number of iterations of the optimiser in a round."""
 _STEP = 1e-5
-"""Step of the logarithm of a limit by which margins are differentiated: along the parts' own derivatives."""
+"""Step of the logarithm of a limit for the numerical derivative of the margins, along the derivatives of the merits'
+parts.
+"""
 _SETTLED = 0.1
 """Change of the logarithms of the limits below which no further round is made."""
 _LAST = 4
-"""Times that all limits are tightened together at last, where exact traces say that the yield is not met."""
+"""Largest number of final rounds that tighten all limits together while the exact traces miss the required yield."""
 _NEAR = 0.02
-"""Share of the cameras about the quantile whose gradients are averaged."""
+"""Share of the cameras on either side of the quantile whose gradients are averaged."""
 _SAFE = 1.0
-"""Standard deviations of the checked yield's own uncertainty by which the chosen limits are to exceed what is asked."""
+"""Number of standard deviations of the sampled yield by which the chosen limits are to exceed the required yield."""
 
 
 @dataclass(frozen=True, eq=False)
 class Allocation:
-    """Limits that were chosen.
+    """Result of an allocation: the chosen limits with their costs and yields.
 
     Attributes
     ----------
-    scales : np.ndarray
-        Of every entry, new limit over the old one, before and after rounding, (E,) each.
-    limits : Mapping[str, str | float]
-        Entry -> new limit as files have it.
-    costs : np.ndarray
-        Of every entry, before and after, (2, E).
-    predicted : tuple[float, float]
-        Yield of the old and of the new limits, by the model as it was corrected.
+    scales, rounded : (E,) ndarray
+        Ratio of the new to the specified limit of every tolerance, before and after rounding to the grades.
+    limits : dict
+        New limit of every tolerance by name, in the form of the files.
+    costs : (2, E) ndarray
+        Cost of every limit, before and after the allocation.
+    predicted : tuple of float
+        Yield of the specified and of the new limits, predicted by the corrected model.
     reached : bool
-        Whether the yield of the new limits, as they are rounded, reaches what was asked.
+        True if the yield of the rounded limits reaches the required yield.
     unrounded : bool
-        Whether that of the limits before rounding does.
+        True if the yield of the limits before rounding reaches it.
     """
 
     scales: np.ndarray
@@ -73,7 +77,7 @@ class Allocation:
 
     @property
     def cost(self) -> tuple[float, float]:
-        """Of all entries, before and after."""
+        """Total cost of all limits, before and after the allocation."""
         before, after = np.sum(self.costs, axis=1)
         return float(before), float(after)
 
@@ -86,22 +90,27 @@ def allocate(
     spec: AllocationSpec,
     advance: Advance = silent,
 ) -> Allocation:
-    """Choose limits.
+    """Choose the limits that reach the required yield at the least cost.
 
     Parameters
     ----------
     setup : ToleranceSetup
-        The budget.
+        Tolerance budget.
     bench : ToleranceBench
-        Of it.
+        Bench of the budget.
     model : MeritModel
-        Of its merits.
+        Second-order model of the merits at the specified limits.
     samples : Samples
-        Cameras of it.
+        Monte Carlo cameras of the budget.
     spec : AllocationSpec
-        What is asked.
+        Required yield, bounds of the limits and grades.
     advance : Advance
-        Shows how far it is.
+        Callback that reports progress.
+
+    Returns
+    -------
+    Allocation
+        Chosen limits, rounded to the grades.
     """
     costs = _Costs.of(setup)
     checked = min(CHECKED, len(samples.x))
@@ -151,12 +160,12 @@ def allocate(
 
 
 class CostCurve:
-    """What a limit costs: through stated points a smooth line that never rises, straight beyond them, in logarithms.
+    """Cost of a limit: a monotone curve through specified points in logarithms, extrapolated by straight lines.
 
     Parameters
     ----------
-    points
-        Limits over the stated one and their costs, ascending, two at least.
+    points : sequence of tuple
+        Ratios to the specified limit and their costs, ascending; at least two.
     """
 
     def __init__(self, points: Sequence[tuple[float, float]]) -> None:
@@ -165,7 +174,7 @@ class CostCurve:
         self._slope = self._line.derivative()
 
     def __call__(self, level: float) -> tuple[float, float]:
-        """Logarithm of the cost, and its derivative, at the logarithm of a limit over the stated one."""
+        """Return the logarithm of the cost and its derivative at the logarithm of a limit's ratio."""
         x, y = self._x, self._y
         if x[0] <= level <= x[-1]:
             return float(self._line(level)), float(self._slope(level))
@@ -176,14 +185,15 @@ class CostCurve:
 
 @dataclass(frozen=True, eq=False)
 class _Costs:
-    """What limits cost.
+    """Costs of all limits of a budget.
 
     Attributes
     ----------
-    curves : tuple[CostCurve, ...]
-        Logarithm of the cost of every entry by that of its limit over the stated one, E.
-    kept : np.ndarray
-        Whether its limit stays: as stated, and where its distribution is not about zero.
+    curves : tuple of CostCurve
+        Curve of every tolerance (E): logarithm of the cost against the logarithm of the ratio to the specified limit.
+    kept : (E,) ndarray of bool
+        True for a limit that the allocation must not change: so specified, or of a distribution that is not centred on
+        zero.
     """
 
     curves: tuple[CostCurve, ...]
@@ -191,41 +201,42 @@ class _Costs:
 
     @classmethod
     def of(cls, setup: ToleranceSetup) -> _Costs:
+        """Return the costs of a budget."""
         entries = list(setup.test.tolerances.values())
         kept = [one.kept or one.mean is not None or one.measured is not None for one in entries]
         return cls(tuple(CostCurve(one.cost_points) for one in entries), np.array(kept))
 
     def of_each(self, level: np.ndarray) -> np.ndarray:
-        """Of every entry, (E,), with limits at exp(level) times the stated ones."""
+        """Return the cost of every limit, (E,), with limits at exp(level) times the specified ones."""
         return np.exp([curve(x)[0] for curve, x in zip(self.curves, level.tolist(), strict=True)])
 
     def of_level(self, level: np.ndarray) -> float:
-        """Of all entries."""
+        """Return the total cost of all limits."""
         return float(np.sum(self.of_each(level)))
 
     def slope(self, level: np.ndarray) -> np.ndarray:
-        """Derivatives of the costs by the level, (E,)."""
+        """Return the derivatives of the costs with respect to the level, (E,)."""
         both = np.array([curve(x) for curve, x in zip(self.curves, level.tolist(), strict=True)])
         return np.asarray(np.exp(both[:, 0]) * both[:, 1])
 
 
 class _Trade:
-    """Worst margins of cameras as functions of the limits, about those of a bench.
+    """Worst margins of cameras as functions of the limits, about the limits of a bench.
 
     Parameters
     ----------
-    bench
-        At whose limits the model was made.
-    model
-        Of its merits.
-    samples
-        Draws and the errors of their adjustments.
-    costs
-        Of the limits.
-    share
-        Of the cameras that is to pass.
-    values
-        Of the merits of the first of the cameras by exact traces; they are traced if they are not given.
+    bench : ToleranceBench
+        Bench at whose limits the model was made.
+    model : MeritModel
+        Second-order model of its merits.
+    samples : Samples
+        Random draws, and the seeds of the adjustment errors.
+    costs : _Costs
+        Costs of the limits.
+    share : float
+        Share of the cameras that must pass.
+    values : (S, M) ndarray, optional
+        Merits of the first cameras by exact traces; traced here by default.
     """
 
     def __init__(
@@ -249,12 +260,12 @@ class _Trade:
 
     @classmethod
     def at(cls, bench: ToleranceBench, total: np.ndarray, samples: Samples, costs: _Costs, share: float) -> _Trade:
-        """About limits at exp(total) (E,) times those of a bench."""
+        """Return the margins about limits at exp(total) (E,) times those of a bench."""
         now = bench.scaled(np.exp(total))
         return cls(now, sensitivities(now).model, samples, costs, share)
 
     def _margins(self, values: np.ndarray) -> np.ndarray:
-        """Worst margin of every camera, (S,), of values (S, M); without light one that quantiles can be taken of."""
+        """Return the worst margin of every camera, (S,), from merits (S, M); large but finite without light."""
         worst = self.bench.worst_margins(values)
         return np.asarray(np.where(np.isinf(worst), 1e3, worst))
 
@@ -262,11 +273,11 @@ class _Trade:
         return self._margins(self.bench.values(parts))
 
     def passing(self, level: np.ndarray) -> float:
-        """Share of the cameras that pass with limits at exp(level) times the bench's."""
+        """Return the share of the cameras that pass with limits at exp(level) times those of the bench."""
         return float(np.mean(self._worst(self.model.parts(np.exp(level))) + self.offset <= 0.0))
 
     def quantile(self, level: np.ndarray) -> tuple[float, np.ndarray]:
-        """The margin that the share keeps, and its gradient by ``level``, the mean of those of cameras near it."""
+        """Return the worst margin at the required yield, and its gradient averaged over cameras near the quantile."""
         parts = self.model.parts(np.exp(level))
         margin = self._worst(parts)
         order = np.argsort(margin)
@@ -281,16 +292,19 @@ class _Trade:
         return float(margin[order[at]]) + self.offset, slope
 
     def cheapest(self, low: np.ndarray, high: np.ndarray, total: np.ndarray) -> np.ndarray:
-        """The step (E,) within bounds to the cheapest limits that pass; without any, to the tightest.
+        """Return the step to the cheapest limits within bounds that pass, or to the tightest ones if none passes.
 
         Parameters
         ----------
-        low : np.ndarray
-            Bounds of the step, (E,).
-        high : np.ndarray
-            likewise.
-        total : np.ndarray
-            Where the bench's own limits are, (E,).
+        low, high : (E,) ndarray
+            Bounds of the step in the logarithms of the limits.
+        total : (E,) ndarray
+            Logarithms of the bench's limits over the specified ones.
+
+        Returns
+        -------
+        (E,) ndarray
+            Step in the logarithms of the limits.
         """
         start = self.tightened(low)
         if self.costs.kept.all() or self.quantile(start)[0] > 0.0:
@@ -312,16 +326,14 @@ class _Trade:
         return self._between(start, np.clip(found.x, low, high), total)
 
     def tightened(self, low: np.ndarray) -> np.ndarray:
-        """The first step (E,) on the way to the tightest limits, ``low``, that passes; that to the tightest if none
-        does.
-        """
+        """Return the first step (E,) towards the tightest limits, ``low``, that passes, or ``low`` if none does."""
         for part in np.linspace(0.0, 1.0, 33):
             if self.quantile(part * low)[0] <= 0.0:
                 return np.asarray(part * low)
         return low
 
     def _between(self, inside: np.ndarray, outside: np.ndarray, total: np.ndarray) -> np.ndarray:
-        """The cheapest limits that pass on the way from those that do to others."""
+        """Return the cheapest step that passes on the line from a passing step to another."""
         best = inside
         for part in np.linspace(0.0, 1.0, 17)[1:]:
             step = inside + part * (outside - inside)
@@ -334,12 +346,14 @@ class _Trade:
 def _graded(
     setup: ToleranceSetup, trade: _Trade, total: np.ndarray, spec: AllocationSpec, looser: bool
 ) -> tuple[dict[str, str | float], np.ndarray]:
-    """Limits rounded down to grades; then, if some may be looser, one after the other goes up where the yield allows.
+    """Round limits down to grades and, if ``looser``, raise one after the other by grades where the yield allows.
 
     Returns
     -------
-    tuple[dict[str, str | float], np.ndarray]
-        Entry -> limit, and limits over the stated ones, (E,).
+    limits : dict
+        Limit of every tolerance by name, in the form of the files.
+    scales : (E,) ndarray
+        Ratios of the limits to the specified ones.
     """
     entries = list(setup.test.tolerances.items())
     old = np.array([one.limit_si for _, one in entries])
@@ -367,8 +381,9 @@ def _graded(
 
 
 def _ladder(limit: str | float, kind: str, value: float, grades: Sequence[float]) -> list[tuple[str | float, float]]:
-    """The grade at or below a value and those near above it, as files have them and in SI; grades are counted in the
-    unit of the old limit.
+    """Return the grade at or below a value and the next ones above it, in the form of the files and in SI.
+
+    Grades are numbers in the unit of the old limit.
     """
     parts = split_quantity(limit)
     unit = amount_si(f"1 {parts[1]}", kind) if parts is not None else 1.0

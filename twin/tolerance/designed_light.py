@@ -1,6 +1,4 @@
-"""The light in which wavefronts and MTFs of a tolerance run are told, and what of it does not change from camera to
-camera.
-"""
+"""Spectrum in which a budget evaluates wavefronts and MTFs, and matrices that all its cameras share."""
 
 from __future__ import annotations
 
@@ -20,16 +18,16 @@ from twin.camera.camera_optics import CameraOptics
 from twin.tolerance.monitor_merit import Merit
 
 TRANSFER = 1e-3
-"""By how much an MTF at fixed nodes may differ from that of the designed pupil by itself."""
+"""Largest allowed difference between an MTF at fixed pupil nodes and that of the nominal pupil."""
 
 
 def light_of(test: ToleranceBudgetSpec, camera: CameraSpec) -> SpectrumSpec | None:
-    """The spectrum in which a budget judges a camera; None for its design wavelength.
+    """Return the spectrum in which a budget evaluates a camera; None for its design wavelength.
 
     Raises
     ------
     InputError
-        a spectrum is asked for that the camera does not have.
+        The budget asks for a spectrum that the camera does not have.
     """
     if test.light == "spectrum" and camera.light is None:
         raise test.error(
@@ -42,15 +40,14 @@ def light_of(test: ToleranceBudgetSpec, camera: CameraSpec) -> SpectrumSpec | No
 
 @dataclass(frozen=True, eq=False)
 class LitRoots:
-    """From coefficients of a wavefront (T,) to what it is worth over the light that comes through.
+    """Square roots of the quadratic forms from wavefront coefficients (T,) to mean squares over the illuminated pupil.
 
     Attributes
     ----------
-    rest : np.ndarray
-        Matrices (F, T, T) of which the squares of products with the coefficients are the mean square, piston and tilt
-        taken out.
-    tilt : np.ndarray
-        Likewise (F, 2, T) that of the tilt.
+    rest : (F, T, T) ndarray
+        Matrices whose products with the coefficients have squares that sum to the mean square without piston and tilt.
+    tilt : (F, 2, T) ndarray
+        Matrices that give the two components of the tilt in the same way.
     """
 
     rest: np.ndarray
@@ -58,14 +55,14 @@ class LitRoots:
 
     @classmethod
     def of(cls, lit: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], degree: int) -> LitRoots:
-        """Make them.
+        """Compute the matrices for the illuminated pupils of several fields.
 
         Parameters
         ----------
-        lit : Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]
-            Of F fields nodes x, y and shares of a quadrature over the light, as of ``VariedBeams.lit``.
+        lit : sequence of tuple
+            For each of F fields the nodes x, y and the weights of a quadrature over the illuminated pupil.
         degree : int
-            Of the polynomials over the stop.
+            Degree of the polynomials over the stop.
         """
         rest, tilt = [], []
         for x, y, share in lit:
@@ -81,16 +78,21 @@ class LitRoots:
         return cls(np.stack(rest), np.stack(tilt))
 
     def residuals(self, terms: np.ndarray, shares: np.ndarray) -> np.ndarray:
-        """Residuals (S, R) whose squares sum to the mean squares over all fields and over the light.
+        """Return residuals whose squares sum to the mean squares over all fields and over the spectrum.
 
-        Tilt is taken out of all wavelengths together: where they stand apart in the image, that blurs it.
+        The mean tilt of all wavelengths is removed; a tilt that differs between wavelengths blurs the image and stays.
 
         Parameters
         ----------
-        terms : np.ndarray
-            Coefficients of K wavelengths about one point of the image, (S, F, K, T).
-        shares : np.ndarray
-            Of the wavelengths, which sum to 1, (K,).
+        terms : (S, F, K, T) ndarray
+            Coefficients of K wavelengths about a common image point.
+        shares : (K,) ndarray
+            Weights of the wavelengths; they sum to 1.
+
+        Returns
+        -------
+        (S, R) ndarray
+            Residuals in the unit of the coefficients.
         """
         out = terms @ np.swapaxes(self.rest, 1, 2)
         if len(shares) > 1:
@@ -109,29 +111,34 @@ def fixed_transfers(
     cosines: np.ndarray,
     degree: int,
 ) -> dict[int, list[list[VariedTransfer]]]:
-    """For every merit of kind mtf its transfer functions, field by field and direction by direction.
+    """Return the transfer functions of every merit of kind mtf, by field and direction.
 
     Parameters
     ----------
     optics : CameraOptics
-        The designed camera.
+        Nominal camera.
     test : ToleranceBudgetSpec
-        The budget, for messages.
-    merits : Sequence[Merit]
-        Of it.
-    fields : np.ndarray
-        (F, 2).
-    light : tuple[np.ndarray, np.ndarray]
-        Wavelengths, metres, and their shares, (C,) each.
-    cosines : np.ndarray
-        Direction cosines of the traced rays, (C or 1, F, N, 2).
+        Budget, for messages.
+    merits : sequence of Merit
+        Merits of the budget.
+    fields : (F, 2) ndarray
+        Fields of the bench.
+    light : tuple of ndarray
+        Wavelengths, metres, and their weights, (C,) each.
+    cosines : (C or 1, F, N, 2) ndarray
+        Direction cosines of the traced rays.
     degree : int
-        Of the polynomials over the stop.
+        Degree of the polynomials over the stop.
+
+    Returns
+    -------
+    dict
+        Index of the merit -> transfer functions by field and direction.
 
     Raises
     ------
     InputError
-        No MTF, or none at that frequency.
+        The nominal camera has no MTF, or none at the requested frequency.
     """
     asked = [(k, merit) for k, merit in enumerate(merits) if merit.spec.kind == "mtf"]
     if not asked:

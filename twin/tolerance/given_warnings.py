@@ -1,6 +1,7 @@
-"""What the user should know of the instrument that a tolerance budget is given, as other commands tell it: cameras that
-are not sharp, own parts in a beam of which the file does not say so, coarse grey values, and bodies that motions bring
-into beams of the monitor.
+"""Warnings about the instrument of a tolerance budget, as other commands give them.
+
+They concern cameras that are not sharp, own parts in a beam that the file does not model, coarse grey values, and
+bodies that move into beams of the monitor.
 """
 
 from __future__ import annotations
@@ -16,19 +17,11 @@ from twin.sensors.area_detector import coarse_warnings
 from twin.tolerance.tolerance_bench import ToleranceBench
 
 FAR = 1e-3
-"""Relative difference of a monitor's sigma that is warned of."""
+"""Relative error of a monitor's sigma by interpolation above which a warning is given."""
 
 
 def given_warnings(setup: ToleranceSetup, bench: ToleranceBench) -> tuple[str, ...]:
-    """Of the instrument as designed.
-
-    Parameters
-    ----------
-    setup : ToleranceSetup
-        The budget.
-    bench : ToleranceBench
-        Of it.
-    """
+    """Return the warnings about the nominal instrument."""
     model = bench.optics.model
     shadow = unstated_shadows(model, obscuration(model, bench.backend))
     return (
@@ -39,14 +32,14 @@ def given_warnings(setup: ToleranceSetup, bench: ToleranceBench) -> tuple[str, .
 
 
 def beam_warnings(bench: ToleranceBench, states: Sequence[State]) -> tuple[str, ...]:
-    """Of bodies that stand in beams of the monitor in some states, each body and beam once.
+    """Return warnings about bodies that block beams of the monitor in some cameras, once for each body and beam.
 
     Parameters
     ----------
     bench : ToleranceBench
-        Of the budget.
-    states : Sequence[State]
-        The worst cameras.
+        Bench of the budget.
+    states : sequence of State
+        States of the worst cameras.
     """
     found: dict[str, list[str]] = {}
     for state in states:
@@ -58,14 +51,14 @@ def beam_warnings(bench: ToleranceBench, states: Sequence[State]) -> tuple[str, 
 
 
 def missed_warnings(missed: Mapping[str, float], cameras: int) -> tuple[str, ...]:
-    """Of monitor merits whose interpolated derivatives are too coarse.
+    """Return warnings about monitor merits whose interpolated derivatives are too coarse.
 
     Parameters
     ----------
-    missed : Mapping[str, float]
-        Name of a merit -> relative difference of its sigmas from those with traced derivatives.
+    missed : dict
+        Name of a merit -> relative difference of its sigma from that with traced derivatives.
     cameras : int
-        In which they were traced.
+        Number of cameras in which the derivatives were traced.
     """
     return tuple(
         f"{name}: with derivatives traced in {cameras} cameras the sigma differs by up to {100.0 * off:.2g} % from "

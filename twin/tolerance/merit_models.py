@@ -1,7 +1,8 @@
-"""Merits as functions of what varies: first and second derivatives, sensitivities, and limits for a stated loss.
+"""Models of the merits to the second order, sensitivities, and inverse limits for a specified loss.
 
-Where a camera is at its best a slope says nothing: there the second derivative is what a motion costs. So the models
-are of the merits' smooth parts, to the second order, and every sensitivity and every limit is traced exactly.
+Where a camera is at its optimum the first derivative vanishes, and the second derivative gives the cost of a motion. So
+the models describe the merits' smooth parts to the second order, and every sensitivity and every inverse limit is
+traced exactly.
 """
 
 from __future__ import annotations
@@ -17,35 +18,38 @@ from twin.framework.procedure import Advance, silent
 from twin.tolerance.tolerance_bench import ToleranceBench, Tried
 
 MOST_PAIRED = 600
-"""Numbers up to which the second order has products of two: of more they would fill the memory."""
+"""Largest number of varied parameters for which the second order has mixed terms; of more they would fill the memory.
+"""
 FARTHEST = 10.0
-"""Largest and, inverted, smallest share of its limit at which a tolerance is tried."""
+"""Largest and, inverted, smallest ratio to its limit at which a tolerance is traced."""
 _MOST_TURNS = 40
+"""Largest number of iterations of the root search."""
 _GRID = 241
+"""Number of ratios, in geometric steps, at which the model is searched for a loss."""
 _CLOSE = 1e-4
-"""Share of the loss to which a limit is found."""
+"""Relative accuracy, in the loss, of an inverse limit."""
 _AT_ONCE = 8_000_000
-"""Numbers of a product that are held in memory."""
+"""Largest number of elements of a product that are held in memory at a time."""
 _MOST_HELD, _FEWEST = 25_000_000, 500
-"""Numbers of a scaled model that are held in memory, and draws that it has at least."""
+"""Largest number of elements of a scaled model in memory, and its smallest number of draws."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeritModel:
     """Parts of the merits to the second order: parts = nominal + slope x + x curvature x / 2.
 
-    x are the numbers that vary, in units of their sizes; compensators follow ideally.
+    x are the varied parameters in units of their sizes; the compensators are adjusted ideally.
 
     Attributes
     ----------
-    nominal : np.ndarray
-        Of the designed camera, adjusted, (P,).
-    slope : np.ndarray
-        (P, K).
-    curvature : np.ndarray
-        Symmetric, (P, K, K).
+    nominal : (P,) ndarray
+        Parts of the nominal camera, adjusted.
+    slope : (P, K) ndarray
+        First derivatives.
+    curvature : (P, K, K) ndarray
+        Symmetric second derivatives.
     paired : bool
-        Whether products of two numbers are in it.
+        True if the curvature has mixed terms of two parameters.
     """
 
     nominal: np.ndarray
@@ -54,11 +58,11 @@ class MeritModel:
     paired: bool = True
 
     def linear(self, x: np.ndarray) -> np.ndarray:
-        """Parts (S, P) to the first order at x (S, K)."""
+        """Return the parts (S, P) to the first order at x (S, K)."""
         return np.asarray(self.nominal + x @ self.slope.T)
 
     def quadratic(self, x: np.ndarray) -> np.ndarray:
-        """Parts (S, P) to the second order at x (S, K)."""
+        """Return the parts (S, P) to the second order at x (S, K)."""
         step = max(1, _AT_ONCE // max(1, self.curvature.shape[0] * x.shape[1]))
         parts = [self.linear(own) + 0.5 * self._bent(own) for own in (x[s : s + step] for s in range(0, len(x), step))]
         return np.concatenate(parts)
@@ -69,16 +73,16 @@ class MeritModel:
 
 @dataclass(frozen=True, eq=False)
 class ScaledModel:
-    """A model at fixed draws of which every tolerance may be scaled.
+    """Second-order model at fixed random draws in which every tolerance can be scaled.
 
     Attributes
     ----------
-    nominal : np.ndarray
-        Parts of the designed camera, (P,).
-    first : np.ndarray
-        What each tolerance adds by itself to the first order, (S, P, E).
-    second : np.ndarray
-        What pairs add to the second, symmetric, halves counted, (S, P, E, E).
+    nominal : (P,) ndarray
+        Parts of the nominal camera.
+    first : (S, P, E) ndarray
+        First-order contribution of each tolerance.
+    second : (S, P, E, E) ndarray
+        Second-order contribution of each pair of tolerances, symmetric, with the factor 1/2.
     """
 
     nominal: np.ndarray
@@ -87,16 +91,16 @@ class ScaledModel:
 
     @classmethod
     def of(cls, model: MeritModel, x: np.ndarray, entries: Sequence[Sequence[int]]) -> ScaledModel:
-        """Make it of a model.
+        """Evaluate a model at random draws.
 
         Parameters
         ----------
         model : MeritModel
-            Of the numbers that vary.
-        x : np.ndarray
-            Draws, (S, K); of many numbers only as many are kept as the memory holds.
-        entries : Sequence[Sequence[int]]
-            Numbers of each tolerance, E.
+            Model in the varied parameters.
+        x : (S, K) ndarray
+            Random draws; with many parameters only as many are used as fit in memory.
+        entries : sequence of sequence of int
+            Indices of the parameters of each of E tolerances.
         """
         count, parts = len(entries), len(model.nominal)
         draws = x[: max(_FEWEST, _MOST_HELD // (parts * count**2))]
@@ -110,31 +114,31 @@ class ScaledModel:
         return cls(model.nominal, first, second)
 
     def parts(self, scales: np.ndarray) -> np.ndarray:
-        """Parts (S, P) where tolerances are scales (E,) times what they are."""
+        """Return the parts (S, P) with the tolerances scaled by scales (E,)."""
         return np.asarray(self.nominal + (self.first + self.second @ scales) @ scales)
 
     def slope(self, scales: np.ndarray, which: np.ndarray) -> np.ndarray:
-        """Derivatives of the parts (W, P, E) of some draws by the logarithms of the scales."""
+        """Return the derivatives (W, P, E) of the parts of selected draws by the logarithms of the scales."""
         return np.asarray((self.first[which] + 2.0 * (self.second[which] @ scales)) * scales)
 
 
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
-    """What every tolerance does by itself.
+    """Merits and compensator moves with each tolerance alone at its limits.
 
     Attributes
     ----------
-    nominal : np.ndarray
-        Values of the merits of the designed camera, adjusted, (M,).
-    values : np.ndarray
-        With each tolerance at its limit, below and above, (E, 2, M); of a figure error what its terms come to on the
-        average.
-    moves : np.ndarray
-        Of the compensators for that, SI, (E, 2, C); NaN for a figure error.
-    problems : tuple[str, ...]
-        Why a camera has no light there, empty where it has, (E,).
+    nominal : (M,) ndarray
+        Merits of the nominal camera, adjusted, SI.
+    values : (E, 2, M) ndarray
+        Merits with each tolerance at its lower and upper limit, SI; for a figure error the average over its random
+        terms.
+    moves : (E, 2, C) ndarray
+        Compensator moves for it, SI; NaN for a figure error.
+    problems : tuple of str
+        Reason why the camera has no light there, (E,); empty where it has light.
     model : MeritModel
-        Of all numbers together.
+        Model of all parameters together.
     """
 
     nominal: np.ndarray
@@ -145,7 +149,10 @@ class Sensitivities:
 
 
 def sensitivities(bench: ToleranceBench, advance: Advance = silent) -> Sensitivities:
-    """Try every number at plus and minus its size; products of two follow from the wavefronts' derivatives."""
+    """Trace every parameter at plus and minus its size and derive the second-order model of the merits.
+
+    Mixed terms follow from the first derivatives of the wavefronts.
+    """
     count = len(bench.numbers)
     x = np.concatenate([np.zeros((1, count)), np.eye(count), -np.eye(count)])
     done = []
@@ -178,7 +185,10 @@ def sensitivities(bench: ToleranceBench, advance: Advance = silent) -> Sensitivi
 
 
 def _spread(bench: ToleranceBench, model: MeritModel, rows: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Parts (L, P) that stand for a figure error of shares (L,) of its limit: of what bends the mean, else the rms."""
+    """Return the parts (L, P) that represent a figure error at shares (L,) of its limit.
+
+    Parts that depend quadratically on the wavefront get their mean over the random terms, the others their rms.
+    """
     mean = 0.5 * np.outer(share**2, model.curvature[:, rows, rows].sum(axis=1))
     rms = np.outer(share, np.sqrt(np.sum(model.slope[:, rows] ** 2, axis=1)))
     bends = np.zeros(bench.parts, dtype=bool)
@@ -189,15 +199,15 @@ def _spread(bench: ToleranceBench, model: MeritModel, rows: np.ndarray, share: n
 
 @dataclass(frozen=True, eq=False)
 class InverseLimits:
-    """At which share of its limit each tolerance by itself spoils each merit by its loss.
+    """Ratio to its limit at which each tolerance alone degrades each merit by its loss.
 
     Attributes
     ----------
-    losses : np.ndarray
-        Of the merits, SI, (M,).
-    shares : np.ndarray
-        (E, M); infinite where the loss is not reached at ``FARTHEST`` times the limit, NaN for a figure error whose
-        mean cannot tell.
+    losses : (M,) ndarray
+        Loss of each merit, SI.
+    shares : (E, M) ndarray
+        Ratios to the limits; infinite where the loss is not reached at ``FARTHEST`` times the limit, NaN where no loss
+        is defined.
     """
 
     losses: np.ndarray
@@ -205,8 +215,10 @@ class InverseLimits:
 
 
 def default_losses(bench: ToleranceBench, nominal: np.ndarray) -> np.ndarray:
-    """What one tolerance may spoil of every merit, SI, (M,): as stated, or what is left between design and requirement
-    over the square root of the number of tolerances; NaN where nothing is left.
+    """Return the loss by which one tolerance may degrade each merit, SI, (M,).
+
+    It is the specified loss, or the margin between the nominal camera and the requirement over the square root of the
+    number of tolerances; NaN where there is no margin.
     """
     share = 1.0 / np.sqrt(len(bench.entries))
     out = []
@@ -218,7 +230,7 @@ def default_losses(bench: ToleranceBench, nominal: np.ndarray) -> np.ndarray:
 
 
 def inverse_limits(bench: ToleranceBench, found: Sensitivities, advance: Advance = silent) -> InverseLimits:
-    """Find the limits by exact traces of both signs, from where the model has them; those of a figure error by it."""
+    """Find the inverse limits by exact traces of both signs; those of figure errors by the model alone."""
     losses = default_losses(bench, found.nominal)
     entries = list(bench.entries.values())
     guess = np.array([[_modelled_share(bench, found, own, m, losses) for m in range(len(losses))] for own in entries])
@@ -228,7 +240,7 @@ def inverse_limits(bench: ToleranceBench, found: Sensitivities, advance: Advance
         which = np.array(open_)
 
         def excess(rows: np.ndarray, level: np.ndarray) -> np.ndarray:
-            """Logarithm of the larger loss of both signs over the allowed one, at shares exp(level)."""
+            """Return the logarithm of the larger loss of both signs over the allowed one, at ratios exp(level)."""
             own, m = np.array([entries[e][0] for e in which[rows, 0]]), which[rows, 1]
             x = np.zeros((2, len(rows), len(bench.numbers)))
             x[0, np.arange(len(rows)), own], x[1, np.arange(len(rows)), own] = np.exp(level), -np.exp(level)
@@ -244,7 +256,7 @@ def inverse_limits(bench: ToleranceBench, found: Sensitivities, advance: Advance
 
 
 def _loss(bench: ToleranceBench, found: Sensitivities, values: np.ndarray, m: int) -> np.ndarray:
-    """By how much values of a merit are worse than the designed camera's; infinite where the light is lost."""
+    """Return by how much values of a merit are worse than the nominal camera's; infinite where the light is lost."""
     lost = bench.merits[m].worse(values, found.nominal[m])
     return np.asarray(np.where(np.isnan(lost), np.inf, lost))
 
@@ -252,7 +264,10 @@ def _loss(bench: ToleranceBench, found: Sensitivities, values: np.ndarray, m: in
 def _modelled_share(
     bench: ToleranceBench, found: Sensitivities, own: Sequence[int], m: int, losses: np.ndarray
 ) -> float:
-    """Share of a tolerance's limit at which the model has the loss of a merit; infinite beyond ``FARTHEST``."""
+    """Return the ratio to its limit at which a tolerance causes a merit's loss in the model, at most ``FARTHEST``.
+
+    Infinite if the loss is not reached.
+    """
     if not losses[m] > 0.0:
         return np.nan
     share = np.geomspace(FARTHEST**-2, FARTHEST, _GRID)
@@ -268,19 +283,19 @@ def _modelled_share(
 
 
 def _roots(excess: Callable[[np.ndarray, np.ndarray], np.ndarray], start: np.ndarray, advance: Advance) -> np.ndarray:
-    """Where functions that grow cross zero, each from its own start, all together; infinite beyond the farthest level.
+    """Find the zeros of increasing functions from individual starting levels; infinite beyond the farthest level.
 
-    First a step that doubles until the zero lies between two levels, then the straight line through both ends, of which
-    the one that stays twice counts half (Illinois).
+    Steps grow threefold until two levels bracket the zero; then the method of false position (Illinois variant)
+    converges.
 
     Parameters
     ----------
-    excess : Callable[[np.ndarray, np.ndarray], np.ndarray]
-        Numbers of the functions and a level for each -> values.
-    start : np.ndarray
-        Levels, (R,).
+    excess : callable
+        Function from indices of the functions and one level for each to their values.
+    start : (R,) ndarray
+        Starting levels.
     advance : Advance
-        Shows how far it is.
+        Callback that reports progress.
     """
     count = len(start)
     low, high = np.full(count, -np.inf), np.full(count, np.inf)

@@ -1,16 +1,15 @@
-"""Merits of a camera that is out of tolerance: their smooth parts, obstruction of its beams, and variances of its
-monitor.
+"""Merits of a camera out of tolerance: smooth parts, obstruction of beams, and variances of the monitor.
 
-**Monitor.** Everything is linear about the instrument as it is built and adjusted: the disturbances of the prior
-move spots and cameras by the derivatives of that state, and the images before and after have the noise of that
-state. So the sigma is that of ``twin.uncertainty`` for that instrument. The gain of the posterior estimator is that
-of the instrument as built; other estimators use the gain of the nominal instrument. The area CCDs have been set to
-their spots when it was built.
+**Monitor.** Everything is linear about the instrument as it is built and adjusted: the disturbances of the prior move
+spots and cameras by the derivatives of that state, and the images before and after have the noise of that state. So the
+sigma is that of ``twin.uncertainty`` for that instrument. The gain of the posterior estimator is that of the instrument
+as built; other estimators use the gain of the nominal instrument. The area CCDs have been set to their spots when it
+was built.
 
-The derivatives change by about 1e-4 within tolerances. The change due to each tolerance and each adjustment is
-traced once, and changes of several are added. The terms of a whole figure error are omitted: 10 nm of a term change
-the derivatives by less than 1e-5. The noise of every camera is that of its own images. ``MonitorMerit.missed`` gives
-the resulting error of the sigmas.
+The derivatives change by about 1e-4 within tolerances. The change due to each tolerance and each adjustment is traced
+once, and changes of several are added. The terms of a whole figure error are omitted: 10 nm of a term change the
+derivatives by less than 1e-5. The noise of every camera is that of its own images. ``MonitorMerit.missed`` gives the
+resulting error of the sigmas.
 
 **Obstruction.** Prisms, housings, baffles and parts of other cameras block part of the beams of a camera, each where
 the state puts it. The camera's own mirrors belong to its prescription.
@@ -305,9 +304,9 @@ class Merit:
 
 
 PART_COUNTS = {"boresight": 2, "roll": 1, "principal_distance": 1}
+"""Number of parts of each kind of merit for which it does not depend on fields."""
 AT_FIELDS = ("wavefront", "mtf", "chief_ray", "obstruction")
 """Kinds of merits that have fields."""
-"""Kind of a merit -> number of its parts, where that does not depend on fields."""
 
 
 def part_count(spec: MeritSpec, line_points: int, cameras: Sequence[str] = ()) -> int:

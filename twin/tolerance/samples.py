@@ -1,4 +1,4 @@
-"""Cameras that are drawn within their tolerances: the base job of a study, whose engine runs them on all cores."""
+"""Monte Carlo cameras of a tolerance budget, drawn by the engine of studies on all cores."""
 
 from __future__ import annotations
 
@@ -26,11 +26,13 @@ from twin.study.runs.setup import StudySetup
 from twin.tolerance.tolerance_bench import ToleranceBench
 
 KIND = "tolerance"
+"""Name of the base command in the study that draws the cameras."""
 DRAWS = "draws"
+"""Key of the random draws in the study's tree."""
 
 
 class ToleranceBase:
-    """``python -m twin.tolerance``: of every camera the merits after its adjustments, and the adjustments."""
+    """Base job of the study that draws cameras: merits and compensator moves of every camera."""
 
     model: type[Spec] = ToleranceSetup
     block = AT_ONCE
@@ -39,15 +41,15 @@ class ToleranceBase:
         self._benches: dict[int, tuple[Tree, ToleranceBench]] = {}
 
     def resolve(self, file: Path | str) -> Spec:
-        """Read a budget. Raises InputError."""
+        """Read a budget; raise InputError if it is invalid."""
         return ToleranceSetup.read(file)
 
     def check(self, tree: Tree, backend: Backend) -> None:
-        """Whether all that the budget names is there. Raises InputError."""
+        """Raise InputError if a name in the budget does not exist."""
         self._bench(tree, backend)
 
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
-        """Outcome of every run."""
+        """Return the outcome of every run."""
         out: list[Outcome] = [Failure("not done")] * len(runs)
         groups: dict[str, list[int]] = {}
         others: dict[str, tuple[Any, ...]] = {}
@@ -74,7 +76,7 @@ class ToleranceBase:
         return outcomes(bench, x, seeds)
 
     def _bench(self, tree: Tree, backend: Backend) -> ToleranceBench:
-        """The tree of a study is the same object from block to block."""
+        """Return the bench of a tree, kept between blocks because a study passes the same tree object to each."""
         known = self._benches.get(id(tree))
         if known is None or known[0] is not tree:
             setup = validate(ToleranceSetup, YamlFile("", tree, {}))
@@ -83,16 +85,16 @@ class ToleranceBase:
 
 
 def outcomes(bench: ToleranceBench, x: np.ndarray, seeds: Sequence[int]) -> list[Outcome]:
-    """What cameras come to.
+    """Trace and adjust cameras and return their merits and compensator moves.
 
     Parameters
     ----------
     bench : ToleranceBench
-        Of the budget.
-    x : np.ndarray
-        Numbers that vary, in units of their sizes, (S, K).
-    seeds : Sequence[int]
-        Of the errors of each camera's adjustments, S.
+        Bench of the budget.
+    x : (S, K) ndarray
+        Varied parameters in units of their sizes.
+    seeds : sequence of int
+        Seeds of the adjustment errors of the S cameras.
     """
     errors = adjustment_errors(bench, seeds)
     tried = bench.try_out(x * bench.sizes, errors)
@@ -114,14 +116,14 @@ def outcomes(bench: ToleranceBench, x: np.ndarray, seeds: Sequence[int]) -> list
 
 
 def adjustment_errors(bench: ToleranceBench, seeds: Sequence[int]) -> np.ndarray | None:
-    """Errors of the adjustments in standard deviations, (S, C); None where they are made without steps and errors."""
+    """Return adjustment errors in standard deviations, (S, C); None without steps and errors."""
     if not np.any((bench.grid_steps > 0.0) | (bench.accuracies > 0.0)):
         return None
     return np.stack([np.random.default_rng([seed, 1]).standard_normal(len(bench.ranges)) for seed in seeds])
 
 
 def law_of(one: ToleranceSpec) -> dict[str, Any]:
-    """How a tolerance is distributed, in units of its limit, as a study's file says it."""
+    """Return the distribution of a tolerance in units of its limit, in the form of a study's file."""
     if one.measured is not None:
         return {"values": list(one.measured_shares)}
     middle = one.mean_share
@@ -134,18 +136,18 @@ def law_of(one: ToleranceSpec) -> dict[str, Any]:
 
 
 def study_of(setup: ToleranceSetup, bench: ToleranceBench, samples: int, seed: int) -> StudySetup:
-    """The study that draws cameras of a budget.
+    """Return the study that draws cameras of a budget.
 
     Parameters
     ----------
     setup : ToleranceSetup
-        The budget.
+        Tolerance budget.
     bench : ToleranceBench
-        Of it.
+        Bench of the budget.
     samples : int
         Number of cameras.
     seed : int
-        Of the draws.
+        Seed of the random draws.
     """
     test = setup.test
     factors: dict[str, Any] = {}
@@ -174,24 +176,24 @@ def study_of(setup: ToleranceSetup, bench: ToleranceBench, samples: int, seed: i
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Cameras that were drawn.
+    """Monte Carlo cameras of a budget.
 
     Attributes
     ----------
-    x : np.ndarray
-        Numbers that vary, in units of their sizes, (S, K).
-    values : np.ndarray
-        Of the merits, SI, (S, M); NaN for a camera without light.
-    moves : np.ndarray
-        Of the compensators, SI, (S, C).
-    settled : np.ndarray
-        By how much a further step of the adjustments would change the wavefront, waves, (S,).
-    seeds : np.ndarray
-        Of the errors of each camera's adjustments, (S,).
-    problems : tuple[str, ...]
-        Why a camera has no light, empty where it has, (S,).
+    x : (S, K) ndarray
+        Varied parameters in units of their sizes.
+    values : (S, M) ndarray
+        Merits, SI; NaN for a camera without light.
+    moves : (S, C) ndarray
+        Compensator moves, SI.
+    settled : (S,) ndarray
+        Change of the rms wavefront error by a further step of the adjustments, waves; it shows convergence.
+    seeds : (S,) ndarray of int
+        Seeds of the adjustment errors.
+    problems : tuple of str
+        Reason why a camera has no light, (S,); empty where it has light.
     seconds : float
-        That it took.
+        Computing time.
     """
 
     x: np.ndarray
@@ -205,18 +207,19 @@ class Samples:
 
 @dataclass(frozen=True)
 class Workforce:
-    """Who draws cameras.
+    """Processes that trace the cameras.
 
     Attributes
     ----------
-    workers : int | None
+    workers : int or None
         Number of processes; None for one per core.
-    scheduler : str | None
-        Address of a running cluster, None for none.
-    journal : Path | None
-        Folder that keeps what is done, to go on with; None for none, then this process does it alone.
-    warn : Callable[[str], None]
-        Told what the user should know of how it is done.
+    scheduler : str or None
+        Address of a running Dask cluster; None for local processes.
+    journal : Path or None
+        Folder of the journal of finished work, from which a run can be resumed; None for no journal, in this process
+        alone.
+    warn : callable
+        Function that receives warnings about the computation.
     """
 
     workers: int | None = None
@@ -235,33 +238,33 @@ def draw_samples(
     part: str = "samples",
     advance: Advance = silent,
 ) -> Samples:
-    """Draw cameras and try them; the numbers do not depend on who does it.
+    """Draw cameras and trace them; the results do not depend on the number of workers.
 
     Parameters
     ----------
     setup : ToleranceSetup
-        The budget.
+        Tolerance budget.
     bench : ToleranceBench
-        Of it, in this process.
+        Bench of the budget in this process.
     backend : Backend
-        Where to trace.
+        Array backend of the ray trace.
     samples : int
         Number of cameras.
     seed : int
-        Of the draws.
+        Seed of the random draws.
     force : Workforce
-        Who does it.
+        Processes that trace the cameras.
     part : str
-        Of the work, for the journal and the progress.
+        Name of this part of the work, for the journal and the progress.
     advance : Advance
-        Shows how far it is.
+        Callback that reports progress.
 
     Raises
     ------
     RunFolderError
-        The journal is another run's, or cannot be written.
+        The journal belongs to another run, or cannot be written.
     Incomplete
-        As the engine of studies.
+        The engine of studies could not finish all runs.
     """
     study = study_of(setup, bench, samples, seed)
     plan = Plan.of(study)

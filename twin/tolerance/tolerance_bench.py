@@ -1,10 +1,11 @@
-"""One camera on which tolerances are tried: exact traces of many cameras at once, with their adjustments.
+"""Camera of a tolerance budget: exact traces of many perturbed cameras at once, with their adjustments.
 
-All wavefronts are those of the beams that the designed camera images at the merits' fields, traced through the same
-points of the stop. What bodies and edges take of a beam is that of the designed camera, at its design wavelength, but
-where it is itself the merit.
+All wavefronts are those of the beams that the nominal camera images at the merits' fields, traced through the same
+points of the stop. Vignetting and obstruction of a beam are those of the nominal camera at its design wavelength,
+except in merits about obstruction.
 
-Adjustments of a camera: the moves of its compensators that make the wavefront error least, and how they are made.
+The adjustments of a camera are the compensator moves that minimise the wavefront error, executed with finite steps and
+errors.
 """
 
 from __future__ import annotations
@@ -35,24 +36,24 @@ from twin.tolerance.variations import VariedNumber, compensator_numbers, states_
 
 
 def told(slopes: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """What slopes (S, R, C) tell of a change of the moves (S, C): of the residuals, (S, R)."""
+    """Return the linear change (S, R) of the residuals by slopes (S, R, C) for a change of the moves (S, C)."""
     return np.asarray((slopes @ change[..., None])[..., 0])
 
 
 @dataclass(frozen=True, eq=False)
 class Adjustments:
-    """Compensators and what they do to the residuals of the wavefront.
+    """Compensators and their effect on the residuals of the wavefront.
 
     Attributes
     ----------
-    ranges : np.ndarray
-        SI, (C,); zero leaves a compensator where it is.
-    steps : np.ndarray
-        Of which they are moved by whole numbers, SI, 0 for any amount, (C,).
-    accuracies : np.ndarray
-        Standard deviations of their moves, SI, (C,).
-    slope : np.ndarray
-        Derivatives of the designed camera's residuals, (R, C), waves per SI unit; 0 where the range is zero.
+    ranges : (C,) ndarray
+        Largest moves in either direction, SI; zero fixes a compensator.
+    steps : (C,) ndarray
+        Step sizes of the moves, SI; 0 for continuous moves.
+    accuracies : (C,) ndarray
+        Standard deviations of the moves, SI.
+    slope : (R, C) ndarray
+        Derivatives of the nominal camera's residuals, waves per SI unit; 0 where the range is zero.
     """
 
     ranges: np.ndarray
@@ -61,23 +62,23 @@ class Adjustments:
     slope: np.ndarray
 
     def best(self, slopes: np.ndarray, residuals: np.ndarray, moves: np.ndarray, free: np.ndarray) -> np.ndarray:
-        """Amounts that make linearised residuals least, within ranges.
+        """Return the moves within their ranges that minimise the linearised residuals.
 
         Parameters
         ----------
-        slopes : np.ndarray
-            Of the residuals of each camera, (S, R, C).
-        residuals : np.ndarray
-            Where the moves are, (S, R).
-        moves : np.ndarray
-            SI, (S, C).
-        free : np.ndarray
-            Compensators that move, (C,); the others stay.
+        slopes : (S, R, C) ndarray
+            Derivatives of the residuals of each camera.
+        residuals : (S, R) ndarray
+            Residuals at the current moves.
+        moves : (S, C) ndarray
+            Current moves, SI.
+        free : (C,) ndarray of bool
+            True for the compensators that may move.
 
         Returns
         -------
-        np.ndarray
-            SI, (S, C).
+        (S, C) ndarray
+            Moves, SI.
         """
         size = np.where(self.ranges > 0.0, self.ranges, 1.0)
         slope = slopes * size
@@ -103,16 +104,16 @@ class Adjustments:
         return np.asarray(target * size)
 
     def corrected(self, slopes: np.ndarray, change: np.ndarray, miss: np.ndarray) -> np.ndarray:
-        """Slopes (S, R, C) that have what a step came to (Broyden's rank-one update); of a camera that stays, as it is.
+        """Return slopes (S, R, C) updated by the outcome of a step, by Broyden's rank-one update.
 
         Parameters
         ----------
-        slopes : np.ndarray
-            Before, (S, R, C).
-        change : np.ndarray
-            Of the moves, SI, (S, C).
-        miss : np.ndarray
-            Residuals after the step less what the slopes told of them, (S, R).
+        slopes : (S, R, C) ndarray
+            Slopes before the step.
+        change : (S, C) ndarray
+            Change of the moves, SI.
+        miss : (S, R) ndarray
+            Residuals after the step minus those predicted by the slopes.
         """
         size = np.where(self.ranges > 0.0, self.ranges, 1.0)
         step = change / size
@@ -122,22 +123,24 @@ class Adjustments:
 
     @property
     def exact(self) -> bool:
-        """Whether moves are made as they are wanted, without steps and errors."""
+        """True if moves are executed without steps and errors."""
         return not np.any((self.steps > 0.0) | (self.accuracies > 0.0))
 
     def made(self, slopes: np.ndarray, residuals: np.ndarray, moves: np.ndarray, errors: np.ndarray) -> np.ndarray:
-        """Moves as they are made: by whole steps and with errors, one after the other.
+        """Return the moves as executed one after the other, in whole steps and with errors.
+
+        The later ones compensate the errors of the earlier.
 
         Parameters
         ----------
-        slopes : np.ndarray
-            Of the residuals, (S, R, C).
-        residuals : np.ndarray
-            Where ``moves`` are, (S, R).
-        moves : np.ndarray
-            That are wanted, SI, (S, C).
-        errors : np.ndarray
-            In standard deviations, (S, C).
+        slopes : (S, R, C) ndarray
+            Derivatives of the residuals.
+        residuals : (S, R) ndarray
+            Residuals at ``moves``.
+        moves : (S, C) ndarray
+            Ideal moves, SI.
+        errors : (S, C) ndarray
+            Errors in standard deviations.
         """
         free = np.ones(len(self.ranges), dtype=bool)
         wanted, made = moves.copy(), moves.copy()
@@ -156,35 +159,37 @@ class Adjustments:
 
 
 SETTLED = 1e-3
-"""Rms wavefront error that the next step of the adjustments would still change, waves; in the worst of three times as
-many steps as any camera of the library has needed."""
+"""Rms wavefront error, waves, that a further step of the adjustments may still change in a camera that counts as
+converged.
+"""
 MOST_STEPS = 12
+"""Largest number of steps of the adjustments, three times as many as any camera of the library has needed."""
 
 FIRST_RULE, LARGEST_RULE = 3, 17
 """Wavelengths of the first and of the last rule over a spectrum."""
 EVERY = 4
-"""Distortion is told of each fourth point of the line."""
+"""Spacing, in points of the line, of those at which distortion is evaluated."""
 _MOVE = 1e-3
-"""Step of the derivatives by compensators, as a share of their range."""
+"""Step of the numerical derivatives by compensators, as a share of their range."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """Cameras that were tried.
+    """Perturbed cameras after their adjustments.
 
     Attributes
     ----------
-    moves : np.ndarray
-        Amounts of the compensators, SI, (S, C).
-    parts : np.ndarray
-        Of all merits, (S, P); NaN where the light is lost.
-    problems : tuple[str, ...]
-        Why it is lost, empty where it is not, (S,).
-    settled : np.ndarray
-        Rms by which one further step would change the wavefront, waves, (S,).
-    paths : np.ndarray | None
-        Optical paths of the beams' rays less those of the chief rays, of all traced wavelengths, (S, F, K N), metres;
-        None if not asked for.
+    moves : (S, C) ndarray
+        Compensator moves, SI.
+    parts : (S, P) ndarray
+        Parts of all merits; NaN where the light is lost.
+    problems : tuple of str
+        Reason why the light is lost, (S,); empty where it is not.
+    settled : (S,) ndarray
+        Change of the rms wavefront error by a further step of the adjustments, waves.
+    paths : (S, F, K N) ndarray or None
+        Optical paths of the beams' rays minus those of the chief rays, for all traced wavelengths, metres; None if not
+        requested.
     """
 
     moves: np.ndarray
@@ -195,7 +200,7 @@ class Tried:
 
     @classmethod
     def joined(cls, several: Sequence[Tried]) -> Tried:
-        """Several, one after the other."""
+        """Return several results concatenated in order."""
         paths = [one.paths for one in several if one.paths is not None]
         return cls(
             np.concatenate([one.moves for one in several]),
@@ -207,36 +212,36 @@ class Tried:
 
 
 class ToleranceBench:
-    """A camera with what varies, what is adjusted and what is asked.
+    """Camera with its varied parameters, compensators and merits.
 
     Parameters
     ----------
-    setup
-        The budget.
-    backend
-        Where to trace.
-    experiment
-        Of the budget's instrument, where it is built already.
+    setup : ToleranceSetup
+        Tolerance budget.
+    backend : Backend
+        Array backend of the ray trace.
+    experiment : MonitorExperiment, optional
+        Instrument of the budget, if it has been built already.
 
     Attributes
     ----------
-    numbers
-        That vary.
-    compensators
-        That are adjusted.
-    merits
-        That are asked.
-    fields
-        Of the wavefronts, (F, 2).
-    monitor
-        Of the instrument; None where no merit is about it.
-    colours, shares
-        Wavelengths of the light of the wavefronts and MTFs, metres, and their shares, (C,) each.
+    numbers : tuple of VariedNumber
+        Varied parameters.
+    compensators : tuple of VariedNumber
+        Adjusted parameters.
+    merits : tuple of Merit
+        Merits of the budget.
+    fields : (F, 2) ndarray
+        Fields of the wavefronts.
+    monitor : MonitorMerit or None
+        Monitor of the instrument; None if no merit is about it.
+    colours, shares : (C,) ndarray
+        Wavelengths of wavefronts and MTFs, metres, and their weights.
 
     Raises
     ------
     InputError
-        Names that do not exist, a merit that the camera cannot have, or a camera without light.
+        A name does not exist, the camera cannot have a merit, or it has no light.
     """
 
     def __init__(self, setup: ToleranceSetup, backend: Backend, experiment: MonitorExperiment | None = None) -> None:
@@ -271,7 +276,7 @@ class ToleranceBench:
 
     @property
     def figure_faces(self) -> dict[str, Element]:
-        """Name of each tolerance of a figure -> the surface that has it."""
+        """Surface of each tolerance that is a figure error, by the tolerance's name."""
         bodies = {number.entry: next(iter(number.moves)) for number in self.numbers if number.kind == SPECTRUM}
         return {name: self.instrument.assembly.face(body) for name, body in bodies.items()}
 
@@ -284,7 +289,7 @@ class ToleranceBench:
         return test.camera or names[0]
 
     def _adjusts_before_stop(self) -> bool:
-        """Whether adjustments change where light meets the stop, so that rays have to be aimed anew after them."""
+        """Return True if adjustments move the light at the stop, so that rays have to be aimed again."""
         path = self.optics.path
         chain = [path.assembly.elements[name] for name in path.assembly.sequences[f"{path.name}/to_stop"]]
         bodies = {body for one in chain for body in (one.body, one.solid) if body is not None}
@@ -295,7 +300,7 @@ class ToleranceBench:
 
     @one_blas_thread()
     def _prepare(self) -> None:
-        """Look at the designed camera in the light of the budget, by as many wavelengths as its merits take."""
+        """Trace the nominal camera in the spectrum of the budget, with as many wavelengths as its merits need."""
         test, spectrum = self.setup.test, light_of(self.setup.test, self.optics.model.spec)
         if spectrum is None:
             self._prepare_in(np.array([self.wavelength]), np.ones(1))
@@ -312,20 +317,20 @@ class ToleranceBench:
             raise test.error(f"merits over the light: {error}", ("light",), allowed="light: design") from error
 
     def _designed_values(self) -> np.ndarray:
-        """Rms wavefront errors and MTFs of the designed camera in its light, as it stands."""
+        """Return rms wavefront errors and MTFs of the nominal camera in the current spectrum, before adjustment."""
         squares = np.sum(self._residuals(self.beams.designed.paths).reshape(len(self.fields), -1) ** 2, axis=-1)
         mtfs = [one.known for rows in self._transfers.values() for row in rows for one in row]
         return np.concatenate([np.sqrt(squares), mtfs])
 
     def _prepare_in(self, colours: np.ndarray, shares: np.ndarray) -> None:
-        """Work out what does not change from camera to camera.
+        """Compute what all cameras share, for given wavelengths.
 
         Parameters
         ----------
-        colours : np.ndarray
-            Wavelengths of the light, metres, (C,).
-        shares : np.ndarray
-            Of them, which sum to 1, (C,).
+        colours : (C,) ndarray
+            Wavelengths, metres.
+        shares : (C,) ndarray
+            Weights of the wavelengths; they sum to 1.
         """
         model = self.optics.model
         self.colours, self.shares = colours, shares
@@ -349,7 +354,10 @@ class ToleranceBench:
         self._adjust = Adjustments(self.ranges, self.grid_steps, self.accuracies, self._adjustment_slope())
 
     def _adjustment_slope(self) -> np.ndarray:
-        """Derivatives of the residuals by the compensators, (R, C), waves per SI unit; 0 where the range is zero."""
+        """Return the derivatives (R, C) of the residuals by the compensators, waves per SI unit.
+
+        They are 0 where the range is zero.
+        """
         used = np.flatnonzero(self.ranges)
         slope = np.zeros((self._residuals(self.beams.designed.paths).shape[1], len(self.ranges)))
         if not used.size:
@@ -364,8 +372,9 @@ class ToleranceBench:
         return slope
 
     def _residuals(self, paths: np.ndarray) -> np.ndarray:
-        """Residuals (S, R) whose squares sum to the mean squares of the wavefronts over all fields and over the light,
-        waves of the design wavelength.
+        """Return residuals (S, R) whose squares sum to the mean square wavefront errors of all fields.
+
+        They are in waves of the design wavelength.
         """
         terms = paths.reshape(len(paths), len(self.fields), len(self.traced_shares), -1) @ self.beams.solve.T
         return self._roots.residuals(terms / self.wavelength, self.traced_shares)
@@ -373,22 +382,22 @@ class ToleranceBench:
     # adjustments
 
     def try_out(self, amounts: np.ndarray, errors: np.ndarray | None = None, paths: bool = False) -> Tried:
-        """Trace cameras, adjust them, and work out their merits.
+        """Trace perturbed cameras, adjust them, and compute their merits.
 
         Parameters
         ----------
-        amounts : np.ndarray
-            Of the numbers that vary, SI, (S, K).
-        errors : np.ndarray | None
-            Of the compensators' moves in standard deviations, (S, C); then each is moved by whole steps with its error,
-            in their order, the later ones following the earlier; None for the ideal adjustment.
+        amounts : (S, K) ndarray
+            Amounts of the varied parameters, SI.
+        errors : (S, C) ndarray, optional
+            Errors of the compensator moves in standard deviations. With them each compensator moves by whole steps with
+            its error, in order, and the later ones compensate the earlier. None for the ideal adjustment.
         paths : bool
-            Whether their optical paths are wanted.
+            True if the optical paths are wanted.
 
         Returns
         -------
         Tried
-            The cameras; one whose light is lost does not change the others.
+            The adjusted cameras; one whose light is lost does not affect the others.
         """
         starts = range(0, len(amounts), AT_ONCE)
         found = [
@@ -411,7 +420,7 @@ class ToleranceBench:
 
     @one_blas_thread()
     def _adjusted(self, amounts: np.ndarray, errors: np.ndarray | None) -> Tried:
-        """Raises PhysicalError: the light of one is lost."""
+        """Adjust cameras and compute their merits; raise PhysicalError if the light of any is lost."""
         count = len(amounts)
         moves, settled = np.zeros((count, len(self.ranges))), np.zeros(count)
 
@@ -425,7 +434,7 @@ class ToleranceBench:
         light = self.beams.light(states)
 
         def again(own: Sequence[State], which: np.ndarray) -> BeamLight:
-            """Those of cameras that were adjusted, whose rays start where they did if no adjustment aims them anew."""
+            """Trace adjusted cameras; rays keep their starting points unless an adjustment moves the stop's beam."""
             return self.beams.light(own, None if self._moves_stop else light.aimed[which])
 
         if np.any(self.ranges > 0.0):
@@ -460,16 +469,20 @@ class ToleranceBench:
     # merits
 
     def parts_of(self, states: Sequence[State]) -> np.ndarray:
-        """Parts of all merits (S, P) of cameras in any states, as they are. Raises PhysicalError: the light is lost."""
+        """Return the parts of all merits (S, P) in given states; raise PhysicalError if the light is lost."""
         amounts, moves = np.zeros((len(states), len(self.numbers))), np.zeros((len(states), len(self.ranges)))
         return self._parts(states, amounts, moves, self.beams.light(states) if len(self.fields) else None)
 
     def numbers_of(self, states: Sequence[State]) -> np.ndarray:
-        """Numbers (S, R) of cameras whose squares sum to their merits' mean squares over fields or points, each in
-        units of its requirement; an MTF counts as the wavefront at its fields, a quarter of the wavelength rms as one.
-        What bodies take of beams, and what a monitor knows, have no such numbers.
+        """Return residuals (S, R) whose squares sum to the mean squares of the merits, in units of the requirements.
 
-        They change linearly with small motions. Raises PhysicalError: the light is lost.
+        They change linearly with small motions. An MTF is represented by the wavefront at its fields, in units of a
+        quarter of a wavelength rms. Obstruction and monitor merits have no residuals.
+
+        Raises
+        ------
+        PhysicalError
+            The light of a camera is lost.
         """
         count = len(states)
         light = self.beams.light(states) if len(self.fields) else None
@@ -490,15 +503,15 @@ class ToleranceBench:
         return np.concatenate(out, axis=1) if out else np.zeros((count, 0))
 
     def pair_curvature(self, slopes: np.ndarray) -> np.ndarray:
-        """Second derivatives of the parts by pairs of numbers, (P, K, K), as first derivatives of the wavefronts make
-        them; 0 for parts that are no function of a wavefront.
+        """Return the second derivatives (P, K, K) of the parts that follow from first derivatives of the wavefronts.
 
-        Mean squares and MTFs bend because they are functions of a wavefront that hardly does.
+        Mean squares and MTFs are quadratic in a wavefront that itself is nearly linear in the parameters. Parts that
+        are no function of a wavefront get 0.
 
         Parameters
         ----------
-        slopes : np.ndarray
-            Of the optical paths by the numbers, metres, (L, F, K N).
+        slopes : (K, F, C N) ndarray
+            Derivatives of the optical paths by the varied parameters, metres per unit.
         """
         out = np.zeros((self.parts, len(slopes), len(slopes)))
         residuals = self._residuals(slopes).reshape(len(slopes), len(self.fields), -1) if len(self.fields) else None
@@ -516,7 +529,7 @@ class ToleranceBench:
     def _parts(
         self, states: Sequence[State], amounts: np.ndarray, moves: np.ndarray, light: BeamLight | None
     ) -> np.ndarray:
-        """Parts of all merits, (S, P)."""
+        """Return the parts of all merits, (S, P)."""
         out = np.empty((len(states), self.parts))
         known: dict[str, np.ndarray] = {}
         if self.monitor is not None:
@@ -548,7 +561,7 @@ class ToleranceBench:
         return out
 
     def _change(self, merit: Merit, line: dict[str, np.ndarray], light: BeamLight | None) -> np.ndarray:
-        """Parts of a merit that is a change against the designed camera, of what ``_line`` tells or of chief rays."""
+        """Return the parts of a merit that is a change against the nominal camera, of the line or of chief rays."""
         if merit.spec.kind != "chief_ray":
             return line[merit.spec.kind]
         assert light is not None
@@ -567,7 +580,7 @@ class ToleranceBench:
         )
 
     def _line(self, states: Sequence[State]) -> dict[str, np.ndarray]:
-        """Parts of the merits that are about the line, by kind."""
+        """Return the parts of the merits about the line, by kind."""
         if not self._wanted & {"boresight", "roll", "principal_distance", "distortion"}:
             return {}
         sight, axes = self.experiment.sight, self.experiment.sight.axes[self.camera]
@@ -588,11 +601,11 @@ class ToleranceBench:
 
     @property
     def _along(self) -> np.ndarray:
-        """Points of the line at which distortion is told."""
+        """Indices of the points of the line at which distortion is evaluated."""
         return np.arange(0, LINE_POINTS, EVERY)
 
     def scaled(self, scales: np.ndarray) -> ToleranceBench:
-        """The same bench with limits that are scales (E,) times these."""
+        """Return the same bench with limits scaled by scales (E,)."""
         other = copy(self)
         by_entry = dict(zip(self.entries, scales.tolist(), strict=True))
         other.numbers = tuple(replace(one, size=one.size * by_entry[one.entry]) for one in self.numbers)
@@ -601,7 +614,7 @@ class ToleranceBench:
 
     @cached_property
     def entries(self) -> dict[str, tuple[int, ...]]:
-        """Name of a tolerance -> numbers that are its own."""
+        """Indices of the varied parameters of each tolerance, by its name."""
         out: dict[str, tuple[int, ...]] = {}
         for k, number in enumerate(self.numbers):
             out[number.entry] = (*out.get(number.entry, ()), k)
@@ -609,21 +622,19 @@ class ToleranceBench:
 
     @cached_property
     def sizes(self) -> np.ndarray:
-        """SI amount of one unit of every number, (K,)."""
+        """SI amount of one unit of every varied parameter, (K,)."""
         return np.array([number.size for number in self.numbers])
 
     def values(self, parts: np.ndarray) -> np.ndarray:
-        """Values of all merits, (..., M)."""
+        """Return the values of all merits, (..., M), from their parts (..., P)."""
         return np.stack([merit.values(parts) for merit in self.merits], axis=-1)
 
     def worst_margins(self, values: np.ndarray) -> np.ndarray:
-        """How far cameras of values (S, M) are beyond the requirement that they meet least, (S,); infinite without
-        light.
-        """
+        """Return the worst margin of each camera, (S,), from merits (S, M); infinite without light."""
         each = np.stack([merit.margin(values[:, k]) for k, merit in enumerate(self.merits)])
         return np.asarray(np.where(np.isnan(each), np.inf, each).max(axis=0))
 
     def passing(self, values: np.ndarray) -> np.ndarray:
-        """Whether values (..., M) meet their requirements, (..., M)."""
+        """Return True where merits (..., M) meet their requirements."""
         each: Iterable[np.ndarray] = (merit.passes(values[..., k]) for k, merit in enumerate(self.merits))
         return np.stack(list(each), axis=-1)

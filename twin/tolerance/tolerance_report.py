@@ -1,4 +1,4 @@
-"""Report of a tolerance budget: yield, shares of variance, sensitivities, inverse limits, and the allocation of limits."""
+"""Report of a tolerance budget: yield, shares of variance, sensitivities, inverse limits and allocation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A tolerance budget computed: sensitivities, limits for a loss, yield by models and by exact traces, allocation."""
+"""Computation of a tolerance budget: sensitivities, inverse limits, yield and allocation."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from twin.tolerance.tolerance_bench import SETTLED, ToleranceBench
 from twin.tolerance.variations import states_of
 
 CONFIDENCE = 0.95
-"""Of the intervals of yields."""
+"""Confidence level of the intervals of yields."""
 WORST = 10
-"""Cameras that are handed over as jobs."""
+"""Number of the worst cameras that are written as jobs."""
 LEVELS = (0.5, 0.9, 0.95)
-"""Shares of cameras of which a merit's value is told."""
+"""Shares of cameras at which the quantiles of a merit are reported."""
 _MORE = 7919
-"""What is added to the seed for the cameras by which an allocation is judged, so that they are others."""
+"""Number added to the seed for the independent cameras that validate an allocation."""
 _NOTHING = 1e-15
-"""Metres and radians below which a motion is rounding."""
+"""Metres and radians below which a motion is rounding error."""
 EXACT = 4
-"""Cameras in which the derivatives of the monitor are traced."""
+"""Number of cameras in which the derivatives of the monitor are traced as a check."""
 NEAR_MODEL = 0.05
-"""Share by which a model's quantile may differ from the samples' without a warning."""
+"""Largest relative difference of a model's quantile from that of the samples without a warning."""
 _PAIR, _DRAWN, _SHOWN, _MODELLED = 6.6e3, 32.0, 120.0, 40.0
 """Bytes of two numbers that vary together, by which the merits are modelled to the second order; of each camera, of a
 number that varies, of a merit or compensator in the tables, and of a merit of the models.
@@ -51,14 +51,16 @@ number that varies, of a merit or compensator in the tables, and of a merit of t
 
 @dataclass(frozen=True)
 class Yield:
-    """Share of cameras that pass.
+    """Share of cameras that pass, with its confidence interval.
 
     Attributes
     ----------
     passed : int
-        Number of cameras that do; of: all.
+        Number of cameras that pass.
+    of : int
+        Number of all cameras.
     low, high : float
-        Limits of the share, at ``CONFIDENCE`` (Clopper and Pearson).
+        Clopper-Pearson limits of the share, at ``CONFIDENCE``.
     """
 
     passed: int
@@ -68,42 +70,42 @@ class Yield:
 
     @classmethod
     def count(cls, passing: np.ndarray) -> Yield:
-        """Of cameras that pass or not, (S,)."""
+        """Return the yield of cameras that pass or not, (S,)."""
         passed, total = int(np.sum(passing)), len(passing)
         return cls(passed, total, *proportion_interval(passed, total, CONFIDENCE))
 
     @property
     def share(self) -> float:
-        """Passed of all."""
+        """Share of cameras that pass."""
         return self.passed / self.of
 
     def judged(self, wanted: float) -> str:
-        """``met``, ``missed``, or ``open`` where the interval holds what is wanted."""
+        """Return ``met``, ``missed``, or ``open`` if the confidence interval contains the required share."""
         return "met" if self.low >= wanted else "missed" if self.high < wanted else "open"
 
 
 @dataclass(frozen=True, eq=False)
 class MeritResult:
-    """One merit over all cameras.
+    """Distribution of a merit over all cameras.
 
     Attributes
     ----------
     merit : Merit
         The merit.
     nominal : float
-        Of the designed camera, adjusted, SI.
+        Value of the nominal camera, adjusted, SI.
     mean, deviation : float
-        Over the cameras, SI.
-    levels : tuple[float, ...]
-        Value that shares ``LEVELS`` of the cameras do not exceed (of MTF: exceed), SI.
-    linear, quadratic : tuple[float, ...]
-        The same by the models.
+        Mean and standard deviation over the cameras, SI.
+    levels : tuple of float
+        Values that shares ``LEVELS`` of the cameras do not exceed (for an MTF: exceed), SI.
+    linear, quadratic : tuple of float
+        The same quantiles by the linear and the quadratic model.
     passing : Yield
-        Share that passes.
-    model_passing : tuple[float, float]
-        The same by the linear and the quadratic model.
-    shares : Mapping[str, float]
-        Entry -> share of the variance that is gone without it, by the quadratic model.
+        Share of cameras that meet the requirement.
+    model_passing : tuple of float
+        That share by the linear and by the quadratic model.
+    shares : dict
+        Tolerance -> share of the variance that vanishes without it, by the quadratic model.
     """
 
     merit: Merit
@@ -120,35 +122,35 @@ class MeritResult:
 
 @dataclass(frozen=True, eq=False)
 class ToleranceRun:
-    """A tolerance budget and what it comes to.
+    """Tolerance budget and its results.
 
     Attributes
     ----------
     setup : ToleranceSetup
-        The budget.
+        Tolerance budget.
     bench : ToleranceBench
-        On which it was tried.
+        Bench of the budget.
     found : Sensitivities
-        Sensitivities and model.
+        Sensitivities and the model of the merits.
     inverse : InverseLimits
-        Limits for a loss.
+        Inverse limits for a loss.
     samples : Samples
-        Cameras that were drawn.
-    merits : tuple[MeritResult, ...]
-        Of them.
+        Monte Carlo cameras.
+    merits : tuple of MeritResult
+        Distribution of each merit over these cameras.
     passing : Yield
         Share of cameras that meet all requirements.
-    allocation : Allocation | None
-        Limits chosen anew; None where none are asked.
-    judged : Yield | None
-        Share of cameras with these limits that meet all requirements, of cameras of their own.
-    jobs : Mapping[str, str]
-        The worst cameras as files of jobs, by name.
-    warnings : tuple[str, ...]
-        What the user should know.
-    missed : Mapping[str, float]
-        Merit of the monitor -> largest relative difference of its sigma from that with derivatives which are traced in
-        the camera itself, in the first ``EXACT`` cameras.
+    allocation : Allocation or None
+        Allocated limits; None if no allocation is requested.
+    judged : Yield or None
+        Share of independent cameras with these limits that meet all requirements.
+    jobs : dict
+        Worst cameras as files of jobs, by name.
+    warnings : tuple of str
+        Warnings for the user.
+    missed : dict
+        Merit of the monitor -> largest relative difference of its sigma from that with derivatives traced in the camera
+        itself, in the first ``EXACT`` cameras.
     """
 
     setup: ToleranceSetup
@@ -177,22 +179,22 @@ def run_tolerance(
     Parameters
     ----------
     setup : ToleranceSetup
-        The budget.
+        Tolerance budget.
     backend : Backend
-        Where to trace.
-    seed : int | None
-        Of the draws; the budget's own by default.
+        Array backend of the ray trace.
+    seed : int, optional
+        Seed of the random draws; the budget's by default.
     advance : Advance
-        Shows how far it is.
-    force : Workforce | None
-        Who draws the cameras; this process alone by default.
+        Callback that reports progress.
+    force : Workforce, optional
+        Processes that trace the cameras; this process alone by default.
 
     Raises
     ------
     InputError
-        Names that do not exist, a designed camera without the light that is asked, or more memory than there is.
+        A name does not exist, the nominal camera has no light at a field, or the memory does not suffice.
     RunFolderError, Incomplete
-        As ``draw_samples``.
+        See ``draw_samples``.
     """
     test, force = setup.test, force or Workforce()
     told: dict[str, None] = {}  # what is told twice, of the cameras and of those by which an allocation is judged
@@ -242,22 +244,22 @@ def run_tolerance(
 
 
 def _amounts(bench: ToleranceBench, samples: Samples, which: np.ndarray) -> np.ndarray:
-    """Amounts of the numbers and the compensators of some cameras, SI, (W, K)."""
+    """Return the amounts of the parameters and the compensators of selected cameras, SI, (W, K)."""
     return np.concatenate([samples.x[which] * bench.sizes, np.nan_to_num(samples.moves[which])], axis=1)
 
 
 def _states(bench: ToleranceBench, samples: Samples, which: np.ndarray) -> list[State]:
-    """States of some cameras with their adjustments."""
+    """Return the states of selected cameras with their adjustments."""
     return states_of((*bench.numbers, *bench.compensators), _amounts(bench, samples, which))
 
 
 def worst_of(bench: ToleranceBench, samples: Samples) -> np.ndarray:
-    """Numbers of the worst cameras, the worst first."""
+    """Return the indices of the worst cameras, the worst first."""
     return np.argsort(-bench.worst_margins(samples.values), kind="stable")[:WORST]
 
 
 def _missed(bench: ToleranceBench, samples: Samples) -> dict[str, float]:
-    """Merit of the monitor -> by how much its sigma is off in the first of the cameras, relative; empty for none."""
+    """Return the relative interpolation error of each monitor merit's sigma in the first cameras."""
     known = np.flatnonzero(np.all(np.isfinite(samples.values), axis=1))[:EXACT]
     if bench.monitor is None or not known.size:
         return {}
@@ -278,7 +280,7 @@ def _require_light(setup: ToleranceSetup, found: Sensitivities) -> None:
 
 
 def with_limits(setup: ToleranceSetup, limits: Mapping[str, str | float]) -> ToleranceSetup:
-    """The budget with other limits."""
+    """Return the budget with other limits."""
     entries = {
         name: one.model_copy(update={"limit": limits.get(name, one.limit)})
         for name, one in setup.test.tolerances.items()
@@ -289,7 +291,7 @@ def with_limits(setup: ToleranceSetup, limits: Mapping[str, str | float]) -> Tol
 def _judged(
     setup: ToleranceSetup, backend: Backend, allocation: Allocation, seed: int, force: Workforce, advance: Advance
 ) -> Yield:
-    """Yield of the allocated limits by cameras of their own."""
+    """Return the yield of the allocated limits over independent cameras."""
     other = with_limits(setup, allocation.limits)
     bench = ToleranceBench(other, backend)
     drawn = draw_samples(other, bench, backend, setup.test.samples, seed + _MORE, force, "allocated", advance)
@@ -298,14 +300,14 @@ def _judged(
 
 @dataclass(frozen=True, eq=False)
 class Modelled:
-    """What the models say of the cameras that were drawn.
+    """Merits of the Monte Carlo cameras predicted by the models.
 
     Attributes
     ----------
-    linear, quadratic : np.ndarray
-        Values of the merits, SI, (S, M).
-    without : np.ndarray
-        The same to the second order without each tolerance, of the first of the cameras, (E, S', M).
+    linear, quadratic : (S, M) ndarray
+        Merits to the first and to the second order, SI.
+    without : (E, S', M) ndarray
+        Merits to the second order without each tolerance, of the first S' cameras.
     """
 
     linear: np.ndarray
@@ -314,7 +316,7 @@ class Modelled:
 
     @classmethod
     def of(cls, bench: ToleranceBench, found: Sensitivities, samples: Samples) -> Modelled:
-        """The models at the cameras' own draws."""
+        """Evaluate the models at the draws of the cameras."""
         scaled = ScaledModel.of(found.model, samples.x, list(bench.entries.values()))
         every = np.eye(len(bench.entries))
         return cls(
@@ -398,7 +400,7 @@ def _warnings(
 
 
 def _allocation_warnings(allocation: Allocation, judged: Yield, spec: AllocationSpec) -> list[str]:
-    """Of limits that do not reach what is asked, or of which other cameras say something else than the model."""
+    """Return warnings about limits that miss the required yield, or a model that contradicts exact traces."""
     out = []
     if not allocation.reached and allocation.unrounded:
         out.append(
@@ -419,7 +421,7 @@ def _allocation_warnings(allocation: Allocation, judged: Yield, spec: Allocation
 
 
 def worst_jobs(setup: ToleranceSetup, bench: ToleranceBench, samples: Samples) -> dict[str, str]:
-    """The worst cameras as jobs that ``python -m twin.render`` and ``twin.camera`` take, the worst first."""
+    """Return the worst cameras as jobs for ``python -m twin.render`` and ``twin.camera``, the worst first."""
     worst = worst_of(bench, samples)
     out = {}
     for rank, (s, state) in enumerate(zip(worst, _states(bench, samples, worst), strict=True)):
@@ -435,20 +437,20 @@ def worst_jobs(setup: ToleranceSetup, bench: ToleranceBench, samples: Samples) -
 
 
 def _short(disturbances: dict[str, Any]) -> Any:
-    """Disturbances as a file says them: by the name alone where nothing of the file is changed."""
+    """Return disturbances in the form of a file: the name alone if nothing of that file is changed."""
     said = {key: value for key, value in disturbances.items() if value}
     return said["file"] if said.keys() == {"file"} else said
 
 
 def _reference(setup: ToleranceSetup) -> str:
-    """The instrument as a job in another folder names it: by name, or by its whole path."""
+    """Return the instrument as a job in another folder refers to it: by name or by its absolute path."""
     named = setup.test.instrument
     place = (Path(setup.test.source.file).parent / named).resolve()
     return str(place) if is_path(named) and place.is_file() else named
 
 
 def _perturb(motion: Any) -> dict[str, Any]:
-    """A motion as a job's file says it."""
+    """Return a motion in the form of a job's file."""
     out: dict[str, Any] = {}
     for kind in ("rotate", "shift"):
         values = [value if abs(value) > _NOTHING else 0.0 for value in getattr(motion, kind)]
@@ -529,7 +531,7 @@ def _tolerance_plain(run: ToleranceRun) -> dict[str, Any]:
 
 
 def _moves_at(run: ToleranceRun, entry: int, end: int) -> dict[str, str | float | None]:
-    """Compensator -> its move with one tolerance at an end of its limit, as files have it; None for a figure error."""
+    """Return each compensator's move with a tolerance at an end of its limit; None for a figure error."""
     moves = run.found.moves[entry, end].tolist()
     return {
         one.name: amount_text(move, one.kind) if np.isfinite(move) else None

@@ -1,7 +1,7 @@
-"""What varies in a tolerance budget: numbers, each a motion of bodies per unit, and the states that they add up to.
+"""Varied parameters of a tolerance budget, each a motion of bodies per unit, and the states that they add up to.
 
-Several numbers may move one body. Their rotation vectors and shifts add up, each turn about its own point, so that the
-order in which a file lists them does not matter.
+Several parameters may move one body. Their rotation vectors and shifts are added, each rotation about its own point, so
+that the order in a file does not matter.
 """
 
 from __future__ import annotations
@@ -29,26 +29,27 @@ from scenes.yaml.errors import InputError, KeyPath, Problem, shown
 from scenes.yaml.spec import Spec
 
 HEAT = ("temperature", "gradient")
+"""Kinds of motions that are thermal."""
 SHAPE = ("scale", "expansion", "radius", "conic", "index", "abbe")
-"""Numbers of a motion that are neither rigid nor a figure."""
+"""Kinds of motions that are neither rigid nor a figure error."""
 
 
 @dataclass(frozen=True, eq=False)
 class BodyMove:
-    """What one number does to one body, per SI unit, in the body's own frame.
+    """Motion of one body per SI unit of a varied parameter, in the body's frame.
 
     Attributes
     ----------
-    rotate : np.ndarray
-        Rotation vector, (3,).
-    shift : np.ndarray
-        (3,), metres.
-    pivot : np.ndarray
-        Point that the turn leaves in place, (3,), metres.
-    figure : FrozenMap[int, float]
-        Noll index -> metres of sag.
-    shape : FrozenMap[str, float]
-        Name of ``SHAPE`` -> change.
+    rotate : (3,) ndarray
+        Rotation vector, rad.
+    shift : (3,) ndarray
+        Shift, metres.
+    pivot : (3,) ndarray
+        Point that the rotation leaves in place, metres.
+    figure : FrozenMap
+        Noll index -> rms of the sag, metres.
+    shape : FrozenMap
+        Name in ``SHAPE`` -> change.
     """
 
     rotate: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -60,21 +61,21 @@ class BodyMove:
 
 @dataclass(frozen=True, eq=False)
 class VariedNumber:
-    """One number that varies.
+    """Varied parameter of a tolerance budget.
 
     Attributes
     ----------
     name : str
-        Of the entry of the file, with the term where it is one of a whole figure error.
+        Name of the entry in the file, with the Zernike term if it is one of a whole figure error.
     entry : str
         Name of the entry.
     kind : str
-        Of the motion.
+        Kind of the motion.
     size : float
-        SI amount of one unit of it: the limit of a tolerance, 1 of a compensator; of a term of a figure error its
-        standard deviation.
-    moves : FrozenMap[str, BodyMove]
-        Body -> what it does.
+        SI amount of one unit: the limit of a tolerance, 1 for a compensator, the standard deviation for a term of a
+        figure error.
+    moves : FrozenMap
+        Path of a body -> its motion.
     """
 
     name: str
@@ -85,12 +86,12 @@ class VariedNumber:
 
 
 def tolerance_numbers(setup: ToleranceSetup, instrument: Instrument, thermal: ThermalModel) -> tuple[VariedNumber, ...]:
-    """The numbers of all tolerances, in the order of the file; a figure error has one for each of its terms.
+    """Return the parameters of all tolerances in the order of the file; a figure error has one for each of its terms.
 
     Raises
     ------
     InputError
-        a body that is not there, or that does not allow what a tolerance says.
+        A body does not exist, or does not allow the motion of a tolerance.
     """
     maker = _Maker(setup.test, instrument, thermal)
     out: list[VariedNumber] = []
@@ -102,7 +103,7 @@ def tolerance_numbers(setup: ToleranceSetup, instrument: Instrument, thermal: Th
 def compensator_numbers(
     setup: ToleranceSetup, instrument: Instrument, thermal: ThermalModel
 ) -> tuple[VariedNumber, ...]:
-    """One number for each compensator, as ``tolerance_numbers``."""
+    """Return one parameter for each compensator; see ``tolerance_numbers``."""
     maker = _Maker(setup.test, instrument, thermal)
     return tuple(maker.compensator(name, one) for name, one in setup.test.compensators.items())
 
@@ -110,14 +111,14 @@ def compensator_numbers(
 def actuator_number(
     test: Spec, instrument: Instrument, thermal: ThermalModel, name: str, one: CompensatorSpec
 ) -> VariedNumber:
-    """The number of an actuator under ``actuators`` of a test, as ``tolerance_numbers``."""
+    """Return the parameter of an actuator under ``actuators`` of a test; see ``tolerance_numbers``."""
     moves = _Maker(test, instrument, thermal)._moves(one, ("actuators", name), one.range_si or 1.0)
     return VariedNumber(name, name, one.parts[1], 1.0, moves)
 
 
 @dataclass(frozen=True, eq=False)
 class _Maker:
-    """Makes numbers of entries."""
+    """Builder of parameters from the entries of a file."""
 
     test: Spec
     instrument: Instrument
@@ -142,7 +143,7 @@ class _Maker:
         return VariedNumber(name, name, one.parts[1], 1.0, moves)
 
     def _node(self, one: Varied, name: str, key: KeyPath) -> str:
-        """Path of a body that allows the motion. Raises InputError."""
+        """Return the path of a body that allows the motion; raise InputError if there is none."""
         try:
             body = find_node(name, self.instrument.nodes)
         except Problem as problem:
@@ -191,7 +192,7 @@ class _Maker:
         return self.instrument.assembly.tree[path]
 
     def _heat(self, body: str, kind: str, axis: str, key: KeyPath, limit: float) -> FrozenMap[str, BodyMove]:
-        """What a change of temperature does, taken between none and the limit."""
+        """Return the effect of a change of temperature per unit, between zero and the limit."""
         try:
             return heat_moves(self.thermal, self.instrument, body, kind, AXES.get(axis, 0), limit)
         except TemperatureError as error:
@@ -207,29 +208,31 @@ def heat_moves(
     amount: float,
     others: Mapping[str, Temperature] = FrozenMap(),
 ) -> FrozenMap[str, BodyMove]:
-    """What a change of temperature does to every body, per SI unit, taken between none and an amount.
+    """Return the effect of a change of temperature on every body, per SI unit.
+
+    It is the difference quotient between zero and an amount.
 
     Parameters
     ----------
     thermal : ThermalModel
-        Of the instrument.
+        Thermal model of the instrument.
     instrument : Instrument
-        Whose bodies they are.
+        Instrument with the bodies.
     body : str
-        That is warmed, with all it carries.
+        Path of the body that is warmed, with all that it carries.
     kind : str
         ``temperature`` or ``gradient``.
     axis : int
-        Of a gradient.
+        Axis of a gradient, 0 to 2.
     amount : float
-        Kelvin, or K/m.
-    others : Mapping[str, Temperature]
-        Temperatures that other bodies have meanwhile.
+        Change of temperature, K, or gradient, K/m.
+    others : dict
+        Temperatures of other bodies at the same time.
 
     Raises
     ------
     TemperatureError
-        Expansion or index is not known there.
+        Expansion or index is not known at that temperature.
     """
     heat = Temperature(amount) if kind == "temperature" else Temperature(0.0, triple(amount * np.eye(3)[axis]))
     fields = {**others, body: heat}
@@ -256,7 +259,7 @@ def _per_unit(body: Body, motion: Motion, amount: float) -> BodyMove:
 
 
 def _rigid(pose: Pose, kind: str, way: np.ndarray, point: np.ndarray) -> BodyMove:
-    """A motion along or about a direction of the world (3,), about a point (3,), in a body's own frame."""
+    """Return a motion along or about a world direction (3,), about a world point (3,), in a body's own frame."""
     own = pose.rotation.T @ way
     if kind == "shift":
         return BodyMove(shift=own)
@@ -264,16 +267,16 @@ def _rigid(pose: Pose, kind: str, way: np.ndarray, point: np.ndarray) -> BodyMov
 
 
 def spectrum_shares(terms: Sequence[int], power: float) -> np.ndarray:
-    """Standard deviation of each term of a figure error whose rms is 1, (T,).
+    """Return the standard deviation of each term of a figure error whose rms is 1, (T,).
 
-    The variance of a term falls with the power of its radial order n, as (n + 1)^-power.
+    The variance of a term with radial order n is proportional to (n + 1)^-power.
 
     Parameters
     ----------
-    terms : Sequence[int]
-        Noll's numbers.
+    terms : sequence of int
+        Noll indices.
     power : float
-        Of the radial order.
+        Exponent of the spectrum.
     """
     order = np.array([noll_to_nm(j)[0] for j in terms])
     variance = (order + 1.0) ** -power
@@ -283,17 +286,17 @@ def spectrum_shares(terms: Sequence[int], power: float) -> np.ndarray:
 def spectrum_over(element: Element, terms: Sequence[int], power: float) -> np.ndarray:
     """Return the standard deviation of each term of a figure error whose rms over a clear aperture is 1, (T,).
 
-    The mean square is that of many surfaces, about each surface's mean over its clear aperture. Terms have unit rms
-    over the smallest circle round that aperture, and another one over a rectangle or a ring in it.
+    The mean square is that of an ensemble of surfaces, about each surface's mean over its clear aperture. Terms have
+    unit rms over the smallest circle round that aperture, and another rms over a rectangle or a ring in it.
 
     Parameters
     ----------
     element : Element
         The surface.
-    terms : Sequence[int]
-        Noll's numbers.
+    terms : sequence of int
+        Noll indices.
     power : float
-        As of ``spectrum_shares``.
+        Exponent of the spectrum, see ``spectrum_shares``.
     """
     shares, disk, outer = spectrum_shares(terms, power), element.figure_disk, element.outer_edge
     assert outer is not None
@@ -308,23 +311,23 @@ def spectrum_over(element: Element, terms: Sequence[int], power: float) -> np.nd
 
 
 _CELLS = 200
-"""Cells along each side of the box round a clear aperture, over which the rms of terms is taken: right to 1e-3."""
+"""Number of cells along each side of the box round a clear aperture for the rms of terms; accurate to 1e-3."""
 
 
 def states_of(numbers: Sequence[VariedNumber], amounts: np.ndarray) -> list[State]:
-    """The states that numbers add up to.
+    """Return the states that amounts of varied parameters add up to.
 
     Parameters
     ----------
-    numbers : Sequence[VariedNumber]
-        K of them.
-    amounts : np.ndarray
-        SI, (S, K).
+    numbers : sequence of VariedNumber
+        K parameters.
+    amounts : (S, K) ndarray
+        Amounts, SI.
 
     Returns
     -------
-    list[State]
-        S states; bodies that nothing moves in any of them are left out.
+    list of State
+        S states; bodies that no parameter moves are omitted.
     """
     count = len(amounts)
     bodies = tuple(dict.fromkeys(path for number in numbers for path in number.moves))
@@ -360,7 +363,7 @@ def states_of(numbers: Sequence[VariedNumber], amounts: np.ndarray) -> list[Stat
 def _motions(
     count: int, rotate: np.ndarray, shift: np.ndarray, figure: dict[int, np.ndarray], shape: dict[str, np.ndarray]
 ) -> list[Motion]:
-    """Motions of one body in S states."""
+    """Return the motions of one body in S states."""
     turns, shifts = rotate.tolist(), shift.tolist()
     figures = {j: values.tolist() for j, values in figure.items()}
     shapes = {name: values.tolist() for name, values in shape.items()}

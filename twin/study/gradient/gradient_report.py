@@ -1,4 +1,4 @@
-"""``python -m twin.study --gradient``: the Jacobian of a study as data, figures, tables and a report."""
+"""Command ``python -m twin.study --gradient``: the Jacobian of a study as data, figures, tables and a report."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ DOUBTFUL_TEXT = (
     "Differences that are not good to 1% of the response's largest change (their step crosses a bend, or the job "
     "is noisy)"
 )
+"""Beginning of the warning about inaccurate finite differences."""
 
 
 def _write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warnings: Sequence[str] = ()) -> None:
@@ -41,11 +42,11 @@ def _write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warning
     setup : StudySetup
         The study.
     found : Gradient
-        Its Jacobian.
+        Jacobian of the study.
     folder : RunFolder
-        where.
-    warnings : Sequence[str]
-        What the user should know.
+        Folder of the study.
+    warnings : sequence of str
+        Warnings for the user.
     """
     with svg.look("gradient"):
         figures = (
@@ -100,7 +101,7 @@ def _agreement(found: Gradient) -> str:
 
 
 def verdict(found: Gradient) -> tuple[str, tuple[str, ...]]:
-    """Which factors move most, and how certain that is: two sentences at most, and what follows."""
+    """Return the verdict on which factors dominate and how accurate that is, and the sentences that follow it."""
     moved = [i for i in range(len(found.responses)) if np.any(found.change[i])]
     strongest = Counter(found.factors[int(np.argmax(np.abs(found.change[i])))].name for i in moved)
     total = len(found.responses)
@@ -118,7 +119,7 @@ def verdict(found: Gradient) -> tuple[str, tuple[str, ...]]:
 
 
 def _response_table(found: Gradient) -> Table:
-    """Per response: the factor that moves it most, its derivative, and how well AD and differences agree."""
+    """Return the dominant factor of each response, its derivative, and the agreement of AD with finite differences."""
     rows: list[list[Cell]] = []
     change, relative = found.change, found.relative
     for i, response in enumerate(found.responses):
@@ -162,7 +163,7 @@ def _response_table(found: Gradient) -> Table:
 
 
 def _factor_rows(found: Gradient) -> Table:
-    """What was differentiated by."""
+    """Return the table of the factors."""
     rows: list[list[Cell]] = []
     for k, factor in enumerate(found.factors):
         keys = [*factor.spec.places, *(scale.key for scale in factor.spec.scales)]
@@ -179,21 +180,22 @@ def _factor_rows(found: Gradient) -> Table:
 
 
 MOST_BARS = 8
+"""Largest number of bars in a panel."""
 LINEAR = 1e-3
-"""Share of a response's largest change below which the colours are linear."""
+"""Share of a response's largest change below which the colour scale is linear."""
 NEGLIGIBLE = 1e-3
 """Share of a response's largest change below which no bar is drawn."""
 
 
 def _normalised(found: Gradient) -> np.ndarray:
-    """(R, F) changes per spread as shares of each response's largest; zeros for responses that nothing moves."""
+    """Return the changes per spread (R, F) relative to each response's largest; zero where no factor moves it."""
     change = found.change
     largest = np.max(np.abs(change), axis=1, initial=0.0, keepdims=True)
     return np.asarray(np.where(largest > 0.0, change / np.where(largest > 0.0, largest, 1.0), 0.0))
 
 
 def _heat_map(found: Gradient) -> Figure:
-    """Responses along x, factors down, coloured by the _normalised change."""
+    """Plot the normalised changes as colours, responses along x, factors down."""
     shares = _normalised(found).T
     rows, columns = shares.shape
     figure = svg.new_figure(2.1 + 0.21 * max(rows, 4))
@@ -217,7 +219,7 @@ def _heat_map(found: Gradient) -> Figure:
 
 
 def _tornado(found: Gradient) -> Figure:
-    """Per response the largest changes per spread."""
+    """Plot for each response the largest changes per spread."""
     moved = [i for i in range(len(found.responses)) if np.any(found.change[i])]
     largest = [_largest(found.change[i]) for i in moved]
     figure, grid = svg.panels([0.85 + 0.2 * len(one) for one in largest] or [1.5], 2)
@@ -246,18 +248,20 @@ def _bars(axes: Axes, found: Gradient, i: int, order: np.ndarray) -> None:
 
 
 DOUBTFUL = 0.01
-"""Differences that Richardson's extrapolation moved by more than this share of a response's largest change are told."""
+"""Change by Richardson's extrapolation, as a share of a response's largest change, beyond which differences are
+reported as inaccurate.
+"""
 
 
 def _unit_text(response: str, factor: str) -> str:
-    """Unit of a derivative."""
+    """Return the unit of a derivative."""
     if not factor:
         return response or "1"
     return f"{response or '1'}/{factor}" if "/" not in factor else f"{response or '1'}/({factor})"
 
 
 def _entries(of: Callable[[Gradient], np.ndarray]) -> Callable[[Gradient], list[list[float | None]]]:
-    """What gives a table of the Jacobian as plain numbers, None where there is none."""
+    """Return a function that gives a table of the Jacobian as lists, None for NaN."""
 
     def rows(found: Gradient) -> list[list[float | None]]:
         return [[None if np.isnan(value) else float(value) + 0.0 for value in row] for row in of(found)]
@@ -289,7 +293,7 @@ GRADIENT: Record[Gradient] = Record(
 
 
 def _whole_table(found: Gradient) -> Table:
-    """Every entry of the Jacobian, a row each."""
+    """Return every entry of the Jacobian, one row each."""
     told = GRADIENT(found)
     keys = ("units", "method", "ad", "differences", "relative", "difference_error", "step", "change")
     rows = [
@@ -302,7 +306,10 @@ def _whole_table(found: Gradient) -> Table:
 
 
 def _doubtful(found: Gradient) -> list[str]:
-    """Responses some of whose differences are not to be trusted to 1%: noise, or a step over a kink or a bend."""
+    """Return the responses whose finite differences are not accurate to 1 %.
+
+    Causes are noise, or a kink or bend within the step.
+    """
     spread = np.array([factor.spread for factor in found.factors])
     largest = np.max(np.abs(found.change), axis=1, initial=0.0, keepdims=True)
     bad = (found.method != AD) & (found.error * spread > DOUBTFUL * largest)
@@ -313,19 +320,19 @@ def _doubtful(found: Gradient) -> list[str]:
 
 
 def run_gradient(file: Path, options: cli.Options) -> None:
-    """Read a study, differentiate it at its base, write gradient.json, gradient.csv and a report, print what they say.
+    """Read a study, differentiate it at its base, write gradient.json, gradient.csv and a report, and print the result.
 
     Parameters
     ----------
     file : Path
-        Of the study, or a config.yaml.
+        Study, or a config.yaml.
     options : cli.Options
-        What the user chose.
+        Options of the command.
 
     Raises
     ------
     typer.Exit
-        With the exit code of a failure, which has been told.
+        The command failed; the error has been printed, and the exit code is set.
     """
     command.run_command(f"{file.stem}-gradient", options, lambda: read_for(PROGRAM, file, resolve_study), _work)
 

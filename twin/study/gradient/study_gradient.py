@@ -1,15 +1,13 @@
-"""The Jacobian of a study's responses by its factors at the base's values.
+"""Jacobian of a study's responses with respect to its factors, at the base's values.
 
-Spots and lines of sight are differentiated by automatic differentiation through the trace
-(``twin.monitor.monitor_derivative`` backward, ``twin.study.gradient.study_gradient`` forward); the estimators,
-formulas on these numbers, along the directions that come out of it. All else has differences only: traced ones, of
-everything that needs no image and so has no noise, or those of the whole job with the noise of the base's seed.
+Spots and lines of sight are differentiated by automatic differentiation through the trace (spots backward in
+``twin.monitor.monitor_derivative``, lines of sight forward in this file). The estimators, formulas on these numbers,
+are differentiated along the resulting directions. All other responses have finite differences only: of traces for
+everything that needs no image and so has no noise, else of the whole job with the noise of the base's seed.
 
-From elementary motions to spots, lines of sight and the numbers of a run, with derivatives.
-
-A chief ray starts at a point of the line CCD and is turned so that it goes through the middle of the stop. By the
-implicit function theorem the turn per motion is -(d hit / d turn)^-1 (d hit / d motion); with it the ray is pushed
-forward to the object space.
+A chief ray starts at a point of the line CCD and is aimed through the centre of the stop. By the implicit function
+theorem the change of its direction per motion is -(d hit / d direction)^-1 (d hit / d motion); with it the ray's
+derivative is propagated forward to object space.
 """
 
 from __future__ import annotations
@@ -49,24 +47,27 @@ from twin.study.runs.render_base import PERTURB, JobMaker, run_results
 from twin.study.runs.setup import StudySetup
 
 CAP = {"shift": 1e-3, "rotate": 3e-4, "scale": 1e-3, "figure": 1e-6}
-"""Largest steps of differences, SI: they move the beam on the mirrors by a few millimetres at most."""
+"""Largest steps of the finite differences, SI: they move the beam on the mirrors by a few millimetres at most."""
 ROUNDING = 1e-9
-"""Motions smaller than this share of a motion's size come from rounding in a composition of motions."""
+"""Share of a motion's size below which a motion is rounding error of a composition of motions."""
 
 Slopes = Mapping[ElementaryMotion, float]
+"""Derivative of each elementary motion with respect to a factor."""
 
 
 def motion_slopes(about: State, state: Callable[[float], State], step: float) -> Slopes | None:
-    """Derivative of a state's motions by a factor; None if the factor changes more than motions, figures and scales.
+    """Return the derivative of a state's motions with respect to a factor.
+
+    None if the factor changes more than rigid motions, figures and scales.
 
     Parameters
     ----------
     about : State
-        The state of the base.
-    state : Callable[[float], State]
-        Change of the factor -> the state.
+        State of the base.
+    state : callable
+        Function from a change of the factor to the state.
     step : float
-        a change of the factor. Motions are linear in it, or nearly so where temperatures add to them.
+        Step of the factor. Motions are linear in it, or nearly so where temperatures contribute.
     """
     at = [state(share * step) for share in SHARES]
     slopes: dict[ElementaryMotion, float] = {}
@@ -87,50 +88,66 @@ def motion_slopes(about: State, state: Callable[[float], State], step: float) ->
 
 
 def _rest(motion: Motion) -> Motion:
-    """What is no elementary motion: the pivot, and what temperatures do."""
+    """Return the part of a motion that is not elementary: its pivot and its thermal deformation."""
     nothing = (0.0, 0.0, 0.0)
     return replace(motion, rotate=nothing, shift=nothing, scale=0.0, figure=FrozenMap({}))
 
 
 SPOT_REACH, SIGHT_REACH = 1.0, 1e-4
-"""Steps of the derivative of the formulas, px and 1: so small that what is left of them after Richardson's
-extrapolation, to the fifth power, is below rounding, and so large that rounding is below 1e-11."""
+"""Steps of the derivative of the formulas, px and rad.
+
+They are so small that the error after Richardson's extrapolation is below rounding, and so large that rounding is
+below 1e-11."""
 SIGHT_SHARE = 5e-3
-"""Largest step of directions as a share of half the field along a line, over which a principal distance is taken: its
-fourth power is left of the derivative of that."""
+"""Largest step of directions as a share of half the field along a line.
+
+The derivative of a principal distance, which is a fit over that field, has a relative error of its fourth power.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """One instrument and the formulas that its job applies to what is traced.
+    """Instrument of a job with the formulas that the job applies to traced spots and directions.
 
-    Spots are means of rays, which are the energy centroids of the images. An instrument without a monitor has none, and
-    lines of sight alone.
+    Spots are means of rays, which are the energy centroids of the images. An instrument without a monitor has lines of
+    sight alone.
 
     Attributes
     ----------
     resolved : ResolvedJob
         The job.
     experiment : MonitorExperiment
-        Its instrument.
+        Instrument of the job.
     """
 
     resolved: ResolvedJob
     experiment: MonitorExperiment
 
     def spots(self, states: Sequence[State]) -> np.ndarray:
-        """Positions (S, C, 2), row and column, px from the first pixel's centre. Raises AimError, BeamMissedError."""
+        """Return the spot positions (S, C, 2), row and column, px from the first pixel's centre.
+
+        Raises
+        ------
+        AimError, BeamMissedError
+            The light of a state is lost.
+        """
         if not self.experiment.monitored:
             return np.zeros((len(states), 0, 2))
         return self.experiment.path.coarse.mean_spots(states)
 
     def sight(self, states: Sequence[State]) -> np.ndarray:
-        """Directions of the line CCDs' points, (S, cameras, points, 3). Raises AimError, BeamMissedError."""
+        """Return the directions of the line CCDs' points, (S, cameras, points, 3).
+
+        Raises
+        ------
+        AimError, BeamMissedError
+            The light of a state is lost.
+        """
         return np.swapaxes(self.experiment.sight.trace(states), 0, 1)
 
     @cached_property
     def reach(self) -> float:
-        """Step of directions of lines of sight for the formulas, radians; a narrow field takes a small one."""
+        """Step of directions of lines of sight for the formulas, radians; smaller for a narrow field."""
         ends = self.experiment.sight.nominal[:, 0, [0, -1]]
         half = 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)
         return float(min(SIGHT_REACH, SIGHT_SHARE * np.min(half)))
@@ -141,8 +158,9 @@ class Chain:
         return self.spots([{}])
 
     def outcome(self, state: State, spots: np.ndarray, sight: np.ndarray) -> dict[str, Any]:
-        """``truth`` and ``recovered`` of one state with spots (C, 2) and directions (cameras, points, 3); ``truth``
-        alone where there is no monitor.
+        """Return ``truth`` and ``recovered`` of one state with spots (C, 2) and directions (cameras, points, 3).
+
+        Without a monitor there is ``truth`` alone.
         """
         truth = self.experiment.sight.told_by(sight[:, None])
         if not self.experiment.monitored:
@@ -158,8 +176,10 @@ class Chain:
     def moved(
         self, state: State, at: tuple[np.ndarray, np.ndarray], spots: np.ndarray, sight: np.ndarray
     ) -> tuple[list[dict[str, Any]], float]:
-        """Four outcomes about a state along derivatives of its spots (C, 2) and directions (cameras, points, 3), for
-        ``extrapolated``, and the step; ``at``: the state's own spots and directions.
+        """Return four outcomes about a state along derivatives of its spots and directions, and the step.
+
+        ``at`` holds the spots and directions of the state; the derivatives have the shapes (C, 2) and (cameras, points,
+        3).
         """
         largest = max(np.abs(spots).max(initial=0.0) / SPOT_REACH, np.abs(sight).max() / self.reach)
         step = 1.0 / float(largest) if largest > 0.0 else 1.0
@@ -170,18 +190,18 @@ class Chain:
 
 
 SHARES = (1.0, -1.0, 0.5, -0.5)
-"""Shares of a step at which values for ``extrapolated`` are taken."""
+"""Multiples of a step at which values for ``extrapolated`` are taken."""
 
 
 def extrapolated(values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Central differences with a step and its half, extrapolated after Richardson, and how far that went.
+    """Return central differences extrapolated by Richardson's method, and the size of the correction.
 
     Parameters
     ----------
-    values : np.ndarray
-        (4, ...) at the base plus ``SHARES`` times the step.
+    values : (4, ...) ndarray
+        Values at the base plus ``SHARES`` times the step.
     step : float
-        Of the whole step.
+        Full step.
     """
     wide, narrow = (values[0] - values[1]) / (2.0 * step), (values[2] - values[3]) / step
     return narrow + (narrow - wide) / 3.0, np.abs(narrow - wide) / 3.0
@@ -190,23 +210,23 @@ def extrapolated(values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarra
 def sight_gradient(
     instrument: Instrument, backend: Backend, motions: Sequence[ElementaryMotion], about: State
 ) -> np.ndarray:
-    """Derivative of the directions of ``twin.monitor.truth.LineSight.trace``.
+    """Return the derivative of the directions of ``twin.monitor.truth.LineSight.trace``.
 
     Parameters
     ----------
     instrument : Instrument
         The instrument.
     backend : Backend
-        Where to trace.
-    motions : Sequence[ElementaryMotion]
+        Array backend of the ray trace.
+    motions : sequence of ElementaryMotion
         M elementary motions, with the pivots that the bodies have in ``about``.
     about : State
-        The state at which to differentiate.
+        State at which to differentiate.
 
     Returns
     -------
-    np.ndarray
-        (cameras, M, LINE_POINTS, 3), world, per radian, metre or unit.
+    (cameras, M, LINE_POINTS, 3) ndarray
+        Derivatives in the world frame, per radian, metre or unit.
 
     Raises
     ------
@@ -244,7 +264,7 @@ def sight_gradient(
 
 
 def _named(motion: ElementaryMotion, about: State) -> State:
-    """The state ``about`` in which the motion's body names its pivot and, with zero amplitude, its figure term."""
+    """Return the state ``about`` in which the motion's body has its pivot and, with zero amplitude, its figure term."""
     start = about.get(motion.body, Motion(pivot=motion.pivot))
     figure = {motion.axis: 0.0, **start.figure} if motion.kind == FIGURE else start.figure
     return {**about, motion.body: replace(start, figure=figure)}
@@ -252,22 +272,22 @@ def _named(motion: ElementaryMotion, about: State) -> State:
 
 @dataclass(frozen=True, eq=False)
 class GradientFactor:
-    """One factor.
+    """Factor with respect to which responses are differentiated.
 
     Attributes
     ----------
     setup : StudySetup
         The study.
     name : str
-        Of the factor.
+        Name of the factor.
     unit : str
-        Of its numbers, empty for pure ones.
+        Unit of its numbers, empty for pure ones.
     value : float
-        In the base.
+        Value in the base.
     spread : float
         Sigma of a normal distribution, else half of the range of its values; in its unit.
     spread_of : str
-        Which of the two, in words.
+        Description of the spread.
     """
 
     setup: StudySetup
@@ -279,12 +299,12 @@ class GradientFactor:
 
     @classmethod
     def of(cls, setup: StudySetup, name: str) -> GradientFactor:
-        """The factor of that name.
+        """Return the factor of that name.
 
         Raises
         ------
         InputError
-            It has no numbers, or the base has none where it acts.
+            It has no numbers, or the base has none at its key.
         """
         factor = setup.study.factors[name]
         numbers = factor.numbers()
@@ -306,16 +326,16 @@ class GradientFactor:
 
     @property
     def spec(self) -> FactorSpec:
-        """What the study's file says of the factor."""
+        """Specification of the factor in the study's file."""
         return self.setup.study.factors[self.name]
 
     def values(self, value: float) -> tuple[tuple[KeyPath, Any], ...]:
-        """(place, what stands there) of all that the factor changes when it has this value; others are as in the base.
+        """Return place and value of everything that the factor changes when it has this value.
 
         Raises
         ------
         InputError
-            a value that follows the factor cannot be worked out.
+            A value that scales with the factor cannot be computed.
         """
         cell = with_unit(value, self.unit) if self.unit else value
         out: dict[KeyPath, Any] = dict.fromkeys(self.spec.places, cell)
@@ -330,7 +350,7 @@ class GradientFactor:
 
 
 def _in_base(setup: StudySetup, name: str, factor: FactorSpec, unit: str) -> float:
-    """The factor's value in the base, in its own unit; 1 for one that only scales."""
+    """Return the factor's value in the base, in its own unit; 1 for a factor that only scales."""
     numbers: list[float] = []
     for k, place in enumerate(factor.places):
         try:
@@ -345,49 +365,54 @@ def _in_base(setup: StudySetup, name: str, factor: FactorSpec, unit: str) -> flo
 
 
 MOVE = 2.0
-"""By how many pixels the step of a motion moves a spot; the CCDs have room for some ten."""
+"""Displacement of a spot by the step of a motion, pixels; the CCDs have room for about ten."""
 TURN = 1e-4
-"""By how many radians it turns a line of sight, where there are no spots: some ten pixels, too."""
+"""Rotation of a line of sight by the step of a motion, radians, where there are no spots; about ten pixels."""
 PART = 0.5
-"""Step of other factors, in their spreads."""
+"""Step of other factors, in units of their spreads."""
 QUALITY_PART = 0.1
-"""Step for image quality, in spreads of the factor: it is far from linear (a wavefront error is a root of squares), and
-traced without noise."""
+"""Step for image quality, in units of the factor's spread.
+
+It is small because image quality is far from linear (a wavefront error is a root of squares); it is traced without
+noise.
+"""
 TOGETHER = 8
-"""Motions of which differences are traced at once."""
+"""Number of factors whose differences are traced at once."""
 SMALL = 1e-3
-"""Entries below this share of a response's largest one, both per spread of their factor, are judged against that
-share: what is zero by symmetry has no digits. An entry of a response that is a difference counts as much as the larger
-of its two terms, for the digits that they have in common are lost."""
+"""Share of a response's largest entry, both per spread, to which the error of smaller entries is related.
+
+Entries that are zero by symmetry have no significant digits. An entry of a response that is a difference counts as much
+as the larger of its two terms, since their common digits cancel.
+"""
 AD, TRACED, WHOLE = "ad", "traced differences", "differences of the whole job"
 AD_PART = "automatic differentiation"
-"""Name of the work in the progress display; that of the others is their method."""
+"""Name of this part of the work in the progress display; the other parts are named after their method."""
 
 
 @dataclass(frozen=True, eq=False)
 class Gradient:
-    """Jacobian of R responses by F factors, per unit of the factor.
+    """Jacobian of R responses with respect to F factors, per unit of the factor.
 
     Attributes
     ----------
-    factors : tuple[GradientFactor, ...]
-        What was differentiated by.
-    responses : tuple[str, ...]
-        names.
-    units : tuple[str, ...]
-        Of the responses, empty for pure numbers.
-    ad : np.ndarray
-        (R, F) by automatic differentiation; NaN where there is none.
-    differences : np.ndarray
-        (R, F) by central differences.
-    error : np.ndarray
-        (R, F) how far Richardson's extrapolation took the differences.
-    scale : np.ndarray
-        (R, F) size of the terms that an entry is the difference of; the entry's own where there is one term.
-    step : np.ndarray
-        (R, F) of the differences, in the factor's unit.
-    method : np.ndarray
-        (R, F) names: how the best value was found.
+    factors : tuple of GradientFactor
+        Factors.
+    responses : tuple of str
+        Names of the responses.
+    units : tuple of str
+        Units of the responses, empty for pure numbers.
+    ad : (R, F) ndarray
+        Derivatives by automatic differentiation; NaN where there is none.
+    differences : (R, F) ndarray
+        Derivatives by central differences.
+    error : (R, F) ndarray
+        Correction of the differences by Richardson's extrapolation.
+    scale : (R, F) ndarray
+        Size of the terms of which an entry is the difference; the entry's own size where there is one term.
+    step : (R, F) ndarray
+        Steps of the differences, in the factor's unit.
+    method : (R, F) ndarray of str
+        Method of the best value.
     """
 
     factors: tuple[GradientFactor, ...]
@@ -402,31 +427,31 @@ class Gradient:
 
     @classmethod
     def unknown(cls, factors: tuple[GradientFactor, ...], asked: Sequence[_Asked]) -> Gradient:
-        """A Jacobian whose entries are still to be filled in."""
+        """Return a Jacobian whose entries are not filled in yet."""
         shape = (len(asked), len(factors))
         names, units = tuple(one.name for one in asked), tuple(one.spec.units for one in asked)
         ad, differences, error, scale, step = (np.full(shape, np.nan) for _ in range(5))
         return cls(factors, names, units, ad, differences, error, scale, step, np.full(shape, WHOLE, object))
 
     def put(self, rows: Sequence[int], k: int, values: np.ndarray, step: float, method: str) -> None:
-        """Fill in the differences of factor k in some rows from their values (4, rows)."""
+        """Fill in the differences with respect to factor k in selected rows from their values (4, rows)."""
         self.differences[rows, k], self.error[rows, k] = extrapolated(values, step)
         self.step[rows, k] = step
         self.method[rows, k] = method
 
     @property
     def best(self) -> np.ndarray:
-        """(R, F): by automatic differentiation where it is known, else by differences."""
+        """Derivatives (R, F): by automatic differentiation where available, else by differences."""
         return np.where(np.isnan(self.ad), self.differences, self.ad)
 
     @property
     def change(self) -> np.ndarray:
-        """(R, F) change of a response when the factor changes by its spread."""
+        """Change of each response when the factor changes by its spread, (R, F)."""
         return np.asarray(self.best * np.array([factor.spread for factor in self.factors]))
 
     @property
     def relative(self) -> np.ndarray:
-        """(R, F) deviation of the differences from AD, NaN where there is no AD; see ``SMALL`` for small entries."""
+        """Relative deviation of the differences from AD, (R, F), NaN without AD; see ``SMALL`` for small entries."""
         spread = np.array([factor.spread for factor in self.factors])
         size = self.scale * spread
         largest = np.max(np.nan_to_num(size), axis=1, initial=0.0, keepdims=True)
@@ -436,18 +461,18 @@ class Gradient:
 
     @property
     def worst(self) -> float | None:
-        """The largest of ``relative``, None without AD."""
+        """Largest of ``relative``, None without AD."""
         return float(np.nanmax(self.relative)) if np.any(~np.isnan(self.ad)) else None
 
 
 @dataclass(frozen=True)
 class _Asked:
-    """A response: where its number stands, and what is subtracted.
+    """Response with the keys of its number and of the number that is subtracted.
 
     Attributes
     ----------
     name : str
-        Of the response.
+        Name of the response.
     spec : ResponseSpec
         Its keys.
     """
@@ -456,12 +481,12 @@ class _Asked:
     spec: ResponseSpec
 
     def value(self, outcome: Any, setup: StudySetup) -> float:
-        """The number. Raises InputError."""
+        """Return the response; raise InputError if the results have no such number."""
         first, second = self.terms(outcome, setup)
         return first - second
 
     def terms(self, outcome: Any, setup: StudySetup) -> tuple[float, float]:
-        """The number and what is subtracted from it, 0 if nothing is. Raises InputError."""
+        """Return the number and the subtracted one, 0 if there is none; raise InputError if the results lack them."""
         out = []
         for key, where in ((self.spec.key, "key"), (self.spec.minus, "minus")):
             if key is None:
@@ -479,8 +504,9 @@ class _Asked:
 
     @property
     def roots(self) -> set[str]:
-        """Files of the results that it needs; what depends on the noise needs images: sigmas, and whether shifts agree
-        with the stated disturbances.
+        """Result files that the response needs.
+
+        Sigmas, and the test of the shifts against the prior, depend on the noise and so need images.
         """
         keys: list[KeyPath] = [key for key in (self.spec.key, self.spec.minus) if key is not None]
         noisy = [key[:2] == ("recovered", "disturbances") or "sigma" in str(key[-1]) for key in keys]
@@ -493,16 +519,16 @@ def study_gradient(setup: StudySetup, backend: Backend, advance: Advance = silen
     Parameters
     ----------
     setup : StudySetup
-        The study; its design plays no part.
+        The study; its design is not used.
     backend : Backend
-        Where to trace.
+        Array backend of the ray trace.
     advance : Advance
-        Told of each kind of derivative by how many of how many factors it is done.
+        Callback that receives, for each method, the numbers of finished and of all factors.
 
     Raises
     ------
     InputError
-        a factor or response has no number, the base's schema refuses a value beside the base's, or a factor's step
+        A factor or response has no number, the base's schema refuses a value beside the base's, or a factor's step
         loses the light.
     InputErrorText
         The base itself cannot be run.
@@ -537,7 +563,7 @@ def _spot_responses(resolved: ResolvedJob) -> list[_Asked]:
 
 @dataclass(eq=False)
 class _Traced:
-    """The part of the Jacobian that needs no image; ``slopes``: of the motions by the factors that are nothing else."""
+    """Part of the Jacobian that needs no image; ``slopes`` are those of the factors that only move bodies."""
 
     setup: StudySetup
     maker: JobMaker
@@ -553,7 +579,7 @@ class _Traced:
         self.quality = [i for i in self.rows if i not in self.exact]
 
     def fill(self, table: Gradient) -> None:
-        """AD and differences of all factors."""
+        """Fill in AD and differences with respect to all factors."""
         chain = Chain(self.maker.base, MonitorExperiment(self.maker.base, self.backend))
         try:
             about = _state(chain, self.maker.base)
@@ -576,7 +602,7 @@ class _Traced:
             table.method[self.exact, k] = AD
 
     def _differences(self, chain: Chain, table: Gradient, rows: Sequence[int], steps: Mapping[int, float]) -> None:
-        """Differences of some rows by all factors."""
+        """Fill in the differences of selected rows with respect to all factors."""
         if not rows:
             return
         moving = list(self.slopes)
@@ -615,7 +641,7 @@ class _Traced:
             raise _refused(self.setup, factor, change, error) from None
 
     def _exact(self, chain: Chain, about: State, table: Gradient) -> dict[int, float]:
-        """Fill in what AD finds; the steps of the differences by these factors."""
+        """Fill in the derivatives by AD, and return the steps for the differences with respect to these factors."""
         self.advance(AD_PART, 0, 1)
         motions = list(dict.fromkeys(motion for slopes in self.slopes.values() for motion in slopes))
         spots: np.ndarray = np.zeros((*chain.nominal.shape[1:], 0))
@@ -645,7 +671,7 @@ class _Traced:
         return sizes
 
     def _values(self, chain: Chain, factor: GradientFactor, step: float, rows: Sequence[int]) -> np.ndarray:
-        """Responses of the four jobs beside the base, (4, rows)."""
+        """Return the responses of the four jobs beside the base, (4, rows)."""
         jobs = [self._job(factor, share * step) for share in SHARES]
         same = all(place[:2] == PERTURB for place, _ in factor.values(factor.value))
         try:
@@ -674,7 +700,7 @@ class _Traced:
 
 
 def _state(chain: Chain, resolved: ResolvedJob) -> State:
-    """What a job makes of an instrument; it may call bodies by their short names. Raises InputError."""
+    """Return the state of an instrument under a job, which may use short names of bodies; raise InputError."""
     return chain.experiment.state(checked_nodes(resolved.job, chain.experiment.instrument.nodes))
 
 
@@ -687,7 +713,7 @@ def _whole(
     table: Gradient,
     advance: Advance,
 ) -> None:
-    """Differences of the base command's own results; all runs have the noise of the base's seed."""
+    """Fill in differences of the base command's results; all runs have the noise of the base's seed."""
     for k, factor in enumerate(factors):
         advance(WHOLE, k, len(factors))
         step = PART * factor.spread

@@ -1,4 +1,4 @@
-"""What a study found, in sentences; its numbers as text; and what a reader must know before using them."""
+"""Conclusions of a study as sentences, formatting of its numbers, and its warnings."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from twin.study.report.study_analysis import GOALS, Convergence, Requirement, St
 from twin.study.report.study_statistics import LEAST, Description, Estimate, Interval, Response, impossible, typeset
 
 BAD_MODEL = 0.8
+"""Cross-validated R² below which a polynomial chaos model is called poor."""
 
 
 def design_title(kind: str) -> str:
-    """A kind of design, for readers."""
+    """Return the name of a kind of design for readers."""
     return "complete grid" if kind == GRID else SAMPLERS[kind].title
 
 
 def warnings(found: StudyAnalysis) -> list[str]:
-    """Shown in front of everything else."""
+    """Return the warnings, which precede everything else in the report."""
     runs = found.runs
     failed = int(runs.failed.sum())
     out = []
@@ -63,7 +64,7 @@ def warnings(found: StudyAnalysis) -> list[str]:
 
 
 def _reason(doubt: str) -> str:
-    """A doubt in its first words, without numbers and names of spots."""
+    """Return the beginning of a doubt without numbers and names of spots, so that equal reasons can be counted."""
     head, _, rest = doubt.partition("; ")
     if "fit of the spots" in head:
         return f"the fit of spots is not good: {rest.partition(':')[0].partition('. ')[0]}"
@@ -71,7 +72,7 @@ def _reason(doubt: str) -> str:
 
 
 def indices_texts(found: StudyAnalysis) -> list[str]:
-    """How the indices were found, and how good that is."""
+    """Return sentences on how the sensitivity indices were computed, and how accurate they are."""
     if found.runs.sampled:
         out = [
             f"From the given runs ({design_title(found.runs.kind)}) by polynomial chaos, with intervals from "
@@ -106,7 +107,7 @@ def _model_text(name: str, part: Indices) -> str:
 
 
 def convergence_texts(found: StudyAnalysis, names: list[str]) -> list[str]:
-    """Whether there are enough runs."""
+    """Return sentences on whether there are enough runs."""
     goals = (
         f"A statistic counts as known when half its 95% interval is below {GOALS['mean']:g}σ (mean, standard "
         f"deviation) or {GOALS['p95']:g}σ (quantiles)."
@@ -137,19 +138,19 @@ def _needed(convergence: Convergence) -> str:
 
 
 def _round_up(count: int) -> int:
-    """Two digits."""
+    """Return a count rounded up to two digits."""
     step = 10 ** max(len(str(count)) - 2, 0)
     return -(-count // step) * step
 
 
 WORTH = 0.02
-"""Smaller shares of the variance are not named."""
+"""Share of the variance below which a factor is not named."""
 LINEAR = 0.5
-"""Below this share of the variance a linear model says little about a response."""
+"""Share of the variance below which a linear model describes a response poorly."""
 
 
 def conclusions(found: StudyAnalysis) -> list[str]:
-    """The sentences at the top of the report, the requirements first."""
+    """Return the sentences at the top of the report, the requirements first."""
     out = [_requirement_text(found)] if found.requirements else []
     out += [_knee(found, k) for k in range(len(found.fronts))]
     out += [_contributors(found, response) for response in found.runs.responses]
@@ -160,8 +161,10 @@ def conclusions(found: StudyAnalysis) -> list[str]:
 
 
 def verdict(found: StudyAnalysis) -> tuple[str, tuple[str, ...]]:
-    """A study in two sentences, and what follows: how its requirements are met, or else what moves its first response,
-    and whether its runs are enough for that.
+    """Return a study's verdict of two sentences, and the sentences that follow it.
+
+    The verdict says how the requirements are met, or else which factors move the first response, and whether the runs
+    suffice.
     """
     runs = found.runs
     failed = int(runs.failed.sum())
@@ -201,7 +204,7 @@ def _requirement_text(found: StudyAnalysis) -> str:
 
 
 def _whatever(r: Requirement) -> str:
-    """The share that failed runs leave open, for the end of a sentence."""
+    """Return the range of shares that failed runs leave open, for the end of a sentence."""
     if r.bounds is None:
         return ""
     interval = f" (95% interval {span(r.bounds_interval)})" if r.bounds_interval is not None else ""
@@ -289,19 +292,19 @@ DASH = "\N{EN DASH}"
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """A number with some digits, a dash for none."""
+    """Return a number as text with some digits, a dash for None."""
     return DASH if value is None else significant(value, digits, floor=0.0)
 
 
 def with_unit(value: float | None, unit: str, digits: int = 3) -> str:
-    """A number with its unit."""
+    """Return a number as text with its unit."""
     sign = typeset(unit)
     space = "" if sign in ("°", "") else " "
     return f"{number(value, digits)}{space}{sign}"
 
 
 def limits(interval: Interval) -> str:
-    """An interval as text; an end that cannot be told is left open."""
+    """Return an interval as text; an end that is None is a question mark."""
     low, high = interval
     if low is None and high is None:
         return ""
@@ -313,7 +316,7 @@ def limits(interval: Interval) -> str:
 
 
 def with_limits(value: Estimate | None) -> str:
-    """A number and its interval, as many decimals as the interval has."""
+    """Return a number and its interval as text, with decimals according to the interval."""
     if value is None:
         return DASH
     low, high = value.interval
@@ -331,7 +334,7 @@ def with_limits(value: Estimate | None) -> str:
 
 
 def share(value: Estimate | None) -> str:
-    """An index between 0 and 1 and its interval, three decimals."""
+    """Return an index between 0 and 1 and its interval as text, with three decimals."""
     if value is None:
         return DASH
     low, high = value.interval
@@ -340,7 +343,7 @@ def share(value: Estimate | None) -> str:
 
 
 def percent(value: float | None, decimals: int = 1) -> str:
-    """A share as percent; not 100 or 0 when it is not quite."""
+    """Return a share as percent; values that only round to 0 or 100 get a sign < or >."""
     if value is None:
         return DASH
     least = 10.0 ** -(decimals + 2)
@@ -352,22 +355,22 @@ def percent(value: float | None, decimals: int = 1) -> str:
 
 
 def span(interval: tuple[float, float] | None) -> str:
-    """An interval of a share, a dash for none."""
+    """Return an interval of a share as text, a dash for None."""
     return DASH if interval is None else f"{percent(interval[0])} … {percent(interval[1])}"
 
 
 def listed(texts: Sequence[str]) -> str:
-    """a, b and c."""
+    """Return texts joined as in "a, b and c"."""
     return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}"
 
 
 def plural(count: int, noun: str) -> str:
-    """1 run, 2 runs."""
+    """Return a count with its noun, such as "1 run" and "2 runs"."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def normality_text(response: Response, about: Description) -> str | None:
-    """What the distribution looks like; None where it was not judged."""
+    """Return a sentence on the shape of the distribution; None if it was not tested."""
     if about.normality is None or about.mean is None or about.std is None:
         return None
     test = about.normality

@@ -1,4 +1,4 @@
-"""Variance-based sensitivity indices of Sobol, first order and total, and the orthonormal functions behind them."""
+"""Variance-based sensitivity indices of Sobol, first order and total, and the orthonormal bases of polynomial chaos."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from scipy.special import roots_legendre
 from twin.study.report.study_statistics import CONFIDENCE, LEAST, Estimate, Factor, Response, StudyRuns, noise_share
 
 MOST_LEVELS = 20
-"""Texts with more values are not taken apart."""
+"""Largest number of different texts of a factor for which indices are computed."""
 
 
 class _NoBasis(Exception):
-    """A factor for which no functions can be made; the text says why."""
+    """No basis can be made for a factor; the text gives the reason."""
 
 
 def axis_functions(axis: tuple[Factor, ...], good: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Functions 1, 2, ... of the factors of an axis at the runs: values (n, m) and degrees (m,).
+    """Return the orthonormal basis functions 1, 2, ... of an axis at the runs: values (n, m) and degrees (m,).
 
-    Each has mean 0 and mean square 1 under the axis' distribution, and the mean product of two is 0: of a uniform
-    factor Legendre's polynomials, of a normal one Hermite's, of others, lists and texts those that Gram and Schmidt's
-    method makes on the distribution itself. All functions of a text have degree 1.
+    Each function has mean 0 and mean square 1 under the axis' distribution, and different ones are orthogonal: Legendre
+    polynomials for a uniform factor, Hermite polynomials for a normal one, Gram-Schmidt on the distribution itself for
+    others, lists and texts. All functions of a text have degree 1.
 
     Parameters
     ----------
-    axis : tuple[Factor, ...]
+    axis : tuple of Factor
         Factors that vary together.
-    good : np.ndarray
-        (runs,) which runs are used.
+    good : (runs,) ndarray of bool
+        True for the runs that are used.
     degree : int
-        The highest.
+        Highest degree.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def axis_functions(axis: tuple[Factor, ...], good: np.ndarray, degree: int) -> t
 
 
 def _text_weights(axis: tuple[Factor, ...], levels: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Probability of every level: of a list by how often it holds it, of a table's rows as they were drawn."""
+    """Return the probability of every level: its frequency in a list, or among the drawn rows of a table."""
     if len(axis) == 1:
         listed = [_text(value) for value in axis[0].spec.scalars()]
         names = [str(value) for value in np.unique(axis[0].values)[levels[:, 0]]]
@@ -107,7 +107,7 @@ def _of_number(factor: Factor, values: np.ndarray, degree: int) -> tuple[np.ndar
 def _by_recurrence(
     places: np.ndarray, weights: np.ndarray, values: np.ndarray, degree: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Orthonormal polynomials of a discrete measure at ``values``, by Stieltjes' recurrence."""
+    """Return the orthonormal polynomials of a discrete measure at ``values``, by Stieltjes' recurrence."""
     middle, reach = 0.5 * (places.max() + places.min()), 0.5 * np.ptp(places)
     if reach == 0.0:
         return np.empty((len(values), 0)), np.empty(0, int)
@@ -129,7 +129,7 @@ def _by_recurrence(
 
 
 def _of_table(table: np.ndarray, values: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Polynomials of several columns that belong together, orthonormal over the rows of the table."""
+    """Return the polynomials of several columns that belong together, orthonormal over the rows of the table."""
     middle, reach = table.mean(axis=0), np.maximum(np.ptp(table, axis=0), np.finfo(float).tiny)
     nodes, x = (table - middle) / reach, (values - middle) / reach
     powers = [p for p in np.ndindex(*[degree + 1] * table.shape[1]) if 0 < sum(p) <= degree]
@@ -154,45 +154,54 @@ def _of_table(table: np.ndarray, values: np.ndarray, degree: int) -> tuple[np.nd
 
 
 def _orthonormal(columns: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Columns made orthonormal under the weights, the first one 1."""
+    """Return the columns orthonormalised under the weights; the first one must be constant."""
     root = np.sqrt(weights)[:, None]
     q, r = np.linalg.qr(columns * root)
     return np.asarray(q * np.sign(np.diag(r)) / root)
 
 
 HIGHEST_DEGREE = 12
+"""Highest total degree of the polynomials."""
 MOST_TERMS = 250
+"""Largest number of terms of a polynomial chaos model."""
 MOST_RUNS = 20_000
+"""Largest number of runs to which a model is fitted."""
 TINY = sys.float_info.min
+"""Smallest positive normal float64, which avoids divisions by zero."""
 RUNS_TO_CHOOSE = 3_000
-"""The degree is chosen by this many runs, the first ones."""
+"""Number of runs, the first ones, with which the degree is selected."""
 RUNS_PER_TERM = 2.5
+"""Smallest number of runs per term."""
 RESAMPLES = 1000
+"""Number of bootstrap resamples for the intervals."""
 HARMONICS = 10
-"""Harmonics of the factor's cycle that RBD-FAST sums."""
+"""Number of harmonics that RBD-FAST sums."""
 MANY_FAILED = 0.05
-"""Share of runs without a number beyond which the others say too little of the stated distributions."""
+"""Share of runs without a number beyond which the others do not represent the specified distributions."""
 DISAGREE = 3.0
-"""Over the root of the number of runs: distance of RBD-FAST's index from the interval of polynomial chaos at which they
-disagree, five standard deviations of the former for smooth responses of 100 to 300 runs."""
+"""Distance of the RBD-FAST index from the interval of polynomial chaos at which they disagree, times the root of the
+number of runs.
+
+It is five standard deviations of RBD-FAST for smooth responses of 100 to 300 runs.
+"""
 
 
 @dataclass(frozen=True)
 class Index:
-    """Sensitivity to an axis.
+    """Sensitivity index of an axis.
 
     Attributes
     ----------
-    factors : tuple[str, ...]
+    factors : tuple of str
         Names of the factors that vary together, mostly one.
     first : Estimate
-        Share of the variance that the axis explains alone.
+        First-order index: share of the variance that the axis explains alone.
     total : Estimate
-        Share that is gone when the axis is fixed.
-    check : float | None
-        First order by RBD-FAST, which needs no model; None where it cannot be used.
-    agrees : bool | None
-        Whether that lies within the interval of ``first``, but for its noise; None without it.
+        Total index: share of the variance that vanishes when the axis is fixed.
+    check : float or None
+        First-order index by RBD-FAST, which needs no model; None where it cannot be used.
+    agrees : bool or None
+        True if that lies within the interval of ``first``, apart from its noise; None without it.
     """
 
     factors: tuple[str, ...]
@@ -203,7 +212,7 @@ class Index:
 
     @property
     def name(self) -> str:
-        """All of them."""
+        """Names of the factors, joined."""
         return " + ".join(self.factors)
 
 
@@ -214,20 +223,20 @@ class Indices:
     Attributes
     ----------
     method : str
-        ``chaos``, polynomial chaos fitted to the runs, or ``grid``, the exact parts of a complete grid.
-    axes : tuple[Index, ...]
-        The largest total first.
+        ``chaos`` for polynomial chaos fitted to the runs, or ``grid`` for the exact decomposition of a complete grid.
+    axes : tuple of Index
+        Indices, the largest total first.
     degree : int
-        Of the polynomials; 0 for a grid.
+        Degree of the polynomials; 0 for a grid.
     terms : int
-        Of them; 0 for a grid.
-    held_out : float | None
-        R2 of runs that the model was not fitted to, by leaving each out in turn; None for a grid.
+        Number of polynomials; 0 for a grid.
+    held_out : float or None
+        Leave-one-out cross-validated R²; None for a grid.
     rest : float
         Share of the variance that the model does not explain; 0 for a grid.
-    noise : float | None
-        Share of the variance that the runs state as noise, as `noise_share`; None without. By chance above 1 where
-        nothing else varies.
+    noise : float or None
+        Share of the variance that the runs report as noise, see `noise_share`; None without. It may exceed 1 by chance
+        where only noise varies.
     """
 
     method: str
@@ -241,29 +250,29 @@ class Indices:
 
 @dataclass(frozen=True)
 class NoIndices:
-    """Why there are no indices."""
+    """Reason why there are no indices."""
 
     reason: str
 
 
 def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | NoIndices:
-    """Indices of a response, by the method that fits the design.
+    """Compute the sensitivity indices of a response by the method that fits the design.
 
-    No design of a study is Saltelli's, so that the indices come from the given runs. A complete grid is its own
-    distribution, whose variance is taken apart exactly. Of drawn designs polynomial chaos is fitted (Sudret,
-    Reliability Engineering and System Safety 93, 964, 2008); the variances are sums of its squared coefficients, less
-    what their noise adds. The degree is that with the smallest error of runs left out in turn. Intervals come from 1000
-    resamples of the runs. They are those of the terms that were chosen; what these leave may belong to any factor, and
-    counts for the upper end of each as far as the runs do not state it as noise. Where few runs have no number, the
-    intervals reach as far as any numbers within the range of the others would move them; where many have none, the
-    others have another distribution than the factors, and there are no indices.
+    No design of a study is Saltelli's, so that the indices are estimated from the available runs. The variance of a
+    complete grid is decomposed exactly. To drawn designs polynomial chaos is fitted (Sudret, Reliability Engineering
+    and System Safety 93, 964, 2008); the partial variances are sums of its squared coefficients, corrected for their
+    noise. The degree is selected by leave-one-out cross-validation. Intervals come from 1000 bootstrap resamples of the
+    runs, for the selected terms; the unexplained variance may belong to any factor and is added to the upper end of
+    each, except for reported noise. If a few runs have no number, the intervals are widened for any values within the
+    range of the others; if many have none, the others do not follow the distributions of the factors, and there are no
+    indices.
 
     Parameters
     ----------
     runs : StudyRuns
-        Of the study.
+        Runs of the study.
     response : Response
-        One of its responses or stated sigmas.
+        One of its responses or reported sigmas.
     """
     axes = [axis for axis in runs.axes if any(len(np.unique(f.values[response.good])) > 1 for f in axis)]
     if response.constant:
@@ -295,7 +304,7 @@ def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | NoIndi
 
 
 def _of_grid(axes: Sequence[tuple[Factor, ...]], values: np.ndarray) -> tuple[Index, ...]:
-    """Exact parts of the variance of a complete grid, all combinations equally likely."""
+    """Return the exact indices of a complete grid, with all combinations equally likely."""
     total = float(np.var(values))
     out = []
     for k, axis in enumerate(axes):
@@ -312,7 +321,7 @@ def _of_grid(axes: Sequence[tuple[Factor, ...]], values: np.ndarray) -> tuple[In
 
 
 def _cells(axes: Sequence[tuple[Factor, ...]]) -> np.ndarray:
-    """(runs,) number of the combination of values that each run has."""
+    """Return the index of the combination of values of each run, (runs,)."""
     factors = [factor for axis in axes for factor in axis]
     if not factors:
         return np.zeros(0, int)
@@ -321,7 +330,7 @@ def _cells(axes: Sequence[tuple[Factor, ...]]) -> np.ndarray:
 
 
 def _between(cells: np.ndarray, values: np.ndarray) -> float:
-    """Variance of the means of the cells."""
+    """Return the variance of the means of the cells."""
     if len(cells) == 0:
         return 0.0
     counts = np.bincount(cells)
@@ -331,20 +340,20 @@ def _between(cells: np.ndarray, values: np.ndarray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Chaos:
-    """Polynomials fitted to the runs.
+    """Polynomial chaos model fitted to the runs.
 
     Attributes
     ----------
-    terms : np.ndarray
-        Per coefficient but the constant: which function of each axis, (m, axes), 0 for none.
-    coefficients : np.ndarray
-        (m,) of them.
-    q : np.ndarray
-        (n, m + 1) orthonormal columns of the fit, r its triangle.
-    rest_values
-        (n,) what is left, each as if its run had been left out.
+    terms : (m, axes) ndarray of int
+        For each coefficient but the constant the index of the function of each axis, 0 for none.
+    coefficients : (m,) ndarray
+        Coefficients of the terms.
+    q, r : ndarray
+        QR decomposition of the design matrix (n, m + 1).
+    held_out : float
+        Leave-one-out cross-validated R².
     rest : float
-        Share of the variance that is left.
+        Share of the variance that is not explained.
     """
 
     axes: Sequence[tuple[Factor, ...]]
@@ -405,16 +414,16 @@ class _Chaos:
         return cls(axes, terms, coefficients[1:], y, q, r, degree, held_out, rest / total, good)
 
     def indices(self, noise: float, seed: int, missing: np.ndarray) -> tuple[Index, ...]:
-        """Indices of every axis, the largest total first.
+        """Return the indices of every axis, the largest total first.
 
         Parameters
         ----------
         noise : float
-            Variance of the noise that the runs state, 0 where they state none.
+            Noise variance that the runs report, 0 if they report none.
         seed : int
-            Of the resamples.
-        missing : np.ndarray
-            (runs,) which runs have no number.
+            Seed of the bootstrap.
+        missing : (runs,) ndarray of bool
+            True for runs without a number.
         """
         shares = self._shares()
         ends = [
@@ -435,10 +444,10 @@ class _Chaos:
         return tuple(sorted(out, key=lambda index: -index.total.value))
 
     def _with_missing(self, low: np.ndarray, high: np.ndarray, missing: np.ndarray) -> list[np.ndarray]:
-        """Ends of intervals (2, axes) that hold for any responses of the missing runs within the range of the others.
+        """Widen intervals (2, axes) for any responses of the missing runs within the range of the others.
 
-        A run of N that is off the polynomials by d, where these have the part p of an axis, changes the variance of the
-        axis by 2 p d / N, and by d^2 / N at most beside it.
+        A run of N that departs from the polynomials by d, where the part of an axis is p, changes the variance of the
+        axis by 2 p d / N, and by at most d^2 / N in addition.
         """
         functions = [axis_functions(axis, missing, HIGHEST_DEGREE)[0] for axis in self.axes]
         terms = _columns(functions, self.terms)[:, 1:] * self.coefficients
@@ -455,8 +464,9 @@ class _Chaos:
         return [lowest, np.minimum((high + moved + added) / max(1.0 - whole, TINY), 1.0)]
 
     def _parts(self, squares: np.ndarray) -> np.ndarray:
-        """Sums of squared coefficients (..., m): of each axis alone, and of all terms with it, (..., 2, axes). Together
-        with others an axis explains no less than alone, although what is taken off for noise may be more than is there.
+        """Return sums of squared coefficients (..., m) for each axis alone and with interactions, (..., 2, axes).
+
+        With interactions an axis explains no less than alone, although the noise correction may exceed the sum.
         """
         used = self.terms > 0
         alone = used & (used.sum(axis=1) == 1)[:, None]
@@ -465,7 +475,7 @@ class _Chaos:
 
     @cached_property
     def _fit_rest(self) -> tuple[np.ndarray, float]:
-        """What is left at each run as if it had been left out, (n,), and the variance of what is left."""
+        """Leave-one-out residuals of the runs, (n,), and the residual variance."""
         centred = self.y - self.y.mean()
         left = centred - self.q @ (self.q.T @ centred)
         rest = float(np.sum(left**2)) / (len(self.y) - len(self.terms) - 1)
@@ -475,22 +485,21 @@ class _Chaos:
 
     @cached_property
     def _squares(self) -> np.ndarray:
-        """(m,) squared coefficients; each is too large by its variance, which is taken off."""
+        """Squared coefficients (m,), corrected for the bias by their variance."""
         inverse = np.linalg.inv(self.r)
         return np.asarray(self.coefficients**2 - np.sum(inverse**2, axis=1)[1:] * self._fit_rest[1])
 
     def _shares(self) -> np.ndarray:
-        """First order and total indices, (2, axes)."""
+        """Return first-order and total indices, (2, axes)."""
         whole = max(float(np.sum(self._squares)), 0.0) + self._fit_rest[1]
         return np.clip(self._parts(self._squares) / whole, 0.0, 1.0)
 
     def _resampled(self, noise: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """Indices of resampled runs, (b, 2, axes) each: without what the model leaves, and with all of it that is not
-        noise.
+        """Return bootstrapped indices, (b, 2, axes) each, without and with the residual variance that is not noise.
 
-        Pairs are resampled, each run with its factors and its response, so that the coefficients and the whole variance
-        vary as between studies: each run as often as a Poisson variable of mean 1 says, the coefficients to first order
-        by what each run does to them when it is left out.
+        Pairs of factors and response are resampled, so that coefficients and total variance vary as between studies.
+        Each run is weighted by a Poisson variable of mean 1; the coefficients change to first order by the
+        leave-one-out influence of each run.
         """
         n, m = len(self.y), len(self.terms)
         out, rest = self._fit_rest
@@ -528,7 +537,7 @@ def _columns(functions: Sequence[np.ndarray], terms: np.ndarray) -> np.ndarray:
 
 
 def _terms(degrees: Sequence[np.ndarray], degree: int, norm: float, runs: int) -> np.ndarray | None:
-    """Products of functions whose degrees d fulfil (sum d^norm)^(1/norm) <= degree; None for too many of them."""
+    """Return products of functions with degrees (sum d^norm)^(1/norm) <= degree; None if there are too many."""
     most = min(MOST_TERMS, int(runs / RUNS_PER_TERM))
     found = []
     for term in _products(degrees, 0, degree**norm + 1e-9, norm):
@@ -550,10 +559,10 @@ def _products(degrees: Sequence[np.ndarray], axis: int, left: float, norm: float
 
 
 def _rbd_fast(axis: tuple[Factor, ...], good: np.ndarray, y: np.ndarray) -> float | None:
-    """First order index of a factor by random balance designs, as SALib has it; None for texts, lists and few runs.
+    """Return the first-order index of a factor by random balance designs (SALib); None for texts, lists and few runs.
 
-    Source: Tarantola, Gatelli and Mara, Reliability Engineering and System Safety 91, 717 (2006); bias corrected as by
-    Tissot and Prieur, the same 107, 205 (2012).
+    Source: Tarantola, Gatelli and Mara, Reliability Engineering and System Safety 91, 717 (2006); bias correction of
+    Tissot and Prieur, ibid. 107, 205 (2012).
     """
     factor = axis[0]
     # values that are equal have no order; the harmonics need some runs each

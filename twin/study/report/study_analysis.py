@@ -1,4 +1,4 @@
-"""Everything that the report says of a study, as numbers."""
+"""Analysis of a study: Pareto fronts, requirements, convergence, and all numbers of the report."""
 
 from __future__ import annotations
 
@@ -20,22 +20,20 @@ from twin.study.report.study_statistics import Estimate, Response, StudyRuns
 
 @dataclass(frozen=True, eq=False)
 class ParetoFront:
-    """Non-dominated runs of a pair.
+    """Non-dominated runs of a pair of factors or responses.
 
     Attributes
     ----------
     spec : ParetoSpec
-        The pair, and which way each is better.
-    runs : np.ndarray
-        (m,) numbers of the runs on the front, from the best x to the best y.
-    x : np.ndarray
-        (m,) their x.
-    y : np.ndarray
-        (m,) their y.
-    ranks : np.ndarray
-        (n,) of all runs: 0 on the front, 1 when the front is taken away, ...; -1 without numbers.
-    knee : int | None
-        Index into ``runs`` of the strongest bulge; None where the front has none.
+        The pair and the preferred direction of each.
+    runs : (m,) ndarray of int
+        Numbers of the runs on the front, from the best x to the best y.
+    x, y : (m,) ndarray
+        Their values.
+    ranks : (n,) ndarray of int
+        Rank of every run: 0 on the front, 1 on the front of the remaining runs, and so on; -1 without numbers.
+    knee : int or None
+        Index into ``runs`` of the knee; None if the front has none.
     """
 
     spec: ParetoSpec
@@ -47,16 +45,14 @@ class ParetoFront:
 
 
 def pareto_front(spec: ParetoSpec, x: np.ndarray, y: np.ndarray) -> ParetoFront:
-    """The front of (n,) ``x`` and ``y``.
+    """Return the Pareto front of (n,) ``x`` and ``y``.
 
     Parameters
     ----------
     spec : ParetoSpec
-        The pair, and which way each is better.
-    x : np.ndarray
-        (n,) of all runs.
-    y : np.ndarray
-        (n,) of all runs.
+        The pair and the preferred direction of each.
+    x, y : (n,) ndarray
+        Values of all runs.
     """
     good = np.isfinite(x) & np.isfinite(y)
     signs = {"min": 1.0, "max": -1.0}
@@ -69,8 +65,10 @@ def pareto_front(spec: ParetoSpec, x: np.ndarray, y: np.ndarray) -> ParetoFront:
 
 
 def ranks_of(costs: np.ndarray) -> np.ndarray:
-    """Fronts of (n, 2) costs by non-dominated sorting: (n,) 0 for points that no other is better than or equal to in
-    both and better in one, 1 for those that only points of front 0 dominate, and so on. Equal points share a front.
+    """Return the ranks (n,) of (n, 2) costs by non-dominated sorting.
+
+    Rank 0 holds the points that no other point dominates, rank 1 those that only points of rank 0 dominate, and so on.
+    Equal points share a rank.
     """
     order = np.lexsort((costs[:, 1], costs[:, 0]))
     ranks = np.empty(len(costs), np.int64)
@@ -93,10 +91,10 @@ def ranks_of(costs: np.ndarray) -> np.ndarray:
 
 
 def knee(costs: np.ndarray) -> int | None:
-    """Where a front (m, 2), in order of the first cost, lies farthest below the line through its ends.
+    """Return the index of the point of a front (m, 2) that lies farthest below the line through its ends.
 
-    Both costs are scaled to the front's range. None for fewer than three different points, or when no point lies below
-    the line by more than rounding.
+    The front is sorted by the first cost, and both costs are scaled to its range. None for fewer than three different
+    points, or if no point lies below the line by more than rounding.
     """
     if len(np.unique(costs, axis=0)) < 3:
         return None
@@ -110,26 +108,26 @@ def knee(costs: np.ndarray) -> int | None:
 
 @dataclass(frozen=True)
 class Requirement:
-    """What became of a requirement.
+    """Result of a requirement.
 
     Attributes
     ----------
     name : str
-        Of the requirement; empty for all of them together.
+        Name of the requirement; empty for all of them together.
     text : str
-        In words.
+        The requirement as text.
     met : int
-        Runs that meet it.
+        Number of runs that meet it.
     count : int
-        Runs that have a number.
+        Number of runs with a finite value.
     runs : int
-        All runs, those without a number too.
-    interval : tuple[float, float] | None
-        Of the share of those that have a number, in a drawn design; None in a grid.
-    judged : statistics.Description | None
-        Statistics of what is judged: the response, or its size; None for all together.
+        Number of all runs, also those without a value.
+    interval : tuple of float or None
+        Interval of the share among runs with a value, in a drawn design; None in a grid.
+    judged : Description or None
+        Statistics of the response or its absolute value; None for all requirements together.
     unit : str
-        Of it.
+        Unit of the response.
     """
 
     name: str
@@ -143,34 +141,39 @@ class Requirement:
 
     @property
     def share(self) -> float | None:
-        """Share of the runs with a number; None without any."""
+        """Share of the runs with a value that meet it; None without any."""
         return self.met / self.count if self.count else None
 
     @property
     def most(self) -> int:
-        """Runs that would meet it if all without a number did."""
+        """Number of runs that would meet it if all runs without a value did."""
         return self.met + self.runs - self.count
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """Share of all runs if none and if all of those without a number meet it; None where all have one. Whether a
-        run fails may go with what it would have given: then the interval of the others says nothing of all.
+        """Shares of all runs if none, and if all, of those without a value meet it; None if all runs have a value.
+
+        Failure may be correlated with the value that a run would have given, so that the interval of the others does
+        not hold for all runs.
         """
         return None if self.count == self.runs else (self.met / self.runs, self.most / self.runs)
 
     @property
     def bounds_interval(self) -> tuple[float, float] | None:
-        """From the lower end of the interval of the lower bound to the upper end of that of the upper one, in a drawn
-        design: whatever runs without a number would have given.
+        """Interval from the lower limit of the lower bound to the upper limit of the upper bound, in a drawn design.
+
+        It holds for any values of the runs without one.
         """
         if self.bounds is None or (self.interval is None and self.count):
             return None
-        (low, _), (_, high) = (proportion_interval(met, self.runs, statistics.CONFIDENCE) for met in (self.met, self.most))
+        (low, _), (_, high) = (
+            proportion_interval(met, self.runs, statistics.CONFIDENCE) for met in (self.met, self.most)
+        )
         return low, high
 
 
 def _is_met(spec: ThresholdSpec, values: np.ndarray) -> np.ndarray:
-    """(n,) whether each value meets the requirement; NaN does not."""
+    """Return True where a value meets the requirement, (n,); NaN does not."""
     judged = np.abs(values) if spec.magnitude else values
     good = np.isfinite(judged)
     if spec.at_most is not None:
@@ -181,7 +184,7 @@ def _is_met(spec: ThresholdSpec, values: np.ndarray) -> np.ndarray:
 
 
 def requirements(runs: StudyRuns) -> tuple[Requirement, ...]:
-    """All requirements of a study, then, of several, all together."""
+    """Return the results of all requirements of a study and, if there are several, of all together."""
     out = []
     everything = np.ones(runs.count, bool)
     judged = np.ones(runs.count, bool)
@@ -224,33 +227,33 @@ def _text(spec: ThresholdSpec) -> str:
 
 
 QUANTILES = {"p95": 0.95, "p99.7": 0.997}
+"""Quantiles whose convergence is reported, and their probabilities."""
 GOALS = {"mean": 0.1, "sigma": 0.1, "p95": 0.2, "p99.7": 0.2}
-"""Half of the 95% interval, in units of sigma, below which a statistic counts as known."""
+"""Half-width of the 95 % interval, in units of sigma, below which a statistic counts as known."""
 POINTS = 40
+"""Number of points of a convergence curve."""
 
 
 @dataclass(frozen=True, eq=False)
 class Convergence:
-    """A statistic of the first n runs.
+    """Convergence of a statistic with the number of runs.
 
     Attributes
     ----------
     name : str
-        Mean, sigma, p95 or p99.7.
-    counts : np.ndarray
-        (m,) numbers of runs.
-    values : np.ndarray
-        (m,) the statistic.
-    low : np.ndarray
-        (m,) lower end of its interval, NaN where there is none.
-    high : np.ndarray
-        (m,) upper end.
-    relative : float | None
-        Half the interval at the end, in units of sigma; None where it is open.
+        ``mean``, ``sigma``, ``p95`` or ``p99.7``.
+    counts : (m,) ndarray of int
+        Numbers of runs.
+    values : (m,) ndarray
+        The statistic of the first runs.
+    low, high : (m,) ndarray
+        Ends of its interval, NaN where open.
+    relative : float or None
+        Half-width of the last interval in units of sigma; None if it is open.
     enough : bool
-        Whether that is below the goal.
-    needed : int | None
-        About how many runs would reach it; None where it cannot be told.
+        True if that is below the goal.
+    needed : int or None
+        Approximate number of runs that reaches the goal; None if it cannot be estimated.
     """
 
     name: str
@@ -264,7 +267,7 @@ class Convergence:
 
 
 def convergences(values: np.ndarray) -> tuple[Convergence, ...]:
-    """How the statistics of (n,) finite values settle, run by run; none below 20 runs and for constant values."""
+    """Return the convergence of the statistics of (n,) finite values; none below 20 runs and for constant values."""
     n = len(values)
     if n < 20 or np.ptp(values) == 0.0:
         return ()
@@ -298,30 +301,30 @@ def _convergence(
 
 @dataclass(frozen=True, eq=False)
 class StudyAnalysis:
-    """What was found; mappings go by the name of the response.
+    """Analysis of all responses of a study; mappings are keyed by the name of the response.
 
     Attributes
     ----------
     runs : StudyRuns
-        The study's.
-    descriptions : Mapping[str, statistics.Description]
-        Statistics of responses and of stated sigmas.
-    linear : Mapping[str, statistics.LinearModel | None]
-        None where no model can be fitted.
-    effects : Mapping[str, tuple[statistics.MainEffect, ...]]
+        Runs of the study.
+    descriptions : dict
+        Statistics of responses and of reported sigmas.
+    linear : dict
+        Linear models; None where none can be fitted.
+    effects : dict
         Main effects of a grid; empty in drawn designs.
-    noise : Mapping[str, statistics.NoiseShare]
-        Of the responses whose noise the runs state.
-    indices : Mapping[str, Indices | NoIndices]
-        Empty when the study does not ask for them.
-    convergences : Mapping[str, tuple[Convergence, ...]]
-        How the statistics settle; empty for grids.
-    requirements : tuple[Requirement, ...]
-        In the study's order, then all together.
-    fronts : tuple[ParetoFront, ...]
-        Of the pairs that the study asks for and that are numbers.
-    not_numbers : tuple[str, ...]
-        Pairs that are not.
+    noise : dict
+        Noise shares of the responses whose noise the runs report.
+    indices : dict
+        Sensitivity indices; empty if the study does not request them.
+    convergences : dict
+        Convergence of the statistics; empty for grids.
+    requirements : tuple of Requirement
+        Requirements in the study's order, then all together.
+    fronts : tuple of ParetoFront
+        Pareto fronts of the requested pairs that are numbers.
+    not_numbers : tuple of str
+        Requested pairs that are not numbers.
     """
 
     runs: StudyRuns
@@ -368,9 +371,9 @@ class StudyAnalysis:
         )
 
     def influence(self, response: str) -> dict[str, float]:
-        """Factor -> how much of the response's variance it moves, the largest first; for orders and choices only.
+        """Return the share of a response's variance due to each factor, the largest first, for sorting only.
 
-        The total index where there is one, otherwise the squared standardised coefficient or the share of the main
+        It is the total index if there is one, else the squared standardised coefficient or the share of the main
         effect.
         """
         found = self.indices.get(response)
@@ -449,7 +452,7 @@ CONVERGENCE: Record[Convergence] = Record(
 
 @dataclass(frozen=True, eq=False)
 class _About:
-    """A response, or the sigma of one, and all that was found."""
+    """Response, or reported sigma of one, with its analysis."""
 
     found: StudyAnalysis
     of: Response

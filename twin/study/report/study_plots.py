@@ -1,4 +1,4 @@
-"""Figures of a study: distributions, curves, influences, pairs, convergence and compromises."""
+"""Figures of a study: distributions, response curves, effects, pairs, convergence and Pareto fronts."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from twin.study.report.study_statistics import Description, Factor, Response, Se
 COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 MARKS = ("o", "s", "^", "D", "v", "P")
 MOST_POINTS = 500
-"""Points in a scatter plot at most: more would make the page heavy and the picture black."""
+"""Largest number of points in a scatter plot, to limit the size of the page and overplotting."""
 STEPS = (1, 2, 2.5, 5, 10)
-"""Ticks are these times a power of ten apart."""
+"""Allowed spacings of ticks, times a power of ten."""
 LONGEST = 18
-"""Characters of a text on an axis."""
+"""Largest number of characters of a text on an axis."""
 
 
 def finish(axes: Axes, x_ticks: int | None = 6, y_ticks: int | None = 5) -> None:
-    """The look of all panels; None leaves the ticks of an axis as they are."""
+    """Format the axes of a panel; None leaves the ticks of an axis unchanged."""
     svg.gridded(axes)
     if x_ticks is not None:
         axes.xaxis.set_major_locator(MaxNLocator(x_ticks, steps=STEPS))
@@ -40,26 +40,26 @@ def finish(axes: Axes, x_ticks: int | None = 6, y_ticks: int | None = 5) -> None
 
 
 def _plain_numbers(axes: Axes, which: str) -> None:
-    """Whole numbers at the ticks, and not what is to be added to each, as long as they stay short."""
+    """Show full numbers at the ticks instead of an offset, as long as they are short."""
     low, high = axes.get_xlim() if which == "x" else axes.get_ylim()
     short = abs(high - low) > 1e-4 * max(abs(low), abs(high))
     axes.ticklabel_format(axis=which, style="sci", scilimits=(-3, 5), useOffset=not short)  # type: ignore[arg-type]
 
 
 def short(text: str) -> str:
-    """A text that fits on an axis."""
+    """Return a text cut to fit on an axis."""
     return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
 
 
 def positions(thing: Series) -> np.ndarray:
-    """(runs,) where the values stand on an axis: numbers where they are, texts at 0, 1, ..."""
+    """Return the positions (runs,) of values on an axis: numbers themselves, texts at 0, 1, ..."""
     if not thing.numeric:
         return np.array([np.flatnonzero(thing.levels == value)[0] for value in thing.values], np.float64)
     return thing.values
 
 
 def name_texts(axes: Axes, thing: Series, which: str) -> None:
-    """Names of the texts at an axis with ``positions``; nothing for numbers."""
+    """Label an axis of ``positions`` with the texts; do nothing for numbers."""
     if thing.numeric:
         return
     places, names = np.arange(len(thing.levels)), [short(str(level)) for level in thing.levels]
@@ -73,20 +73,20 @@ def name_texts(axes: Axes, thing: Series, which: str) -> None:
 
 
 def some(good: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
-    """Numbers of up to ``most`` runs of (n,) ``good``, evenly through the study."""
+    """Return the indices of up to ``most`` runs of (n,) ``good``, evenly spaced through the study."""
     found = np.flatnonzero(good)
     return found if len(found) <= most else found[np.linspace(0, len(found) - 1, most).astype(int)]
 
 
 def jitter(thing: Series, seed: int) -> np.ndarray:
-    """(runs,) what is added to ``positions`` so that points of one text do not hide each other."""
+    """Return random offsets (runs,) to ``positions`` that keep points of one text from hiding each other."""
     if not thing.numeric:
         return np.random.default_rng(np.random.SeedSequence(seed)).uniform(-0.2, 0.2, len(thing.values))
     return np.zeros(len(thing.values))
 
 
 def bins(factor: Factor, good: np.ndarray) -> Iterator[np.ndarray]:
-    """Runs of a numeric factor in groups of neighbours of equal size, or of equal value for few values."""
+    """Yield the runs of a numeric factor in groups of neighbours of equal size, or of equal value for few values."""
     levels = np.unique(factor.values[good])
     if len(levels) <= 12:
         for level in levels:
@@ -98,7 +98,7 @@ def bins(factor: Factor, good: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def histogram_figure(found: StudyAnalysis, names: Sequence[str]) -> Figure:
-    """A panel for each of the named responses."""
+    """Plot the histograms of the named responses."""
     things = [r for r in found.runs.responses if r.name in names]
     figure, grid = svg.panels([3.0] * len(things), min(len(things), 2))
     for axes, response in zip(grid, things, strict=True):
@@ -136,7 +136,7 @@ def _histogram(axes: Axes, response: Response, about: Description, sampled: bool
 
 
 def _bin_count(values: np.ndarray) -> int:
-    """Freedman and Diaconis' rule within 5 and 50."""
+    """Return the number of bins by the rule of Freedman and Diaconis, limited to 5 to 50."""
     low, high = np.quantile(values, (0.25, 0.75))
     width = 2.0 * (high - low) / len(values) ** (1.0 / 3.0)
     return int(np.clip(np.ceil(np.ptp(values) / width), 5, 50)) if width > 0.0 else 10
@@ -146,7 +146,7 @@ _TITLES = {"mean": "mean", "sigma": "standard deviation", "p95": "95% quantile",
 
 
 def convergence_figure(found: StudyAnalysis, response: Response) -> Figure:
-    """Mean, sigma and the upper quantiles of the first n runs, each with its interval."""
+    """Plot mean, sigma and the upper quantiles of the first n runs, each with its interval."""
     convergences = found.convergences[response.name]
     figure, grid = svg.panels([2.8] * len(convergences), len(convergences))
     for axes, convergence in zip(grid, convergences, strict=True):
@@ -165,11 +165,13 @@ def convergence_figure(found: StudyAnalysis, response: Response) -> Figure:
 
 
 MOST_LINES = 6
+"""Largest number of lines in a panel."""
 MOST_PANELS = 6
+"""Largest number of factors for which a response curve is drawn."""
 
 
 def curve_figure(found: StudyAnalysis, response: Response) -> Figure:
-    """A panel for each of the factors that matter most, up to six."""
+    """Plot a response against each of the most important factors, up to six."""
     order = list(found.influence(response.name))
     factors = sorted(found.runs.factors, key=lambda factor: order.index(factor.name))
     factors = [factor for factor in factors if len(factor.levels) > 1][:MOST_PANELS]
@@ -197,12 +199,12 @@ def curve_figure(found: StudyAnalysis, response: Response) -> Figure:
 
 
 def _partner(factor: Factor, factors: Sequence[Factor]) -> Factor | None:
-    """The most important other factor that takes several values, for lines or groups."""
+    """Return the most important other factor with several values, for lines or groups."""
     return next((f for f in factors if f is not factor and len(f.levels) > 1), None)
 
 
 def _binned(axes: Axes, factor: Factor, response: Response) -> None:
-    """Mean of neighbouring runs, its interval, the middle 68% of the runs, and the runs."""
+    """Plot runs, means of neighbouring runs with their intervals, and the middle 68 % of the runs."""
     shown = some(response.good)
     axes.plot(factor.values[shown], response.values[shown], ".", color=GREY, ms=2.0, alpha=0.5, zorder=1)
     groups = list(bins(factor, response.good))
@@ -218,7 +220,7 @@ def _binned(axes: Axes, factor: Factor, response: Response) -> None:
 
 
 def _groups(other: Factor | None, response: Response) -> list[tuple[str, np.ndarray]]:
-    """(label, runs) of each value of the other factor."""
+    """Return label and runs of each value of the other factor."""
     if other is None:
         return [("", response.good)]
     number = (lambda level: plain(level, 4)) if other.numeric else (lambda level: short(str(level)))
@@ -232,7 +234,7 @@ def _groups(other: Factor | None, response: Response) -> list[tuple[str, np.ndar
 
 
 def _lines(axes: Axes, factor: Factor, other: Factor | None, response: Response) -> None:
-    """Means at the values of a grid, a line for each value of the other factor."""
+    """Plot the means at the values of a grid, one line for each value of the other factor."""
     for k, (label, runs) in enumerate(_groups(other, response)):
         means = [(v, response.values[runs & (factor.values == v)]) for v in factor.levels]
         points = np.array([(v, part.mean()) for v, part in means if len(part)])
@@ -242,9 +244,7 @@ def _lines(axes: Axes, factor: Factor, other: Factor | None, response: Response)
 
 
 def _bars(axes: Axes, factor: Factor, other: Factor | None, response: Response) -> None:
-    """Means for each text, with one standard deviation of the runs as whiskers; bars where zero is in sight, otherwise
-    points.
-    """
+    """Plot the mean for each text with one standard deviation; as bars if zero is near, else as points."""
     groups = _groups(other, response)
     width = 0.8 / len(groups)
     means = [[response.values[runs & (factor.values == level)] for level in factor.levels] for _, runs in groups]
@@ -266,7 +266,7 @@ def _bars(axes: Axes, factor: Factor, other: Factor | None, response: Response) 
 
 
 def scatter_figure(found: StudyAnalysis, pairs: Sequence[tuple[str, str]]) -> Figure:
-    """The pairs that the study asks for."""
+    """Plot the pairs that the study requests."""
     wide = min(len(pairs), 3)
     figure, grid = svg.panels([3.5] * len(pairs), wide)
     for axes, (x_name, y_name) in zip(grid, pairs, strict=True):
@@ -289,7 +289,7 @@ _WAYS = {"min": "small is good", "max": "large is good"}
 
 
 def pareto_figure(found: StudyAnalysis) -> Figure:
-    """A panel for each pair: all runs, the front, its knee."""
+    """Plot for each pair all runs, the front and its knee."""
     figure, grid = svg.panels([3.9] * len(found.fronts), min(len(found.fronts), 2))
     for axes, front in zip(grid, found.fronts, strict=True):
         x, y = found.runs.find(front.spec.x), found.runs.find(front.spec.y)
@@ -312,20 +312,21 @@ def pareto_figure(found: StudyAnalysis) -> Figure:
 
 
 MOST_BARS = 10
+"""Largest number of bars in a panel."""
 
 
 def _bar_panels(rows: Sequence[int]) -> tuple[Figure, list[Axes]]:
-    """Panels as high as their bars need, two beside each other."""
+    """Return panels whose heights fit their bars, two beside each other."""
     return svg.panels([0.95 + 0.3 * max(row, 2) for row in rows], min(2, len(rows)))
 
 
 def with_tornado(found: StudyAnalysis) -> list[Response]:
-    """Responses and sigmas of which there is something to draw."""
+    """Return the responses and sigmas with effects to draw."""
     return [r for r in found.runs.everything if found.effects[r.name] or found.linear[r.name] is not None]
 
 
 def tornado_figure(found: StudyAnalysis) -> Figure:
-    """Swing of each response over each factor, the largest first."""
+    """Plot the swing of each response over each factor, the largest first."""
     things = with_tornado(found)
     rows = [min(len(found.effects[r.name]) or _effects(found, r.name), MOST_BARS) for r in things]
     figure, grid = _bar_panels(rows)
@@ -357,7 +358,7 @@ def _swings(axes: Axes, found: StudyAnalysis, response: Response) -> None:
 
 
 def _main_effects(axes: Axes, found: StudyAnalysis, response: Response) -> None:
-    """From the smallest to the largest mean of a factor's values, about the mean of all."""
+    """Plot bars from the smallest to the largest mean of a factor's values, relative to the mean of all runs."""
     shown = found.effects[response.name][:MOST_BARS][::-1]
     mean = float(np.mean(response.known))
     y = np.arange(len(shown))
@@ -382,12 +383,12 @@ def _name_bars(axes: Axes, names: Sequence[str], label: str) -> None:
 
 
 def with_indices(found: StudyAnalysis) -> list[Response]:
-    """Responses and sigmas that have indices."""
+    """Return the responses and sigmas that have sensitivity indices."""
     return [r for r in found.runs.everything if isinstance(found.indices.get(r.name), Indices)]
 
 
 def indices_figure(found: StudyAnalysis) -> Figure:
-    """First order and total index of each factor."""
+    """Plot first-order and total index of each factor."""
     things = with_indices(found)
     parts = [found.indices[r.name] for r in things]
     rows = [min(2 * len(part.axes), 2 * MOST_BARS) for part in parts if isinstance(part, Indices)]
@@ -415,7 +416,7 @@ MOST_RESPONSES, MOST = 3, 6
 
 
 def chosen(found: StudyAnalysis) -> list[Series]:
-    """The first three responses that vary, and as many factors as have room, by their influence on these."""
+    """Return the first three responses that vary, and the most influential factors, as many as fit."""
     responses = [r for r in found.runs.responses if not r.constant][:MOST_RESPONSES]
     weight = {factor.name: 0.0 for factor in found.runs.factors}
     for response in responses:
@@ -428,7 +429,7 @@ def chosen(found: StudyAnalysis) -> list[Series]:
 
 
 def matrix_figure(found: StudyAnalysis) -> Figure:
-    """Points below the diagonal, rank correlations above it, distributions on it."""
+    """Plot a matrix of points below the diagonal, rank correlations above it, and distributions on it."""
     things = chosen(found)
     n = len(things)
     figure = svg.new_figure(min(1.65 * n + 0.6, 10.2), {"h_pad": 0.03, "w_pad": 0.03, "hspace": 0.02, "wspace": 0.02})

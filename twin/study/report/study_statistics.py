@@ -1,7 +1,4 @@
-"""Runs of a finished study, and statistics of each response with confidence intervals and its share of noise.
-
-Linear model of a response: what each factor moves, and how much of the variance a straight line explains.
-"""
+"""Statistics of the responses of a finished study: descriptions, noise shares, linear models and main effects."""
 
 from __future__ import annotations
 
@@ -23,7 +20,7 @@ _SIGNS = {"um": "µm", "us": "µs", "urad": "µrad", "percent": "%", "deg": "°"
 
 
 def typeset(unit: str) -> str:
-    """A unit as the report writes it."""
+    """Return a unit as the report writes it."""
     return _SIGNS.get(unit, unit)
 
 
@@ -34,11 +31,11 @@ class Series:
     Attributes
     ----------
     name : str
-        Of it.
+        Name of the factor or response.
     unit : str
-        Of the numbers, empty for pure numbers and texts.
-    values : np.ndarray
-        (runs,) float64, NaN where there is none; of some factors text.
+        Unit of the numbers, empty for pure numbers and texts.
+    values : (runs,) ndarray
+        Values as float64, NaN where there is none; text for some factors.
     """
 
     name: str
@@ -52,12 +49,12 @@ class Series:
 
     @property
     def numeric(self) -> bool:
-        """Whether the values are numbers."""
+        """True if the values are numbers."""
         return self.values.dtype.kind == "f"
 
     @cached_property
     def levels(self) -> np.ndarray:
-        """The different values, numbers in order, texts in the order of the study."""
+        """Distinct values, numbers in ascending order, texts in the order of the study."""
         found = np.unique(self.values)
         if self.numeric:
             return found
@@ -67,14 +64,14 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class Factor(Series):
-    """What was varied.
+    """Varied factor.
 
     Attributes
     ----------
     spec : FactorSpec
-        Where the values come from.
+        Distribution or list of its values.
     drawn : bool
-        Whether the runs are drawn from it; those of a grid are not.
+        True if the runs are drawn from it; those of a grid are not.
     """
 
     spec: FactorSpec
@@ -83,14 +80,14 @@ class Factor(Series):
 
 @dataclass(frozen=True, eq=False)
 class Response(Series):
-    """What came out.
+    """Response of the runs.
 
     Attributes
     ----------
-    noise : np.ndarray | None
-        (runs,) the standard deviation by noise alone that each run states for it; None without.
+    noise : (runs,) ndarray or None
+        Standard deviation by noise alone that each run reports; None without.
     of : str
-        Of a standard deviation that is looked at like a response: what it belongs to; empty for responses.
+        For a reported standard deviation treated as a response, the response to which it belongs; empty for responses.
     """
 
     noise: np.ndarray | None = None
@@ -98,17 +95,17 @@ class Response(Series):
 
     @cached_property
     def good(self) -> np.ndarray:
-        """(runs,) where there is a finite number."""
+        """True where there is a finite number, (runs,)."""
         return np.isfinite(self.values)
 
     @cached_property
     def known(self) -> np.ndarray:
-        """The finite numbers."""
+        """Finite numbers."""
         return np.asarray(self.values[self.good])
 
     @cached_property
     def constant(self) -> bool:
-        """Whether all numbers are the same, or differ by rounding."""
+        """True if all numbers are equal within rounding."""
         if len(self.known) == 0:
             return True
         # 64 units in the last place: what sums over a few hundred terms lose
@@ -122,19 +119,19 @@ class StudyRuns:
     Attributes
     ----------
     study : StudySpec
-        As the user wrote it.
-    factors : tuple[Factor, ...]
-        What was varied, in the study's order.
-    responses : tuple[Response, ...]
-        What came out, in the study's order.
-    sigmas : tuple[Response, ...]
-        The standard deviations that the runs state for responses, where they are not all the same.
-    failed : np.ndarray
-        (runs,) bool.
-    messages : tuple[str, ...]
-        (runs,) why a run failed.
-    doubts : tuple[str, ...]
-        (runs,) why sigma does not hold in a run, empty where it does; none of commands that do not say so.
+        Specification in the study's file.
+    factors : tuple of Factor
+        Factors in the study's order.
+    responses : tuple of Response
+        Responses in the study's order.
+    sigmas : tuple of Response
+        Standard deviations that the runs report for responses, if they are not all equal.
+    failed : (runs,) ndarray of bool
+        True for a run that failed.
+    messages : tuple of str
+        Reason of each failure, (runs,).
+    doubts : tuple of str
+        Reason why sigma does not hold in a run, (runs,), empty where it holds; an empty tuple for commands without it.
     """
 
     study: StudySpec
@@ -147,7 +144,7 @@ class StudyRuns:
 
     @classmethod
     def of(cls, data: xr.Dataset, study: StudySpec) -> StudyRuns:
-        """The runs of a data set as ``twin.study.study_files.make_dataset`` makes it."""
+        """Return the runs of a data set of ``twin.study.study_files.make_dataset``."""
         drawn = study.design.kind != GRID
         factors = tuple(
             Factor(name, str(data[name].attrs.get("units", "")), _factor_values(data[name].values), spec, drawn)
@@ -177,28 +174,28 @@ class StudyRuns:
 
     @property
     def sampled(self) -> bool:
-        """Whether the runs are a sample of distributions; those of a grid are not."""
+        """True if the runs are a sample of distributions; those of a grid are not."""
         return self.kind != GRID
 
     @property
     def everything(self) -> tuple[Response, ...]:
-        """Responses, then the stated standard deviations."""
+        """Responses, then the reported standard deviations."""
         return (*self.responses, *self.sigmas)
 
     @cached_property
     def axes(self) -> tuple[tuple[Factor, ...], ...]:
-        """Factors that vary independently: each alone, columns of one table together."""
+        """Groups of factors that vary independently: single factors, or the columns of one table."""
         by_name = {factor.name: factor for factor in self.factors}
         return tuple(tuple(by_name[name] for name in names) for names in axes_of(self.study))
 
     def find(self, name: str) -> Series:
-        """A factor or response by its name."""
+        """Return a factor or response by its name."""
         things: Sequence[Series] = (*self.factors, *self.responses, *self.sigmas)
         return next(thing for thing in things if thing.name == name)
 
 
 def _factor_values(values: np.ndarray) -> np.ndarray:
-    """Numbers as float64, texts as text; switches, which the data set holds as 8-bit numbers, as no and yes."""
+    """Return numbers as float64, texts as text, and switches, which are 8-bit in the data set, as no and yes."""
     if values.dtype.kind in "OUS":
         return np.array([str(value) for value in values.tolist()], np.str_)
     if values.dtype.itemsize == 1:
@@ -209,41 +206,41 @@ def _factor_values(values: np.ndarray) -> np.ndarray:
 CONFIDENCE = 0.95
 """Two-sided confidence of all intervals."""
 LEAST = 20
-"""With fewer runs no distribution is judged."""
+"""Smallest number of runs from which distributions are tested and sensitivity indices computed."""
 UNLIKELY = 0.01
-"""A distribution is called not normal when a normal one would give such a sample less often."""
+"""Significance level of the test of normality."""
 TAILS = (0.00135, 0.99865)
-"""Quantiles that lie at -3 and +3 sigma of a normal distribution."""
+"""Probabilities of a normal distribution at -3 and +3 sigma."""
 
 Interval = tuple[float | None, float | None]
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its confidence interval; None for an end that the runs cannot tell."""
+    """Number with its confidence interval; an end is None where the runs do not determine it."""
 
     value: float
     interval: Interval = (None, None)
 
     @property
     def half_width(self) -> float | None:
-        """Half the interval, None without one."""
+        """Half the width of the interval; None if an end is open."""
         low, high = self.interval
         return None if low is None or high is None else 0.5 * (high - low)
 
 
 @dataclass(frozen=True)
 class Normality:
-    """D'Agostino and Pearson's test of skewness and kurtosis.
+    """Test of normality of D'Agostino and Pearson, by skewness and kurtosis.
 
     Attributes
     ----------
     skewness : float
-        0 for a normal distribution; + has its long tail above.
+        0 for a normal distribution; positive for a long upper tail.
     kurtosis : float
-        Excess, 0 for a normal distribution; + has heavy tails.
+        Excess kurtosis, 0 for a normal distribution; positive for heavy tails.
     p : float
-        How often a normal distribution gives a sample that is as far from it.
+        p-value of the test.
     """
 
     skewness: float
@@ -252,28 +249,26 @@ class Normality:
 
     @property
     def normal(self) -> bool:
-        """Whether nothing speaks against it."""
+        """True if normality is not rejected."""
         return self.p >= UNLIKELY
 
 
 @dataclass(frozen=True)
 class Description:
-    """Statistics of a response.
+    """Descriptive statistics of a response.
 
     Attributes
     ----------
     count : int
-        Runs that have a number.
-    mean, std, median, p95, p997 : Estimate | None
-        With intervals where the runs were drawn; std with n - 1; None without runs.
-    low : float | None
-        Smallest value.
-    high : float | None
-        Largest value.
-    normality : Normality | None
-        None where it is not judged.
-    tails : tuple[float, float] | None
-        Quantiles at `TAILS`, None where too few runs reach there.
+        Number of runs with a finite value.
+    mean, std, median, p95, p997 : Estimate or None
+        Estimates, with intervals where the runs were drawn; std with n - 1; None without runs.
+    low, high : float or None
+        Smallest and largest value.
+    normality : Normality or None
+        Test of normality; None if it is not tested.
+    tails : tuple of float or None
+        Quantiles at ``TAILS``; None if there are too few runs.
     """
 
     count: int
@@ -289,17 +284,17 @@ class Description:
 
 
 def describe(values: np.ndarray, sampled: bool) -> Description:
-    """Statistics of the finite values, with intervals and a test of normality where the runs are a sample.
+    """Return statistics of the finite values, with intervals and a test of normality for sampled runs.
 
-    The intervals take the runs as independent. Evenly spread designs (Latin hypercube, Sobol) know the mean better, so
-    that theirs are on the safe side.
+    The intervals assume independent runs. Stratified designs (Latin hypercube, Sobol) determine the mean better, so
+    that their intervals are conservative.
 
     Parameters
     ----------
-    values : np.ndarray
-        (n,) of a response.
+    values : (n,) ndarray
+        Values of a response.
     sampled : bool
-        Whether the runs are drawn from distributions; those of a grid are not.
+        True if the runs are drawn from distributions; those of a grid are not.
     """
     good = values[np.isfinite(values)]
     n = len(good)
@@ -329,7 +324,7 @@ def describe(values: np.ndarray, sampled: bool) -> Description:
 
 
 def mean_interval(values: np.ndarray) -> Interval:
-    """Student's interval of the mean of (n,) values; open for a single one."""
+    """Return Student's interval of the mean of (n,) values; open for a single value."""
     n = len(values)
     if n < 2:
         return None, None
@@ -339,10 +334,10 @@ def mean_interval(values: np.ndarray) -> Interval:
 
 
 def std_interval(values: np.ndarray) -> Interval:
-    """Interval of the standard deviation of (n,) values, n - 1.
+    """Return the interval of the standard deviation (n - 1) of (n,) values; open below four values.
 
-    In the logarithm, with the variance (k - (n-3)/(n-1)) / (4n) that follows from the kurtosis k of the values; for a
-    normal distribution it is that of chi-square for large n. Open below four values.
+    It is symmetric in the logarithm, whose variance (k - (n-3)/(n-1)) / (4n) follows from the kurtosis k of the values;
+    for a normal distribution it equals the chi-square interval for large n.
     """
     n = len(values)
     if n < 4:
@@ -357,16 +352,16 @@ def std_interval(values: np.ndarray) -> Interval:
 
 
 def quantile_interval(values: np.ndarray, q: float) -> Interval:
-    """Interval of the quantile ``q`` of any continuous distribution by order statistics of (n,) values.
+    """Return the interval of the quantile ``q`` of any continuous distribution from order statistics of (n,) values.
 
-    Each end is passed with a chance of (1 - CONFIDENCE)/2 at most; an end that n values do not reach is None.
+    Each end is exceeded with a probability of at most (1 - CONFIDENCE)/2; an end that n values do not reach is None.
 
     Parameters
     ----------
-    values : np.ndarray
-        (n,) of a response.
+    values : (n,) ndarray
+        Values of a response.
     q : float
-        Share of the runs that lie below the quantile.
+        Probability of the quantile.
     """
     found = stats.quantile_test(values, p=q).confidence_interval(CONFIDENCE)
     return (None if math.isnan(found.low) else float(found.low)), (
@@ -375,14 +370,14 @@ def quantile_interval(values: np.ndarray, q: float) -> Interval:
 
 
 def runs_for_quantile(q: float) -> int:
-    """Number of runs from which on the interval of the quantile ``q`` has both ends."""
+    """Return the smallest number of runs for which the interval of the quantile ``q`` has both ends."""
     side = 0.5 * (1.0 - CONFIDENCE)
     # the largest of n lies below the quantile with q^n
     return math.ceil(math.log(side) / math.log(max(q, 1.0 - q)))
 
 
 def normality(values: np.ndarray) -> Normality | None:
-    """Test of (n,) values; None for fewer than 20 and for constant ones."""
+    """Test (n,) values for normality; None for fewer than 20 values and for constant ones."""
     if len(values) < LEAST or np.ptp(values) == 0.0:
         return None
     p = float(stats.normaltest(values).pvalue)
@@ -390,22 +385,23 @@ def normality(values: np.ndarray) -> Normality | None:
 
 
 FALSE_ALARM = 1e-6
-"""How often noise that is stated rightly, and all that varies, is called impossible; of a response."""
+"""Probability per response that a correctly reported noise is called impossible, where it causes all of the variance.
+"""
 
 
 @dataclass(frozen=True)
 class NoiseShare:
-    """Noise against all that varies in a response.
+    """Reported noise relative to the variance of a response.
 
     Attributes
     ----------
     response : str
-        Its name.
+        Name of the response.
     share : float
-        Mean of the stated variances over the variance of the runs. By chance somewhat above 1 where nothing but noise
+        Mean of the reported noise variances over the variance of the runs; slightly above 1 by chance if only noise
         varies.
     chance : float
-        How often runs vary as little or less where the stated noise is all there is.
+        Probability of so small a variance of the runs, or a smaller one, if the reported noise were all that varies.
     """
 
     response: str
@@ -414,22 +410,22 @@ class NoiseShare:
 
     @property
     def possible(self) -> bool:
-        """Whether the stated noise may be a part of what varies."""
+        """True if the reported noise is compatible with the variance of the runs."""
         return self.chance >= FALSE_ALARM
 
 
 def noise_share(response: Response, study: StudySpec) -> NoiseShare | None:
-    """The share of a response, None where its noise is not stated, does not vary or nothing varies.
+    """Return the noise share of a response; None if no noise is reported, it is common to all runs, or nothing varies.
 
-    Of independent normal noise the sum of squares is chi-square; where the runs differ in noise its degrees of freedom
-    are those of Satterthwaite, Biometrics Bulletin 2, 110 (1946).
+    The sum of squares of independent normal noise has a chi-square distribution; where the noise differs between runs,
+    its degrees of freedom are those of Satterthwaite, Biometrics Bulletin 2, 110 (1946).
 
     Parameters
     ----------
     response : Response
-        Whose noise the runs state.
+        Response with the noise that the runs report.
     study : StudySpec
-        Which says whether runs share their noise.
+        Study, which specifies whether runs share their noise.
     """
     # noise that all runs have in common is a part of what they do not differ by
     if response.noise is None or study.noise == "shared" or response.constant:
@@ -444,7 +440,7 @@ def noise_share(response: Response, study: StudySpec) -> NoiseShare | None:
 
 
 def impossible(runs: StudyRuns) -> InputError | None:
-    """What is wrong with noise that is more than all that varies, each at its key; None where all is possible."""
+    """Return an error about all responses whose reported noise exceeds their variance; None if there is none."""
     study = runs.study
     issues: list[Issue] = []
     for response in runs.responses:
@@ -463,22 +459,22 @@ def impossible(runs: StudyRuns) -> InputError | None:
 
 @dataclass(frozen=True)
 class Effect:
-    """What a factor does to a response, by the linear model and by ranks.
+    """Effect of a factor on a response, by the linear model and by ranks.
 
     Attributes
     ----------
     factor : str
-        Its name.
+        Name of the factor.
     swing : Estimate
-        Change of the response from the factor's 5% to its 95% quantile, in the response's unit; of a text the largest
-        minus the smallest mean of its values, the other factors equal. The quantiles are those of the factor's
+        Change of the response from the factor's 5 % to its 95 % quantile, in the response's unit; for a text the
+        largest minus the smallest mean of its values, at equal other factors. The quantiles are those of the factor's
         distribution where runs are drawn from it.
-    coefficient : Estimate | None
+    coefficient : Estimate or None
         Standardised regression coefficient, sigmas of the response per sigma of the factor; None for texts.
-    rank : Estimate | None
+    rank : Estimate or None
         Spearman's rank correlation; None for texts.
-    span : tuple[float | str, float | str]
-        The factor's quantiles, or for a text its values with the smallest and the largest mean.
+    span : tuple
+        Quantiles of the factor, or for a text its values with the smallest and the largest mean.
     """
 
     factor: str
@@ -490,19 +486,19 @@ class Effect:
 
 @dataclass(frozen=True)
 class LinearModel:
-    """Least squares fit of a response by all factors together, each by itself, without products.
+    """Least-squares fit of a response linear in all factors, without interactions.
 
     Attributes
     ----------
     r2 : float
-        Share of the variance that it explains, 1 for a straight line without noise.
+        Coefficient of determination, 1 for a straight line without noise.
     adjusted : float
-        The same, corrected for the number of terms.
+        Coefficient of determination adjusted for the number of terms.
     terms : int
-        Number of coefficients, the constant included.
-    effects : tuple[Effect, ...]
-        Of each factor that varies, the largest swing first.
-    cannot : tuple[str, ...]
+        Number of coefficients, with the constant.
+    effects : tuple of Effect
+        Effect of each factor that varies, the largest swing first.
+    cannot : tuple of str
         Names of factors whose effects the runs do not separate.
     """
 
@@ -514,19 +510,18 @@ class LinearModel:
 
 
 def linear_model(factors: Sequence[Factor], response: Response) -> LinearModel | None:
-    """The model, None when the response is constant or there are too few runs for it.
+    """Fit the linear model of a response; None if the response is constant or there are too few runs.
 
-    Intervals are those of White's covariance in MacKinnon and White's form HC3, which stays true when what the model
-    leaves is not equally large everywhere. Of standardised coefficients they hold what the drawn factors and responses
-    scatter by, too: sum over the runs of what each does to the coefficient. Columns of the matrix that follow from
-    others are left out.
+    Intervals use the heteroscedasticity-consistent covariance HC3 of MacKinnon and White. Intervals of standardised
+    coefficients also contain the scatter of the sampled factors and responses, by the sum over the runs of the
+    influence of each on the coefficient. Collinear columns of the design matrix are excluded.
 
     Parameters
     ----------
-    factors : Sequence[Factor]
-        Of the study.
+    factors : sequence of Factor
+        Factors of the study.
     response : Response
-        To be fitted.
+        Response to be fitted.
     """
     good = response.good
     y = response.values[good]
@@ -573,7 +568,7 @@ def linear_model(factors: Sequence[Factor], response: Response) -> LinearModel |
 
 
 def _columns(factor: Factor, good: np.ndarray) -> np.ndarray:
-    """(n, m) columns of a factor: its number about the mean in sigmas, or for a text a switch per further value."""
+    """Return the columns (n, m) of a factor: standardised numbers, or for a text one indicator per further value."""
     values = factor.values[good]
     if factor.numeric:
         span = np.ptp(values) if len(values) else 0.0
@@ -586,7 +581,10 @@ def _columns(factor: Factor, good: np.ndarray) -> np.ndarray:
 def _effect(
     factor: Factor, good: np.ndarray, y: np.ndarray, coefficient: np.ndarray, moved: np.ndarray, t: float
 ) -> Effect:
-    """``moved`` (m, n): what each run does to each coefficient; ``t`` of Student's distribution for one interval."""
+    """Return the effect of a factor from its coefficients.
+
+    ``moved`` (m, n) is the influence of each run on each coefficient, ``t`` the quantile of Student's distribution.
+    """
     values = factor.values[good]
     if not factor.numeric:
         levels = [level for level in factor.levels if np.any(values == level)]
@@ -610,7 +608,7 @@ def _effect(
 
 
 def _span(factor: Factor, values: np.ndarray) -> tuple[float, float]:
-    """The 5% and 95% quantiles of a factor: of its distribution, which is known, where the runs are drawn from it."""
+    """Return the 5 % and 95 % quantiles of a factor: of its distribution if drawn, else of its values."""
     if factor.drawn:
         low, high = quantiles(factor.spec, np.array([0.05, 0.95]))
     else:
@@ -619,8 +617,9 @@ def _span(factor: Factor, values: np.ndarray) -> tuple[float, float]:
 
 
 def _largest_difference(means: np.ndarray, moved: np.ndarray, t: float) -> Estimate:
-    """Largest difference of two of (m,) means, the first of which is 0 by definition. The interval covers all pairs at
-    once, after Bonferroni, so that it stays true although the largest is looked for.
+    """Return the largest difference of two of (m,) means, the first of which is 0 by definition.
+
+    The interval covers all pairs simultaneously (Bonferroni), so that it remains valid for the largest.
     """
     moved = np.concatenate([np.zeros((1, moved.shape[1])), moved])
     first, last = np.triu_indices(len(means), 1)
@@ -637,7 +636,7 @@ def _estimate(value: float, moved: np.ndarray, scale: float, t: float) -> Estima
 
 
 def _rank_interval(rank: float, n: int) -> Interval:
-    """Fisher's, with the variance (1 + r^2/2)/(n - 3) of Bonett and Wright for ranks."""
+    """Return Fisher's interval of a rank correlation, with the variance (1 + r^2/2)/(n - 3) of Bonett and Wright."""
     if n < 10:
         return None, None
     if abs(rank) > 1.0 - 1e-12:
@@ -654,13 +653,13 @@ class MainEffect:
     Attributes
     ----------
     factor : str
-        Its name.
-    levels : np.ndarray
-        (m,) its values.
-    means : np.ndarray
-        (m,) mean of the response there.
+        Name of the factor.
+    levels : (m,) ndarray
+        Values of the factor.
+    means : (m,) ndarray
+        Mean of the response at each value.
     swing : float
-        Largest minus smallest.
+        Largest minus smallest mean.
     """
 
     factor: str
@@ -670,14 +669,14 @@ class MainEffect:
 
 
 def main_effects(factors: Sequence[Factor], response: Response) -> tuple[MainEffect, ...]:
-    """Main effects of the factors that take several values with numbers, the largest swing first.
+    """Return the main effects of the factors with at least two values, the largest swing first.
 
     Parameters
     ----------
-    factors : Sequence[Factor]
-        Of the study.
+    factors : sequence of Factor
+        Factors of the study.
     response : Response
-        Of a grid.
+        Response of a grid.
     """
     out = []
     for factor in factors:

@@ -1,4 +1,4 @@
-"""What a job is to a study: a tree of values that runs change, what evaluates the runs, and what is kept of them."""
+"""Base job of a study: a tree of values that runs change, the evaluation of runs, and the responses that are kept."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class Run:
     Attributes
     ----------
     number : int
-        From 0.
-    values : tuple[tuple[KeyPath, Any], ...]
-        (place, value) of everything the factors change in the base's tree.
-    seed : int | None
-        Of its noise; None for the base's own.
+        Number of the run, from 0.
+    values : tuple of tuple
+        Place and value of everything that the factors change in the base's tree.
+    seed : int or None
+        Seed of its noise; None for the base's.
     """
 
     number: int
@@ -46,51 +46,54 @@ class Run:
 
 @dataclass(frozen=True)
 class Failure:
-    """A run that cannot be: light is lost, or its values do not go together.
+    """Run that is physically impossible: light is lost, or its values are incompatible.
 
     Attributes
     ----------
     message : str
-        Why, one line.
+        Reason, on one line.
     """
 
     message: str
 
 
 Outcome = Mapping[str, Any] | Failure
-"""Results by file, as the run folder's JSON files without .json hold them; or why there are none."""
+"""Results by file, as in the run folder's JSON files without the suffix .json; or the reason why there are none."""
 
 
 class BaseJob(Protocol):
-    """A command that a study can vary."""
+    """Command that a study can vary."""
 
     @property
     def model(self) -> type[Spec]:
-        """What its config.yaml describes."""
+        """Model of its config.yaml."""
 
     @property
     def block(self) -> int:
-        """Consecutive runs that are always evaluated together, whoever does it."""
+        """Number of consecutive runs that are always evaluated together, on any worker."""
 
     def resolve(self, file: Path | str) -> Spec:
-        """Read its file, or the name of one in the library, with all it refers to. Raises InputError."""
+        """Read its file, or a name in the library, with everything it refers to; raise InputError."""
 
     def check(self, tree: Tree, backend: Backend) -> None:
-        """What can only be told with the job built; called once, in a worker, before the study. Raises InputError."""
+        """Check what needs the built instrument; called once, in a worker, before the study; raise InputError."""
 
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
-        """Outcome of every run. The numbers may depend on which runs are done together, but on nothing else."""
+        """Return the outcome of every run.
+
+        The numbers may depend on which runs are evaluated together, but on nothing else.
+        """
 
 
 PHYSICS = (InputError, PhysicalError, MeasurementError)
-"""What says that a run cannot be: its values do not go together, light is lost, a fit finds no end. Any other error is
-a fault of the program and stops the study.
+"""Errors of a run that is physically impossible: incompatible values, lost light, a fit without convergence. Any other
+error is a fault of the program and stops the study.
 """
 
 
 @dataclass(frozen=True)
 class ProcedureBase:
-    """A test, one run after the other; only its numbers are made.
+    """Test as a base job, run after run; only its numbers are computed.
 
     Attributes
     ----------
@@ -102,16 +105,16 @@ class ProcedureBase:
 
     @property
     def model(self) -> type[Spec]:
-        """The test's set-up."""
+        """Model of the test's set-up."""
         return self.procedure.model
 
     @property
     def block(self) -> int:
-        """One: nothing is gained by doing several together, and each is kept as soon as it is done."""
+        """Block size 1: evaluating runs together gains nothing, and each is kept as soon as it is finished."""
         return 1
 
     def resolve(self, file: Path | str) -> Spec:
-        """Read the test with all it refers to. Raises InputError."""
+        """Read the test with everything it refers to; raise InputError."""
         setup: Any = self.procedure.resolve(file)
         if not isinstance(setup, self.model):
             text = "measurements cannot be varied; a study needs a simulated bench"
@@ -119,10 +122,10 @@ class ProcedureBase:
         return setup
 
     def check(self, tree: Tree, backend: Backend) -> None:
-        """Nothing more can be told before a run."""
+        """Do nothing, since nothing can be checked before a run."""
 
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
-        """Outcome of every run, one after the other."""
+        """Return the outcome of every run, evaluated one after the other."""
         return [self._one(tree, run, backend) for run in runs]
 
     def _one(self, tree: Tree, run: Run, backend: Backend) -> Outcome:
@@ -136,33 +139,34 @@ class ProcedureBase:
 
 
 def one_line(error: Exception) -> str:
-    """What went wrong, on one line; an input error without the file it does not have."""
+    """Return the error's text on one line; an input error without its file, which does not exist."""
     if not str(error).strip():
         return type(error).__name__
     return "; ".join(line.strip().removeprefix("input: ") for line in str(error).splitlines() if line.strip())
 
 
 Tree = dict[str, Any]
+"""Plain data of a model: mappings, lists and single values."""
 
 
 def with_place(tree: Tree, model: type[Spec], key: KeyPath, neutral: bool = False) -> Tree:
-    """The tree in which ``key`` leads to a single value; what is missing but may be there is made with its defaults.
+    """Return the tree in which ``key`` leads to a single value; missing optional parts are created with their defaults.
 
     Parameters
     ----------
-    tree : Tree
+    tree : dict
         Plain data of a ``model``; not changed.
-    model : type[Spec]
-        What the tree describes.
+    model : type of Spec
+        Model of the tree.
     key : KeyPath
         Keys and list indices from the root.
     neutral : bool
-        Whether a number without a default, which would be None, is zero where zero has the same effect.
+        True to replace a missing number without a default by zero where zero has the same effect as its absence.
 
     Raises
     ------
     Problem
-        It leads nowhere; ``within`` is the part that does not fit.
+        The key does not exist; ``within`` is the part that does not fit.
     """
     out = copy.deepcopy(tree)
     node: Any = out
@@ -186,16 +190,16 @@ def with_place(tree: Tree, model: type[Spec], key: KeyPath, neutral: bool = Fals
 
 
 def says_nothing(tree: Tree, model: type[Spec], key: KeyPath) -> bool:
-    """Return whether all that ``with_place`` adds for ``key`` has the same effect as its absence.
+    """Return True if everything that ``with_place`` adds for ``key`` has the same effect as its absence.
 
     Parameters
     ----------
-    tree : Tree
+    tree : dict
         Plain data of a ``model``.
-    model : type[Spec]
-        What the tree describes.
+    model : type of Spec
+        Model of the tree.
     key : KeyPath
-        Keys and list indices from the root, which lead somewhere.
+        Keys and list indices from the root, which must exist in the model.
     """
     node: Any = tree
     for k, part in enumerate(key):
@@ -212,7 +216,7 @@ def says_nothing(tree: Tree, model: type[Spec], key: KeyPath) -> bool:
 
 
 def _entry(node: Tree, model: type[Spec], key: KeyPath, k: int, last: bool) -> Any:
-    """What stands below ``key[k]`` in a mapping, made if it may be there."""
+    """Return the entry at ``key[k]`` of a mapping, created if the model allows it."""
     part = key[k]
     if part in node:
         return node[part]
@@ -234,7 +238,7 @@ def _fields(annotation: Any) -> tuple[str, ...]:
 
 
 def _default(annotation: Any) -> Any:
-    """Plain data of what a value is when nothing is said of it; None if there is no such thing."""
+    """Return the plain data of a value's default; None if it has none."""
     if not _is_model(annotation):
         return {} if typing.get_origin(annotation) is dict else None
     try:
@@ -248,14 +252,14 @@ def _is_model(annotation: Any) -> bool:
 
 
 def with_values(tree: Tree, values: Iterable[tuple[KeyPath, Any]]) -> Tree:
-    """The tree with other values at places that are there; what is not changed is shared with ``tree``.
+    """Return the tree with other values at existing places; unchanged parts are shared with ``tree``.
 
     Parameters
     ----------
-    tree : Tree
+    tree : dict
         Plain data; not changed.
-    values : Iterable[tuple[KeyPath, Any]]
-        (place, value) of all that changes.
+    values : iterable of tuple
+        Place and value of everything that changes.
     """
     out = dict(tree)
     own = {id(out)}
@@ -273,7 +277,7 @@ def with_values(tree: Tree, values: Iterable[tuple[KeyPath, Any]]) -> Tree:
 
 
 def leaf(tree: Any, key: KeyPath) -> Any:
-    """What stands at ``key`` of results.
+    """Return the value at ``key`` of results.
 
     Parameters
     ----------
@@ -285,7 +289,7 @@ def leaf(tree: Any, key: KeyPath) -> Any:
     Raises
     ------
     Problem
-        Nothing does; ``within`` is the part that does not fit.
+        The key does not exist; ``within`` is the part that does not fit.
     """
     node = tree
     for k, part in enumerate(key):
@@ -307,18 +311,18 @@ class BlockResult:
 
     Attributes
     ----------
-    values : np.ndarray
-        (n, R) in the order of the study's responses, NaN in runs that failed and where there is no number.
-    sigmas : np.ndarray
-        (n, R) their standard deviations, NaN where none is asked for.
-    noises : np.ndarray
-        (n, R) those by noise alone, likewise.
-    messages : tuple[str, ...]
-        (n,) why a run failed, empty for one that did not.
+    values : (n, R) ndarray
+        Responses in the study's order, NaN in failed runs and where there is no number.
+    sigmas : (n, R) ndarray
+        Their standard deviations, NaN where none is requested.
+    noises : (n, R) ndarray
+        Their standard deviations by noise alone, NaN where none is requested.
+    messages : tuple of str
+        Reason of each failure, (n,), empty for a run that did not fail.
     seconds : float
-        That a worker took for them.
-    doubts : tuple[str, ...]
-        (n,) why sigma does not hold in a run that did not fail, empty where it does.
+        Computing time on the worker.
+    doubts : tuple of str
+        Reason why sigma does not hold in a run that did not fail, (n,), empty where it holds.
     """
 
     values: np.ndarray
@@ -329,7 +333,7 @@ class BlockResult:
     doubts: tuple[str, ...]
 
     def fits(self, shape: tuple[int, int]) -> bool:
-        """Return whether these are results of so many runs and responses, as a file may hold anything."""
+        """Return True if these are results of the given numbers of runs and responses; a file may hold anything."""
         arrays = all(
             isinstance(one, np.ndarray) and one.shape == shape and one.dtype == float
             for one in (self.values, self.sigmas, self.noises)
@@ -339,14 +343,14 @@ class BlockResult:
 
     @property
     def failed(self) -> np.ndarray:
-        """(n,) whether a run failed."""
+        """True for failed runs, (n,)."""
         return np.array([bool(message) for message in self.messages], bool)
 
     @classmethod
     def of(
         cls, outcomes: Sequence[Outcome], responses: Mapping[str, ResponseSpec], seconds: float = 0.0
     ) -> BlockResult:
-        """The responses of some outcomes."""
+        """Return the responses of outcomes."""
         values = np.full((len(outcomes), len(responses)), np.nan)
         sigmas, noises = (np.full(values.shape, np.nan) for _ in range(2))
         messages: list[str] = []
@@ -374,7 +378,7 @@ class BlockResult:
 
     @classmethod
     def joined(cls, parts: Sequence[BlockResult]) -> BlockResult:
-        """Several, one after the other."""
+        """Return several results concatenated in order."""
         return cls(
             np.concatenate([part.values for part in parts]),
             np.concatenate([part.sigmas for part in parts]),
@@ -386,11 +390,11 @@ class BlockResult:
 
 
 CONTRADICTED = "the shifts of the spots contradict the stated disturbances"
-"""Why sigma does not hold where the fits of the spots are good."""
+"""Reason why sigma does not hold although the fits of the spots are good."""
 
 
 def _doubt(outcome: Mapping[str, Any]) -> str:
-    """Why the sigmas of what was recovered do not hold, without its numbers; empty where they do."""
+    """Return the reason why the recovered sigmas do not hold, without its numbers; empty where they hold."""
     recovered = outcome.get("recovered", {})
     course = outcome.get("course", {}).get("sigma_holds", [])
     if not isinstance(recovered, Mapping) or (recovered.get("sigma_holds", True) and all(course)):
@@ -401,7 +405,7 @@ def _doubt(outcome: Mapping[str, Any]) -> str:
 
 
 def _number(outcome: Mapping[str, Any], key: Any, name: str) -> float:
-    """The number at a key of the results; NaN where they hold none."""
+    """Return the number at a key of the results; NaN where they have none."""
     try:
         value = leaf(outcome, key)
     except Problem as problem:
@@ -414,12 +418,12 @@ def _number(outcome: Mapping[str, Any], key: Any, name: str) -> float:
 
 
 def check_response(sample: Mapping[str, Any], key: Any) -> None:
-    """Check that results like ``sample`` have a number at ``key``.
+    """Raise Problem if results like ``sample`` have no number at ``key``.
 
     Raises
     ------
     Problem
-        They do not; ``within`` is the part that does not fit, ``allowed`` what there is.
+        There is no number; ``within`` is the part that does not fit, ``allowed`` what exists.
     """
     value = leaf(sample, key)
     if isinstance(value, Mapping):

@@ -1,6 +1,6 @@
-"""The blocks of a study that are not there yet, computed by worker processes: first one that tells how long all take.
+"""Computation of the missing blocks of a study by worker processes; a first block is timed for an estimate.
 
-A worker evaluates whole blocks, on one thread. A finished block is in the study's journal before it counts.
+A worker evaluates whole blocks on one thread. A finished block is written to the study's journal before it counts.
 """
 
 from __future__ import annotations
@@ -29,31 +29,31 @@ from twin.study.runs.plan import Plan
 from twin.study.runs.setup import StudySetup, study_from_text
 
 BLOCKS = "blocks.journal"
-"""The journal in the folder of a study."""
+"""Name of the journal in the folder of a study."""
 LONGEST_REPEAT = 4.0
-"""Seconds: a first block that took longer is not evaluated again for the sake of its time."""
+"""Time, seconds, beyond which the first block is not evaluated a second time for a better estimate."""
 _ALONE = threading.Lock()
-"""A worker that has several threads still evaluates one block at a time: Dr.Jit's state belongs to the process."""
+"""Lock by which a worker with several threads evaluates one block at a time: Dr.Jit's state belongs to the process."""
 
 
 class OtherProgramError(Exception):
-    """The worker does not run the program that the study was started with."""
+    """The worker runs another version of the program than the study was started with."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """A block of a study with all that a worker needs for it.
+    """Block of a study with everything that a worker needs for it.
 
     Attributes
     ----------
     config : str
         Text of the study's config.yaml.
     source : str
-        Checksum of the program's source files, which the worker's must have too.
+        Checksum of the program's source files, which the worker must have too.
     backend : str
-        Where to trace.
-    runs : tuple[Run, ...]
-        Of the block.
+        Array backend of the ray trace.
+    runs : tuple of Run
+        Runs of the block.
     """
 
     config: str
@@ -64,20 +64,20 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class Pilot:
-    """The first block of a study.
+    """First block of a study.
 
     Attributes
     ----------
     result : BlockResult
-        Of the block; its seconds are those of a second evaluation, with everything compiled and calibrated.
-    sample : Mapping[str, Any] | None
+        Result of the block; its time is that of a second evaluation, with everything compiled and calibrated.
+    sample : dict or None
         All results of the first run that did not fail, None if all did.
     start_seconds : float
-        What the first evaluation took longer.
+        Time that the first evaluation took longer than the second.
     memory : float
-        Largest that the worker's process has been, bytes.
-    refusal : InputError | None
-        Why the study cannot be run at all.
+        Peak memory of the worker's process, bytes.
+    refusal : InputError or None
+        Reason why the study cannot be run at all.
     """
 
     result: BlockResult
@@ -88,15 +88,15 @@ class Pilot:
 
 
 def evaluate(task: Task) -> BlockResult:
-    """Results of a block. A fault of the program is raised with the runs' numbers in its notes."""
+    """Return the results of a block; a fault of the program is raised with the runs' numbers in its notes."""
     with _ALONE:
         return _block(*_prepared(task), task.runs)[0]
 
 
 def pilot(task: Task) -> Pilot:
-    """Evaluate one block, twice: the first time the instrument is built and kernels are compiled.
+    """Evaluate one block twice: the first time the instrument is built and kernels are compiled.
 
-    The second evaluation gives the same numbers; it is the one that is timed and kept.
+    The second evaluation gives the same numbers; it is timed and kept.
     """
     with _ALONE:
         start = time.monotonic()
@@ -136,10 +136,10 @@ def _setup(config: str) -> StudySetup:
 
 
 def _one_thread() -> None:
-    """Let this process do everything on the thread that asks for it; workers are as many as there are cores.
+    """Limit this process to the calling thread; there are as many workers as cores.
 
-    For workers that somebody else has started the environment comes too late, so the libraries are told as well; again
-    for every block, since some are loaded only when they are needed.
+    For workers started by somebody else the environment variables come too late, so the libraries are limited directly,
+    again for every block, since some are loaded only when they are needed.
     """
     from threadpoolctl import ThreadpoolController
 
@@ -156,42 +156,42 @@ def _one_thread() -> None:
 
 
 def journal_of(setup: StudySetup, file: Path | None, noun: str = "study") -> Journal:
-    """The journal of a study's blocks.
+    """Return the journal of a study's blocks.
 
     Parameters
     ----------
     setup : StudySetup
         The study.
-    file : Path | None
-        Of the journal, None to keep nothing.
+    file : Path or None
+        File of the journal, None to keep nothing.
     noun : str
-        What the study is, for messages.
+        Word for the study in messages.
     """
     return Journal(file, setup.content, noun, (BlockResult,))
 
 
 @dataclass(eq=False)
 class Engine:
-    """Computes the blocks of a study that are not in its journal.
+    """Engine that computes the blocks of a study that are missing in its journal.
 
     Attributes
     ----------
     plan : Plan
         All runs.
     journal : Journal
-        Of the study's blocks, open.
+        Open journal of the study's blocks.
     backend : str
-        Where to trace.
-    advance : Callable[[int, int], None]
-        Told the number of runs that are there, and of all.
-    say : Callable[[str], None]
-        Told how long it will take, once the first block is there.
-    warn : Callable[[str], None]
-        Told what the user should know.
+        Array backend of the ray trace.
+    advance : callable
+        Function that receives the numbers of finished and of all runs.
+    say : callable
+        Function that receives the estimate of time and memory after the first block.
+    warn : callable
+        Function that receives warnings.
     computed : int
         Number of runs that this engine has computed.
     seconds : float
-        That it took for them.
+        Computing time of these runs.
     """
 
     plan: Plan
@@ -204,47 +204,46 @@ class Engine:
     seconds: float = 0.0
 
     def __post_init__(self) -> None:
-        """Tell of what the journal has lost."""
+        """Warn about corrupt lines of the journal."""
         if lost := self.journal.damaged:
             lines = "1 line of it is" if lost == 1 else f"{lost} lines of it are"
             self.warn(f"{self.journal.file}: {lines} corrupt; what it held is computed again")
 
     def _known(self, block: int) -> BlockResult | None:
-        """The results of a block if it is there."""
+        """Return the results of a block if they are in the journal."""
         found = self.journal.known.get(str(block))
         shape = len(self.plan.block(block)), len(self.plan.setup.study.responses)
         return found if isinstance(found, BlockResult) and found.fits(shape) else None
 
     @property
     def missing(self) -> list[int]:
-        """Numbers of the blocks that are not there, in order."""
+        """Numbers of the missing blocks, in order."""
         return [block for block in range(self.plan.blocks) if self._known(block) is None]
 
     def result(self) -> BlockResult:
-        """Results of all runs, in order; all blocks must be there."""
+        """Return the results of all runs, in order; no block may be missing."""
         return BlockResult.joined([found for block in range(self.plan.blocks) if (found := self._known(block))])
 
     def run(self, workers: cluster.Workers, own_memory: float = 0.0) -> None:
-        """Compute whatever is missing.
+        """Compute all missing blocks.
 
         Parameters
         ----------
         workers : cluster.Workers
-            Who computes.
+            Worker processes.
         own_memory : float
-            Of this process, bytes, for the estimate.
+            Memory of this process, bytes, for the estimate.
 
         Raises
         ------
         InputError
-            The base cannot be run as it is, or a response's key leads nowhere in its results.
+            The base cannot be run as it is, or the key of a response does not exist in its results.
         Incomplete
-            Workers died again and again in some runs; or any error but those that say that a run cannot be. What is
-            done is kept.
+            Workers died repeatedly in some runs, or the program failed; finished blocks are kept.
         ClusterError
             The scheduler is gone.
         RunFolderError
-            a block cannot be kept.
+            A block cannot be written to the journal.
         """
         started = time.monotonic()
         missing = self.missing
@@ -265,7 +264,7 @@ class Engine:
         return sum(len(self.plan.block(block)) for block in blocks)
 
     def _estimate(self, first: Pilot, missing: Sequence[int], there: int, workers: int, own_memory: float) -> None:
-        """Tell what the study will take, by its first block."""
+        """Report the estimated time and memory of the study, from its first block."""
         runs = self._runs(missing)
         each = first.result.seconds / len(first.result.messages)
         seconds = -(-(len(missing) - 1) // workers) * first.result.seconds + first.start_seconds * (workers > 1)
@@ -282,7 +281,7 @@ class Engine:
         )
 
     def _first(self, workers: cluster.Workers, block: int) -> Pilot:
-        """Do the first block and see whether the results hold what is asked for."""
+        """Compute the first block and check that its results hold all responses."""
         ((_, future),) = next(workers.each(pilot, [self.task(block)]))
         if future.status != "finished":
             if cluster.killed(future.exception()):
@@ -300,7 +299,7 @@ class Engine:
         return first
 
     def _all(self, workers: cluster.Workers, blocks: Sequence[int], there: int) -> list[int]:
-        """Compute blocks; return those in which workers died."""
+        """Compute blocks and return those in which workers died."""
         lost = []
         for finished in workers.each(evaluate, map(self.task, blocks)):
             self._keep({blocks[k]: future.result() for k, future in finished if future.status == "finished"})
@@ -317,13 +316,13 @@ class Engine:
         self.computed += self._runs([*results])
 
     def task(self, block: int) -> Task:
-        """What a worker is given of a block."""
+        """Return the task of a block for a worker."""
         runs = tuple(self.plan.run(number) for number in self.plan.block(block))
         return Task(self.plan.config, source_digest(), self.backend, runs)
 
 
 def _fault(future: Any) -> Incomplete:
-    """What is raised for a task that has failed otherwise than by the death of its worker."""
+    """Return the error to raise for a task that failed otherwise than by the death of its worker."""
     error = future.exception()
     notes = " ".join(getattr(error, "__notes__", ()))
     text = f"{type(error).__name__}: {error} {notes}".strip()
@@ -334,7 +333,7 @@ def _fault(future: Any) -> Incomplete:
 
 
 def check_responses(setup: StudySetup, sample: Any) -> None:
-    """Check that the results hold every response of a study.
+    """Raise InputError if the results lack a response of a study.
 
     Parameters
     ----------
@@ -346,7 +345,7 @@ def check_responses(setup: StudySetup, sample: Any) -> None:
     Raises
     ------
     InputError
-        One that they do not, with what there is.
+        A response is missing; the error lists what exists.
     """
     for name, response in setup.study.responses.items():
         asked = {"key": response.key, "sigma": response.sigma, "noise": response.noise, "minus": response.minus}
@@ -365,12 +364,12 @@ def check_responses(setup: StudySetup, sample: Any) -> None:
 
 
 def _check_noise(setup: StudySetup, sample: Any, name: str, path: KeyPath) -> None:
-    """Check that the noise of a response is not a total standard deviation beside which that of noise stands.
+    """Raise InputError if the noise of a response is a total standard deviation beside which that of noise exists.
 
     Raises
     ------
     InputError
-        It is.
+        The key is that of a total standard deviation.
     """
     place = max((k for k, part in enumerate(path) if isinstance(part, str)), default=0)
     named = str(path[place])

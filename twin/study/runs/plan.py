@@ -1,4 +1,4 @@
-"""Plan of a study: the values of its factors in every run, the values that scale with a factor, and the memory needed."""
+"""Plan of a study: values of its factors in every run, values that scale with them, and memory needed."""
 
 from __future__ import annotations
 
@@ -120,8 +120,9 @@ def _far(a: float, b: float, u: np.ndarray) -> np.ndarray:
 
 
 def quantiles(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
-    """Return the quantiles of a factor of numbers at probabilities ``u``; for a list the smallest value that reaches
-    ``u``.
+    """Return the quantiles of a factor of numbers at probabilities ``u``.
+
+    For a list each is the smallest value that reaches the probability.
 
     Parameters
     ----------

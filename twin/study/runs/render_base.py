@@ -1,7 +1,7 @@
-"""The main job as the base of a study: states of one instrument are done together, all else run by run.
+"""Main job as the base of a study: states of one instrument are evaluated together, everything else run by run.
 
-A state's numbers differ in the last bits with the states it is done with; so a block is always the same runs. Most
-studies change nothing but numbers under ``perturb``, so that the job of a run can be made quickly (`JobMaker`).
+The last bits of a state's numbers depend on the states it is traced with, so a block always holds the same runs. Most
+studies change only numbers under ``perturb``, for which the job of a run is built quickly (`JobMaker`).
 """
 
 from __future__ import annotations
@@ -37,21 +37,20 @@ from twin.study.runs.base_job import PHYSICS, Failure, Outcome, Run, Tree, one_l
 def run_results(
     resolved: ResolvedJob, experiment: MonitorExperiment, state: State, truth: Truth, recovery: Recovery | None = None
 ) -> dict[str, Any]:
-    """``truth`` and, with a monitor, ``recovered``: contents of truth.json and recovered.json, made by the code that
-    makes the files.
+    """Return ``truth`` and, with a monitor, ``recovered``, as in truth.json and recovered.json.
 
     Parameters
     ----------
     resolved : ResolvedJob
         The job.
     experiment : MonitorExperiment
-        Its instrument.
+        Instrument of the job.
     state : State
-        What the job perturbs.
+        Perturbed state.
     truth : Truth
-        Of this one state.
-    recovery : Recovery | None
-        What its images or spots say, None without a monitor.
+        Exact trace of this state.
+    recovery : Recovery, optional
+        Estimates from its images or spots, None without a monitor.
     """
     known: dict[str, Any] = {"resolved": resolved, "experiment": experiment, "state": state, "truth": truth}
     known |= {"frames": resolved.frames, "seed": resolved.job.render.seed, "warnings": ()}
@@ -63,28 +62,28 @@ def run_results(
 
 
 MonitorRun = tuple[ResolvedJob, State]
-"""A job, and what it perturbs."""
+"""Job and its perturbed state."""
 
 
 def _run_together(
     experiment: MonitorExperiment, runs: Sequence[MonitorRun], before: Callable[[int, int], np.ndarray]
 ) -> list[Outcome]:
-    """Results of runs of one instrument with one number of frames, as truth.json and recovered.json hold them.
+    """Return the results of runs of one instrument with one number of frames, as in truth.json and recovered.json.
 
     Parameters
     ----------
     experiment : MonitorExperiment
         The instrument.
-    runs : Sequence[MonitorRun]
-        To be done at once.
-    before : Callable[[int, int], np.ndarray]
-        Number of frames and seed -> frames of the nominal state, (C, frames, rows, columns).
+    runs : sequence of MonitorRun
+        Runs to be evaluated together.
+    before : callable
+        Function from number of frames and seed to frames of the nominal state, (C, frames, rows, columns).
 
     Returns
     -------
-    list[Outcome]
-        For each run its results, or why it has none. When one run's light is lost, all runs of the group are tried
-        alone, and those that are good are done together without it.
+    list of Outcome
+        Results of each run, or the reason of its failure. If one run's light is lost, all runs of the group are tried
+        alone, and the others are then evaluated together.
     """
     out: list[Outcome] = [Failure("not done")] * len(runs)
     frames, seeds = runs[0][0].frames, [resolved.job.render.seed for resolved, _ in runs]
@@ -112,12 +111,13 @@ def _run_together(
 
 
 _PATTERN_FRAMES = 8
-"""Frames that take as much memory as the fixed pattern of their CCDs."""
+"""Number of frames whose memory equals that of the fixed pattern of their CCDs."""
 
 
 def _traced_together(experiment: MonitorExperiment, runs: Sequence[MonitorRun]) -> list[Outcome]:
-    """Truth of runs of one instrument without a monitor, as truth.json holds it; when one run's light is lost, all are
-    tried alone.
+    """Return the truth of runs of one instrument without a monitor, as in truth.json.
+
+    If one run's light is lost, all are evaluated alone.
     """
     try:
         truth = experiment.sight.truth([state for _, state in runs])
@@ -131,15 +131,15 @@ def _traced_together(experiment: MonitorExperiment, runs: Sequence[MonitorRun]) 
 
 
 BLOCK = 25
-"""A run's last digits depend on those that it is traced with, its block; and not on the number of workers
-or where a study was interrupted.
+"""Number of runs in a block. A run's last digits depend on the runs of its block, and so neither on the number of
+workers nor on interruptions.
 """
 KEPT = 4
-"""Instruments with their calibration that a worker keeps."""
+"""Number of calibrated instruments that a worker keeps."""
 
 
 class RenderBase:
-    """``python -m twin.render``, without the crosstalk tables. It keeps instruments from one block to the next."""
+    """Base job ``python -m twin.render``, without the crosstalk tables; it keeps instruments between blocks."""
 
     model: type[Spec] = ResolvedJob
     block = BLOCK
@@ -150,11 +150,11 @@ class RenderBase:
         self._maker: JobMaker | None = None
 
     def resolve(self, file: Path | str) -> Spec:
-        """Read a job with all it refers to. Raises InputError."""
+        """Read a job with everything it refers to; raise InputError."""
         return resolve(file)
 
     def check(self, tree: Tree, backend: Backend) -> None:
-        """Whether the perturbed nodes are there and allow what is done to them. Raises InputError."""
+        """Raise InputError if a perturbed node does not exist or does not allow its perturbation."""
         resolved = read_job(tree)
         experiment = self._experiment(resolved, backend)[1]
         checked_nodes(resolved.job, experiment.instrument.nodes)
@@ -162,8 +162,9 @@ class RenderBase:
             experiment.stated  # noqa: B018 - raises where the instrument does not have what is stated
 
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
-        """Outcome of every run: ``truth`` and ``recovered``; if asked for, also ``quality``, and with a course, stray
-        light or targets these.
+        """Return the outcome of every run: ``truth`` and ``recovered``, and further results on request.
+
+        These are ``quality``, and the results of a course, stray light or targets.
         """
         if self._maker is None or self._maker.tree is not tree:  # the same object from block to block
             self._maker = JobMaker(tree)
@@ -212,7 +213,7 @@ class RenderBase:
         return [outcome if outcome is not None else Failure("not done") for outcome in out]
 
     def _experiment(self, resolved: ResolvedJob, backend: Backend) -> tuple[str, MonitorExperiment]:
-        """The instrument with its calibration, and what tells it from others."""
+        """Return the instrument with its calibration, and a name that identifies it."""
         parts: list[Spec | None] = [resolved.instrument, *resolved.cameras.values(), resolved.detector]
         parts.append(resolved.disturbances)
         name = json.dumps([backend.name, *(part.plain() for part in parts if part is not None)])
@@ -223,7 +224,7 @@ class RenderBase:
         return name, self._experiments[name]
 
     def _frames_before(self, name: str, experiment: MonitorExperiment, frames: int, seed: int) -> np.ndarray:
-        """Kept, since runs that share their noise share these frames."""
+        """Return the frames before, kept between runs because runs with common noise share them."""
         key = (name, frames, seed)
         if key not in self._before:
             self._before[key] = experiment.frames_before(frames, seed)
@@ -234,7 +235,7 @@ class RenderBase:
 def _qualities(
     instrument: Instrument, backend: Backend, states: Sequence[State], obstructed: bool
 ) -> list[dict[str, Any] | Failure]:
-    """Image quality of states, done together; when it cannot be in one, all are tried alone."""
+    """Return the image quality of states, computed together; if one state fails, all are computed alone."""
     try:
         return [*quality_dicts(instrument, backend, states, obstructed)]
     except PHYSICS as error:
@@ -244,7 +245,7 @@ def _qualities(
 
 
 def _alone(resolved: ResolvedJob, backend: Backend) -> Outcome:
-    """A job that has more than one state, or more than spots."""
+    """Return the outcome of a job with more than one state, or with more than spots."""
     from twin.main_job.render_job import render_job
 
     run = render_job(resolved, backend)
@@ -261,37 +262,38 @@ def _alone(resolved: ResolvedJob, backend: Backend) -> Outcome:
 
 
 def _forget(kept: OrderedDict[Any, Any]) -> None:
-    """Drop what was used longest ago."""
+    """Drop the least recently used items."""
     while len(kept) > KEPT:
         kept.popitem(last=False)
 
 
 PERTURB = ("job", "perturb")
+"""Beginning of the keys of perturbations in the base's tree."""
 
 
 class JobMaker:
-    """Jobs of the runs of one study.
+    """Builder of the jobs of the runs of one study.
 
-    Of a run that changes nothing but numbers under ``perturb`` only the perturbations of these bodies are read again,
-    without their tables of displaced nodes, which a study does not vary; of any other the whole job, which takes some
-    ten times as long.
+    For a run that changes only numbers under ``perturb``, only the perturbations of these bodies are validated again,
+    without their tables of displaced nodes, which a study does not vary. Any other run needs the whole job, which takes
+    about ten times as long.
 
     Parameters
     ----------
-    tree
-        Plain data of a ResolvedJob; whatever is changed is there.
+    tree : dict
+        Plain data of a ResolvedJob, with an entry at every place that runs change.
     """
 
     def __init__(self, tree: Tree) -> None:
         self.tree, self.base = tree, read_job(tree)
 
     def job(self, values: tuple[tuple[KeyPath, Any], ...]) -> ResolvedJob:
-        """The job with these values.
+        """Return the job with these values.
 
         Raises
         ------
         InputError
-            a value that the schema does not allow.
+            The schema does not allow a value.
         """
         if not values:
             return self.base
@@ -310,11 +312,11 @@ class JobMaker:
 
 
 def read_job(tree: Tree) -> ResolvedJob:
-    """The job that plain data describe. Raises InputError."""
+    """Return the job of plain data; raise InputError if it is invalid."""
     resolved: ResolvedJob = validate(ResolvedJob, YamlFile("", tree, {}))
     return resolved
 
 
 def _needs_more(job: JobSpec) -> bool:
-    """Whether a job asks for what is not done for many states at once: a course, stray light or test targets."""
+    """Return True if a job has a course, stray light or targets, which are not computed for many states at once."""
     return job.course is not None or job.render.stray is not None or bool(job.render.target_images)

@@ -1,4 +1,4 @@
-"""A study together with all it refers to: its base job's resolved tree and the tables of its factors."""
+"""Setup of a study: its specification, the resolved tree of its base job and the tables of its factors."""
 
 from __future__ import annotations
 
@@ -29,28 +29,25 @@ from twin.study.runs.base_job import BaseJob, ProcedureBase, Tree, says_nothing,
 
 PROGRAM = "twin.study"
 BY_NAME = ("instrument", "disturbances")
-"""Keys of a job whose files are parts of the resolved base, beside the job; a change of the name would change nothing.
-"""
+"""Keys of a job that name files whose contents are in the resolved base; changing the name would have no effect."""
 WORDS = ("name", "description", "limits", "report")
-"""Keys of a study that change no number of it: they may be others when it is gone on with, as may names and units of
-responses.
-"""
+"""Keys of a study that affect no number; they, names and units of responses may be changed when a study is resumed."""
 
 
 @dataclass(frozen=True, eq=False)
 class StudySetup:
-    """A study with all it refers to.
+    """Study with everything it refers to.
 
     Attributes
     ----------
     study : StudySpec
-        As the user wrote it, with the tables' values.
-    tree : Tree
-        Plain data of the resolved base with a place for every factor; where the base has no value, and none has the
-        same effect, one of the factor's.
-    base : Tree
-        The same without any value of a factor: a place is there only if the base has a value at it, or one that has the
-        same effect as none.
+        Specification in the study's file, with the values of the tables.
+    tree : dict
+        Plain data of the resolved base with an entry at the place of every factor. If the base has no value there and
+        absence has the same effect as a value, that value is used; else one of the factor's.
+    base : dict
+        The same without values of factors: an entry exists only if the base has one, or one with the same effect as its
+        absence.
     """
 
     study: StudySpec
@@ -59,16 +56,16 @@ class StudySetup:
 
     @cached_property
     def job(self) -> BaseJob:
-        """What runs the base."""
+        """Base job."""
         return _job(self.study.base.command)
 
     def to_yaml(self) -> str:
-        """Text of the study's config.yaml, which ``resolve_study`` reads back to the same values."""
+        """Return the text of the study's config.yaml, which ``resolve_study`` reads back to the same values."""
         return yaml_file.dump_yaml({"study": self.study.plain(), "base": self.base})
 
     @cached_property
     def content(self) -> str:
-        """Checksum of everything in the study that a number depends on; the base's tree has all library files."""
+        """Checksum of everything in the study that affects a number; the base's tree contains all library files."""
         study = {key: value for key, value in self.study.plain().items() if key not in WORDS}
         study["base"] = {"command": self.study.base.command}
         # in their order: what is drawn for a factor, and the column of a response, go by their numbers
@@ -79,25 +76,23 @@ class StudySetup:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Tells studies with other numbers apart: the content, the program's source files and the versions of what it
-        uses.
-        """
+        """Checksum of the content, the program's source files and the versions of its dependencies."""
         return hashlib.sha256(json.dumps([self.content, versions(), source_digest()]).encode()).hexdigest()
 
     def error(self, problem: Problem | str, key: KeyPath, allowed: str | None = None) -> InputError:
-        """Something wrong at ``key`` of the study."""
+        """Return an error at ``key`` of the study."""
         if isinstance(problem, str):
             return self.study.error(problem, key, allowed=allowed)
         told = Issue(problem.problem, "", None, (), problem.found, problem.allowed, problem.suggestion)
         return InputError(self._placed(told, (*key, *problem.within)))
 
     def _placed(self, issue: Issue, key: KeyPath) -> Issue:
-        """The issue told at ``key`` of the study."""
+        """Return the issue placed at ``key`` of the study."""
         source = self.study.source
         return replace(issue, file=source.file, line=source.line(key), key=(*source.prefix, *key))
 
     def factor_at(self, place: KeyPath) -> tuple[str, KeyPath] | None:
-        """Name of the factor that changes ``place`` of the base, or something around or below it, and its key."""
+        """Return name and key of the factor that changes ``place`` of the base, or something above or below it."""
         for name, factor in self.study.factors.items():
             scaled = [(scale.key, ("scales", k)) for k, scale in enumerate(factor.scales)]
             for own, where in (*((p, factor.key_of(k)) for k, p in enumerate(factor.places)), *scaled):
@@ -107,7 +102,7 @@ class StudySetup:
         return None
 
     def blamed(self, error: InputError, prefix: KeyPath = ()) -> InputError:
-        """An error in the base's tree told at the factor that caused it; others as they are."""
+        """Return an error in the base's tree placed at the factor that caused it; other errors unchanged."""
         issues = []
         for issue in error.issues:
             found = self.factor_at((*prefix, *issue.key))
@@ -119,23 +114,23 @@ class StudySetup:
 
 
 def resolve_study(path: str | Path) -> StudySetup:
-    """Read a study and all it refers to. The config.yaml of an earlier one can be given in its place.
+    """Read a study and everything it refers to; the config.yaml of an earlier study is also accepted.
 
     Raises
     ------
     InputError
-        Any of the files cannot be read or is not valid, or a factor's key leads nowhere in the base.
+        A file cannot be read or is invalid, or a factor's key does not exist in the base.
     """
     return _resolved(yaml_file.read_yaml(path))
 
 
 def base_of(setup: StudySetup) -> Spec:
-    """The study's base as its own file has it, without what the factors do to it.
+    """Return the study's base as in its own file, without the factors.
 
     Raises
     ------
     InputError
-        The file has changed meanwhile.
+        The file has changed since it was read.
     """
     source = setup.study.source
     if source.prefix:  # a study's config.yaml holds it
@@ -145,7 +140,7 @@ def base_of(setup: StudySetup) -> Spec:
 
 
 def study_from_text(text: str) -> StudySetup:
-    """The study that the text of a config.yaml holds, for a worker that shares no files."""
+    """Return the study in the text of a config.yaml, for a worker without access to its files."""
     return _resolved(yaml_file.parse_yaml(text))
 
 
@@ -170,7 +165,7 @@ def _resolved(yaml: yaml_file.YamlFile) -> StudySetup:
 
 
 def _again(yaml: yaml_file.YamlFile) -> StudySetup:
-    """From a config.yaml."""
+    """Return the study of a config.yaml."""
     known = ("study", "base")
     for key in yaml.data:
         if key not in known:
@@ -193,13 +188,13 @@ def _again(yaml: yaml_file.YamlFile) -> StudySetup:
 
 
 def _base_file(study: StudySpec) -> Path:
-    """The base's file: a path relative to the study's, or a name in the library."""
+    """Return the base's file: a path relative to the study's, or a name in the library."""
     kind = study.base.command.split()[0]
     return find_named("examples" if kind == "render" else kind, study.base.file, study, ("base", "file"))
 
 
 def _placed(study: StudySpec, tree: Tree) -> StudySetup:
-    """The study, with a place for every factor in its base; the factors' extreme values are tried by the schema."""
+    """Return the study with an entry in its base for every factor, and validate extreme values of the factors."""
     setup, base = StudySetup(study, tree, tree), tree
     model = setup.job.model
     changed: list[tuple[KeyPath, KeyPath, bool]] = []
@@ -231,7 +226,7 @@ def _inherited(base: Tree, place: KeyPath) -> bool:
 
 
 def _refuse_names(study: StudySpec, place: KeyPath) -> None:
-    """Refuse a factor that would change the name of a file that has been read. Raises Problem."""
+    """Raise Problem for a factor that would change the name of a file that has already been read."""
     if study.base.command == "render" and place[:1] == ("job",) and place[1:2] and place[1] in BY_NAME:
         text = "the file that stands here has been read, its contents are what can be varied"
         raise Problem(text, key_text(place), f"a key that begins with {place[1]}, without job", within=(0,))
@@ -246,7 +241,7 @@ def _refuse_names(study: StudySpec, place: KeyPath) -> None:
 
 
 def _unset(tree: Tree, factor: FactorSpec) -> list[KeyPath]:
-    """Places of a factor that have no value yet."""
+    """Return the places of a factor that have no value yet."""
     out = []
     for place in factor.places:
         node: Any = tree
@@ -258,7 +253,7 @@ def _unset(tree: Tree, factor: FactorSpec) -> list[KeyPath]:
 
 
 def _with_tables(study: StudySpec) -> StudySpec:
-    """The study with the values of its tables' columns."""
+    """Return the study with the values of its tables' columns."""
     factors = dict(study.factors)
     tables: dict[str, dict[str, list[Any]]] = {}
     named: dict[str, dict[str, KeyPath]] = {}
@@ -286,14 +281,16 @@ def _with_tables(study: StudySpec) -> StudySpec:
 
 
 LARGEST_TABLE = 100_000_000
-"""Bytes of a table's file, of which a study takes some columns."""
+"""Largest size of a table's file, bytes."""
 MOST_CELLS = 90_000
-"""Cells of all tables together: config.yaml of the study holds them, and has room for 100 000 keys and values."""
+"""Largest number of cells of all tables together: config.yaml of the study holds them, at most 100 000 keys and values.
+"""
 
 
 def _read_table(study: StudySpec, path: Path, key: KeyPath, named: Mapping[str, KeyPath]) -> dict[str, list[Any]]:
-    """The named columns of a CSV file, each with the key at which it is named; row by row, so that no more of the file
-    than these and its text is held.
+    """Return the named columns of a CSV file, each with the key at which it is named.
+
+    The file is read row by row, so that only its text and these columns are held in memory.
     """
 
     def wrong(text: str, allowed: str) -> InputError:
@@ -337,11 +334,11 @@ def _read_table(study: StudySpec, path: Path, key: KeyPath, named: Mapping[str, 
 
 _SCALAR: TypeAdapter[Any] = TypeAdapter(Scalar)
 _PLAIN = re.compile(r"[-+]?\.?[0-9A-Za-z][-+0-9A-Za-z._/^() ]*")
-"""Cells that in YAML can be nothing but a plain scalar; most are."""
+"""Pattern of most cells that YAML reads as a plain scalar."""
 
 
 def _cell(text: str) -> Any:
-    """A cell as YAML would read it: number, true, false or text."""
+    """Return a cell as YAML would read it: number, true, false or text."""
     try:
         if _PLAIN.fullmatch(text):
             return _SCALAR.validate_python(yaml_file.plain_scalar(text.strip()))
@@ -352,7 +349,7 @@ def _cell(text: str) -> Any:
 
 
 def _job(command: str) -> BaseJob:
-    """The job of that name: one of `BASES`, or a test of `PROCEDURES` that can be varied.
+    """Return the job of that name: one of `BASES`, or a test of `PROCEDURES` that can be varied.
 
     Raises
     ------
