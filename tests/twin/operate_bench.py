@@ -142,8 +142,8 @@ class StandIn:
             1e-9,
             {"base/backward": 3.25, "base/forward/M3": 70.5},
         )
-        stuck = f"40 readings in a row of 293.1 K {EVIL}"
-        reason = "its own sigma does not hold"
+        stuck = f"40 consecutive readings of 293.1 K {EVIL}"
+        reason = "its reported sigma does not hold"
         return FilterResult(
             newest,
             len(times),

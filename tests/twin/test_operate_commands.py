@@ -114,7 +114,7 @@ def test_a_record_without_a_reading_of_the_monitor(life: Path, tmp_path: Path) -
     for words, code in ((("forecast", tmp_path / "record"), 2), (ingest, 0)):
         done = run(*words)
         assert done.exit_code == code
-        assert "no reading of the monitor is in the record" in done.stderr
+        assert "the record has no reading of the monitor" in done.stderr
 
 
 def test_status_tells_how_the_instrument_stands(record: Path, life: Path) -> None:
@@ -255,18 +255,18 @@ def test_what_contradicts_the_plan_is_in_the_numbers(filter_result: FilterResult
     good = calm.to_dict()
     assert (good["agrees"], good["warnings"]) == (True, [])
     for change, words in (
-        ({"undecided": True}, "the newest reading may be bad: y; until then sigmas count with both"),
-        ({"bad_readings": ((1, "x"),) * 3}, "3 readings were taken for bad ones"),
-        ({"understated_causes": ("heat", "mounts")}, "sensors of several bodies together disagree with heat, mounts"),
-        ({"widened": 1.01}, "all sigmas are 1.01 times as wide"),
+        ({"undecided": True}, "the newest reading may be an outlier: y; until then sigmas allow for both"),
+        ({"bad_readings": ((1, "x"),) * 3}, "3 readings were rejected as outliers"),
+        ({"understated_causes": ("heat", "mounts")}, "sensors of several bodies jointly disagree with heat, mounts"),
+        ({"widened": 1.01}, "all sigmas are inflated by a factor of 1.01"),
     ):
         (text,) = replace(calm, **change).warnings
         assert words in text
     bad = replace(clean(filter_result), sigma_inflation=2.5, too_many_jumps=True).to_dict()
     assert not bad["agrees"]
     assert [text.partition(";")[0] for text in bad["warnings"]] == [
-        "the last or the first readings contradict what is stated",
-        "0 jumps are more than is stated: something else moves, or more of it",
+        "the first or the latest readings contradict the prior",
+        "0 jumps are more than the plan states: other motions, or larger ones, occur",
     ]
     assert negative_verdicts({"estimate": bad}) == ["estimate.agrees"]
 
@@ -276,10 +276,10 @@ def test_what_is_told_of_requirements(filter_result: FilterResult) -> None:
     soon = replace(one, chance_now=0.01, holds_now=True, breaks_us=filter_result.time + 3 * DAY)
     never = replace(soon, breaks_us=None)
     assert list(told_of(replace(clean(filter_result), requirements=(one, soon, never)))) == [
-        ("broken", "Δf of forward is beyond 20 µm with a chance of 12 %; 5.0 % is allowed"),
+        ("broken", "Δf of forward exceeds 20 µm with a probability of 12 %; 5.0 % is allowed"),
         (
             "requirements",
-            "Δf of forward is expected to be beyond 20 µm with a chance above 5.0 % from "
+            "Δf of forward is expected to exceed 20 µm with a probability above 5.0 % from "
             f"{utc_text(filter_result.time + 3 * DAY)} on",
         ),
     ]
@@ -293,7 +293,7 @@ def test_a_reading_that_contradicts_what_is_stated(filter_result: FilterResult) 
     seen = tuple((time, square, 8) for time, square in zip(times, (90.0, 50.0, 50.0, 8.0), strict=True))
     (found,) = alarms_of(PLAN, replace(own, innovations=seen))
     assert (found.kind, found.time) == ("contradiction", times[2])
-    assert "chi-square 50 of 8 coordinates, at most 45.7" in found.text
+    assert "chi-square 50 for 8 degrees of freedom, limit 45.7" in found.text
     assert found.content["degrees_of_freedom"] == 8
     assert list(alarms_of(PLAN, replace(own, innovations=tuple((t, 45.0, 8) for t in times)))) == []
     jump = DetectedJump("base/forward/M1", times[1], times[2], times[3], (), 30.0, 1e-9, {})

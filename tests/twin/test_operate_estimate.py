@@ -182,7 +182,7 @@ def test_times_of_a_pass_go_together(known, tmp_path) -> None:
             posterior(estimate, wrong)
     with pytest.raises(Problem, match="no such quantity"):
         posterior(estimate, times, ["forward d_g_um"])
-    with pytest.raises(Problem, match="before all readings"):
+    with pytest.raises(Problem, match="before the first reading"):
         posterior(estimate, [START - 1, START])
 
 
@@ -282,9 +282,9 @@ def test_a_requirement_that_is_going_to_break(known, tmp_path) -> None:
 def test_times_that_nobody_knows_anything_of(known, tmp_path) -> None:
     stated = known[2]
     estimate = followed(known, tmp_path, entries_of(known, life_of(stated, 12.0, 3.0, 1, {}), 1))
-    with pytest.raises(Problem, match="a time before all readings"):
+    with pytest.raises(Problem, match="the time is before the first reading"):
         estimate.smoothed([START - MICRO])
-    with pytest.raises(Problem, match="a forecast of what is past"):
+    with pytest.raises(Problem, match="the time of the forecast is in the past"):
         estimate.forecast([START])
     history = record_of(tmp_path / "empty", known[0])
     with pytest.raises(Problem, match="no reading of the monitor"):
@@ -399,7 +399,7 @@ def test_a_bad_reading_is_named_left_out_and_forgotten(known, tmp_path, monkeypa
             estimate = Operation(history, plan)
             told = estimate.filter_readings()
             assert told.undecided == (k == BAD)
-            assert any("may be bad" in doubt for doubt in told.warnings) == (k == BAD)
+            assert any("may be an outlier" in doubt for doubt in told.warnings) == (k == BAD)
             assert np.all(off(estimate, life, told.now) < 5.0)
     told = Operation(history, plan).filter_readings()
     assert not told.jumps
@@ -407,7 +407,7 @@ def test_a_bad_reading_is_named_left_out_and_forgotten(known, tmp_path, monkeypa
     assert time == life.times[BAD]
     assert f"entry {BAD + 1}: the row of the spot forward/left is" in reason
     assert told.readings == len(entries) - 1
-    assert any("taken for a bad one" in one.text for one in alarms_of(plan.operation, told))
+    assert any("rejected as an outlier" in one.text for one in alarms_of(plan.operation, told))
     other = followed(known, tmp_path, entries[:BAD] + entries[BAD + 1 :], "clean").smoothed(life.times)
     assert np.all(np.abs(Operation(history, plan).smoothed(life.times).values - other.values) < 1e-6 * other.sigmas)
     assert followed(known, tmp_path, entries, "whole").filter_readings().to_dict() == told.to_dict()
@@ -463,10 +463,10 @@ def test_a_contradicted_start_stays_in_sigma(known, tmp_path) -> None:
     told = estimate.filter_readings()
     assert told.sigma_inflation >= start
     plain = estimate.estimator_state.filter_state
-    _, covariance = estimate.model.how.parameters_of(plain.mean, plain.covariance, plain.time)
+    _, covariance = estimate.model.series_filter.parameters_of(plain.mean, plain.covariance, plain.time)
     assert np.allclose(told.now.covariance[0], told.sigma_inflation**2 * covariance, rtol=1e-9)
     assert np.all(off(estimate, life) < 6.0)
-    assert any("contradict what is stated" in doubt for doubt in told.warnings)
+    assert any("contradict the prior" in doubt for doubt in told.warnings)
     wide = estimate._sigma_inflation_at(np.array([one.time for one in entries[12:20]]))
     assert np.all(wide >= start)
 

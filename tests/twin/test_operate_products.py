@@ -564,7 +564,7 @@ def test_a_state_has_the_temperatures_that_do_what_was_found(tmp_path: Path) -> 
     away = by @ found.covariance @ by.T - one.course.covariance[0]
     assert np.abs(away / np.outer(unit, unit)).max() < 1e-6
     # heat that does twice what is stated of it contradicts the statement from the first readings on
-    assert all("contradict what is stated" in text for text in one.warnings)
+    assert all("contradict the prior" in text for text in one.warnings)
     # what the sensors read is half of it
     assert np.abs((by @ plain.mean - one.course.changes[0]) / unit).max() > 3.0
     np.testing.assert_allclose(plain.mean[heat], life.motions[-1, heat] * stated.sigmas[heat], atol=0.03)

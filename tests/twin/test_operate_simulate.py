@@ -25,7 +25,7 @@ from twin.operate.__main__ import app
 from twin.operate.judged_life import covered, likely_shares
 from twin.operate.record.entries import MICRO, micros
 from twin.operate.record.history import History, content_of, initialise_record
-from twin.operate.record.telemetry import WITHIN
+from twin.operate.record.telemetry import MOST_DEPARTURE
 from twin.operate.simulate import Life, Simulation, drawn_life, sensed_temperatures
 from twin.operate.simulation_run import take_files
 from twin.verify import app as verify
@@ -205,7 +205,7 @@ def test_a_life_is_a_record_as_any_other(made: tuple[Path, Path, Mapping]) -> No
     }
     warm = content_of(kinds[FORWARD][0])
     assert (warm["sigma"], warm["unit"]) == (0.05, "K")
-    assert abs(warm["values"][0] - 293.0) < WITHIN
+    assert abs(warm["values"][0] - 293.0) < MOST_DEPARTURE
     numbers = content_of(kinds["monitor"][1])["numbers"]
     assert {"cameras", "intersection_angle", "spots", "disturbances", "sigma_holds", "frames"} <= set(numbers)
     assert numbers["frames"] == 2

@@ -182,7 +182,7 @@ def ingest(
         try:
             while True:
                 before = totals["new"]
-                for given in sources.look(call.history):
+                for given in sources.poll(call.history):
                     taken = call.history.ingest(given, late)
                     totals.update(taken.counts)
                     first = first or (f"{taken.file}: {taken.refused[0][1]}" if taken.refused else "")
@@ -285,7 +285,7 @@ def status(
     """
     found = call.estimate(plan) if plan is not None or call.has_estimate else None
     rows = call.history.alarms()
-    opened = sum(one["acknowledged"] is None for one in rows)
+    opened = sum(row["acknowledged"] is None for row in rows)
     power = () if found is None else found[0].power()
     jumps_found = {one.body: one.plain for one in power}
     estimate = None if found is None else {**found[1].to_dict(), "jumps_found": jumps_found}
@@ -348,7 +348,9 @@ def export(
     cli.require_one_of("--tables", tables, TABLE_FORMATS)
     require_new(out)
     try:
-        made = [(f"{one.name}.{tables}", TABLE_FORMATS[tables](one), one.rows) for one in all_tables(call.history)]
+        made = [
+            (f"{table.name}.{tables}", TABLE_FORMATS[tables](table), table.rows) for table in all_tables(call.history)
+        ]
     except MissingPackage as error:
         raise InputErrorText(str(error)) from None
     call.write_new(out, {name: content for name, content, _ in made}, "record")

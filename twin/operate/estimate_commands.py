@@ -62,7 +62,7 @@ def forecast(
     if end <= start:
         raise InputErrorText(f"--until: {until} is not after the newest reading, {result.now.utc[0]}")
     course = operation.forecast([start + round((end - start) * k / steps) for k in range(steps + 1)])
-    requirements = [one.to_dict() for one in result.requirements]
+    requirements = [requirement.to_dict() for requirement in result.requirements]
     name, warnings = call.history.name, result.warnings
     data = {"record": call.history.url, "instrument": name, **course.to_dict(), "requirements": requirements}
 
@@ -102,7 +102,7 @@ def alarms(
     elif by is not None or note:
         raise InputErrorText("--by and --note: which alarm? --acknowledge ID")
     rows = call.history.alarms()
-    opened = sum(one["acknowledged"] is None for one in rows)
+    opened = sum(row["acknowledged"] is None for row in rows)
 
     def show(console: Console) -> None:
         print_verdict(console, f"{call.history.name}: {_open_text(opened)}, {len(rows)} in all")
@@ -310,23 +310,17 @@ def show_estimate(result: FilterResult, rows: Sequence[Mapping[str, Any]], conso
     for text in result.warnings:
         line(console, f"warning: {text}")
     for jump in result.jumps:
-        line(console, f"jump of {jump.body} {jump.found}")
-    bad = [one for one in result.sensors if one.state != "ok"]
+        line(console, f"jump of {jump.body} {jump.summary}")
+    bad = [sensor for sensor in result.sensors if sensor.state != "ok"]
     if result.sensors:
-        line(
-            console,
-            f"sensors: {len(result.sensors) - len(bad)} of {len(result.sensors)} are as they should be",
-        )
+        line(console, f"sensors: {len(result.sensors) - len(bad)} of {len(result.sensors)} are as they should be")
     for sensor in bad:
         line(console, f"  {sensor.body}: {sensor.state} since {utc_text(sensor.since_us)}: {sensor.reason}")
     if result.excluded:
-        line(
-            console,
-            f"left out of the estimate: {len(result.excluded)} of the last readings and more; the newest",
-        )
+        line(console, f"left out of the estimate: {len(result.excluded)} of the last readings and more; the newest")
         for time, _, subject, reason in result.excluded[-3:]:
             line(console, f"  {utc_text(time)} {subject}: {reason}")
-    waiting = [one for one in rows if one["acknowledged"] is None]
+    waiting = [row for row in rows if row["acknowledged"] is None]
     for alarm in waiting[-10:]:
         line(console, alarm_line(alarm))
     if waiting:
@@ -339,10 +333,10 @@ def _show_course(course: Course, console: Console) -> None:
 
     utc = course.utc
     rows = []
-    for k, one in enumerate(course.quantities):
+    for k, quantity in enumerate(course.quantities):
         cells = zip(course.values[:, k].tolist(), course.sigmas[:, k].tolist(), strict=True)
-        name = name_of(one.name, course.quantities)
-        rows.append([name, *(with_sigma(v, s, one.parameter.unit, sign=True) for v, s in cells)])
+        name = name_of(quantity.name, course.quantities)
+        rows.append([name, *(with_sigma(v, s, quantity.parameter.unit, sign=True) for v, s in cells)])
     show_table(console, ("change of", *utc), rows, range(1, len(utc) + 1))
 
 
@@ -362,16 +356,18 @@ def show_requirements(result: FilterResult, console: Console) -> None:
     if not result.requirements:
         return
     rows = []
-    for one in result.requirements:
-        later = "now" if not one.holds_now else "not in the horizon"
+    for requirement in result.requirements:
+        later = "now" if not requirement.holds_now else "not in the horizon"
         rows.append(
             [
-                name_of(one.quantity, result.now.quantities),
-                f"{plain(one.limit)} {one.unit}",
-                percent(one.chance_now),
-                percent(1.0 - one.probability),
-                "yes" if one.holds_now else "no",
-                utc_text(one.breaks_us) if one.holds_now and one.breaks_us is not None else later,
+                name_of(requirement.quantity, result.now.quantities),
+                f"{plain(requirement.limit)} {requirement.unit}",
+                percent(requirement.chance_now),
+                percent(1.0 - requirement.probability),
+                "yes" if requirement.holds_now else "no",
+                utc_text(requirement.breaks_us)
+                if requirement.holds_now and requirement.breaks_us is not None
+                else later,
             ]
         )
     heads = ("has to keep", "limit", "chance beyond", "allowed", "holds now", "expected to break")

@@ -68,7 +68,7 @@ class EstimatedMotions:
         ValueError
             Not as many numbers as components.
         """
-        size = np.array([one.unit_size for one in components])
+        size = np.array([component.unit_size for component in components])
         if mean.shape != size.shape or covariance.shape != (len(size),) * 2:
             raise ValueError(f"{len(size)} components with {mean.shape} amounts and a covariance {covariance.shape}")
         return cls(tuple(components), mean * size, covariance * np.outer(size, size))
@@ -115,7 +115,7 @@ def perturbation(found: EstimatedMotions, thermal: ThermalModel) -> dict[str, Pe
     thermal : ThermalModel
         Of the instrument.
     """
-    said = [k for k, one in enumerate(found.components) if one.kind not in (*HEAT, *UNSUPPORTED)]
+    said = [k for k, component in enumerate(found.components) if component.kind not in (*HEAT, *UNSUPPORTED)]
     moves = state_of(found.mean[said], [found.components[k] for k in said], thermal)
     heat: dict[str, Temperature] = {}
     for one, amount in zip(found.components, found.mean.tolist(), strict=True):
@@ -192,7 +192,7 @@ def merge_components(found: EstimatedMotions, instrument: Instrument) -> tuple[t
     instrument : Instrument
         Of them.
     """
-    nodes, bodies = instrument.nodes, {one.path: one for one in instrument.assembly.tree.bodies}
+    nodes, bodies = instrument.nodes, {body.path: body for body in instrument.assembly.tree.bodies}
     components: list[Component] = []
     places: dict[tuple[str, str, int], int] = {}
     entries: list[tuple[int, int, float]] = []
@@ -203,12 +203,16 @@ def merge_components(found: EstimatedMotions, instrument: Instrument) -> tuple[t
             components.append(Component("estimate", body, kind, axis, pivot, 0.0))
         return own
 
-    for k, one in enumerate(found.components):
-        own = place(one.body, one.kind, one.axis, one.pivot)
+    for k, component in enumerate(found.components):
+        own = place(component.body, component.kind, component.axis, component.pivot)
         entries.append((own, k, 1.0))
-        away = _pivot_shift(bodies[one.body], one, components[own].pivot) if one.kind in PIVOTED else np.zeros(3)
+        away = (
+            _pivot_shift(bodies[component.body], component, components[own].pivot)
+            if component.kind in PIVOTED
+            else np.zeros(3)
+        )
         for axis in np.flatnonzero(np.abs(away) > 0.0).tolist():
-            shift = place(one.body, "shift", axis, usual_pivot(nodes[one.body]))
+            shift = place(component.body, "shift", axis, usual_pivot(nodes[component.body]))
             entries.append((shift, k, float(away[axis])))
     table = np.zeros((len(components), len(found.components)))
     for row, column, value in entries:
@@ -302,7 +306,7 @@ def largest_shares(found: EstimatedMotions, stated: Disturbances) -> Array:
     stated : Disturbances
         What one standard deviation of each does.
     """
-    size = np.array([one.unit_size for one in found.components]) * stated.sigmas
+    size = np.array([component.unit_size for component in found.components]) * stated.sigmas
     rows = np.concatenate([stated.spots, stated.parameters]) / np.where(size > 0.0, size, np.inf)
     own = rows**2 * found.sigma**2
     total = own.sum(axis=1, keepdims=True)

@@ -103,7 +103,7 @@ class JudgedLife:
         key : str
             Which of its readings.
         """
-        return next(k for k, one in enumerate(self.quantities) if (one.group, one.key) == (group, key))
+        return next(k for k, quantity in enumerate(self.quantities) if (quantity.group, quantity.key) == (group, key))
 
 
 def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance: Advance) -> JudgedLife:
@@ -163,10 +163,10 @@ def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance:
 
 def _prior(operation: Operation, times: NDArray[np.int64]) -> Estimate:
     """What is known without any reading: nothing has changed, but for what is stated to move."""
-    how, rows = operation.model.how, operation.model.rows
+    series_filter, rows = operation.model.series_filter, operation.model.rows
     seconds = ((times - times[0]) / MICRO).tolist()
-    start = how.start(seconds[0])
-    found = [how.parameters(start, time) for time in seconds]
+    start = series_filter.start(seconds[0])
+    found = [series_filter.parameters(start, time) for time in seconds]
     values = np.array([mean for mean, _ in found]) @ rows.T
     spread = np.array([covariance for _, covariance in found])
     return Estimate(values, np.sqrt(np.einsum("qi,tij,qj->tq", rows, spread, rows)))
@@ -189,7 +189,7 @@ class StepwiseIngest:
         self._given = [
             read_table_file(table, path, history) for table in spec.readings for path in tables_of(spec, table)
         ]
-        every = {one.time for given in self._given for one in _entries(given) if one.kind == "monitor"}
+        every = {entry.time for given in self._given for entry in _entries(given) if entry.kind == "monitor"}
         self.times = np.array(sorted(every), np.int64)
 
     def take(self, until: int) -> None:
@@ -201,14 +201,14 @@ class StepwiseIngest:
             Microseconds of TAI since 2000.
         """
         for given in self._given:
-            own = [one for one in _entries(given) if self._taken < one.time <= until]
+            own = [entry for entry in _entries(given) if self._taken < entry.time <= until]
             if own:
                 self._history.ingest(FileContent(given.file, given.sha256, given.meaning, own, given.frames))
         self._taken = until
 
 
 def _entries(given: FileContent) -> list[Entry]:
-    return [one for one in given.items if isinstance(one, Entry)]
+    return [item for item in given.items if isinstance(item, Entry)]
 
 
 def true_changes(truth: Mapping[str, Any], quantities: Sequence[Quantity], times: NDArray[np.int64]) -> Array:
@@ -226,9 +226,11 @@ def true_changes(truth: Mapping[str, Any], quantities: Sequence[Quantity], times
     at = {moment: k for k, moment in enumerate(truth["times_us"])}
     own = [at[moment] for moment in times.tolist()]
     columns = []
-    for one in quantities:
-        group = truth[one.group] if one.group in (ANGLE_GROUP, GROUND_GROUP) else truth["cameras"][one.group]
-        columns.append(np.array(group[one.key])[own])
+    for quantity in quantities:
+        group = (
+            truth[quantity.group] if quantity.group in (ANGLE_GROUP, GROUND_GROUP) else truth["cameras"][quantity.group]
+        )
+        columns.append(np.array(group[quantity.key])[own])
     return np.stack(columns, axis=1)
 
 
@@ -237,7 +239,7 @@ def _single(readings: Sequence[Mapping[str, Any]], quantities: Sequence[Quantity
     values, sigmas = [], []
     for read in readings:
         groups = {**read["cameras"], **{name: read[name] for name in (ANGLE_GROUP, GROUND_GROUP) if name in read}}
-        own = [groups[one.group]["posterior"] for one in quantities]
+        own = [groups[quantity.group]["posterior"] for quantity in quantities]
         values.append([found[one.key] for found, one in zip(own, quantities, strict=True)])
         sigmas.append([found[f"{one.key}_sigma"] for found, one in zip(own, quantities, strict=True)])
     return Estimate(np.array(values), np.array(sigmas))
@@ -289,12 +291,15 @@ def judged_numbers(life: JudgedLife) -> dict[str, Any]:
         That was followed.
     """
     told: dict[str, dict[str, Any]] = {}
-    for number, one in enumerate(life.quantities):
-        own = {way: _error_summary(life.errors(way)[:, number], said.sigmas[:, number]) for way, said in life.methods.items()}
+    for number, quantity in enumerate(life.quantities):
+        own = {
+            way: _error_summary(life.errors(way)[:, number], said.sigmas[:, number])
+            for way, said in life.methods.items()
+        }
         for name, which in ((FORECAST, ~life.interrupted), ("forecast_over_events", life.interrupted)):
             error = (life.forecast.values - life.updated)[which, number]
             own[name] = _error_summary(error, life.forecast.sigmas[which, number])
-        told.setdefault(one.group, {})[one.key] = own
+        told.setdefault(quantity.group, {})[quantity.key] = own
     filter_result = life.filter_result.to_dict()
     scores = life.filter_result.scores
     return {
@@ -380,8 +385,8 @@ def judged_report(life: JudgedLife, name: str) -> Report:
 
 def _shown(life: JudgedLife) -> tuple[tuple[str, str], ...]:
     """Group and key of what the figure shows."""
-    names = [(one.group, one.key) for one in life.quantities]
-    focal = next(one for one in names if one[1] == "d_f_um")
+    names = [(quantity.group, quantity.key) for quantity in life.quantities]
+    focal = next(name for name in names if name[1] == "d_f_um")
     return (*(one for one in SHOWN if one in names), focal)
 
 
@@ -416,9 +421,9 @@ def _table(life: JudgedLife) -> Table:
     heads += tuple(f"{way} within {n} σ [%]" for way in _COVERED for n in (1, 2))
     rows: list[list[Cell]] = []
     quantities = judged_numbers(life)["quantities"]
-    for one in life.quantities:
-        said = quantities[one.group][one.key]
-        row: list[Cell] = [f"{one.group} {one.parameter.label}"]
+    for quantity in life.quantities:
+        said = quantities[quantity.group][quantity.key]
+        row: list[Cell] = [f"{quantity.group} {quantity.parameter.label}"]
         row += [_cell(said[way]["rms"]) for way in (*METHODS, FORECAST)]
         for way in _COVERED:
             row += [_cell(said[way][key], 100.0) for key in ("within_one", "within_two")]

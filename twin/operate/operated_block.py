@@ -62,7 +62,7 @@ class Posterior:
     @property
     def names(self) -> tuple[str, ...]:
         """Group and key of each: ``forward d_alpha_arcsec``."""
-        return tuple(one.name for one in self.quantities)
+        return tuple(quantity.name for quantity in self.quantities)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data: times, names and numbers."""
@@ -102,14 +102,14 @@ def posterior(
     late = np.flatnonzero(np.diff(times) <= 0)
     if len(late):
         raise Problem("times out of order", utc_text(int(times[late[0] + 1])), "each time later than the one before")
-    known = {one.name: one for one in operation.quantities}
+    known = {quantity.name: quantity for quantity in operation.quantities}
     cameras = dict.fromkeys(camera for camera, _ in operation.model.spots)
     wanted = [name for name, one in known.items() if one.group in cameras] if names is None else list(names)
     for name in wanted:
         if name not in known:
             raise Problem("no such quantity", name, f"one of: {', '.join(known)}")
     quantities = tuple(known[name] for name in wanted)
-    rows = np.array([one.row for one in quantities]).reshape(len(wanted), -1)
+    rows = np.array([quantity.row for quantity in quantities]).reshape(len(wanted), -1)
     values, covariance = operation.smooth_jointly(times)
     return Posterior(
         times, quantities, values @ rows.T, np.einsum("qi,tiuj,rj->tqur", rows, covariance, rows, optimize=True)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from twin.operate.record.history import History
 
 KIND = "monitor"
-_TOGETHER = 400
+_BATCH = 400
 """Rows asked for at once."""
 
 
@@ -75,8 +75,8 @@ def readings(history: History, begin: int, end: int, most: int) -> list[dict[str
         step = max(1, -(-len(found) // most))
         chosen = found[::-1][::step][::-1]  # the newest is always among them
         rows: list[dict[str, Any]] = []
-        for k in range(0, len(chosen), _TOGETHER):
-            part = connection.execute(_rows().where(c.id.in_(chosen[k : k + _TOGETHER])).order_by(c.time_us, c.id))
+        for k in range(0, len(chosen), _BATCH):
+            part = connection.execute(_rows().where(c.id.in_(chosen[k : k + _BATCH])).order_by(c.time_us, c.id))
             rows += map(dict, part.mappings())
     return [{**row, "content": content_of(row)} for row in rows]
 
@@ -252,7 +252,7 @@ class Overview:
     def of(cls, history: History, operation: Operation) -> Overview:
         """The state after all readings of the record."""
         known = operation.plan.operation.events
-        found = ((int(one["time_us"]), str(one["subject"])) for one in history.entries("event"))
+        found = ((int(entry["time_us"]), str(entry["subject"])) for entry in history.entries("event"))
         events = tuple((time, name, tuple(known.get(name, ()))) for time, name in found)
         return cls(operation, operation.filter_readings(), tuple(history.alarms()), events, span_of(history)[0])
 
@@ -273,7 +273,10 @@ class Overview:
 
     def required(self, quantity: Quantity) -> RequirementStatus | None:
         """The requirement on a quantity with what is known of it; None where nothing is required."""
-        return next((one for one in self.filter_result.requirements if one.quantity == quantity.name), None)
+        return next(
+            (requirement for requirement in self.filter_result.requirements if requirement.quantity == quantity.name),
+            None,
+        )
 
     @property
     def horizon(self) -> int:
@@ -312,7 +315,7 @@ class Overview:
 
     def changed(self, begin: int, end: int) -> list[Occurrence]:
         """What happened from a time on and before another one, in the order of time."""
-        found = [one for one in self.occurrences() if begin <= one.time < end]
+        found = [occurrence for occurrence in self.occurrences() if begin <= occurrence.time < end]
         return sorted(found, key=lambda one: one.time)
 
     def state_sentence(self) -> str:
@@ -320,7 +323,7 @@ class Overview:
         requirements = self.filter_result.requirements
         if not requirements:
             return "The plan states no requirement"
-        broken = [one for one in requirements if not one.holds_now]
+        broken = [requirement for requirement in requirements if not requirement.holds_now]
         worst = max(requirements, key=lambda one: one.chance_now / (1.0 - one.probability))
         which = f"{self._now(worst)}, limit {_limit(worst)} (beyond it with a chance of {percent(worst.chance_now)}; "
         which += f"{percent(1.0 - worst.probability)} is allowed)"
@@ -353,7 +356,11 @@ class Overview:
 
     def break_sentences(self) -> list[str]:
         """Which requirements are expected to break, the first to break first."""
-        coming = [one for one in self.filter_result.requirements if one.holds_now and one.breaks_us is not None]
+        coming = [
+            requirement
+            for requirement in self.filter_result.requirements
+            if requirement.holds_now and requirement.breaks_us is not None
+        ]
         return [
             f"{_capital(self._name(one))} is expected to break its requirement of {_limit(one)} on "
             f"{day_text(one.breaks_us or 0)}"
@@ -375,7 +382,7 @@ class Overview:
 
     def open_alarms(self) -> list[Mapping[str, Any]]:
         """Alarms that nobody has acknowledged, the newest first."""
-        found = [one for one in self.alarms if one["acknowledged"] is None]
+        found = [alarm for alarm in self.alarms if alarm["acknowledged"] is None]
         return sorted(found, key=lambda one: -int(one["time_us"]))
 
     def _name(self, one: RequirementStatus) -> str:

@@ -306,7 +306,7 @@ def make_products(
     ]
     held = validity(operation.smoothed, time, *ends, [*_validity_limits(result), *limits], beside)
     motions = operation.motions(time, acting=True)
-    disturbances = operation.model.how.stated
+    disturbances = operation.model.series_filter.stated
     found = EstimatedMotions.in_units(_components(operation), motions.mean, motions.covariance)
     version = _version(operation, history)
     changes = _changes(operation, course, found, _notes(time, held, result, version))
@@ -319,17 +319,15 @@ def make_products(
     )
     export = None if scene is None else _exported(scene, backend, changes)
     warnings = _warnings(result, time, at, export, left, prior)
-    return Products(
-        history, time, at, result, version, course, held, changes, export, state, left, prior, warnings
-    )
+    return Products(history, time, at, result, version, course, held, changes, export, state, left, prior, warnings)
 
 
 def _components(operation: Operation) -> list[Component]:
     """What is stated, in the order of the model: it may have been traced under the same plan in another order."""
     stated = operation.experiment.stated
     assert stated is not None, "a plan states what moves"
-    own = {(one.cause, one.name): one for one in stated.components}
-    of = operation.model.how.stated
+    own = {(component.cause, component.name): component for component in stated.components}
+    of = operation.model.series_filter.stated
     return [own[key] for key in zip(of.causes, of.labels, strict=True)]
 
 
@@ -373,9 +371,11 @@ def _validity_limits(result: FilterResult) -> list[ValidityLimit]:
         marks += [
             ValidityLimit(moment, f"a jump of {jump.body} was found") for moment in (jump.after_us, jump.until_us)
         ]
-    for one in result.requirements:
-        if one.breaks_us is not None:
-            marks.append(ValidityLimit(one.breaks_us, f"{one.quantity} no longer keeps its requirement"))
+    for requirement in result.requirements:
+        if requirement.breaks_us is not None:
+            marks.append(
+                ValidityLimit(requirement.breaks_us, f"{requirement.quantity} no longer keeps its requirement")
+            )
     return marks
 
 
@@ -391,9 +391,9 @@ def _changes(
     operation: Operation, course: Course, found: EstimatedMotions, notes: tuple[str, ...]
 ) -> dict[str, EstimatedChange]:
     """Camera -> its change at the course's one time, without white motions."""
-    stated = operation.model.how.stated
+    stated = operation.model.series_filter.stated
     white = np.array([law.white for law in stated.laws])
-    size = np.array([one.unit_size for one in found.components]) * stated.sigmas
+    size = np.array([component.unit_size for component in found.components]) * stated.sigmas
     rows = stated.parameters / np.where(size > 0.0, size, np.inf)  # (4 K, M) per SI unit of each motion
     other, own = rows * ~white, rows * white
     # p = p_other + p_white: their covariance goes out with that of the white part
@@ -454,9 +454,9 @@ def _warnings(
     out = list(result.warnings)
     if scene is not None and abs(scene - time) > APART:
         out.append(f"the scene was taken at {utc_text(scene)}, and the estimate is for {utc_text(time)}")
-    for one in result.requirements:
-        if not one.holds_now:
-            out.append(f"{one.quantity} does not keep its requirement")
+    for requirement in result.requirements:
+        if not requirement.holds_now:
+            out.append(f"{requirement.quantity} does not keep its requirement")
     for name, line in (export.lines if export is not None else {}).items():
         if line.polynomial is None:
             out.append(f"{name} has no rational polynomials: {line.refused}")

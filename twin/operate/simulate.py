@@ -119,9 +119,9 @@ class Life:
     def temperatures(self) -> dict[str, Array]:
         """Body -> (T,) change of its temperature against the instrument's, kelvin."""
         out: dict[str, Array] = {}
-        for k, one in enumerate(self.components):
-            if one.kind == "temperature":
-                out[one.body] = out.get(one.body, np.zeros(len(self.times))) + self.amounts[:, k]
+        for k, component in enumerate(self.components):
+            if component.kind == "temperature":
+                out[component.body] = out.get(component.body, np.zeros(len(self.times))) + self.amounts[:, k]
         return out
 
 

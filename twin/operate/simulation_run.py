@@ -262,7 +262,7 @@ def _is_empty(history: History) -> None:
 def _are_stated(experiment: MonitorExperiment, what: Simulation) -> None:
     """Raises InputErrorText: a sensor on a body that is not stated to get warmer, or that has none."""
     assert experiment.stated is not None  # a plan states something
-    warm = {one.body for one in experiment.stated.components if one.kind == "temperature"}
+    warm = {component.body for component in experiment.stated.components if component.kind == "temperature"}
     for body in what.sensors or ():
         _known("--sensor", body, warm)
     options: Mapping[str, Mapping[str, int]] = {"--dead": what.dead, "--stuck": what.stuck}

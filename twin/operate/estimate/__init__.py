@@ -1,1 +1,1 @@
-"""The estimate from a record under a plan: followed, smoothed, forecast, and what of it somebody has to know."""
+"""Estimate of an instrument's state from its record: filtered, smoothed and forecast, with its alarms."""

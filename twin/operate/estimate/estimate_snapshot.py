@@ -1,7 +1,8 @@
-"""Where an estimate stands after some of a record's entries: what is believed, how good its predictions were, what the
-sensors are worth. It can be kept and taken up again, to the bit.
+"""State of an estimator after some entries of a record, and its serialisation.
 
-Serialisation of an estimate and of its model: the same bytes for the same numbers, and back to the bit.
+An `EstimatorState` holds the filter's state, the scores of its predictions and the condition of the temperature
+sensors. `EntryFilter` updates it with the entries of a record, one moment after the other. `packed` and `unpacked`
+write it as bytes and read it back to the bit: equal numbers give equal bytes.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from twin.operate.estimate.operation_model import OperationModel
 from twin.operate.record.entries import MICRO
 
 _FILTER = (PendingReading, BadReading, FilterState, Disturbances, HeatInputs, Innovation, Jump, Observed, Quantity)
+"""Classes of the filter that a serialised estimate may contain."""
 _CLASSES = (*_FILTER, SeriesFilter, TimeLaw, Track)
 _PARAMETERS = ChainMap(CAMERA_PARAMETERS, {one.key: one for one in (ANGLE, *GROUND)})
 
@@ -58,14 +60,14 @@ def packed(value: Any) -> bytes:
 
 
 def unpacked(content: bytes, *classes: type) -> Any:
-    """Return the value that `packed` was given, sequences as tuples.
+    """Return the value that was serialised by `packed`, with sequences as tuples.
 
     Parameters
     ----------
     content : bytes
-        The bytes.
+        Output of `packed`.
     classes : type
-        Data classes that are in it, beside those of the filter.
+        Data classes that occur in the value, in addition to those of the filter.
     """
     known: dict[str, Any] = {one.__name__: one for one in (*_CLASSES, *classes)}
 
@@ -86,43 +88,51 @@ def unpacked(content: bytes, *classes: type) -> Any:
 
 
 SPANS = (1, 3, 10)
-"""Readings in a row that are held together against what was expected of them."""
+"""Numbers of consecutive readings whose chi-square is tested together against the predictions."""
 HISTORY_LENGTH = 200
-"""Innovations and readings that were left out, of which the last are kept."""
+"""Number of the latest innovations, and of the latest excluded entries, that the state keeps."""
 OUTLIER_SIGMAS = 6.0
-"""Standard deviations of a sensor's reading from what was expected, beyond which it is not used."""
+"""Residual of a sensor's reading, in standard deviations, beyond which the reading is not used."""
 SENSOR_WINDOW = 10
-"""Readings of a sensor by which it is judged."""
+"""Number of a sensor's latest readings from which its condition is judged."""
 INFLATION_SIGMAS = 3.0
-"""Standard deviations beyond which a reading widens what is stated of temperatures, where several sensors disagree."""
+"""Residual, in standard deviations, beyond which a reading inflates the prior of the temperatures, where several
+sensors disagree with it.
+"""
 DOUBTFUL_OUTLIERS = 3
-"""Of these, how many far ones make a sensor doubtful."""
+"""Number of outliers within `SENSOR_WINDOW` readings that makes a sensor doubtful."""
 SILENT_INTERVALS = 10.0
-"""Intervals after which a sensor from which nothing came is dead."""
+"""Time without a reading, in mean intervals of the sensor, after which the sensor is considered dead."""
 STUCK_PROBABILITY = 1e-4
-"""Of as many equal readings in a row by a sensor that works, below which it is called stuck."""
+"""Probability that a working sensor repeats its value as often, below which the sensor is considered stuck."""
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """One sensor of temperature.
+    """State of one temperature sensor.
 
     Attributes
     ----------
     body : str
-        Where it is.
+        Path of the body that carries the sensor.
     readings : int
-        That came. first_us, last_us: the times of the first and of the newest, microseconds.
+        Number of readings so far.
+    first_us, last_us : int
+        Times of the first and of the newest reading, in microseconds of TAI since 2000.
     value : float
-        Of the newest, kelvin; repeats: how often it came in a row before it; since_us: first of these.
+        Newest reading, in kelvin.
+    repeats : int
+        Number of readings directly before the newest that have the same value.
+    since_us : int
+        Time of the first of these equal readings, in microseconds of TAI since 2000.
     step : float
-        Smallest difference of two readings that followed each other, kelvin; infinite before there is one.
+        Smallest difference of two consecutive readings, in kelvin; infinite before there is one.
     sigma : float
-        Of its readings, kelvin.
+        Standard deviation of a reading, in kelvin.
     recent : tuple[float, ...]
-        The last readings against what was expected of each, in standard deviations.
+        Residuals of the latest readings against their predictions, in standard deviations.
     stuck : bool
-        Whether it repeats itself.
+        Whether the sensor repeats its value more often than chance explains.
     """
 
     body: str
@@ -138,7 +148,7 @@ class Sensor:
     stuck: bool = False
 
     def updated(self, time: int, value: float, sigma: float) -> Sensor:
-        """With one more reading."""
+        """Return the sensor after one more reading, time in microseconds, value and sigma in kelvin."""
         again = value == self.value
         step = self.step if again or not self.readings else min(self.step, abs(value - self.value))
         repeats = self.repeats + 1 if again else 0
@@ -158,62 +168,65 @@ class Sensor:
         )
 
     def with_residual(self, white: float) -> Sensor:
-        """With its newest reading against what was expected of it."""
+        """Return the sensor with the residual of its newest reading, in standard deviations, added to `recent`."""
         return replace(self, recent=(*self.recent, white)[-SENSOR_WINDOW:])
 
     @property
     def outliers(self) -> int:
-        """How many of its last readings were far from what was expected."""
+        """Number of the latest readings whose residual exceeds `OUTLIER_SIGMAS`."""
         return sum(abs(white) > OUTLIER_SIGMAS for white in self.recent)
 
     @property
     def disagrees(self) -> bool:
-        """Whether its last readings together are further from what was expected than by chance."""
+        """Whether the chi-square of the latest residuals exceeds its limit."""
         square = sum(white**2 for white in self.recent)
         return bool(self.recent) and square > float(limit_of(FALSE_ALARM, len(self.recent)))
 
     def state(self, now: int, alone: bool) -> tuple[str, int, str]:
-        """``ok``, ``dead``, ``stuck`` or ``doubtful``; since when, microseconds; and why.
+        """Return the sensor's condition, the time since when, and the reason.
+
+        The condition is ``ok``, ``dead``, ``stuck`` or ``doubtful``; the time is in microseconds of TAI since 2000.
 
         Parameters
         ----------
         now : int
-            Time of the newest reading of all.
+            Time of the newest entry of the record, in microseconds of TAI since 2000.
         alone : bool
-            Whether no other sensor disagrees with what is stated as it does.
+            Whether no other sensor disagrees with the prior at the same time. If several do, the prior is wrong and the
+            sensor is not doubtful.
         """
         if self.stuck:
-            return "stuck", self.since_us, f"{self.repeats + 1} readings in a row of {self.value:.6g} K"
+            return "stuck", self.since_us, f"{self.repeats + 1} consecutive readings of {self.value:.6g} K"
         usual = (self.last_us - self.first_us) / max(self.readings - 1, 1)
         if self.readings > 1 and now - self.last_us > SILENT_INTERVALS * usual:
-            stuck_sensors = (now - self.last_us) / MICRO / 86_400.0
+            silence = (now - self.last_us) / MICRO / 86_400.0
             return (
                 "dead",
                 self.last_us,
-                f"nothing came for {stuck_sensors:.3g} days; it used to every {usual / MICRO / 86_400.0:.3g}",
+                f"no reading for {silence:.3g} days; it normally reports every {usual / MICRO / 86_400.0:.3g} days",
             )
         if self.outliers >= DOUBTFUL_OUTLIERS and alone:
-            text = f"{self.outliers} of the last {len(self.recent)} readings far from what was expected"
+            text = f"{self.outliers} of the last {len(self.recent)} readings are over {OUTLIER_SIGMAS:g} sigma from their predictions"
             return "doubtful", self.last_us, text
         return "ok", self.first_us, ""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """How good predictions of readings were that were made before these came.
+    """Quality of the predictions that were made before each reading of the monitor came.
 
     Attributes
     ----------
     readings : int
-        Of the monitor.
+        Number of readings of the monitor.
     components : int
-        Independent numbers in them.
+        Number of independent components of these readings.
     within_one, within_two : int
-        How many of these were within one and two standard deviations.
+        Number of components within one and within two standard deviations of the prediction.
     log_score : float
-        Mean over the readings of the logarithm of the density stated for what came, px^-D.
+        Mean over the readings of the logarithm of the predicted probability density at the reading, px^-D.
     chi_square : float
-        Of all.
+        Sum of squares of all normalised components.
     """
 
     readings: int = 0
@@ -224,7 +237,7 @@ class Scores:
     chi_square: float = 0.0
 
     def updated(self, white: Array, log_score: float) -> Scores:
-        """With one more reading."""
+        """Return the scores with one more reading, given its normalised components and its log score."""
         count = self.readings + 1
         return Scores(
             count,
@@ -238,7 +251,7 @@ class Scores:
 
 @dataclass(frozen=True)
 class JumpDetection:
-    """A jump, and the reading at which it was told, microseconds."""
+    """A jump, and the time of the reading at which it was detected, in microseconds of TAI since 2000."""
 
     time: int
     jump: Jump
@@ -246,47 +259,47 @@ class JumpDetection:
 
 @dataclass(frozen=True, eq=False)
 class EstimatorState:
-    """Where an estimate stands.
+    """State of the estimator after the entries up to a time.
 
     Attributes
     ----------
-    filter_state : Belief
-        What is believed; seconds count from the epoch.
+    filter_state : FilterState
+        State of the filter; its seconds count from the epoch.
     time : int
-        Of the newest entry, microseconds.
+        Time of the newest entry, in microseconds of TAI since 2000.
     scores : Scores
-        Of predictions.
+        Quality of the predictions so far.
     innovations : tuple[tuple[int, float, int], ...]
-        (time_us, chi-square, degrees of freedom) of the last readings.
-    jumps : tuple[Told, ...]
-        That were told.
+        (time_us, chi-square, degrees of freedom) of the latest readings.
+    jumps : tuple[JumpDetection, ...]
+        Jumps detected so far.
     sensors : Mapping[str, Sensor]
-        By body.
-    left_out : tuple[tuple[int, str, str, str], ...]
-        (time_us, kind, subject, reason) of the last entries that were not used.
-    spread : Array
-        (4, Q) sums over the readings of all that is read, of its square, of what temperatures leave of it and of that
-        one's square; see `explained`.
-    basis : Array
-        (D + P, n) what the states do, by which it is seen that they are the states of this computer's linear algebra.
-    used : NDArray[np.int64]
-        (U,) ids of the entries that were used since it was last kept for good, in their order.
-    left : Array
-        (U, m) what share of the mean square of jumps could not be told before each of them.
-    told : tuple[tuple[int, float, int], ...]
-        Innovations since then.
-    silent : tuple[tuple[str, int], ...]
-        (body, time_us) of sensors that repeat themselves, and of the first of their equal readings: none counts from
-        there on.
+        Body -> its temperature sensor.
+    excluded : tuple[tuple[int, str, str, str], ...]
+        (time_us, kind, subject, reason) of the latest entries that were not used.
+    scatter_sums : (4, Q) ndarray
+        Sums over the readings of every quantity, of its square, of the quantity without the part that temperatures
+        explain, and of the square of that; see `explained`.
+    basis : (D + P, n) ndarray
+        Outputs of the filter's states. They identify the state basis that this computer's linear algebra gives.
+    used : (U,) ndarray of int64
+        Ids of the entries used since the last permanent checkpoint, in their order.
+    undetected_shares : (U, m) ndarray
+        Share of the mean square of jumps that could not be detected before each of these entries.
+    new_innovations : tuple[tuple[int, float, int], ...]
+        Innovations since the last permanent checkpoint, as `innovations`.
+    stuck_sensors : tuple[tuple[str, int], ...]
+        (body, time_us) of sensors that repeat their value, with the time of the first equal reading; none of their
+        readings from that time on is used.
     pending : tuple[int, int] | None
-        (id, time_us) of a reading of the monitor that was set aside, of which the next one decides; it is among those
-        that were used. None for none.
-    bad : tuple[tuple[int, str], ...]
-        (time_us, reason) of the last readings of the monitor that were taken for bad ones, and of a pending one.
-    first : tuple[tuple[int, float, int], ...]
-        As ``innovations``, of the first readings of all.
-    accused : tuple[str, ...]
-        Bodies whose sensors have disagreed with what is stated at the same time as others.
+        (id, time_us) of a reading of the monitor that was set aside until the next one decides about it; it is part of
+        `used`.
+    bad_readings : tuple[tuple[int, str], ...]
+        (time_us, reason) of the latest readings of the monitor that were rejected as outliers, and of a pending one.
+    first_innovations : tuple[tuple[int, float, int], ...]
+        Innovations of the first readings of the record, as `innovations`.
+    disagreeing : tuple[str, ...]
+        Bodies whose sensors have disagreed with the prior at the same time as other sensors.
     """
 
     filter_state: FilterState
@@ -309,8 +322,9 @@ class EstimatorState:
 
     @property
     def explained(self) -> Array:
-        """(Q,) share of the scatter of all that is read which temperatures of bodies with sensors explain; NaN before
-        there are two readings.
+        """(Q,) share of the scatter of every quantity that the measured temperatures explain.
+
+        NaN before there are two readings.
         """
         count = self.scores.readings
         if count < 2:
@@ -321,18 +335,18 @@ class EstimatorState:
         return np.where(whole > 0.0, 1.0 - rest / np.where(whole > 0.0, whole, 1.0), np.nan)
 
     def excluding(self, time: int, kind: str, subject: str, reason: str) -> EstimatorState:
-        """With an entry that is not used."""
+        """Return the state with one more entry that is not used."""
         return replace(
             self, time=max(self.time, time), excluded=(*self.excluded, (time, kind, subject, reason))[-HISTORY_LENGTH:]
         )
 
     def with_decision(self, excluded: str) -> EstimatorState:
-        """With the decision on the reading that was set aside.
+        """Return the state after the decision about the reading that was set aside.
 
         Parameters
         ----------
-        left_out : str
-            Why it is left out; empty where it is taken after all.
+        excluded : str
+            Reason for the exclusion; empty if the reading is used.
         """
         assert self.pending is not None
         number, time = self.pending
@@ -342,102 +356,119 @@ class EstimatorState:
             return replace(self, pending=None, excluded=tuple(kept), bad_readings=bad)
         good, bad = self.used != number, (*bad, (time, excluded))
         kept = [*kept, (time, "monitor", "monitor", excluded)]
-        return replace(self, pending=None, excluded=tuple(kept), bad_readings=bad, used=self.used[good], undetected_shares=self.undetected_shares[good])
+        return replace(
+            self,
+            pending=None,
+            excluded=tuple(kept),
+            bad_readings=bad,
+            used=self.used[good],
+            undetected_shares=self.undetected_shares[good],
+        )
 
     @property
     def newly_stuck(self) -> tuple[tuple[str, int], ...]:
-        """Sensors that repeat themselves, whose first equal readings have been used: (body, time_us of the first)."""
-        stuck = ((one.body, one.since_us) for one in self.sensors.values() if one.stuck)
+        """Sensors found to repeat their value whose first equal readings have been used already.
+
+        (body, time_us of the first equal reading) of each.
+        """
+        stuck = ((sensor.body, sensor.since_us) for sensor in self.sensors.values() if sensor.stuck)
         return tuple(one for one in stuck if one not in self.stuck_sensors)
 
     @property
     def jointly_disagreeing(self) -> tuple[str, ...]:
-        """Bodies whose sensors disagree with what is stated, where several do: it is then the prior that is wrong, and
-        not all of these sensors. Empty where one disagrees, or none.
+        """Bodies whose sensors disagree with the prior, if there are several; empty otherwise.
+
+        Where several sensors disagree at the same time, the prior is wrong and not all of these sensors.
         """
-        found = tuple(sorted(one.body for one in self.sensors.values() if one.disagrees))
+        found = tuple(sorted(sensor.body for sensor in self.sensors.values() if sensor.disagrees))
         return found if len(found) > 1 else ()
 
     def with_innovation(self, time: int, found: Innovation) -> EstimatorState:
-        """With the innovation of a reading of the monitor that was taken."""
+        """Return the state with the innovation of a reading of the monitor that was used."""
         innovation = (time, found.chi_square, len(found.white))
         scores = self.scores.updated(found.white, found.log_score)
         innovations = (*self.innovations, innovation)[-HISTORY_LENGTH:]
         first = (*self.first_innovations, innovation)[: SPANS[-1]]
-        return replace(self, scores=scores, innovations=innovations, new_innovations=(*self.new_innovations, innovation), first_innovations=first)
+        return replace(
+            self,
+            scores=scores,
+            innovations=innovations,
+            new_innovations=(*self.new_innovations, innovation),
+            first_innovations=first,
+        )
 
     def with_counters_reset(self) -> EstimatorState:
-        """The same, counting what is used from now on."""
+        """Return the state with empty lists of what was used since the last permanent checkpoint."""
         return replace(self, used=self.used[:0], undetected_shares=self.undetected_shares[:0], new_innovations=())
 
     @classmethod
     def from_bytes(cls, content: bytes) -> EstimatorState:
-        """Return what `packed` made bytes of."""
+        """Return the state that was serialised by `packed`."""
         return cast("EstimatorState", unpacked(content, cls, Scores, Sensor, JumpDetection))
 
 
 @dataclass(frozen=True, eq=False)
 class EntryFilter:
-    """Takes a record's entries one after the other.
+    """Filter that updates an estimator's state with the entries of a record.
 
     Attributes
     ----------
     model : OperationModel
-        What the estimate rests on.
-    how : SeriesFilter
-        Its filter, with the events of the record as steps.
+        Traced model of the instrument and its disturbances.
+    series_filter : SeriesFilter
+        Filter of this model, with the events of the record as steps.
     epoch : int
-        From which seconds count, microseconds.
-    reference : Array
-        (C, 2) px that all shifts are counted from.
+        Origin of the filter's seconds, in microseconds of TAI since 2000.
+    reference : (C, 2) ndarray
+        Spot positions in the reference images, row and column in pixels; all shifts count from them.
     temperature : float
-        Of the instrument in its calibration, kelvin.
+        Temperature of the instrument in its calibration, in kelvin.
     """
 
     model: OperationModel
-    how: SeriesFilter
+    series_filter: SeriesFilter
     epoch: int
     reference: Array
     temperature: float
 
     def seconds(self, time: int) -> float:
-        """Of a time in microseconds."""
+        """Return the seconds from the epoch to a time in microseconds of TAI since 2000."""
         return (time - self.epoch) / MICRO
 
     def start(self, time: int, stuck_sensors: tuple[tuple[str, int], ...] = ()) -> EstimatorState:
-        """Before any entry.
+        """Return the state before any entry.
 
         Parameters
         ----------
         time : int
-            Of the first, microseconds.
-        silent : tuple[tuple[str, int], ...]
-            Sensors that are known to repeat themselves.
+            Time of the first entry, in microseconds of TAI since 2000.
+        stuck_sensors : tuple[tuple[str, int], ...]
+            Sensors that are known to repeat their value, as in `EstimatorState`.
         """
         spread = np.zeros((4, len(self.model.quantities)))
-        filter_state, basis = self.how.start(self.seconds(time)), self.how.space.basis
+        filter_state, basis = self.series_filter.start(self.seconds(time)), self.series_filter.space.basis
         return EstimatorState(filter_state, time, scatter_sums=spread, basis=basis, stuck_sensors=stuck_sensors)
 
     def take(self, state: EstimatorState, entries: Sequence[Mapping[str, Any]]) -> EstimatorState:
-        """All entries of one moment.
+        """Return the state updated with all entries of one moment.
 
         Parameters
         ----------
-        standing : Standing
-            before.
+        state : EstimatorState
+            State before them.
         entries : Sequence[Mapping[str, Any]]
-            Of one time, each with its content as plain data and, as ``decided``, whether somebody includes it and why;
-            None where nobody has decided.
+            Entries of one time, each with its content as plain data and, as ``decided``, the decision of a person
+            (whether it is included, and why); None where there is no decision.
         """
         state = replace(state, time=max(state.time, int(entries[0]["time_us"])))
-        for one in entries:
-            if (decision := one["decided"]) is not None and not decision[0]:
-                reason = f"entry {one['id']} was excluded: {decision[1]}"
-                state = state.excluding(
-                    int(one["time_us"]), str(one["kind"]), str(one["subject"]), reason
-                )
-        entries = [one for one in entries if one["decided"] is None or one["decided"][0]]
-        warm = sorted((one for one in entries if one["kind"] == "temperature"), key=lambda one: str(one["subject"]))
+        for entry in entries:
+            if (decision := entry["decided"]) is not None and not decision[0]:
+                reason = f"entry {entry['id']} was excluded: {decision[1]}"
+                state = state.excluding(int(entry["time_us"]), str(entry["kind"]), str(entry["subject"]), reason)
+        entries = [entry for entry in entries if entry["decided"] is None or entry["decided"][0]]
+        warm = sorted(
+            (entry for entry in entries if entry["kind"] == "temperature"), key=lambda one: str(one["subject"])
+        )
         for one in warm:
             state = self._temperature(state, one)
         for one in entries:
@@ -446,17 +477,17 @@ class EntryFilter:
         return state
 
     def observed(self, entry: Mapping[str, Any]) -> Observed:
-        """What an entry that is used says.
+        """Return an entry as an observation of the filter.
 
         Parameters
         ----------
         entry : Mapping[str, Any]
-            Of the monitor, or of a sensor that the filter knows.
+            Reading of the monitor, or of a sensor that the filter knows.
         """
         time, content = self.seconds(int(entry["time_us"])), entry["content"]
         if entry["kind"] == "temperature":
-            assert self.how.heat is not None
-            number = self.how.heat.sensors.index(str(entry["subject"]))
+            assert self.series_filter.heat is not None
+            number = self.series_filter.heat.sensors.index(str(entry["subject"]))
             value, noise = np.array([float(content["values"][0]) - self.temperature]), float(content["sigma"]) ** 2
             return Observed(time, value, np.array([[noise]]), (number,))
         spots = content["numbers"]["spots"]
@@ -468,43 +499,46 @@ class EntryFilter:
     def _updated(
         self, state: EstimatorState, entry: Mapping[str, Any], observed: Observed
     ) -> tuple[EstimatorState, Innovation]:
-        filter_state, found = self.how.update(state.filter_state, observed, entry["decided"] is not None)
+        """Return the state updated with one observation, and the innovation."""
+        filter_state, found = self.series_filter.update(state.filter_state, observed, entry["decided"] is not None)
         used = np.append(state.used, np.int64(entry["id"]))
         # of no motion that may jump there is nothing to count rows by
-        before = state.undetected_shares.reshape(len(state.used), len(self.how.walking))
+        before = state.undetected_shares.reshape(len(state.used), len(self.series_filter.walking))
         left = np.concatenate([before, state.filter_state.undetected[None]])
         return replace(state, filter_state=filter_state, used=used, undetected_shares=left), found
 
     def _temperature(self, state: EstimatorState, entry: Mapping[str, Any]) -> EstimatorState:
+        """Return the state updated with the reading of a temperature sensor."""
         time, body, content = int(entry["time_us"]), str(entry["subject"]), entry["content"]
         sensor = state.sensors.get(body, Sensor(body)).updated(
             time, float(content["values"][0]), float(content["sigma"])
         )
         state = replace(state, sensors={**state.sensors, body: sensor})
-        if self.how.heat is None or body not in self.how.heat.sensors:
-            return state.excluding(time, "temperature", body, "nothing is stated of its temperature")
+        if self.series_filter.heat is None or body not in self.series_filter.heat.sensors:
+            return state.excluding(time, "temperature", body, "the plan states no temperature of this body")
         included = entry["decided"] is not None
         if not included and (sensor.stuck or (body, sensor.since_us) in state.stuck_sensors):
-            return state.excluding(time, "temperature", body, "its sensor repeats itself")
+            return state.excluding(time, "temperature", body, "its sensor is stuck")
         observed = self.observed(entry)
-        there = self.how.at(state.filter_state, observed.time)
-        white = float(self.how.whitened(there.state, observed).white[0])
+        there = self.series_filter.at(state.filter_state, observed.time)
+        white = float(self.series_filter.whitened(there.state, observed).white[0])
         sensor = sensor.with_residual(white)
         state = replace(state, sensors={**state.sensors, body: sensor})
         if body in state.jointly_disagreeing:  # then it is not the sensor that is wrong
             times = max(abs(white), 1.0)
-            loose = self.how.inflated(there, observed, times) if times > INFLATION_SIGMAS else there
+            loose = self.series_filter.inflated(there, observed, times) if times > INFLATION_SIGMAS else there
             disagreeing = tuple(sorted({*state.disagreeing, *state.jointly_disagreeing}))
             state = replace(state, filter_state=loose, disagreeing=disagreeing)
         elif abs(white) > OUTLIER_SIGMAS and not included:
-            reason = f"{abs(white):.3g} standard deviations from what was expected"
+            reason = f"{abs(white):.3g} standard deviations from its prediction"
             return state.excluding(time, "temperature", body, reason)
         return self._updated(state, entry, observed)[0]
 
     def _monitor(self, state: EstimatorState, entry: Mapping[str, Any]) -> EstimatorState:
+        """Return the state updated with a reading of the monitor."""
         time = int(entry["time_us"])
         if entry["content"]["numbers"].get("sigma_holds") is False:
-            return state.excluding(time, "monitor", "monitor", "its own sigma does not hold")
+            return state.excluding(time, "monitor", "monitor", "its reported sigma does not hold")
         observed, before = self.observed(entry), state.filter_state.pending
         state, found = self._updated(state, entry, observed)
         if found.settled and state.pending is not None and before is not None:
@@ -514,27 +548,25 @@ class EntryFilter:
                 state = state.with_innovation(when, found.earlier)
         if found.bad is not None:
             number = int(entry["id"])
-            reason = f"{self._outlier_text(number, found)}; the next reading decides whether it is left out"
+            reason = f"{self._outlier_text(number, found)}; the next reading decides whether it is excluded"
             state = replace(
                 state, pending=(number, time), bad_readings=(*state.bad_readings, (time, reason))[-HISTORY_LENGTH:]
             )
             return state.excluding(time, "monitor", "monitor", reason)
-        filter_state, space, rows = state.filter_state, self.how.space, self.model.rows
-        values = rows @ self.how.parameters_of(filter_state.mean, filter_state.covariance, observed.time)[0]
+        filter_state, space, rows = state.filter_state, self.series_filter.space, self.model.rows
+        values = rows @ self.series_filter.parameters_of(filter_state.mean, filter_state.covariance, observed.time)[0]
         rest = values - rows @ space.heat_outputs(filter_state.mean, observed.time)[space.width :]
         spread = np.stack([values, values**2, rest, rest**2])
         return replace(
             state.with_innovation(time, found),
-            jumps=state.jumps
-            if found.jump is None
-            else (*state.jumps, JumpDetection(time, found.jump)),
+            jumps=state.jumps if found.jump is None else (*state.jumps, JumpDetection(time, found.jump)),
             scatter_sums=state.scatter_sums + (spread if found.earlier is None else 2.0 * spread),
         )
 
     def _outlier_text(self, number: int, found: Innovation) -> str:
-        """Why a reading is taken for a bad one."""
+        """Return in words why a reading is rejected as an outlier."""
         assert found.bad is not None
         camera, channel = self.model.spots[found.bad.coordinate // 2]
         axis = ("row", "column")[found.bad.coordinate % 2]
-        text = f"entry {number}: the {axis} of the spot {camera}/{channel} is {abs(found.bad.z):.3g} sigma from what"
-        return f"{text} is expected of it, and no jump of stated size explains that"
+        text = f"entry {number}: the {axis} of spot {camera}/{channel} is {abs(found.bad.z):.3g} sigma from its"
+        return f"{text} prediction, and no jump of the stated size explains it"

@@ -1,8 +1,8 @@
-"""The estimate of an instrument's state from its record: now, at any time past and ahead, with its sigma.
+"""Estimate of an instrument's state from its record: now, at any past time and ahead, with standard deviations.
 
-A reading changes the estimate with the same work whatever the length of the record: where the estimate stands is kept
-in the record beside the readings, and what comes later goes on from there. What came late begins anew from what was
-kept before it. The result is the same to the bit whenever it is asked for.
+A reading updates the estimate with the same work whatever the length of the record: the estimator's state is kept in
+the record beside the readings, and later readings continue from there. After a reading that came late the estimate
+continues from the newest checkpoint before it. The result is the same to the bit whenever it is asked for.
 """
 
 from __future__ import annotations
@@ -51,34 +51,42 @@ from twin.operate.record.entries import DECISION, MICRO, digest_of_data, utc_tex
 from twin.operate.record.history import USED, History, content_of
 
 DAY = 86_400 * MICRO
+"""One day, in microseconds."""
 CHECKPOINT_READINGS = 1000
-"""Readings after which it is kept for good where the estimate stands."""
+"""Number of readings between two permanent checkpoints of the estimator's state."""
 HEAD_READINGS = 16
-"""Readings since it was kept after which it is kept at all: to follow as many again is as quick as to write it down."""
+"""Number of new readings after which the newest state is saved: filtering as many again is as fast as writing it."""
 _MODEL, _HEAD = -1, 0
 """Numbers under which a record keeps what was traced, and where the estimate stands after all readings."""
 
 
 class Operation:
-    """The estimate of a record under a plan.
+    """Estimate of a record under a plan of operation.
 
     Parameters
     ----------
     history
         The record.
     plan
-        With its instrument, that of the record.
+        Plan of operation of the record's instrument.
     advance
-        Called with the number of readings that were taken, of how many.
-    before_it
-        The same before some readings came; None for none. See `again`.
+        Called with the number of readings that were filtered, and their total.
+    previous
+        The same estimate before the newest readings came, see `updated`; None if there is none.
+
+    Attributes
+    ----------
+    epoch
+        Time of the first reading of the monitor, in microseconds of TAI since 2000; the filter's seconds count from it.
+    key
+        SHA-256 of everything besides the readings that the estimate depends on; it identifies the checkpoints.
 
     Raises
     ------
     Problem
         The record has no reading of the monitor.
     InputError
-        The plan states what its instrument cannot do.
+        The plan states motions that its instrument cannot make.
     """
 
     def __init__(
@@ -94,8 +102,8 @@ class Operation:
         self._stuck_sensors: tuple[tuple[str, int], ...] = ()
         first = history.first("monitor")
         if first is None:
-            allowed = "a run of twin.recover or twin.render; python -m twin.operate ingest takes one"
-            raise Problem("no reading of the monitor is in the record", None, allowed)
+            allowed = "python -m twin.operate ingest RECORD RUN adds a run of twin.recover or twin.render"
+            raise Problem("the record has no reading of the monitor", None, allowed)
         self.epoch = int(first["time_us"])
         before = [
             (camera, channel, one["before"])
@@ -117,17 +125,18 @@ class Operation:
                 self._previous, self._saved = (known.get("estimator_state"), previous._newest), previous._saved
 
     def updated(self) -> Operation:
-        """The estimate of the same record under the same plan with what has come since; quicker than a new one."""
+        """Return the estimate of the same record under the same plan with the newest readings; faster than a new one.
+        """
         return Operation(self.history, self.plan, self._advance, self)
 
     @cached_property
     def experiment(self) -> MonitorExperiment:
-        """The instrument."""
+        """The monitored instrument."""
         return MonitorExperiment(self.plan.model, load_backend())
 
     @cached_property
     def model(self) -> OperationModel:
-        """What was traced; of a record that knows it already it is taken from there."""
+        """Traced model, read from the record if it is kept there."""
         kept = self.history.checkpoint(self.key, number=_MODEL)
         if kept is not None:
             return cast("OperationModel", unpacked(kept.content, OperationModel))
@@ -138,46 +147,51 @@ class Operation:
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """All that is read."""
+        """All estimated quantities."""
         return self.model.quantities
 
     @cached_property
     def events(self) -> tuple[tuple[int, str, tuple[str, ...]], ...]:
-        """(time_us, name, causes) of the record's events that step something."""
-        found = ((int(one["time_us"]), str(one["subject"])) for one in self.history.entries("event"))
+        """(time_us, name, causes) of the record's events that step motions under the plan."""
+        found = ((int(entry["time_us"]), str(entry["subject"])) for entry in self.history.entries("event"))
         known = self.plan.operation.events
         return tuple((time, name, tuple(known[name])) for time, name in found if known.get(name))
 
     @cached_property
     def _entry_filter(self) -> EntryFilter:
-        causes = self.model.how.stated.causes
+        """Filter with the record's events as steps."""
+        causes = self.model.series_filter.stated.causes
         steps = []
         for time, _, own in self.events:
             motions = tuple(k for k, cause in enumerate(causes) if cause in own)
             steps.append(Step(((motions, 1.0),), (((time - self.epoch) / MICRO, 1.0),)))
-        how = replace(self.model.how, steps=tuple(steps))
+        series_filter = replace(self.model.series_filter, steps=tuple(steps))
         reference = np.array([(self._before[spot]["row"], self._before[spot]["column"]) for spot in self.model.spots])
-        return EntryFilter(self.model, how, self.epoch, reference, self.history.temperature)
+        return EntryFilter(self.model, series_filter, self.epoch, reference, self.history.temperature)
 
     def _moments(self, after_us: int | None) -> Iterator[list[dict[str, Any]]]:
-        """Entries that are used, those of one time together, in the order of time."""
-        own = (one for one in self.history.entries(after_us=after_us) if one["kind"] in USED)
+        """Yield the entries that the estimate uses, grouped by time, in the order of time."""
+        own = (entry for entry in self.history.entries(after_us=after_us) if entry["kind"] in USED)
         for _, entries in groupby(own, key=lambda one: int(one["time_us"])):
-            yield [{**one, "content": content_of(one), "decided": self._decisions.get(one["id"])} for one in entries]
+            yield [
+                {**entry, "content": content_of(entry), "decided": self._decisions.get(entry["id"])}
+                for entry in entries
+            ]
 
     @cached_property
     def _decisions(self) -> dict[int, tuple[bool, str]]:
-        """Number of an entry on which somebody has decided -> whether it is included, and why."""
-        found = (content_of(one) for one in self.history.entries(DECISION))
+        """Id of an entry about which a person has decided -> whether it is included, and why."""
+        found = (content_of(entry) for entry in self.history.entries(DECISION))
         return {int(one["entry"]): (bool(one["included"]), str(one["why"])) for one in found}
 
     @cached_property
     def estimator_state(self) -> EstimatorState:
-        """Where the estimate stands after all readings, of which those that are new are taken."""
+        """State of the estimator after all readings; new readings are filtered on first use."""
         with one_blas_thread():
             return self._latest_state()
 
     def _latest_state(self) -> EstimatorState:
+        """Return the estimator's state after all readings, and save checkpoints on the way."""
         entry_filter, newest = self._entry_filter, self.history.newest_id()
         self._newest = newest
         state = self._load_state()
@@ -207,7 +221,7 @@ class Operation:
         return state
 
     def _rewind(self, state: EstimatorState) -> EstimatorState | None:
-        """Where the estimate stood before a sensor began to repeat itself; its readings from there on are not used."""
+        """Return the newest checkpoint before a sensor got stuck; its readings from there on are not used."""
         self._stuck_sensors = (*state.stuck_sensors, *state.newly_stuck)
         since = min(time for _, time in state.newly_stuck)
         self.history.drop_checkpoints(self.key, since)
@@ -216,11 +230,13 @@ class Operation:
         return (
             None
             if kept is None
-            else replace(EstimatorState.from_bytes(kept.content).with_counters_reset(), stuck_sensors=self._stuck_sensors)
+            else replace(
+                EstimatorState.from_bytes(kept.content).with_counters_reset(), stuck_sensors=self._stuck_sensors
+            )
         )
 
     def _load_state(self) -> EstimatorState | None:
-        """Where the estimate stood before what is new; None for nowhere."""
+        """Return the newest saved state that is still valid; None if there is none."""
         state, newest = self._previous
         if state is not None and not self.history.came_late(newest, state.time):
             return state
@@ -237,24 +253,25 @@ class Operation:
         return state.with_counters_reset() if kept.number > _HEAD else state
 
     def _has_same_basis(self, state: EstimatorState) -> bool:
-        """Whether states that were kept are those of this computer's linear algebra."""
-        own = self._entry_filter.how.space.basis
+        """Return whether a saved state uses the state basis that this computer's linear algebra gives."""
+        own = self._entry_filter.series_filter.space.basis
         if state.basis.shape != own.shape:
             return False
         return bool(np.all(np.abs(state.basis - own) <= 1e-9 * np.abs(own).max(axis=1, keepdims=True)))
 
     def _save_state(self, state: EstimatorState, number: int, newest: int) -> None:
+        """Save the estimator's state in the record under a number."""
         self.history.save_checkpoint(self.key, number, state.time, newest, packed(state))
 
     def filter_readings(self) -> FilterResult:
-        """Take all readings that are new, and tell what is known."""
+        """Filter all new readings and return the result."""
         state = self.estimator_state
         now = self.forecast([state.time])
-        jumps = tuple(self._detected_jump(one.time, one.jump) for one in state.jumps)
+        jumps = tuple(self._detected_jump(jump.time, jump.jump) for jump in state.jumps)
         sensors = []
-        for one in state.sensors.values():
-            condition, since, reason = one.state(state.time, one.body not in state.jointly_disagreeing)
-            sensors.append(SensorState(one.body, condition, since, one.last_us, reason))
+        for sensor in state.sensors.values():
+            condition, since, reason = sensor.state(state.time, sensor.body not in state.jointly_disagreeing)
+            sensors.append(SensorState(sensor.body, condition, since, sensor.last_us, reason))
         return FilterResult(
             state.time,
             state.scores.readings,
@@ -275,29 +292,31 @@ class Operation:
         )
 
     def power(self) -> tuple[DetectionPower, ...]:
-        """Return the smallest jump of each body that is found, at the mean interval of the readings so far; empty where
-        there is one reading.
+        """Return the smallest detectable jump of each body at the mean interval of the readings so far.
+
+        Empty if there is only one reading.
         """
-        count, noise = self.estimator_state.scores.readings, self.model.how.reference_noise
+        count, noise = self.estimator_state.scores.readings, self.model.series_filter.reference_noise
         if count < 2 or noise is None:
             return ()
         interval = (self.estimator_state.time - self.epoch) / MICRO / (count - 1)
         with one_blas_thread():
-            return detection_power(self.model.how, interval, noise)
+            return detection_power(self.model.series_filter, interval, noise)
 
     def _understated_causes(self) -> tuple[str, ...]:
-        """Causes of the temperatures of bodies whose sensors disagree with what is stated at the same time."""
-        stated, heat, disagreeing = self.model.how.stated, self.model.how.heat, self.estimator_state.disagreeing
+        """Return the causes of the temperatures of bodies whose sensors jointly disagree with the prior."""
+        stated, heat, disagreeing = self.model.series_filter.stated, self.model.series_filter.heat, self.estimator_state.disagreeing
         if heat is None:
             return ()
         lasting = (k for k in heat.motions.tolist() if stated.bodies[k] in disagreeing and not stated.laws[k].white)
         return tuple(dict.fromkeys(stated.causes[k] for k in lasting))
 
     def _detected_jump(self, told: int, jump: Jump) -> DetectedJump:
+        """Return a jump with its sizes and its effect on every quantity, as it is reported."""
         sizes = tuple(zip(jump.labels, jump.units, jump.sizes, jump.sigmas, strict=True))
         after, until = (self.epoch + round(time * MICRO) for time in (jump.after, jump.until))
         change, spread, rows = np.array(jump.change), np.array(jump.spread), self.model.rows
-        width = self.model.how.space.width
+        width = self.model.series_filter.space.width
         read, changed = rows @ (self.model.reading @ change[:width]), rows @ change[width:]
         sigma = np.sqrt(np.einsum("qi,ij,qj->q", rows, spread[width:, width:], rows))
         each = zip(self.quantities, read.tolist(), changed.tolist(), sigma.tolist(), strict=True)
@@ -307,89 +326,106 @@ class Operation:
         )
 
     def _requirement_status(self) -> tuple[RequirementStatus, ...]:
+        """Return the status of every requirement of the plan, now and within the horizon."""
         operation, start = self.plan.operation, self.estimator_state.time
         if not operation.requirements:
             return ()
         days = max(1, round(operation.horizon * MICRO / DAY))
         ahead = self.forecast([start + round(k * operation.horizon * MICRO / days) for k in range(days + 1)])
         out = []
-        for one in operation.requirements:
-            k = [each.name for each in ahead.quantities].index(one.name)
-            chance = beyond(ahead.values[:, k], ahead.sigmas[:, k], one.largest)
-            broken = np.flatnonzero(chance > 1.0 - one.probability)
+        for requirement in operation.requirements:
+            k = [each.name for each in ahead.quantities].index(requirement.name)
+            chance = beyond(ahead.values[:, k], ahead.sigmas[:, k], requirement.largest)
+            broken = np.flatnonzero(chance > 1.0 - requirement.probability)
             breaks_us = int(ahead.times[broken[0]]) if len(broken) else None
             unit = self.quantities[k].parameter.unit
             holds = not (len(broken) and broken[0] == 0)
             out.append(
-                RequirementStatus(one.name, unit, one.largest, one.probability, float(chance[0]), holds, breaks_us)
+                RequirementStatus(
+                    requirement.name,
+                    unit,
+                    requirement.largest,
+                    requirement.probability,
+                    float(chance[0]),
+                    holds,
+                    breaks_us,
+                )
             )
         return tuple(out)
 
     def forecast(self, times_us: Sequence[int] | NDArray[np.int64]) -> Course:
-        """What is expected at times ahead, by all readings.
+        """Return the expected values at future times, given all readings.
 
         Parameters
         ----------
-        times_us : Sequence[int] | NDArray[np.int64]
-            (T,) microseconds of TAI since 2000, not before the newest reading.
+        times_us : (T,) sequence of int
+            Microseconds of TAI since 2000, not before the newest reading.
 
         Raises
         ------
         Problem
-            a time before it.
+            A time is before the newest reading.
         """
         times = np.asarray(times_us, np.int64)
         if len(times) and times.min() < self.estimator_state.time:
-            allowed = f"times from {utc_text(self.estimator_state.time)} on, that of the newest reading"
-            raise Problem("a forecast of what is past", utc_text(int(times.min())), allowed)
-        how = self._entry_filter.how
+            allowed = f"times from the newest reading, {utc_text(self.estimator_state.time)}, on"
+            raise Problem("the time of the forecast is in the past", utc_text(int(times.min())), allowed)
+        series_filter = self._entry_filter.series_filter
         with one_blas_thread():
-            found = [how.parameters(self._now, self._entry_filter.seconds(int(time))) for time in times]
+            found = [series_filter.parameters(self._now, self._entry_filter.seconds(int(time))) for time in times]
         return self._course(times, found, np.full(len(times), self._sigma_inflation))
 
     @cached_property
     def _now(self) -> FilterState:
-        """What is known after all readings, jumps that are not told counted by their chances."""
-        return self._entry_filter.how.mixture(self.estimator_state.filter_state)
+        """Filter state after all readings, with undetected jumps weighted by their probabilities."""
+        return self._entry_filter.series_filter.mixture(self.estimator_state.filter_state)
 
     @cached_property
     def _sigma_inflation(self) -> float:
-        """Of sigmas now, where the last readings contradict what is stated."""
+        """Factor of the present sigmas where the latest readings contradict the prior; 1 if they do not."""
         squares = self._unexplained(self.estimator_state.innovations)
         told = [time for time, _, _ in self.estimator_state.innovations]
         return float(inflation_factors(squares, [len(squares)], False, self._lasting(told))[0])
 
     def _lasting(self, told: Sequence[int]) -> list[tuple[int, Array]]:
-        """Return contradictions that widen sigma for good: of the first readings, and of what bodies of jumps do not
-        explain; and the number of readings before each.
+        """Return contradictions that inflate sigma permanently, each with the number of readings before it.
+
+        They are those of the first readings, and the residuals that a detected jump leaves unexplained.
         """
         out = [(0, self._unexplained(self.estimator_state.first_innovations))]
         jumps = [] if self.too_many_jumps else self.estimator_state.jumps
-        return out + [(int(np.searchsorted(told, one.time)) + 1, np.array([one.jump.rest])) for one in jumps]
+        return out + [(int(np.searchsorted(told, jump.time)) + 1, np.array([jump.jump.rest])) for jump in jumps]
 
     @cached_property
     def too_many_jumps(self) -> bool:
-        """Whether more jumps were told than is stated, one in a thousand times by chance; a body of which nothing is
-        stated of how often it jumps does so once.
+        """Whether more jumps were detected than the plan states, at a false-alarm rate of one in a thousand.
+
+        A body without a stated rate counts as one expected jump.
         """
-        stated, lasted = self.model.how.stated, (self.estimator_state.time - self.epoch) / MICRO
+        stated, lasted = self.model.series_filter.stated, (self.estimator_state.time - self.epoch) / MICRO
         every = {body: law.every_s for body, law in zip(stated.bodies, stated.laws, strict=True) if law.jump}
         mean = sum(1.0 if rate is None else lasted / rate for rate in every.values())
         count = len(self.estimator_state.jumps)
         return bool(count > 1 and pdtrc(count - 1, mean) < FALSE_ALARM)
 
     def _unexplained(self, innovations: Sequence[tuple[int, float, int]]) -> Array:
-        """(N, 2) chi-square and degrees of freedom of readings; none of those that jumps explain which were told, but
-        where there are more of these than is stated: then it is not jumps that the readings ask for.
+        """Return chi-square and degrees of freedom (N, 2) of readings, zero for readings that detected jumps explain.
+
+        If more jumps were detected than the plan states, none is taken as an explanation.
         """
-        jumps = [] if self.too_many_jumps else [self._detected_jump(one.time, one.jump) for one in self.estimator_state.jumps]
+        jumps = (
+            []
+            if self.too_many_jumps
+            else [self._detected_jump(jump.time, jump.jump) for jump in self.estimator_state.jumps]
+        )
         out = np.array([(square, degrees) for _, square, degrees in innovations], np.float64).reshape(-1, 2)
         times = np.array([time for time, _, _ in innovations], np.int64)
-        for one in jumps:
-            out[(times > one.after_us) & (times <= one.detected_us)] = 0.0
+        for jump in jumps:
+            out[(times > jump.after_us) & (times <= jump.detected_us)] = 0.0
         return out
 
     def _course(self, times: NDArray[np.int64], found: Sequence[tuple[Array, Array]], sigma_inflation: Array) -> Course:
+        """Return the course of all quantities from parameters and covariances at the times."""
         rows = self.model.rows
         changes = np.array([one for one, _ in found]).reshape(len(times), rows.shape[1])
         covariance = np.array([one for _, one in found]).reshape(len(times), rows.shape[1], rows.shape[1])
@@ -399,24 +435,24 @@ class Operation:
         return Course(times, self.quantities, changes @ rows.T, sigmas, changes, covariance)
 
     def smoothed(self, times_us: Sequence[int] | NDArray[np.int64]) -> Course:
-        """What all readings say of times; of those after the newest it is the forecast.
+        """Return the smoothed estimate at given times from all readings; after the newest reading it is the forecast.
 
         Parameters
         ----------
-        times_us : Sequence[int] | NDArray[np.int64]
-            (T,) microseconds of TAI since 2000, from the first reading on.
+        times_us : (T,) sequence of int
+            Microseconds of TAI since 2000, from the first reading on.
 
         Raises
         ------
         Problem
-            a time before it.
+            A time is before the first reading.
         """
         times = np.asarray(times_us, np.int64)
-        found = self._states_at(times, self._entry_filter.how.parameters_of)
+        found = self._states_at(times, self._entry_filter.series_filter.parameters_of)
         return self._course(times, found, self._sigma_inflation_at(times))
 
     def _sigma_inflation_at(self, times: NDArray[np.int64]) -> Array:
-        """(T,) of sigmas of times past; of those after the newest reading as it is now."""
+        """Return the factors (T,) of sigmas at past times; after the newest reading the present factor."""
         told = [one for span in self._segments(None) for one in span.new_innovations]
         squares = self._unexplained(told)
         number = np.searchsorted([time for time, _, _ in told], times, side="right")
@@ -425,46 +461,47 @@ class Operation:
         return out
 
     def motions(self, time_us: int, acting: bool = False) -> Motions:
-        """Every stated motion at one time, by all readings.
+        """Return every stated motion at one time, given all readings.
 
         Parameters
         ----------
         time_us : int
             Microseconds of TAI since 2000, from the first reading on.
         acting : bool
-            Temperatures of bodies with sensors times the factor by which heat does more to light than was computed, so
-            that what is computed of the motions is what `smoothed` says.
+            Multiply the temperatures of bodies with sensors by the estimated factor between their true and their
+            computed effect on light, so that the traced effect of the motions agrees with `smoothed`.
 
         Raises
         ------
         Problem
-            a time before it.
+            The time is before the first reading.
         """
-        stated = self.model.how.stated
-        how = replace(self._entry_filter.how, steps=(*self._entry_filter.how.steps, *self._steps()))
+        stated = self.model.series_filter.stated
+        series_filter = replace(self._entry_filter.series_filter, steps=(*self._entry_filter.series_filter.steps, *self._steps()))
         since = self._entry_filter.seconds(self.epoch)
         found = self._states_at(
             np.array([time_us], np.int64),
-            lambda mean, covariance, time: how.motions_of(mean, covariance, time, since, acting),
+            lambda mean, covariance, time: series_filter.motions_of(mean, covariance, time, since, acting),
         )
         (mean, spread), size = found[0], stated.sigmas
         spread = spread * self._sigma_inflation_at(np.array([time_us], np.int64))[0] ** 2
         return Motions(int(time_us), stated.labels, stated.units, size * mean, size[:, None] * spread * size)
 
     def _steps(self, told_after: int | None = None) -> tuple[Step, ...]:
-        own = (one for one in self.estimator_state.jumps if told_after is None or one.time > told_after)
+        """Return the detected jumps as steps of the filter; only those detected after a time, if one is given."""
+        own = (jump for jump in self.estimator_state.jumps if told_after is None or jump.time > told_after)
         return tuple(Step.of(one.jump) for one in own)
 
     def _states_at(
         self, times: NDArray[np.int64], each: Callable[[Array, Array, float], tuple[Array, Array]]
     ) -> list[tuple[Array, Array]]:
-        """What is made of the states at times, by all readings; from the newest on it is what a forecast has."""
+        """Evaluate a function of the state at given times, from all readings; later times are forecast."""
         entry_filter, last = self._entry_filter, self.estimator_state
         if len(times) and times.max() >= last.time:
             with one_blas_thread():
                 ahead = []
                 for second in (entry_filter.seconds(int(time)) for time in times[times >= last.time]):
-                    there = entry_filter.how.at(self._now, second)
+                    there = entry_filter.series_filter.at(self._now, second)
                     ahead.append(each(there.mean, there.covariance, second))
             past, ahead_of = iter(self._states_at(times[times < last.time], each)), iter(ahead)
             return [next(ahead_of if time >= last.time else past) for time in times]
@@ -473,98 +510,109 @@ class Operation:
         self._require_known(int(times.min()))
         with one_blas_thread():
             seconds = [entry_filter.seconds(int(time)) for time in times]
-            how, start, observed, left = self._smoothing_inputs(int(times.min()))
-            return smoothed(how, start, observed, seconds, left, each)
+            series_filter, start, observed, left = self._smoothing_inputs(int(times.min()))
+            return smoothed(series_filter, start, observed, seconds, left, each)
 
     def smooth_jointly(self, times_us: Sequence[int] | NDArray[np.int64]) -> tuple[Array, Array]:
-        """What all readings say of several times together; of one time it is what `smoothed` says.
+        """Return the smoothed estimate at several times with the covariance between times.
 
         Parameters
         ----------
-        times_us : Sequence[int] | NDArray[np.int64]
-            (T,) microseconds of TAI since 2000 in order, from the first reading on; if one is before the newest
-            reading, jumps that the last readings hint at do not count for those after it.
+        times_us : (T,) sequence of int
+            Microseconds of TAI since 2000, ascending, from the first reading on. If one is before the newest reading,
+            jumps that the latest readings only hint at are ignored for the later ones.
 
         Returns
         -------
-        tuple[Array, Array]
-            (T, 4 K) d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other, and (T, 4 K, T, 4 K) the
-            covariance of their errors, those of one time with those of another.
+        tuple of ndarray
+            (T, 4 K) d_alpha, d_beta, d_gamma (rad) and d_f (m) of one camera after the other, and (T, 4 K, T, 4 K)
+            covariance of their errors. At a single time they equal `smoothed`.
 
         Raises
         ------
         Problem
-            a time before it.
+            A time is before the first reading.
         """
         times, entry_filter = np.asarray(times_us, np.int64), self._entry_filter
         seconds = [entry_filter.seconds(int(time)) for time in times]
         with one_blas_thread():
             if not len(times) or times[0] >= self.estimator_state.time:
-                values, covariance = smooth_jointly(entry_filter.how, self._now, (), seconds, ())
+                values, covariance = smooth_jointly(entry_filter.series_filter, self._now, (), seconds, ())
             else:
                 self._require_known(int(times[0]))
-                how, start, observed, left = self._smoothing_inputs(int(times[0]))
-                values, covariance = smooth_jointly(how, start, observed, seconds, left)
+                series_filter, start, observed, left = self._smoothing_inputs(int(times[0]))
+                values, covariance = smooth_jointly(series_filter, start, observed, seconds, left)
         wide = self._sigma_inflation_at(times)
         return values, covariance * wide[:, None, None, None] * wide[:, None]
 
     def _require_known(self, time: int) -> None:
-        """Refuse a time before all readings. Raises Problem."""
+        """Raise Problem if a time is before the first reading."""
         if time < (begin := self._begin()):
-            allowed = f"times from {utc_text(begin)} on, that of the first reading"
-            raise Problem("a time before all readings", utc_text(time), allowed)
+            allowed = f"times from the first reading, {utc_text(begin)}, on"
+            raise Problem("the time is before the first reading", utc_text(time), allowed)
 
     def _smoothing_inputs(self, time: int) -> tuple[SeriesFilter, FilterState, list[Observed], list[Array]]:
-        """What a look back to a time rests on: the filter that knows of all jumps that were told, where it begins, the
-        readings from there on, and what of jumps could not be told before each.
+        """Return the inputs of a smoother that reaches back to a time.
+
+        They are the filter with all detected jumps as steps, the state at which it begins, the observations from there
+        on, and the undetected shares of jumps before each.
         """
         entry_filter, start = self._entry_filter, self._checkpoint_before(time)
         told = None if start is None else start.time
-        steps = (*entry_filter.how.steps, *self._steps(told))
+        steps = (*entry_filter.series_filter.steps, *self._steps(told))
         used, left = self._used_entries(told)
         wanted = set(used.tolist())
-        every = (one for entries in self._moments(told) for one in entries)
+        every = (entry for entries in self._moments(told) for entry in entries)
         said = {one["id"]: entry_filter.observed(one) for one in every if one["id"] in wanted}
         observed = [said[number] for number in used.tolist()]
         filter_state = (entry_filter.start(self._begin()) if start is None else start).filter_state
         filter_state = _without_search(filter_state)
-        knowing = replace(entry_filter.how, steps=steps, window=0)
-        filter_state, with_hints = with_hinted_jumps(entry_filter.how, knowing, filter_state, observed, list(left))
+        knowing = replace(entry_filter.series_filter, steps=steps, window=0)
+        filter_state, with_hints = with_hinted_jumps(entry_filter.series_filter, knowing, filter_state, observed, list(left))
         return knowing, filter_state, observed, with_hints
 
     def _used_entries(self, after_us: int | None) -> tuple[NDArray[np.int64], Array]:
-        """Ids of the entries that were used after a time at which it was kept, and what could not be told then."""
+        """Return the ids of the entries used after a checkpoint's time, and the undetected shares before each."""
         spans = self._segments(after_us)
-        width = len(self._entry_filter.how.walking)
+        width = len(self._entry_filter.series_filter.walking)
         left = np.concatenate([one.undetected_shares.reshape(len(one.used), width) for one in spans])
         used, pending = np.concatenate([one.used for one in spans]), self.estimator_state.pending
         good = used != (0 if pending is None else pending[0])
         return used[good], left[good]
 
     def _segments(self, after_us: int | None) -> list[EstimatorState]:
-        """Where the estimate was kept for good after a time and stands now; each knows what was used since the last."""
-        return [one for one in self._all_segments if after_us is None or one.time > after_us]
+        """Return the permanent checkpoints after a time and the newest state.
+
+        Each lists the entries used since the one before.
+        """
+        return [segment for segment in self._all_segments if after_us is None or segment.time > after_us]
 
     @cached_property
     def _all_segments(self) -> list[EstimatorState]:
+        """All permanent checkpoints, and the newest state."""
         last = self.estimator_state  # what is new is taken and kept first
         kept = (
-            EstimatorState.from_bytes(one.content) for one in self.history.checkpoints(self.key) if one.number > _HEAD
+            EstimatorState.from_bytes(checkpoint.content)
+            for checkpoint in self.history.checkpoints(self.key)
+            if checkpoint.number > _HEAD
         )
         return [*(replace(one, filter_state=_without_search(one.filter_state)) for one in kept), last]
 
     def _begin(self) -> int:
+        """Return the time of the first entry that the estimate uses, in microseconds of TAI since 2000."""
         return min(int(one["time_us"]) for kind in USED if (one := self.history.first(kind)) is not None)
 
     def _checkpoint_before(self, time: int) -> EstimatorState | None:
-        """The newest that was kept for good before a time and before all jumps that were told since; None for none."""
+        """Return the newest permanent checkpoint before a time and before all later-detected jumps; None if there is
+        none.
+        """
         last = self.estimator_state
         while True:
             kept = self.history.checkpoint(self.key, before_us=time, valid=True)
             if kept is None:
                 return None
             earlier = [
-                self.epoch + int(one.jump.chances[0][0] * MICRO) for one in last.jumps if one.time > kept.time_us
+                self.epoch + int(jump.jump.chances[0][0] * MICRO) for jump in last.jumps if jump.time > kept.time_us
             ]
             if not earlier or min(earlier) >= kept.time_us:
                 return EstimatorState.from_bytes(kept.content)
@@ -572,6 +620,6 @@ class Operation:
 
 
 def _without_search(filter_state: FilterState) -> FilterState:
-    """What is known without the steps that are looked for, which take most of its memory."""
+    """Return the filter state without the candidate steps of the jump search, which take most of its memory."""
     state, none = filter_state.state.alone(), filter_state.after[:0]
     return replace(filter_state, state=state, search=None, after=none, until=none, pending=None)

@@ -1,7 +1,8 @@
-"""What an estimate of an instrument in operation rests on beside its readings: what moves and what that does to light,
-what sensors see of it, and what is read.
+"""Model on which the estimate of an instrument in operation depends, and its plans of operation.
 
-Plans of operation of a record: read from a file, checked against the record's instrument, and kept in the record.
+`traced_model` traces what each stated motion does to the spots and to the cameras' parameters, and what the temperature
+sensors read of it. Plans of operation are read from a file, checked against the record's instrument and stored in the
+record.
 """
 
 from __future__ import annotations
@@ -32,65 +33,74 @@ from twin.operate.record.entries import digest_of_data, digest_of_job
 from twin.operate.record.history import History
 
 BEFORE = 0.01
-"""Share of the mission that passes between the calibration and the first reading: so large are the chance of a jump
-then and its part of the chance of a false alarm.
+"""Time between the calibration and the first reading, as a share of the mission. The probability of a jump in that
+time, and its part of the false-alarm probability, are proportional to it.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class OperationModel:
-    """What an estimate rests on beside readings.
+    """Traced model of the instrument under a plan of operation.
 
     Attributes
     ----------
-    how : SeriesFilter
-        The filter, which knows of no events yet.
+    series_filter : SeriesFilter
+        Filter of the model, without the record's events.
     spots : tuple[tuple[str, str], ...]
-        (camera, channel) of each spot, in the order of shifts.
+        (camera, channel) of each spot, in the order of the shifts.
     quantities : tuple[Quantity, ...]
-        Q of them that are read.
-    reading : Array
-        (4 K, D) parameters per px by the estimator `model`, by which every camera moves as a whole.
+        The Q estimated quantities.
+    reading : (4 K, D) ndarray
+        Parameters per pixel of spot shift (rad and m) by the estimator `model`, for which every camera moves as a
+        whole.
     """
 
-    how: SeriesFilter
+    series_filter: SeriesFilter
     spots: tuple[tuple[str, str], ...]
     quantities: tuple[Quantity, ...]
     reading: Array
 
     @cached_property
     def rows(self) -> Array:
-        """(Q, 4 K) each in its unit per rad and m of the parameters of one camera after the other."""
-        return np.stack([one.row for one in self.quantities])
+        """(Q, 4 K) derivatives of the quantities by the parameters.
+
+        Numerators are in the quantities' units; denominators are rad and m of one camera after the other.
+        """
+        return np.stack([quantity.row for quantity in self.quantities])
 
 
 def traced_model(
     setup: OperationSetup, reference_sigma: Array, sensors: Sequence[str], experiment: MonitorExperiment
 ) -> OperationModel:
-    """Trace what is stated to move.
+    """Trace the effects of all stated motions and build the filter.
 
     Parameters
     ----------
     setup : OperationSetup
         The plan with its instrument.
-    reference_sigma : Array
-        (C, 2) px of the spots that all shifts are counted from, row and column.
+    reference_sigma : (C, 2) ndarray
+        Standard deviations of the spots in the reference images, row and column in pixels.
     sensors : Sequence[str]
-        Bodies of which there are temperatures.
+        Bodies that have a temperature sensor.
     experiment : MonitorExperiment
-        On the instrument.
+        Monitor experiment of the instrument.
+
+    Returns
+    -------
+    OperationModel
+        The filter, its spots, its quantities and the readings per pixel.
 
     Raises
     ------
     InputError
-        a body that the instrument does not have, or that cannot move or be warmed so.
+        The instrument lacks a body of the plan, or the body cannot move or be warmed as stated.
     """
     plan = setup.operation
     stated, motions = experiment.disturbances, experiment.stated
     assert stated is not None  # a plan states what moves
     assert motions is not None
     stepping = {cause for causes in plan.events.values() for cause in causes}
-    how = SeriesFilter(
+    series_filter = SeriesFilter(
         stated,
         np.diag(reference_sigma.ravel() ** 2),
         heat_inputs(motions, experiment.thermal, sensors, plan.coefficients),
@@ -100,31 +110,31 @@ def traced_model(
         before_s=BEFORE * plan.mission,
     )
     spots = [(name, channel) for name, one in experiment.cameras.items() for channel in one.channels]
-    alone = [one.parameter_jacobian @ np.linalg.pinv(one.spot_jacobian) for one in experiment.cameras.values()]
+    alone = [camera.parameter_jacobian @ np.linalg.pinv(camera.spot_jacobian) for camera in experiment.cameras.values()]
     return OperationModel(
-        how, tuple(spots), quantities(experiment.cameras, experiment.ground), np.asarray(block_diag(*alone))
+        series_filter, tuple(spots), quantities(experiment.cameras, experiment.ground), np.asarray(block_diag(*alone))
     )
 
 
 def heat_inputs(
     stated: StatedMotions, thermal: ThermalModel, sensors: Sequence[str], sigma: float
 ) -> HeatInputs | None:
-    """What sensors of bodies read of the temperatures that are stated; None if none of them reads any.
+    """Return the readings of temperature sensors as functions of the stated temperatures; None if no sensor reads any.
 
-    A sensor stands at its body's origin. A body of which no temperature is stated has that of the body that carries it.
+    A sensor is located at its body's origin. A body without a stated temperature has that of the body that carries it.
 
     Parameters
     ----------
     stated : StatedMotions
-        All that moves or gets warm, M components.
+        All M stated components of motion and temperature.
     thermal : ThermalModel
-        Of the instrument.
+        Thermal model of the instrument.
     sensors : Sequence[str]
-        bodies.
+        Bodies that have a sensor.
     sigma : float
-        Standard deviation of the factor of what heat of each body does.
+        Standard deviation of the factor between the true and the computed effect of each body's heat on light.
     """
-    heat = [k for k, one in enumerate(stated.components) if one.kind in HEAT]
+    heat = [k for k, component in enumerate(stated.components) if component.kind in HEAT]
     still = {stated.components[k].body: Temperature() for k in heat}
     rows = np.zeros((len(sensors), len(heat)))
     for column, k in enumerate(heat):
@@ -146,12 +156,19 @@ def heat_inputs(
 
 
 def read_plan(path: Path, history: History) -> OperationSetup:
-    """The plan in a file.
+    """Read a plan of operation from a file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    history : History
+        Record of the instrument that the plan has to be of.
 
     Raises
     ------
     InputError
-        It cannot be read, is not valid, or is of another instrument than the record; a requirement is of a quantity
+        The file cannot be read, is not valid, or is of another instrument than the record; or it requires a quantity
         that the instrument does not have.
     """
     setup = read_operation(path)
@@ -160,16 +177,16 @@ def read_plan(path: Path, history: History) -> OperationSetup:
         problem = f"a plan of another instrument than the record's ({digest[:12]}, not {history.sha256[:12]})"
         raise operation.error(problem, ("instrument",), found=operation.instrument, allowed=history.name)
     names = quantity_names(setup.model.instrument)
-    for k, one in enumerate(operation.requirements):
-        if one.name not in names:
-            text, near = f"{history.name} has no such quantity", nearest(one.name, names)
-            wrong = Problem(text, shown(one.quantity), names_text(names), near)
+    for k, requirement in enumerate(operation.requirements):
+        if requirement.name not in names:
+            text, near = f"{history.name} has no such quantity", nearest(requirement.name, names)
+            wrong = Problem(text, shown(requirement.quantity), names_text(names), near)
             raise operation.error(wrong, ("requirements", k, "quantity"))
     return setup
 
 
 def quantity_names(instrument: InstrumentSpec) -> tuple[str, ...]:
-    """Group and key of all that is read of an instrument, as `analysis.monitor.limits.quantities` has them."""
+    """Return group and key of all quantities of an instrument, in the order of `analysis.monitor.limits.quantities`."""
     cameras = tuple(instrument.cameras)
     names = [f"{camera} {one.key}" for camera in cameras for one in CAMERA_PARAMETERS.values()]
     if len(cameras) == 2:
@@ -179,25 +196,26 @@ def quantity_names(instrument: InstrumentSpec) -> tuple[str, ...]:
 
 
 def store_plan(setup: OperationSetup, file: Path, history: History) -> bool:
-    """Keep a plan in the record, with the instrument and the disturbances that it names; whether it is a new one."""
+    """Store a plan in the record with its instrument and disturbances, and return whether it is a new one."""
     return history.store_plan(str(file.absolute()), setup.plain())
 
 
 def stored_plan(history: History) -> OperationSetup | None:
-    """The plan that the record keeps and that counts; None for none.
+    """Return the newest plan stored in the record; None if it has none.
 
     Raises
     ------
     InputError
-        It is of a program that wrote it otherwise.
+        Another version of the program stored the plan in another form.
     """
     row = history.plan()
     return None if row is None else validate(OperationSetup, YamlFile("the record's plan", row["content"], {}))
 
 
 def plan_digest(setup: OperationSetup) -> str:
-    """SHA-256 of all of a plan, and of what it names, on which an estimate rests: not of what has to be kept, nor of
-    where its files stand.
+    """Return the SHA-256 of the parts of a plan that the estimate depends on.
+
+    The requirements, and the locations of its files, do not count.
     """
     plain = setup.plain()
     own = {key: value for key, value in plain["operation"].items() if key not in _NO_PART}
@@ -205,4 +223,4 @@ def plan_digest(setup: OperationSetup) -> str:
 
 
 _NO_PART = ("instrument", "disturbances", "horizon", "requirements")
-"""Keys of a plan that do not change what an estimate of the past and of now is."""
+"""Keys of a plan that do not change the estimate of the present and the past."""

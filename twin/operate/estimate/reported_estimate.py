@@ -1,10 +1,9 @@
-"""What an estimate of an instrument in operation tells: courses with their sigmas, jumps, sensors, requirements.
+"""Reported estimate of an instrument in operation: courses with sigmas, jumps, sensors, requirements and alarms.
 
-What of an estimate a person has to know: requirements that are broken or will be, jumps, sensors that fail, readings
-that contradict all that is stated. Each is raised once, and waits in the record until somebody has seen it.
-
-What goes on, as a requirement that stays broken, is not told again while its alarm waits, nor within a month of an
-alarm that somebody has seen.
+An alarm tells a person that a requirement is violated or will be, that a body jumped, that a sensor fails, or that
+readings contradict the prior. Each alarm is raised once, and stays open in the record until somebody acknowledges it. A
+continuing condition, such as a requirement that stays violated, is not raised again while its alarm is open, nor within
+a month of an acknowledged alarm.
 """
 
 from __future__ import annotations
@@ -29,27 +28,27 @@ from twin.operate.record.entries import MICRO, Alarm, utc_text
 from twin.operate.record.history import History
 
 MOST_BAD = 2
-"""Readings taken for bad ones, above which it is said: 3 of 200 come by chance once in a thousand times."""
+"""Number of rejected readings above which a warning is given: 3 of 200 occur by chance once in a thousand times."""
 
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """Estimate at T times.
+    """Estimate of all quantities at T times.
 
     Attributes
     ----------
-    times : NDArray[np.int64]
-        (T,) microseconds of TAI since 2000.
+    times : (T,) ndarray of int64
+        Microseconds of TAI since 2000.
     quantities : tuple[Quantity, ...]
-        Q that are read.
-    values : Array
-        (T, Q) in each one's unit, changes since the calibration.
-    sigmas : Array
-        (T, Q) their total standard deviations.
-    changes : Array
-        (T, 4 K) d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other.
-    covariance : Array
-        (T, 4 K, 4 K) of their errors.
+        The Q estimated quantities.
+    values : (T, Q) ndarray
+        Changes since the calibration, each in its quantity's unit.
+    sigmas : (T, Q) ndarray
+        Total standard deviations of the values.
+    changes : (T, 4 K) ndarray
+        d_alpha, d_beta, d_gamma (rad) and d_f (m) of one camera after the other.
+    covariance : (T, 4 K, 4 K) ndarray
+        Covariance of the errors of `changes`.
     """
 
     times: NDArray[np.int64]
@@ -61,23 +60,23 @@ class Course:
 
     @property
     def utc(self) -> tuple[str, ...]:
-        """The times."""
+        """The times in UTC, ISO 8601."""
         return tuple(utc_text(int(time)) for time in self.times)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data: group -> key -> values at all times, with sigmas beside them."""
+        """Return plain data: group -> key -> values at all times, with the sigmas beside them."""
         out: dict[str, Any] = {"times_utc": list(self.utc)}
-        for k, one in enumerate(self.quantities):
-            own = out.setdefault(one.group, {})
-            own |= {one.key: self.values[:, k].tolist(), f"{one.key}_sigma": self.sigmas[:, k].tolist()}
+        for k, quantity in enumerate(self.quantities):
+            own = out.setdefault(quantity.group, {})
+            own |= {quantity.key: self.values[:, k].tolist(), f"{quantity.key}_sigma": self.sigmas[:, k].tolist()}
         return out
 
 
 class _Dated:
-    """Data of which fields ``..._us`` are ``..._utc`` in plain data."""
+    """Base of data classes whose fields ``..._us`` become ``..._utc`` in plain data."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data."""
+        """Return the fields as plain data, times as UTC."""
         out = vars(self).copy()
         for key in [one for one in out if one.endswith("_us")]:
             time = out.pop(key)
@@ -87,24 +86,28 @@ class _Dated:
 
 @dataclass(frozen=True)
 class DetectedJump(_Dated):
-    """A jump that was told.
+    """A jump of one body that the readings showed.
 
     Attributes
     ----------
     body : str
-        That explains it best; rivals: others -> their log likelihood ratio.
+        Body that explains the jump best.
     after_us, until_us : int
-        Between which readings it came; told_us: at which it was told.
+        Times of the readings between which it occurred, in microseconds of TAI since 2000.
+    detected_us : int
+        Time of the reading at which it was detected.
     sizes : tuple[tuple[str, str, float, float], ...]
-        (motion, unit, size, sigma).
+        (motion, unit, size, sigma) of every motion of the body.
     log_ratio : float
-        Of the likelihoods with it and without it, when it was told.
+        Log likelihood ratio of the readings with and without the jump, when it was detected.
     false_alarm : float
-        Chance of as large a ratio anywhere in the whole life without a jump, at most.
-    carried : Mapping[str, tuple[float, float, float]]
-        Quantity -> (read, changed, sigma): what the spots alone say of it if the camera moved as a whole, what it did
-        to the line by the bodies that can have made it, and the sigma of that. A part that moves spots need not move
-        the line as much.
+        Upper bound of the probability of so large a ratio anywhere in a life without a jump.
+    rivals : Mapping[str, float]
+        Other bodies that could have jumped -> their log likelihood ratio.
+    line_changes : Mapping[str, tuple[float, float, float]]
+        Quantity -> (read, changed, sigma): the change that the spots alone indicate for a camera that moves as a whole,
+        the true change of the line of sight averaged over the bodies that can have jumped, and its standard deviation.
+        A part that moves the spots need not move the line as much.
     """
 
     body: str
@@ -118,13 +121,13 @@ class DetectedJump(_Dated):
     line_changes: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
 
     @property
-    def found(self) -> str:
-        """When it came and how large it is, in words."""
+    def summary(self) -> str:
+        """Time and size of the jump, in words."""
         own = (f"{n.removeprefix(f'{self.body} ')} {with_sigma(z, s, u, sign=True)}" for n, u, z, s in self.sizes)
         return f"between {utc_text(self.after_us)} and {utc_text(self.until_us)}: {', '.join(own)}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data."""
+        """Return the fields as plain data."""
         return {
             **super().to_dict(),
             "sizes": [{"name": n, "unit": u, "size": z, "sigma": s} for n, u, z, s in self.sizes],
@@ -146,18 +149,20 @@ class DetectedJump(_Dated):
 
 @dataclass(frozen=True)
 class SensorState(_Dated):
-    """What a sensor of temperature is worth.
+    """Condition of a temperature sensor.
 
     Attributes
     ----------
     body : str
-        Where it is.
+        Path of the body that carries it.
     state : str
         ``ok``, ``dead``, ``stuck`` or ``doubtful``.
     since_us : int
-        Since when; last_us: its newest reading.
+        Time since which it is in this condition, in microseconds of TAI since 2000.
+    last_us : int
+        Time of its newest reading.
     reason : str
-        Why, empty where it is ok.
+        Reason in words; empty if it is ok.
     """
 
     body: str
@@ -169,20 +174,25 @@ class SensorState(_Dated):
 
 @dataclass(frozen=True)
 class RequirementStatus(_Dated):
-    """A requirement.
+    """Status of a requirement of the plan.
 
     Attributes
     ----------
     quantity : str
-        Group and key; unit: of its limit.
+        Group and key of the quantity.
+    unit : str
+        Unit of the limit.
     limit : float
-        That the size of its change must not exceed; probability: with which.
+        Limit of the absolute change.
+    probability : float
+        Required probability that the limit is kept.
     chance_now : float
-        That it does now.
+        Probability that the limit is exceeded now.
     holds_now : bool
-        Whether that is rare enough.
+        Whether the requirement holds now.
     breaks_us : int | None
-        Time from which on it is not, within the horizon; None if it does not come.
+        First time within the horizon at which it does not hold, in microseconds of TAI since 2000; None if it always
+        holds.
     """
 
     quantity: str
@@ -196,16 +206,20 @@ class RequirementStatus(_Dated):
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """Every stated motion at one time.
+    """Estimate of all M stated motions at one time.
 
     Attributes
     ----------
     time : int
-        microseconds.
+        Microseconds of TAI since 2000.
     labels : tuple[str, ...]
-        M names; units: theirs.
-    mean : Array
-        (M,) in these units. covariance: (M, M) of their errors.
+        Names of the motions.
+    units : tuple[str, ...]
+        Their units.
+    mean : (M,) ndarray
+        Estimated amounts in these units.
+    covariance : (M, M) ndarray
+        Covariance of their errors.
     """
 
     time: int
@@ -217,42 +231,42 @@ class Motions:
 
 @dataclass(frozen=True, eq=False)
 class FilterResult:
-    """What is known after all readings of a record.
+    """Result of filtering all readings of a record.
 
     Attributes
     ----------
     time : int
-        Of the newest, microseconds.
+        Time of the newest entry used, in microseconds of TAI since 2000.
     readings : int
-        Of the monitor that were used.
+        Number of readings of the monitor that were used.
     now : Course
-        The state.
+        Estimate at that time.
     scores : Scores
-        Of predictions made before each reading came.
+        Quality of the predictions made before each reading came.
     innovations : tuple[tuple[int, float, int], ...]
-        (time_us, chi-square, degrees of freedom) of the last readings.
-    jumps : tuple[FoundJump, ...]
-        That were told.
+        (time_us, chi-square, degrees of freedom) of the latest readings.
+    jumps : tuple[DetectedJump, ...]
+        Detected jumps.
     events : tuple[tuple[int, str, tuple[str, ...]], ...]
-        (time_us, name, causes that stepped).
+        (time_us, name, causes that stepped) of the events.
     sensors : tuple[SensorState, ...]
-        What those of temperature are worth.
-    left_out : tuple[tuple[int, str, str, str], ...]
-        (time_us, kind, subject, reason) of the last entries that were not used.
+        Condition of the temperature sensors.
+    excluded : tuple[tuple[int, str, str, str], ...]
+        (time_us, kind, subject, reason) of the latest entries that were not used.
     explained : Mapping[str, float]
         Quantity -> share of its scatter that temperatures explain.
-    widened : float
-        By how much sigmas now are wider since the last readings contradict what is stated; 1 if they do not.
+    sigma_inflation : float
+        Factor by which present sigmas are inflated because the latest readings contradict the prior; 1 if they do not.
     too_many_jumps : bool
-        Whether more jumps were told than is stated.
-    breaks : tuple[Break, ...]
-        The requirements.
+        Whether more jumps were detected than the plan states.
+    requirements : tuple[RequirementStatus, ...]
+        Status of the plan's requirements.
     bad_readings : tuple[tuple[int, str], ...]
-        (time_us, reason) of the last readings of the monitor that were taken for bad ones.
+        (time_us, reason) of the latest readings of the monitor that were rejected as outliers.
     undecided : bool
-        Whether the newest of these may be the first after a jump; sigmas then count with both.
-    too_small : tuple[str, ...]
-        Causes of the prior with which sensors of several bodies disagree at the same time.
+        Whether the newest of these may be the first reading after a jump; the sigmas then allow for both cases.
+    understated_causes : tuple[str, ...]
+        Causes of the prior with which the sensors of several bodies jointly disagree.
     """
 
     time: int
@@ -274,25 +288,25 @@ class FilterResult:
 
     @property
     def warnings(self) -> list[str]:
-        """Return what a reader has to know before the numbers are used, one sentence each."""
+        """Warnings to be read before the numbers are used, one sentence each."""
         out = []
         if self.sigma_inflation > 1.0:
-            text = f"all sigmas are {self.sigma_inflation:.3g} times as wide as it would make them"
-            out.append(f"the last or the first readings contradict what is stated; {text}")
+            text = f"all sigmas are inflated by a factor of {self.sigma_inflation:.3g}"
+            out.append(f"the first or the latest readings contradict the prior; {text}")
         if self.too_many_jumps:
-            out.append(f"{len(self.jumps)} jumps are more than is stated: something else moves, or more of it")
+            out.append(f"{len(self.jumps)} jumps are more than the plan states: other motions, or larger ones, occur")
         if self.undecided:
-            out.append(f"the newest reading may be bad: {self.bad_readings[-1][1]}; until then sigmas count with both")
+            out.append(f"the newest reading may be an outlier: {self.bad_readings[-1][1]}; until then sigmas allow for both")
         if len(self.bad_readings) > MOST_BAD:
             text = "either the readings are worse than usual, or the prior is too small"
-            out.append(f"{len(self.bad_readings)} readings were taken for bad ones: {text}")
+            out.append(f"{len(self.bad_readings)} readings were rejected as outliers: {text}")
         if self.understated_causes:
-            text = "they are stated too small, or of another course in time, and their sigmas do not hold"
-            out.append(f"sensors of several bodies together disagree with {', '.join(self.understated_causes)}: {text}")
+            text = "their sigmas in the prior are too small or their time laws are wrong, and no sigma holds"
+            out.append(f"sensors of several bodies jointly disagree with {', '.join(self.understated_causes)}: {text}")
         return out
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data."""
+        """Return the result as plain data."""
         return {
             "time_utc": utc_text(self.time),
             "readings": self.readings,
@@ -301,9 +315,9 @@ class FilterResult:
             "now": self.now.to_dict(),
             "scores": vars(self.scores),
             "innovations": _rows("chi_square degrees_of_freedom", self.innovations),
-            "jumps": [one.to_dict() for one in self.jumps],
+            "jumps": [jump.to_dict() for jump in self.jumps],
             "events": _rows("name causes", self.events),
-            "sensors": [one.to_dict() for one in self.sensors],
+            "sensors": [sensor.to_dict() for sensor in self.sensors],
             "excluded": _rows("kind subject reason", self.excluded),
             "explained": {name: share if np.isfinite(share) else None for name, share in self.explained.items()},
             "widened": self.sigma_inflation,
@@ -311,26 +325,26 @@ class FilterResult:
             "bad_readings": _rows("reason", self.bad_readings),
             "undecided": self.undecided,
             "understated_causes": list(self.understated_causes),
-            "requirements": [one.to_dict() for one in self.requirements],
+            "requirements": [requirement.to_dict() for requirement in self.requirements],
         }
 
 
 def _rows(keys: str, rows: Sequence[tuple[Any, ...]]) -> list[dict[str, Any]]:
-    """Plain data of rows that begin with their time."""
+    """Return tuples that begin with their time as plain data with the given keys."""
     return [dict(zip(("time_utc", *keys.split()), (utc_text(t), *rest), strict=True)) for t, *rest in rows]
 
 
 def beyond(value: Array, sigma: Array, limit: float) -> Array:
-    """Chance that the size of something is larger than a limit.
+    """Return the probability that the absolute value of a normal quantity exceeds a limit.
 
     Parameters
     ----------
-    value : Array
-        What is expected of it.
-    sigma : Array
-        Its standard deviation, likewise.
+    value : ndarray
+        Mean.
+    sigma : ndarray
+        Standard deviation, of the same shape.
     limit : float
-        In the same unit.
+        Limit in the same unit.
     """
     scale = np.where(sigma > 0.0, sigma, 1e-300)
     return np.asarray(ndtr((value - limit) / scale) + ndtr((-value - limit) / scale))
@@ -339,21 +353,22 @@ def beyond(value: Array, sigma: Array, limit: float) -> Array:
 def inflation_factors(
     squares: Array, now: Sequence[int] | NDArray[np.intp], centred: bool, lasting: Sequence[tuple[int, Array]] = ()
 ) -> Array:
-    """(T,) by how much sigmas are wider than what is stated makes them, where readings contradict it: the root of their
-    chi-square over its degrees of freedom, over the reading alone or some in a row, whichever is more. 1 where chance
-    explains them. What contradicts the first readings, or a jump, is not forgotten: of what the spots do not
-    show, the state rests on it for as long as nothing explains it.
+    """Return the factors (T,) by which readings that contradict the prior inflate the sigmas.
+
+    The factor is the root of chi-square over its degrees of freedom, of the last reading or of several consecutive
+    ones, whichever is larger; it is 1 if chance explains them. A contradiction of the first readings, or of a jump,
+    lasts: the unobservable part of the state depends on it for as long as nothing explains it.
 
     Parameters
     ----------
-    squares : Array
-        (N, 2) chi-square and degrees of freedom of each reading before it came, in the order of time.
-    now : Sequence[int] | NDArray[np.intp]
-        (T,) number of readings up to each time.
+    squares : (N, 2) ndarray
+        Chi-square and degrees of freedom of the innovation of each reading, in the order of time.
+    now : (T,) sequence of int
+        Number of readings up to each time.
     centred : bool
         Whether readings after the time count as well.
-    lasting : Sequence[tuple[int, Array]]
-        Number of readings from which on it counts, and (n, 2) as ``squares``, of what is not forgotten.
+    lasting : Sequence[tuple[int, ndarray]]
+        Lasting contradictions: number of readings from which on each counts, and its (n, 2) array as `squares`.
     """
     sums = np.concatenate([np.zeros((1, 2)), np.cumsum(squares, axis=0)])
     out, number = np.ones(len(now)), np.asarray(now, int)
@@ -372,41 +387,41 @@ def inflation_factors(
 
 
 AGAIN = 30 * 86_400 * MICRO
-"""After which an alarm that somebody has seen is raised again, if what it tells of goes on."""
+"""Time after which a continuing condition raises its alarm again once it is acknowledged, in microseconds (30 days)."""
 LEAST = 1e-6
-"""Chance below which no number is told."""
+"""Probability below which only a bound is printed."""
 _CLOSE = 3.0
-"""Difference of log likelihood ratios, below which another body explains a jump nearly as well: 20 to 1."""
+"""Difference of log likelihood ratios (a factor of 20) below which another body explains a jump nearly as well."""
 BROKEN, BREAKS, JUMP, SENSOR, CONTRADICTION = "broken", "requirements", "jump", "sensor", "contradiction"
 Row = Mapping[str, Any]
 
 
 def raise_alarms(history: History, plan: OperationSpec, result: FilterResult) -> list[Alarm]:
-    """Add to a record what of its estimate is to be known and has not been told.
+    """Add the new alarms of an estimate to its record, and return them.
 
     Parameters
     ----------
     history : History
         The record.
     plan : OperationSpec
-        Under which it was followed.
-    following : Following
-        What is known after all readings.
+        Plan under which the readings were filtered.
+    result : FilterResult
+        Result of filtering all readings.
 
     Returns
     -------
     list[Alarm]
-        The alarms that are new.
+        The new alarms.
     """
     before = history.alarms()
-    return [one for one in alarms_of(plan, result) if not _is_told(one, before) and history.raise_alarm(one)]
+    return [one for one in alarms_of(plan, result) if not _is_repeated(one, before) and history.raise_alarm(one)]
 
 
 def alarms_of(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
-    """What of an estimate is to be known, whether it has been told or not."""
-    for one in result.requirements:
-        if not one.holds_now or one.breaks_us is not None:
-            yield _of_requirement(one, result.time, result.now.quantities)
+    """Yield all alarms of an estimate, whether they have been raised before or not."""
+    for requirement in result.requirements:
+        if not requirement.holds_now or requirement.breaks_us is not None:
+            yield _of_requirement(requirement, result.time, result.now.quantities)
     for jump in result.jumps:
         yield _of_jump(jump)
     for sensor in result.sensors:
@@ -414,15 +429,14 @@ def alarms_of(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
             text = f"the sensor of {sensor.body} is {sensor.state} since {utc_text(sensor.since_us)}: {sensor.reason}"
             yield Alarm(SENSOR, sensor.body, sensor.since_us, text, sensor.to_dict())
     if result.understated_causes:
-        text = next(one for one in result.warnings if result.understated_causes[0] in one)
-        yield Alarm(
-            CONTRADICTION, "temperatures", result.time, text, {"causes": list(result.understated_causes)}
-        )
+        text = next(warning for warning in result.warnings if result.understated_causes[0] in warning)
+        yield Alarm(CONTRADICTION, "temperatures", result.time, text, {"causes": list(result.understated_causes)})
     far = [*_contradictions(plan, result), *map(_of_bad, result.bad_readings)]
     yield from sorted(far, key=lambda one: one.time)[-1:]
 
 
-def _is_told(alarm: Alarm, before: Sequence[Row]) -> bool:
+def _is_repeated(alarm: Alarm, before: Sequence[Row]) -> bool:
+    """Return whether an alarm repeats an earlier one."""
     same = [one for one in before if (one["kind"], one["subject"]) == (alarm.kind, alarm.subject)]
     if alarm.kind == JUMP:  # of a jump the time is known the better the more readings have come
         began, ended = alarm.content["after_us"], alarm.content["until_us"]
@@ -433,14 +447,14 @@ def _is_told(alarm: Alarm, before: Sequence[Row]) -> bool:
 
 
 def name_of(quantity: str, quantities: Sequence[Quantity]) -> str:
-    """A quantity in words: ``Δf of forward``.
+    """Return a quantity in words, such as ``Δf of forward``.
 
     Parameters
     ----------
     quantity : str
         Group and key.
     quantities : Sequence[Quantity]
-        All that are read.
+        All estimated quantities.
     """
     group = quantity.partition(" ")[0]
     symbol = next(one.parameter.symbol for one in quantities if one.name == quantity)
@@ -450,7 +464,7 @@ def name_of(quantity: str, quantities: Sequence[Quantity]) -> str:
 
 
 def percent(chance: float) -> str:
-    """A chance for a sentence, with as many decimals as tell it from certainty."""
+    """Return a probability as text in percent, with as many decimals as distinguish it from certainty."""
     rest = min(chance, 1.0 - chance)
     if rest < LEAST:
         return "less than 0.0001 %" if chance < 0.5 else "more than 99.9999 %"
@@ -458,48 +472,48 @@ def percent(chance: float) -> str:
 
 
 def _of_requirement(one: RequirementStatus, time: int, quantities: Sequence[Quantity]) -> Alarm:
+    """Return the alarm of a requirement that is violated or will be."""
     name, allowed = name_of(one.quantity, quantities), percent(1.0 - one.probability)
     limit = f"{plain(one.limit)} {one.unit}"
     if not one.holds_now:
-        text = f"{name} is beyond {limit} with a chance of {percent(one.chance_now)}; {allowed} is allowed"
+        text = f"{name} exceeds {limit} with a probability of {percent(one.chance_now)}; {allowed} is allowed"
         return Alarm(BROKEN, one.quantity, time, text, one.to_dict())
     assert one.breaks_us is not None
-    text = f"{name} is expected to be beyond {limit} with a chance above {allowed} from {utc_text(one.breaks_us)} on"
+    text = f"{name} is expected to exceed {limit} with a probability above {allowed} from {utc_text(one.breaks_us)} on"
     return Alarm(BREAKS, one.quantity, time, text, one.to_dict())
 
 
 def _of_jump(one: DetectedJump) -> Alarm:
+    """Return the alarm of a detected jump."""
     near = [body for body, ratio in one.rivals.items() if ratio > one.log_ratio - _CLOSE][:3]
     rivals = f"; {', '.join(near)} would explain it nearly as well" if near else ""
     content = {**one.to_dict(), "after_us": one.after_us, "until_us": one.until_us}
-    return Alarm(JUMP, one.body, one.until_us, f"{one.body} jumped {one.found}{rivals}", content)
+    return Alarm(JUMP, one.body, one.until_us, f"{one.body} jumped {one.summary}{rivals}", content)
 
 
 def with_sigma(value: float, sigma: float, unit: str, sign: bool = False) -> str:
-    """A number, with its sign or where it is below zero, its standard deviation, two digits of it, and its unit."""
+    """Return a value with its standard deviation (to two digits) and unit as text, with a plus sign on request."""
     places = decimals_for(sigma)
     return f"{fixed(value, places, sign)} ± {fixed(sigma, places)} {unit.replace('um', 'µm')}"
 
 
 def _of_bad(bad: tuple[int, str]) -> Alarm:
+    """Return the alarm of a reading that was rejected as an outlier."""
     time, reason = bad
-    text = f"the reading of {utc_text(time)} is taken for a bad one: {reason}; exclude --include takes it all the same"
+    text = f"the reading of {utc_text(time)} was rejected as an outlier: {reason}; exclude --include uses it anyway"
     return Alarm(CONTRADICTION, "monitor", time, text, {"time_utc": utc_text(time), "reason": reason})
 
 
 def _contradictions(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
-    """Readings that are too far from their predictions; those at which a jump was found are explained by it.
+    """Yield alarms of readings too far from their predictions; those at which a jump was detected are explained by it.
 
-    Of the chance of a false alarm in the whole life each reading has the share of the time since the one before it.
+    The false-alarm probability of the whole life is shared out by time: each reading has the share of the interval
+    before it.
     """
-    spans = [(one.after_us, one.detected_us) for one in result.jumps]
+    spans = [(jump.after_us, jump.detected_us) for jump in result.jumps]
     told = result.innovations
     # the first of all has no other before it, and a chance of a false alarm of its own
-    befores = (
-        [told[0][0] - round(plan.mission * MICRO) if result.readings == len(told) else told[0][0]]
-        if told
-        else []
-    )
+    befores = [told[0][0] - round(plan.mission * MICRO) if result.readings == len(told) else told[0][0]] if told else []
     befores += [time for time, _, _ in told[:-1]]
     for before, (time, chi_square, degrees) in zip(befores, told, strict=True):
         share = min((time - before) / (plan.mission * MICRO), 1.0)
@@ -508,8 +522,8 @@ def _contradictions(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm
             continue
         limit = float(limit_of(FALSE_ALARM * share, degrees))
         text = (
-            f"the reading of {utc_text(time)} contradicts what is stated: chi-square {plain(chi_square, 4)} of "
-            f"{degrees} coordinates, at most {plain(limit, 3)} by chance; what moves more than the plan says?"
+            f"the reading of {utc_text(time)} contradicts the prior: chi-square {plain(chi_square, 4)} for "
+            f"{degrees} degrees of freedom, limit {plain(limit, 3)}; compare the plan's disturbances with what moves"
         )
         content = {"time_utc": utc_text(time), "chi_square": chi_square, "degrees_of_freedom": degrees, "limit": limit}
         yield Alarm(CONTRADICTION, "monitor", time, text, content)

@@ -1,6 +1,7 @@
-"""The record itself: what it holds, its database, how readings get into it, and its tables for other programs.
+"""Record of an instrument: its contents, its database, the ingest of readings, and its tables for other programs.
 
-Where a record is, and what is wrong with it, stands here: a command tells it before it imports what reads a database.
+The location of a record, and its errors, are defined here, so that a command can report them before it imports the
+database library.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 FILE = "record.sqlite"
-"""Of a record in a folder."""
+"""File name of a record in a folder."""
 
 
 class NotARecord(Exception):
@@ -16,21 +17,21 @@ class NotARecord(Exception):
 
 
 class RecordFailed(Exception):
-    """The database did not do what it was asked: a full disk, a server that is gone. Nothing is half done."""
+    """A database operation that failed, such as on a full disk or a lost server; nothing is half done."""
 
 
 def require_file(file: Path) -> None:
-    """Refuse the file of a record that is not there.
+    """Raise an error if the file of a record does not exist.
 
     Raises
     ------
     NotARecord
-        It is not.
+        The file does not exist.
     """
     if not file.is_file():
         raise NotARecord(f"no record at {file}; python -m twin.operate init DIR INSTRUMENT makes one")
 
 
 def file_of(place: str) -> Path | None:
-    """The file of a record in a folder; None for the address of a database."""
+    """Return the file of a record in a folder; None for the address of a database."""
     return None if "://" in place else Path(place).absolute() / FILE

@@ -1,4 +1,4 @@
-"""What a record holds: readings and events, each recognised by its content, and what was refused with the reason."""
+"""Entries of a record: readings and events, identified by their content, and refusals with their reasons."""
 
 from __future__ import annotations
 
@@ -18,43 +18,50 @@ from twin.orbit.flight.earth import DAY
 from twin.orbit.measured.clock import Readings, calendar, single_reading, tai_minus_utc
 
 EPOCH_DAY = 51544
-"""Modified Julian day from whose beginning in TAI, 2000-01-01, times are counted."""
+"""Modified Julian day of 2000-01-01; times count from its beginning in TAI."""
 MICRO = 1_000_000
+"""Microseconds in a second."""
 DECISION = "decision"
 """Kind of an entry by which a person excludes another entry from the estimate, or includes it."""
 _NOT_THE_INSTRUMENT = ("description", "disturbances")
-"""Keys of an instrument that do not say what it is."""
+"""Keys of an instrument that do not belong to its identity."""
 
 
 def canonical(data: Any) -> str:
-    """Plain data as the one text that stands for them: sorted keys, no blanks. Raises ValueError: NaN, infinities."""
+    """Return plain data as its canonical JSON text, with sorted keys and no blanks.
+
+    Raises
+    ------
+    ValueError
+        The data contain NaN or an infinity.
+    """
     return json.dumps(data, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
 
 
 def digest_of_data(data: Any) -> str:
-    """SHA-256 of the one text of plain data."""
+    """Return the SHA-256 of the canonical text of plain data."""
     return hashlib.sha256(canonical(data).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One reading, or one event.
+    """One reading or one event.
 
     Attributes
     ----------
     kind : str
-        Of reading, as `scenes.specs.operation` names them.
+        Kind of reading, as named in `scenes.specs.operation`.
     subject : str
-        Body, star tracker or camera; name of an event; for a run the kind again.
+        Body, star tracker or camera; for an event its name, for a run its kind.
     time : int
         Microseconds of TAI since 2000-01-01T00:00:00 TAI.
     content : Mapping[str, Any]
-        What was read, plain data in SI units, or in those that the keys of a run's numbers end in.
+        Plain data of the reading, in SI units or in the units given by the ends of the keys.
     line : int | None
-        Of the file, counted from 1; None for a file that is one reading.
+        Line of the file, counted from 1; None for a file that is a single reading.
     origin : str
-        SHA-256 of all that it was found from, such as a monitor's frames, which cannot be of two moments; "" for
-        numbers that are what was read.
+        SHA-256 of the images that the reading was measured in, which cannot belong to two times; empty for a reading
+        that is itself the measurement.
     """
 
     kind: str
@@ -66,22 +73,22 @@ class Entry:
 
     @property
     def digest(self) -> str:
-        """SHA-256 by which it is recognised, whatever file it comes in."""
+        """SHA-256 that identifies the entry, independent of the file that contains it."""
         return digest_of_data([self.kind, self.subject, self.time, self.content])
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """What is not taken.
+    """A row or a file that was refused.
 
     Attributes
     ----------
     reason : str
-        What is wrong with it, and what to do.
+        Error, and its remedy.
     line : int | None
-        Of the file; None for all of it.
+        Line of the file; None for the whole file.
     entry : Entry | None
-        The reading, where it could be read at all.
+        The reading, if it could be read.
     """
 
     reason: str
@@ -91,20 +98,20 @@ class Refusal:
 
 @dataclass(frozen=True)
 class Alarm:
-    """Something of which a person has to know.
+    """A condition that a person has to know of.
 
     Attributes
     ----------
     kind : str
-        What is wrong: ``broken``, ``breaks``, ``jump``, ``sensor`` or ``contradiction``.
+        ``broken``, ``breaks``, ``jump``, ``sensor`` or ``contradiction``.
     subject : str
         Quantity, body or sensor.
     time : int
-        To which it belongs, microseconds of TAI since 2000.
+        Time of the condition, in microseconds of TAI since 2000.
     text : str
-        a sentence.
+        Description, one sentence.
     content : Mapping[str, Any]
-        The numbers behind it, plain data.
+        Numbers of the condition, plain data.
     """
 
     kind: str
@@ -115,26 +122,26 @@ class Alarm:
 
     @property
     def digest(self) -> str:
-        """SHA-256 by which it is recognised: one of a kind and subject at a time, whatever its numbers."""
+        """SHA-256 that identifies the alarm by its kind, subject and time, whatever its numbers."""
         return digest_of_data([self.kind, self.subject, self.time])
 
 
 @dataclass(frozen=True)
 class FileContent:
-    """What one file holds.
+    """Readings and refusals found in one file.
 
     Attributes
     ----------
     file : str
         Absolute path.
     sha256 : str
-        Of it.
+        SHA-256 of the file.
     meaning : str
-        SHA-256 of what was said of it: columns, or the time of a run.
-    items : Sequence[Entry | Refused]
-        Readings and refusals in the order of the file.
+        SHA-256 of the description by which the file was read: its columns, or the time of a run.
+    items : Sequence[Entry | Refusal]
+        Entries and refusals in the order of the file.
     frames : Mapping[str, str]
-        Other files that it was found from, by path, with their SHA-256.
+        Path of every image that the readings were measured in -> its SHA-256.
     """
 
     file: str
@@ -146,25 +153,26 @@ class FileContent:
 
 @cache
 def _leap(day: int) -> float:
+    """Return TAI minus UTC on a Modified Julian day, in seconds."""
     return tai_minus_utc(day)
 
 
 def micros(text: str, scale: str = "UTC", seconds: float = 0.0) -> int:
-    """Microseconds of TAI since 2000 of what a clock showed.
+    """Return the time of a clock's reading in microseconds of TAI since 2000.
 
     Parameters
     ----------
     text : str
         Date and time, ISO 8601.
     scale : str
-        Of the clock.
+        Time scale of the clock.
     seconds : float
-        SI seconds that have passed since.
+        SI seconds to add.
 
     Raises
     ------
     Problem
-        Not such a text.
+        The text is not a date and time.
     """
     one = single_reading(text)
     if scale == "UTC" and one.second[0] < DAY:
@@ -175,32 +183,35 @@ def micros(text: str, scale: str = "UTC", seconds: float = 0.0) -> int:
 
 
 def micros_after(epoch: str, scale: str, seconds: float) -> int:
-    """The same of a clock whose days have 86400 s and that counts seconds from an epoch.
+    """Return the time of a clock that counts seconds from an epoch, in microseconds of TAI since 2000.
+
+    The clock's days have 86400 s.
 
     Parameters
     ----------
     epoch : str
-        What it read at 0 s.
+        Date and time of the clock at 0 s.
     scale : str
-        Of the clock.
+        Time scale of the clock.
     seconds : float
-        That it counted.
+        Seconds counted by the clock.
 
     Raises
     ------
     Problem
-        Not a date and time.
+        The epoch is not a date and time.
     """
     instant = Readings.after(epoch, np.array([seconds])).instants(scale)
     return _count(int(instant.day[0]), float(instant.second[0]))
 
 
 def _count(day: int, second: float) -> int:
+    """Return microseconds since 2000 from a Modified Julian day and a second of TAI."""
     return (day - EPOCH_DAY) * int(DAY) * MICRO + round(second * MICRO)
 
 
 def utc_text(time: int) -> str:
-    """UTC of a time in microseconds of TAI since 2000, ISO 8601 ending in Z; within a leap second the second is 60."""
+    """Return a time in microseconds of TAI since 2000 as UTC, ISO 8601 with Z; the second of a leap second is 60."""
     whole = EPOCH_DAY + (time - 40 * MICRO) // (int(DAY) * MICRO)
     for day in (whole + 1, whole):
         start = (day - EPOCH_DAY) * int(DAY) * MICRO + round(_leap(day) * MICRO)
@@ -216,21 +227,22 @@ def utc_text(time: int) -> str:
 
 
 def now() -> int:
-    """What the computer's clock shows."""
+    """Return the time of the computer's clock, in microseconds of TAI since 2000."""
     return micros(datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%f"))
 
 
 def instrument_digest(instrument: Mapping[str, Any], cameras: Mapping[str, Any]) -> str:
-    """SHA-256 of what an instrument is: its geometry and its cameras' prescriptions, without names of other files.
+    """Return the SHA-256 that identifies an instrument: its geometry and its cameras' prescriptions.
 
-    The data sheet of its CCDs and their exposure are not part of it: a measurement may state others.
+    Descriptions, disturbances, and the data sheet and exposure of its CCDs do not count: a measurement may state
+    others.
 
     Parameters
     ----------
     instrument : Mapping[str, Any]
-        Plain data, as a config.yaml has them.
+        Plain data of the instrument, as in a config.yaml.
     cameras : Mapping[str, Any]
-        Reference -> plain data of the prescription.
+        Name of a camera's file -> plain data of the prescription.
     """
     own = {key: value for key, value in instrument.items() if key not in _NOT_THE_INSTRUMENT}
     monitor = own.get("monitor")
@@ -242,13 +254,13 @@ def instrument_digest(instrument: Mapping[str, Any], cameras: Mapping[str, Any])
 
 
 def digest_of_job(job: ResolvedJob) -> str:
-    """SHA-256 of what a job's instrument is."""
+    """Return the SHA-256 that identifies a job's instrument."""
     plain = job.plain()
     return instrument_digest(plain["instrument"], plain["cameras"])
 
 
 def one_line(error: InputError | Issue | Problem) -> str:
-    """What is wrong, as one line."""
+    """Return an error as one line."""
     if isinstance(error, Problem):
         return str(error.at("")).removeprefix("input: ")
     return "; ".join(str(error).splitlines())

@@ -1,4 +1,5 @@
-"""The record of one instrument: opened, added to, and read, also as it was; what is in it is never altered."""
+"""Record of one instrument in a database: ingest, decisions, queries, also as of an earlier time. Entries never change.
+"""
 
 from __future__ import annotations
 
@@ -43,41 +44,41 @@ from twin.operate.record.schema import (
     database_errors,
     engine_of,
     opened,
-    said,
+    message_of,
     url_of,
     writing,
 )
 from twin.operate.record.taking import Ingest, IngestResult
 
 USED = ("monitor", "temperature")
-"""Kinds of entries that change the estimate; events do by what they step."""
+"""Kinds of entries that are observations of the estimate; events act on it by their steps."""
 
 
 class History:
-    """The record of one instrument in a database.
+    """Record of one instrument in a database.
 
     Parameters
     ----------
     place
         Folder or address of the record.
     until
-        Of the record as it was: by the times of the readings nothing later is in it, and nothing is added to it but
-        what was traced of the instrument; None for the whole record.
+        Time of an earlier state of the record, in microseconds of TAI since 2000: readings after it are hidden, and
+        nothing but the traced model is added. None for the whole record.
 
     Attributes
     ----------
     url
-        Of the database, without its password.
+        Address of the database, without its password.
     name
-        Of the instrument.
+        Name of the instrument.
     sha256
-        By which the instrument is recognised.
+        SHA-256 that identifies the instrument.
     temperature
-        Of the instrument as its file states it, kelvin.
+        Reference temperature of the instrument, in kelvin.
     simulated
-        Whether its times are not compared with the computer's clock.
+        Whether the readings are simulated, so that their times are not compared with the computer's clock.
     bodies
-        ``warm``, paths of those that have a temperature; ``cameras``, their names.
+        ``warm``: paths of the bodies that have a temperature; ``cameras``: names of the cameras.
     """
 
     def __init__(self, place: str, until: int | None = None) -> None:
@@ -95,7 +96,7 @@ class History:
         self.bodies: dict[str, list[str]] = parse_json(row["bodies"], "the record")
 
     def close(self) -> None:
-        """Let go of the database."""
+        """Close the database."""
         self._engine.dispose()
 
     def __enter__(self) -> History:
@@ -106,26 +107,31 @@ class History:
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """A transaction that sees the record at one moment."""
+        """Open a read transaction, which sees the record at one moment."""
         with database_errors(), self._engine.connect() as connection, connection.begin():
             yield connection
 
     def ingest(self, given: FileContent, late: bool = False) -> IngestResult:
-        """Add what a file holds, all of it in one step: after an interruption all of it is there, or nothing.
+        """Add the content of a file in one transaction: after an interruption all of it is in the record, or nothing.
 
         Parameters
         ----------
-        given : Given
-            The file.
+        given : FileContent
+            Content of the file.
         late : bool
-            Whether readings may be older than the newest of their sort and subject in the record.
+            Accept readings older than the newest of their kind and subject in the record.
+
+        Returns
+        -------
+        IngestResult
+            Numbers of new and known entries, and the refusals.
 
         Raises
         ------
         RecordFailed
-            Nothing was added.
+            The database failed; nothing was added.
         TypeError
-            Into the record as it was.
+            The record is that of an earlier time.
         """
         if self._until is not None:
             raise TypeError("nothing is taken into a record as it was")
@@ -135,12 +141,13 @@ class History:
                     return Ingest(connection, self.simulated, late).ingest(given)
             except IntegrityError as error:  # of databases without a lock: another writer was first
                 if not attempt:
-                    raise RecordFailed(said(error)) from None
+                    raise RecordFailed(message_of(error)) from None
         raise AssertionError
 
     def decide(self, number: int, included: bool, why: str) -> dict[str, Any]:
-        """Exclude an entry from the estimate, or include it whatever speaks against it, by an entry of its own: the
-        newest decision on an entry counts.
+        """Exclude an entry from the estimate, or include it; the newest decision on an entry counts.
+
+        The decision is an entry itself.
 
         Parameters
         ----------
@@ -149,7 +156,7 @@ class History:
         included : bool
             Whether it counts from now on.
         why : str
-            The reason.
+            Reason of the decision.
 
         Returns
         -------
@@ -159,7 +166,7 @@ class History:
         Raises
         ------
         Problem
-            There is no such reading, or the same was decided before.
+            There is no such reading, or the newest decision is the same.
         """
         c = ENTRY.c
         with writing(self._engine) as connection:
@@ -186,22 +193,22 @@ class History:
         return {"entry": number, **keys, "included": included, "why": why}
 
     def entries(self, kind: str = "", after_us: int | None = None) -> Iterator[dict[str, Any]]:
-        """Readings and events in the order of time, those of one moment in the order in which they were taken.
+        """Yield readings and events in the order of time; those of one time in the order in which they were ingested.
 
-        SQLite has no writer while they are read: take what is wanted, and write then.
+        SQLite has no writer while they are read: collect what is needed before writing.
 
         Parameters
         ----------
         kind : str
-            Of reading; all if empty.
+            Kind of reading; all kinds if empty.
         after_us : int | None
-            Those after this time, microseconds of TAI since 2000.
+            Yield only entries after this time, in microseconds of TAI since 2000.
 
         Yields
         ------
         dict[str, Any]
-            ``id``, ``kind``, ``subject``, ``time_us``, ``time_utc``, ``sha256``, ``line``, ``file`` and ``content``,
-            which is plain data.
+            ``id``, ``kind``, ``subject``, ``time_us``, ``time_utc``, ``sha256``, ``line``, ``file`` and ``content``
+            (plain data as text).
         """
         c = ENTRY.c
         query = select(*c, SOURCE.c.file).join(SOURCE, c.source_id == SOURCE.c.id)
@@ -216,7 +223,7 @@ class History:
             yield from map(dict, connection.execute(query.order_by(c.time_us, c.id)).mappings())
 
     def refusals(self) -> list[dict[str, Any]]:
-        """What was refused, in the order in which it was; ``taken_since`` says whether the reading is there by now."""
+        """Return the refusals in their order; ``taken_since`` says whether the reading has been ingested since."""
         there = select(ENTRY.c.id).where(ENTRY.c.sha256 == REFUSED.c.entry).exists()
         query = select(*REFUSED.c, SOURCE.c.file, there.label("taken_since")).join(
             SOURCE, REFUSED.c.source_id == SOURCE.c.id
@@ -224,19 +231,19 @@ class History:
         with self.reading() as connection:
             return [dict(row) for row in connection.execute(query.order_by(REFUSED.c.id)).mappings()]
 
-    def status(self, every: bool = False) -> dict[str, Any]:
-        """Return what the record holds, as plain data.
+    def status(self, check_all_entries: bool = False) -> dict[str, Any]:
+        """Return the contents of the record in numbers, as plain data.
 
         Parameters
         ----------
-        every : bool
-            Whether the digests of all entries are worked out again, and not those of the newest alone.
+        check_all_entries : bool
+            Check the digests of all entries, instead of the newest ones only.
         """
         with self.reading() as connection:
-            streams = [(kind, subject, *_extent(connection, kind, subject)) for kind, subject in _streams(connection)]
+            streams = [(kind, subject, *_stream_extent(connection, kind, subject)) for kind, subject in _streams(connection)]
             sources = int(connection.execute(select(func.count()).select_from(SOURCE)).scalar_one())
             guarded = schema.guarded(connection)
-            checked, altered = schema.altered(connection, None if every else schema.LAST_CHECKED)
+            checked, altered = schema.altered(connection, None if check_all_entries else schema.LAST_CHECKED)
         keys = ("file", "line", "reason", "refused_utc")
         refused = [
             {**{key: row[key] for key in keys}, "taken_since": bool(row["taken_since"])} for row in self.refusals()
@@ -261,19 +268,19 @@ class History:
         }
 
     def store_plan(self, file: str, content: Mapping[str, Any]) -> bool:
-        """Keep a plan of operation, which from now on counts.
+        """Store a plan of operation, which counts from now on.
 
         Parameters
         ----------
         file : str
-            From which it is.
+            File that the plan was read from.
         content : Mapping[str, Any]
-            Plain data.
+            Plain data of the plan.
 
         Returns
         -------
         bool
-            Whether it is another one than before.
+            Whether it differs from the newest stored plan.
         """
         digest = digest_of_data(content)
         with writing(self._engine) as connection:
@@ -287,13 +294,13 @@ class History:
         return True
 
     def plan(self) -> dict[str, Any] | None:
-        """The plan that counts: ``sha256``, ``file``, ``content`` and ``kept_utc``; None where none was kept."""
+        """Return the newest plan (``sha256``, ``file``, ``content`` and ``kept_utc``); None if none is stored."""
         with self.reading() as connection:
             row = connection.execute(select(PLAN).order_by(PLAN.c.id.desc()).limit(1)).mappings().first()
         return None if row is None else {**row, "content": content_of(dict(row))}
 
     def first(self, kind: str) -> dict[str, Any] | None:
-        """The earliest entry of a kind, as of `entries`; None for none."""
+        """Return the earliest entry of a kind, as from `entries`; None if there is none."""
         c = ENTRY.c
         with self.reading() as connection:
             # of each subject by the index, which has it before the time
@@ -308,24 +315,24 @@ class History:
         return dict(min(rows, key=lambda row: (row["time_us"], row["id"]))) if rows else None
 
     def subjects(self, kind: str) -> list[str]:
-        """Of what there are readings of a kind, in alphabetical order."""
+        """Return the subjects of a kind of reading, in alphabetical order."""
         with self.reading() as connection:
             return _subjects(connection, kind)
 
     def newest_id(self) -> int:
-        """The largest id of an entry; 0 where there is none."""
+        """Return the largest id of an entry; 0 if there is none."""
         with self.reading() as connection:
             return int(connection.execute(select(func.max(ENTRY.c.id))).scalar_one() or 0)
 
     def came_late(self, after_id: int, until_us: int) -> bool:
-        """Whether an entry up to a time was taken after another one.
+        """Return whether an entry up to a time was ingested after another one.
 
         Parameters
         ----------
         after_id : int
-            The id of that.
+            Id of the other entry.
         until_us : int
-            The time, microseconds of TAI since 2000.
+            The time, in microseconds of TAI since 2000.
         """
         with self.reading() as connection:
             return _is_newer(connection, after_id, until_us)
@@ -333,19 +340,19 @@ class History:
     def checkpoint(
         self, plan: str, number: int | None = None, before_us: int | None = None, valid: bool = False
     ) -> Row[Any] | None:
-        """The newest of what was kept of an estimate, as a row of the table; None for none.
+        """Return the newest checkpoint of an estimate as a row of the table; None if there is none.
 
         Parameters
         ----------
         plan : str
-            As of `save_checkpoint`.
+            Digest of the estimate, as for `save_checkpoint`.
         number : int | None
-            The one of this number alone; without it none of a negative number, and where a time is asked for none of
-            number 0, which is not kept for good.
+            Return the checkpoint of this number only. Without it checkpoints of negative numbers are ignored, and where
+            a time is given also number 0, which is not permanent.
         before_us : int | None
-            The newest before this time, microseconds of TAI since 2000.
+            Return the newest before this time, in microseconds of TAI since 2000.
         valid : bool
-            Only one up to whose time no reading has come since it was kept.
+            Ignore a checkpoint if a reading up to its time has come since it was saved.
         """
         c, e = CHECKPOINT.c, ENTRY.c
         if self._until is not None:
@@ -358,12 +365,12 @@ class History:
             return connection.execute(query.order_by(c.time_us.desc(), c.number.desc()).limit(1)).first()
 
     def checkpoints(self, plan: str) -> list[Row[Any]]:
-        """Where the estimate under a plan stood, in the order of time, as rows of the table.
+        """Return all checkpoints of an estimate in the order of time, as rows of the table.
 
         Parameters
         ----------
         plan : str
-            Digest of all that the estimate rests on besides the readings.
+            Digest of everything that the estimate depends on besides the readings.
         """
         c = CHECKPOINT.c
         query = select(CHECKPOINT).where(c.plan == plan, *_not_after(c.time_us, self._until))
@@ -371,25 +378,25 @@ class History:
             return list(connection.execute(query.order_by(c.time_us, c.number)))
 
     def save_checkpoint(self, plan: str, number: int, time_us: int, entry_id: int, content: bytes) -> bool:
-        """Keep where an estimate stands, in place of what was kept under the number.
+        """Save the state of an estimate, in place of an earlier one of the same number.
 
         Parameters
         ----------
         plan : str
-            Digest of all that the estimate rests on besides the readings.
+            Digest of everything that the estimate depends on besides the readings.
         number : int
-            Counts the checkpoints of a plan.
+            Number of the checkpoint.
         time_us : int
-            Up to which readings are in it.
+            Time of the newest reading in it, in microseconds of TAI since 2000.
         entry_id : int
-            The largest id that the record had when they were read.
+            Largest id in the record when the readings were queried.
         content : bytes
-            The estimate.
+            Serialised state.
 
         Returns
         -------
         bool
-            Whether it is kept; it is not if a reading up to that time has come since.
+            Whether it was saved; it is not if a reading up to that time has come since.
         """
         if self._until is not None and number >= 0:  # the newest estimate stays where it is
             return False
@@ -402,7 +409,7 @@ class History:
         return True
 
     def drop_checkpoints(self, plan: str, from_time_us: int) -> int:
-        """Remove checkpoints of a plan from a time on; how many there were."""
+        """Remove the checkpoints of an estimate from a time on, and return their number."""
         if self._until is not None:
             return 0
         c = CHECKPOINT.c
@@ -411,7 +418,7 @@ class History:
         return int(gone.rowcount)
 
     def raise_alarm(self, alarm: Alarm) -> bool:
-        """Add an alarm, once.
+        """Add an alarm, unless the record has it.
 
         Returns
         -------
@@ -430,8 +437,10 @@ class History:
         return True
 
     def alarms(self) -> list[dict[str, Any]]:
-        """All alarms in the order in which they were raised: ``id``, ``kind``, ``subject``, ``time_us``, ``time_utc``,
-        ``raised_utc``, ``text``, ``content``, and ``acknowledged``: ``by``, ``note`` and ``acknowledged_utc``, or None.
+        """Return all alarms in the order in which they were raised.
+
+        Each has ``id``, ``kind``, ``subject``, ``time_us``, ``time_utc``, ``raised_utc``, ``text``, ``content``, and
+        ``acknowledged``: ``by``, ``note`` and ``acknowledged_utc``, or None.
         """
         a = ACKNOWLEDGEMENT.c
         query = select(*ALARM.c, a.by, a.note, a.acknowledged_utc).where(*_not_after(ALARM.c.time_us, self._until))
@@ -447,21 +456,21 @@ class History:
         ]
 
     def acknowledge(self, alarm: int, by: str, note: str) -> None:
-        """Say who has seen an alarm, and what is done about it.
+        """Acknowledge an alarm.
 
         Parameters
         ----------
         alarm : int
-            Its id.
+            Id of the alarm.
         by : str
-            Name of a person.
+            Name of the person.
         note : str
-            What is done.
+            Action taken.
 
         Raises
         ------
         Problem
-            There is no such alarm, or somebody has said so.
+            There is no such alarm, or it is acknowledged already.
         """
         a = ACKNOWLEDGEMENT.c
         with writing(self._engine) as connection:
@@ -478,7 +487,7 @@ class History:
 
 
 def _late(after_id: Any, until_us: Any) -> tuple[Any, Any]:
-    """Entries up to a time that were taken after another one."""
+    """Return the conditions of entries up to a time that were ingested after another one."""
     # few are newer and all are older: the sum keeps databases from a walk through the index of the times
     return ENTRY.c.id > after_id, ENTRY.c.time_us + 0 <= until_us
 
@@ -499,7 +508,7 @@ def _numbered(number: int | None, before_us: int | None) -> Any:
 
 
 def _streams(connection: Connection) -> Iterator[tuple[str, str]]:
-    """Sort and subject of all that was read, in order: found by looks into the index, not by a walk through it."""
+    """Yield kind and subject of all readings in order, by lookups in the index instead of a scan."""
     c = ENTRY.c
     in_order = select(c.kind, c.subject).order_by(c.kind, c.subject).limit(1)
     found = connection.execute(in_order).first()
@@ -513,8 +522,11 @@ def _subjects(connection: Connection, kind: str) -> list[str]:
     return [subject for own, subject in _streams(connection) if own == kind]
 
 
-def _extent(connection: Connection, kind: str, subject: str) -> tuple[int, int, int]:
-    """How many readings a stream has, the first time and the last one; one query each, which the index answers."""
+def _stream_extent(connection: Connection, kind: str, subject: str) -> tuple[int, int, int]:
+    """Return the number of readings of a stream, and its first and last time.
+
+    Each is one query that the index answers.
+    """
     c = ENTRY.c
     asked = (func.count(), func.min(c.time_us), func.max(c.time_us))
     own = [select(one).select_from(ENTRY).where(c.kind == kind, c.subject == subject) for one in asked]
@@ -523,40 +535,40 @@ def _extent(connection: Connection, kind: str, subject: str) -> tuple[int, int, 
 
 
 def content_of(row: Mapping[str, Any]) -> Any:
-    """What a row of `History.entries` holds, plain data."""
+    """Return the content of a row of `History.entries` as plain data."""
     return parse_json(row["content"], "the record")
 
 
 def bodies_of(job: ResolvedJob) -> dict[str, list[str]]:
-    """Paths of the bodies of a job's instrument that have a temperature, and names of its cameras."""
+    """Return the bodies of a job's instrument that have a temperature (``warm``), and its cameras."""
     nodes = build_instrument(job.instrument, job.cameras, load_backend()).nodes
     warm = [path for path, info in nodes.items() if "temperature" in info.allows]
     return {"warm": warm, "cameras": list(job.instrument.cameras)}
 
 
 def initialise_record(place: str, job: ResolvedJob, simulated: bool = False) -> tuple[int, ...]:
-    """Make a record where there is none.
+    """Create a record if there is none.
 
     Parameters
     ----------
     place : str
         Folder, or address of a database.
     job : ResolvedJob
-        One on the instrument.
+        Job of the instrument.
     simulated : bool
-        Whether times are not compared with the computer's clock.
+        Whether the readings are simulated, so that their times are not compared with the computer's clock.
 
     Returns
     -------
     tuple[int, ...]
-        The version of a new record; nothing where there was one.
+        Version of the new record; empty if there was one.
 
     Raises
     ------
     NotARecord
-        There is one of another instrument, or of another version.
+        There is a record of another instrument, or of another version.
     RecordFailed
-        It cannot be made.
+        The record cannot be created.
     """
     url = url_of(place)
     folder = Path(str(url.database)).parent if url.get_backend_name() == "sqlite" and "://" not in place else None

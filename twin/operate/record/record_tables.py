@@ -1,4 +1,4 @@
-"""The record as numbers for programs: what `status --json` says, and tables of every sort of reading."""
+"""Tables of a record for other programs, one for each kind of reading."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ _WHEN = (
     Quantity[Row]("time_s", lambda row: row["time_us"] / MICRO, "SI seconds since 2000-01-01T00:00:00 TAI"),
 )
 _FROM = (
-    _key("file", "from which it was taken"),
-    _key("sha256", "by which the reading is recognised"),
-    Quantity[Row]("entry", lambda row: row["id"], "number of the entry, by which exclude names it"),
+    _key("file", "file of the reading"),
+    _key("sha256", "SHA-256 that identifies the reading"),
+    Quantity[Row]("entry", lambda row: row["id"], "number of the entry, for the command exclude"),
 )
 
 
 def _readings(meaning: str, *own: Quantity[Row]) -> Record[Row]:
-    """Columns of readings: when each was, what it says, and where it comes from."""
+    """Return the columns of readings: their time, their values, and their file."""
     return Record(meaning, *_WHEN, *own, *_FROM)
 
 
@@ -50,71 +50,71 @@ TABLES: Mapping[str, Record[Row]] = {
     "temperature": _readings(
         "Temperatures of bodies.",
         _key("subject", "body"),
-        Quantity("temperature_K", _value(0), "of the body, absolute"),
+        Quantity("temperature_K", _value(0), "absolute temperature of the body"),
         Quantity("temperature_K_sigma", _sigma, "standard deviation of the sensor's error"),
     ),
     "focus": _readings(
-        "Foci found in orbit.",
+        "Focus measurements in orbit.",
         _key("subject", "camera"),
-        Quantity("defocus_um", _value(0), "of the detector, positive downstream"),
+        Quantity("defocus_um", _value(0), "defocus of the detector, positive downstream"),
         Quantity("defocus_um_sigma", lambda row: 1e6 * _sigma(row), "standard deviation", converted=False),
     ),
     "attitude": _readings(
         "Attitudes of star trackers.",
         _key("subject", "star tracker"),
-        Quantity("form", lambda row: row["content"]["unit"], "quaternion, or rad of three angles"),
-        *(Quantity(f"component_{k + 1}", _value(k), "of the quaternion, the scalar last; or angle") for k in range(4)),
-        Quantity("angle_arcsec_sigma", lambda row: in_unit(_sigma(row), "arcsec"), "about each axis", converted=False),
+        Quantity("form", lambda row: row["content"]["unit"], "quaternion, or rad for three angles"),
+        *(Quantity(f"component_{k + 1}", _value(k), "component of the quaternion (scalar last), or angle") for k in range(4)),
+        Quantity("angle_arcsec_sigma", lambda row: in_unit(_sigma(row), "arcsec"), "standard deviation about each axis", converted=False),
     ),
     "event": _readings(
-        "What happened to the instrument.",
+        "Events of the instrument.",
         _key("subject", "event"),
-        Quantity("detail", lambda row: row["content"].get("detail"), "what the table says of it"),
+        Quantity("detail", lambda row: row["content"].get("detail"), "remark of the table"),
     ),
     "decision": _readings(
-        "Entries that a person excluded from the estimate or included.",
+        "Decisions to exclude entries from the estimate, or to include them.",
         Quantity("decided_entry", lambda row: row["content"]["entry"], "number of the entry"),
         Quantity("included", lambda row: row["content"]["included"], "whether it counts from then on"),
         Quantity("why", lambda row: row["content"]["why"], "the reason"),
     ),
     "run": _readings(
-        "Calibrations and angles found in orbit.",
+        "Calibrations and angles measured in orbit.",
         _key("kind", "calibration or angle"),
-        Quantity("results_sha256", lambda row: row["content"]["sha256"], "of the file of results"),
-        Quantity("verdict", lambda row: row["content"]["numbers"].get("verdict"), "of the run"),
+        Quantity("results_sha256", lambda row: row["content"]["sha256"], "SHA-256 of the file of results"),
+        Quantity("verdict", lambda row: row["content"]["numbers"].get("verdict"), "verdict of the run"),
     ),
     "monitor": _readings(
-        "Changes of cameras that the monitor's frames gave, by camera and estimator; each states its sigma.",
-        _key("camera", "of the instrument"),
-        _key("estimator", "that found it"),
+        "Changes of the cameras measured by the monitor, by camera and estimator, with their sigmas.",
+        _key("camera", "camera of the instrument"),
+        _key("estimator", "estimator of the change"),
         *(
             _number(f"{name}{end}", said)
             for name in ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
-            for end, said in (("", "change"), ("_sigma", "its total sigma"), ("_sigma_noise", "its sigma of noise"))
+            for end, said in (("", "change"), ("_sigma", "its total sigma"), ("_sigma_noise", "its sigma from image noise"))
         ),
     ),
     "intersection_angle": _readings(
-        "Changes of the angle between cameras that the monitor's frames gave.",
-        _key("estimator", "that found it"),
+        "Changes of the angle between the cameras measured by the monitor.",
+        _key("estimator", "estimator of the change"),
         *(
             _number(key, "change of the angle, or its sigma")
             for key in ("change_arcsec", "change_arcsec_sigma", "change_arcsec_sigma_noise")
         ),
     ),
     "refused": Record(
-        "What was refused.",
-        _key("refused_utc", "when"),
-        _key("file", "in which it stands"),
-        _key("line", "of the file"),
-        _key("reason", "what is wrong with it"),
-        _key("taken_since", "whether the reading is in the record by now"),
+        "Refused rows and readings.",
+        _key("refused_utc", "time of the refusal, UTC"),
+        _key("file", "file that contains it"),
+        _key("line", "line of the file"),
+        _key("reason", "reason of the refusal"),
+        _key("taken_since", "whether the reading has been ingested since"),
     ),
 }
 """Name of a table -> its columns."""
 
 
 def tables(history: History) -> list[DataTable]:
-    """All tables of a record that have rows."""
+    """Return all tables of a record that have rows."""
     rows: dict[str, list[Row]] = {name: [] for name in TABLES}
     for entry in history.entries():
         row = {**entry, "content": content_of(entry)}
@@ -126,7 +126,7 @@ def tables(history: History) -> list[DataTable]:
 
 
 def _rows(row: Row) -> Iterator[tuple[str, Row]]:
-    """Rows of tables that an entry gives."""
+    """Yield the table rows of an entry."""
     kind = row["kind"]
     if kind != "monitor":
         yield ("run" if kind in RUNS else kind), row

@@ -1,6 +1,7 @@
-"""The tables of a record in a database, their versions, and what keeps them from being altered.
+"""Tables of a record in a database, and the access to it.
 
-The database of a record: found by its address, opened, written by one writer at a time, its failures told.
+The tables have a version and triggers that refuse every change of a row. A database is found by its address, written by
+one writer at a time, and its failures are raised as `RecordFailed`.
 """
 
 from __future__ import annotations
@@ -41,11 +42,12 @@ from twin.operate.record import NotARecord, RecordFailed, file_of, require_file
 from twin.operate.record.entries import digest_of_data, utc_text
 
 VERSION = 4
+"""Version of the tables."""
 LAST_CHECKED = 500
-"""Entries whose digests are worked out again whenever the status is asked for; all of them take too long."""
+"""Number of the newest entries whose digests are checked at every status; checking all of them takes too long."""
 _METADATA = MetaData()
 _NUMBER = BigInteger().with_variant(Integer(), "sqlite")
-"""SQLite counts rows by itself only where their type is INTEGER."""
+"""Type of ids: SQLite numbers rows by itself only where their type is INTEGER."""
 
 
 def _table(name: str, *columns: Any) -> Table:
@@ -62,7 +64,7 @@ SCHEMA = _table(
     Column("made_utc", String(32), nullable=False),
     Column("program", Text, nullable=False),
 )
-"""A row for each version that the record has had."""
+"""One row for each version that the record has had."""
 INSTRUMENT = _table(
     "instrument",
     Column("name", Text, nullable=False),
@@ -72,7 +74,7 @@ INSTRUMENT = _table(
     Column("bodies", Text, nullable=False),
     Column("plain", Text, nullable=False),
 )
-"""The one instrument of which the record is."""
+"""The one instrument of the record."""
 SOURCE = _table(
     "source",
     Column("file", Text, nullable=False),
@@ -81,14 +83,14 @@ SOURCE = _table(
     Column("taken_utc", String(32), nullable=False),
     Column("rows_read", Integer, nullable=False),
 )
-"""A row for each file that was taken; ``taking`` is the digest of the file and of what was said of it."""
+"""One row for each ingested file; ``taking`` is the digest of the file and of the description by which it was read."""
 FRAME = _table(
     "frame",
     Column("source_id", _NUMBER, ForeignKey("source.id"), nullable=False, index=True),
     Column("file", Text, nullable=False),
     _digest("sha256", nullable=False),
 )
-"""Files from which a source was found: recorded frames of a monitor."""
+"""Images that a source was measured in: recorded frames of a monitor."""
 ENTRY = _table(
     "entry",
     _digest("sha256", nullable=False, unique=True),
@@ -104,7 +106,7 @@ ENTRY = _table(
     Index("entry_origin", "origin"),
     Index("entry_time", "time_us", "id"),
 )
-"""A row for each reading or event, as `twin.operate.record.entries.Entry`."""
+"""One row for each reading or event, as `twin.operate.record.entries.Entry`."""
 REFUSED = _table(
     "refused",
     _digest("sha256", nullable=False, unique=True),
@@ -115,7 +117,7 @@ REFUSED = _table(
     Column("refused_utc", String(32), nullable=False),
     Index("refused_entry", "entry"),
 )
-"""A row for what was not taken, once for each reading or row; ``entry`` is the digest of the reading, if it is one."""
+"""One row for each refused reading or table row; ``entry`` is the digest of the reading, if it could be read."""
 PLAN = _table(
     "plan",
     _digest("sha256", nullable=False),
@@ -123,7 +125,7 @@ PLAN = _table(
     Column("content", Text, nullable=False),
     Column("kept_utc", String(32), nullable=False),
 )
-"""A row for each plan of operation under which the record was followed; the newest counts."""
+"""One row for each plan of operation under which the record was filtered; the newest counts."""
 ALARM = _table(
     "alarm",
     _digest("sha256", nullable=False, unique=True),
@@ -135,7 +137,7 @@ ALARM = _table(
     Column("content", Text, nullable=False),
     Index("alarm_stream", "kind", "subject", "time_us"),
 )
-"""A row for each alarm, as `twin.operate.record.entries.Alarm`."""
+"""One row for each alarm, as `twin.operate.record.entries.Alarm`."""
 ACKNOWLEDGEMENT = _table(
     "acknowledgement",
     Column("alarm_id", _NUMBER, ForeignKey("alarm.id"), nullable=False, unique=True),
@@ -143,7 +145,7 @@ ACKNOWLEDGEMENT = _table(
     Column("note", Text, nullable=False),
     Column("acknowledged_utc", String(32), nullable=False),
 )
-"""A row for each alarm that somebody has seen."""
+"""One row for each acknowledged alarm."""
 CHECKPOINT = _table(
     "checkpoint",
     _digest("plan", nullable=False),
@@ -154,15 +156,15 @@ CHECKPOINT = _table(
     UniqueConstraint("plan", "number"),
     Index("checkpoint_time", "time_us"),
 )
-"""Where an estimate stood at some time: derived from the entries, and the only rows that may be altered and removed."""
+"""States of an estimate at some times. They are derived from the entries: the only rows that may change."""
 _DERIVED = (CHECKPOINT.name,)
 
 
 def _triggers(table: Table) -> dict[str, str]:
-    """Return name and SQL of what lets SQLite refuse to alter, remove and replace rows of a table.
+    """Return name and SQL of the triggers by which SQLite refuses to alter, remove and replace rows of a table.
 
-    INSERT OR REPLACE removes rows without a word to a trigger on DELETE, so the rows that it would remove are looked
-    for before it inserts.
+    INSERT OR REPLACE removes rows without firing a trigger on DELETE, so that the rows it would remove are looked for
+    before the insert.
     """
     out, name = {}, table.name
     for what in ("UPDATE", "DELETE"):
@@ -176,7 +178,7 @@ def _triggers(table: Table) -> dict[str, str]:
 
 
 def _guard(connection: Connection, table: Table) -> None:
-    """Let the database refuse to alter or remove rows of a table; on others than these two only the program does."""
+    """Make SQLite or PostgreSQL refuse changes of a table's rows; in other databases only the program does."""
     if connection.dialect.name == "sqlite":
         for sql in _triggers(table).values():
             connection.execute(text(sql))
@@ -191,7 +193,7 @@ def _guard(connection: Connection, table: Table) -> None:
 
 
 def guarded(connection: Connection) -> bool:
-    """Whether the database itself refuses to alter the record, and not the program alone."""
+    """Return whether the database itself refuses to alter the record."""
     if connection.dialect.name == "sqlite":
         rows = connection.execute(text("SELECT name, sql FROM sqlite_master WHERE type = 'trigger'"))
         there = {name: " ".join(sql.split()) for name, sql in rows}
@@ -207,7 +209,7 @@ def guarded(connection: Connection) -> bool:
 
 
 def altered(connection: Connection, newest: int | None) -> tuple[int, list[str]]:
-    """Return how many of the newest entries, or of all, were compared with their digests, and what is wrong."""
+    """Return the number of entries (the newest, or all) compared with their digests, and the errors found."""
     c = ENTRY.c
     rows = connection.execute(select(*c).order_by(c.id.desc()).limit(newest)).mappings().all()
     wrong = [
@@ -231,7 +233,7 @@ def _digest_of(row: RowMapping) -> str:
 
 
 def create(connection: Connection) -> None:
-    """Make all tables of this version, with what guards them."""
+    """Create all tables of this version, with their triggers."""
     _METADATA.create_all(connection)
     if connection.dialect.name == "postgresql":
         connection.execute(
@@ -246,14 +248,14 @@ def create(connection: Connection) -> None:
 
 
 def version(connection: Connection) -> int:
-    """Version of the record in a database; 0 where there is none."""
+    """Return the version of the record in a database; 0 if there is none."""
     if not inspect(connection).has_table(SCHEMA.name):
         return 0
     return int(connection.execute(select(func.max(SCHEMA.c.version))).scalar_one() or 0)
 
 
 def require_version(found: int) -> None:
-    """Raise NotARecord of a record that a program of another version made."""
+    """Raise NotARecord if another version of the program made the record."""
     if found != VERSION:
         raise NotARecord(
             f"the record is of version {found}, this program knows {VERSION}; use the program that made it"
@@ -261,18 +263,18 @@ def require_version(found: int) -> None:
 
 
 WAIT = 60.0
-"""Seconds that a writer waits for another one."""
+"""Time that a writer waits for another one, in seconds."""
 _LOCK = 7_236_001
-"""Number of the lock by which writers on a PostgreSQL server take turns."""
+"""Number of the advisory lock by which writers on a PostgreSQL server take turns."""
 
 
 def url_of(place: str) -> URL:
-    """Address of the database of a folder, or the address itself.
+    """Return the address of the database of a folder, or the given address.
 
     Raises
     ------
     NotARecord
-        Not an address that SQLAlchemy knows.
+        SQLAlchemy does not know this address.
     """
     if (file := file_of(place)) is not None:
         return URL.create("sqlite", database=str(file))
@@ -283,7 +285,13 @@ def url_of(place: str) -> URL:
 
 
 def engine_of(url: URL) -> Engine:
-    """What speaks to a database. Raises NotARecord: nothing that is installed does."""
+    """Return the engine of a database.
+
+    Raises
+    ------
+    NotARecord
+        No driver for it is installed.
+    """
     more: dict[str, Any] = {"connect_args": {"timeout": WAIT}} if url.get_backend_name() == "sqlite" else {}
     try:
         engine = create_engine(url, **more)
@@ -301,20 +309,21 @@ def engine_of(url: URL) -> Engine:
 
 
 def _on_connect(connection: Any, record: object) -> None:
-    """SQLAlchemy begins transactions, not the driver; each is on the disk, with its folder, before it is over."""
+    """Configure a connection: SQLAlchemy begins the transactions, and each is on the disk with its folder when it ends.
+    """
     connection.isolation_level = None
     for pragma in ("journal_mode = DELETE", "synchronous = EXTRA", "foreign_keys = ON", "trusted_schema = OFF"):
         connection.execute(f"PRAGMA {pragma}").close()
 
 
 def _on_begin(connection: Connection) -> None:
-    """A writer takes its turn before it reads what it is going to compare with."""
+    """Begin a transaction; a writer locks the database before it reads what it compares with."""
     writing = connection.get_execution_options().get("writing", False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")
 
 
 def opened(url: URL) -> Engine:
-    """The database of a record that is there."""
+    """Return the engine of an existing record."""
     if url.get_backend_name() == "sqlite":
         require_file(Path(str(url.database)))
     return engine_of(url)
@@ -322,7 +331,7 @@ def opened(url: URL) -> Engine:
 
 @contextmanager
 def writing(engine: Engine) -> Iterator[Connection]:
-    """A transaction of the one writer of this moment."""
+    """Open the transaction of the record's only writer."""
     with database_errors(), engine.connect().execution_options(writing=True) as connection, connection.begin():
         if engine.dialect.name == "postgresql":
             connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_LOCK})")
@@ -331,15 +340,15 @@ def writing(engine: Engine) -> Iterator[Connection]:
 
 @contextmanager
 def database_errors() -> Iterator[None]:
-    """What a database says when it cannot do what it should. Raises RecordFailed."""
+    """Raise RecordFailed for errors of the database, except integrity errors."""
     try:
         yield
     except IntegrityError:
         raise
     except DBAPIError as error:
-        raise RecordFailed(said(error)) from None
+        raise RecordFailed(message_of(error)) from None
 
 
-def said(error: DBAPIError) -> str:
-    """What a database says of a failure, on one line."""
+def message_of(error: DBAPIError) -> str:
+    """Return the message of a database error on one line."""
     return " ".join(str(error.orig).split())

@@ -1,4 +1,4 @@
-"""One file on its way into a record: what of it is new, what is known already, and what cannot be true of it."""
+"""Ingest of one file into a record: new entries, known entries, and refusals of those that cannot be true."""
 
 from __future__ import annotations
 
@@ -14,38 +14,39 @@ from twin.operate.record.entries import MICRO, Entry, FileContent, Refusal, cano
 from twin.operate.record.schema import CHECKPOINT, ENTRY, FRAME, REFUSED, SOURCE
 
 SAME_IMAGES = 0.2
-"""Root mean square of the differences of spots of the same images, over their sigmas, at most. Those of other images of
-the same state differ by 1.4, and of eight coordinates by less than this once in a million; those of the same images
-differ where other pixels are left out.
+"""Largest root mean square of the differences of spots in the same images, in sigmas.
+
+Spots in other images of the same state differ by 1.4, and with eight coordinates by less than this once in a million;
+spots in the same images differ where other pixels are excluded.
 """
-_TOGETHER = 500
-"""Rows asked for or written at once."""
+_BATCH = 500
+"""Number of rows in one query or insert."""
 AHEAD = 24 * 3600 * MICRO
-"""A reading later than this after the computer's clock comes of a clock that is wrong."""
+"""Time after the computer's clock, in microseconds, beyond which a reading comes from a wrong clock."""
 
 
 Before = Mapping[tuple[str, str, str], tuple[float, float]]
-"""Camera, channel and ``row`` or ``column`` of a spot before -> place and sigma, px."""
+"""Camera, channel and ``row`` or ``column`` of a spot in the reference images -> position and sigma, in pixels."""
 
 
 @dataclass(frozen=True)
 class IngestResult:
-    """What became of one file.
+    """Result of the ingest of one file.
 
     Attributes
     ----------
     file : str
-        Its path.
+        Path of the file.
     new : int
-        Readings and events that are now in the record.
+        Number of readings and events added to the record.
     known : int
-        That were in it already.
+        Number that the record had already.
     refused : tuple[tuple[int | None, str], ...]
-        What was not taken: line, reason.
+        Line and reason of every refusal.
     before : bool
-        Whether the same file had been taken before.
+        Whether the same file was ingested before.
     refused_before : int
-        How many of these had been refused before, and are not counted again.
+        Number of the refusals that were recorded before and are not counted again.
     """
 
     file: str
@@ -57,22 +58,22 @@ class IngestResult:
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many readings and events were taken, were known, and are refused now and were before."""
+        """Numbers of new and known entries, of new refusals and of earlier ones."""
         refused = len(self.refused) - self.refused_before
         return {"new": self.new, "known": self.known, "refused": refused, "refused_before": self.refused_before}
 
 
 class Ingest:
-    """One file on its way into the record.
+    """Ingest of one file into the record.
 
     Parameters
     ----------
     connection
-        In the transaction of the one writer of this moment.
+        Connection in the transaction of the record's only writer.
     simulated
-        Whether times are not compared with the computer's clock.
+        Whether the readings are simulated, so that their times are not compared with the computer's clock.
     late
-        Whether readings may be older than the newest of their sort and subject in the record.
+        Accept readings older than the newest of their kind and subject in the record.
     """
 
     def __init__(self, connection: Connection, simulated: bool, late: bool) -> None:
@@ -82,11 +83,11 @@ class Ingest:
         self.first: tuple[str, Before] | None = None
 
     def ingest(self, given: FileContent) -> IngestResult:
-        """Compare what the file holds with the record and add what is new."""
+        """Compare the content of the file with the record and add what is new."""
         taking = digest_of_data([given.sha256, given.meaning])
         source = self.connection.execute(select(SOURCE.c.id).where(SOURCE.c.taking == taking)).first()
-        entries = [(one, one.digest) for one in given.items if isinstance(one, Entry)]
-        known = self._known(ENTRY.c.sha256, [digest for _, digest in entries])
+        entries = [(item, item.digest) for item in given.items if isinstance(item, Entry)]
+        known = self._present(ENTRY.c.sha256, [digest for _, digest in entries])
         digests, refused, kept = iter(entries), [], []
         again = 0
         for item in given.items:
@@ -97,7 +98,7 @@ class Ingest:
             stream = (one.kind, one.subject)
             if digest in known:
                 again += 1
-            elif reason := self._wrong(one):
+            elif reason := self._refusal_reason(one):
                 refused.append((Refusal(reason, one.line, one), digest))
                 continue
             else:
@@ -107,36 +108,39 @@ class Ingest:
                     self.first = (utc_text(one.time), _before(one.content))
             self.seen[stream] = max(one.time, self.seen.get(stream, one.time))
         before = source is not None
-        fresh = self._fresh(given, refused, before)
+        fresh = self._new_refusals(given, refused, before)
         if kept or fresh or not before:
             self.write(given, taking, None if source is None else int(source[0]), kept, fresh)
-        told = tuple((one.line, one.reason) for one, _ in refused)
-        return IngestResult(given.file, len(kept), again, told, before, len(refused) - len(fresh))
+        refusals_made = tuple((one.line, one.reason) for one, _ in refused)
+        return IngestResult(given.file, len(kept), again, refusals_made, before, len(refused) - len(fresh))
 
-    def _fresh(
+    def _new_refusals(
         self, given: FileContent, refused: list[tuple[Refusal, str | None]], before: bool
     ) -> dict[str, tuple[Refusal, str | None]]:
-        """Return what is refused for the first time, by digest: a reading counts once whatever file it comes in, and a
-        row that could not be read once in each file, however the file grows.
+        """Return the refusals that are new, by digest.
+
+        A reading counts once whatever file it comes in, and an unreadable row once in each file, however the file
+        grows.
         """
         out = {
             digest_of_data([entry] if entry else [given.file, given.meaning, one.line, one.reason]): (one, entry)
             for one, entry in refused
             if entry or not before  # the same file, wherever it lies
         }
-        known = self._known(REFUSED.c.sha256, list(out))
-        readings = self._known(REFUSED.c.entry, [entry for _, entry in out.values() if entry])
+        known = self._present(REFUSED.c.sha256, list(out))
+        readings = self._present(REFUSED.c.entry, [entry for _, entry in out.values() if entry])
         return {key: own for key, own in out.items() if key not in known and own[1] not in readings}
 
-    def _known(self, column: Any, digests: list[str]) -> set[str]:
+    def _present(self, column: Any, digests: list[str]) -> set[str]:
+        """Return those of the digests that a column of the record contains."""
         found: set[str] = set()
-        for k in range(0, len(digests), _TOGETHER):
-            query = select(column).where(column.in_(digests[k : k + _TOGETHER]))
+        for k in range(0, len(digests), _BATCH):
+            query = select(column).where(column.in_(digests[k : k + _BATCH]))
             found |= set(self.connection.execute(query).scalars())
         return found
 
-    def _wrong(self, one: Entry) -> str:
-        """Why a reading that is new cannot be true of this record; empty where it can."""
+    def _refusal_reason(self, one: Entry) -> str:
+        """Return why a new reading cannot be true of this record; empty if it can."""
         c, stream = ENTRY.c, (one.kind, one.subject)
         if not self.simulated and one.time > now() + AHEAD:
             return (
@@ -147,7 +151,7 @@ class Ingest:
             query = select(c.time_utc).where(c.origin == one.origin, c.time_us != one.time).limit(1)
             if (other := self.connection.execute(query).scalar()) is not None:
                 return f"found from the same frames as the reading of {other}; give it that time, or its own frames"
-        if one.kind == "monitor" and (reason := self._other_reference(one)):
+        if one.kind == "monitor" and (reason := self._reference_conflict(one)):
             return reason
         if stream not in self.newest:
             query = select(func.max(c.time_us)).where(c.kind == one.kind, c.subject == one.subject)
@@ -167,8 +171,8 @@ class Ingest:
                 return f"{text}: a clock that was set back, or a reading that comes late; --late takes it"
         return ""
 
-    def _other_reference(self, one: Entry) -> str:
-        """Why a reading of the monitor cannot be compared with those of the record; empty where it can."""
+    def _reference_conflict(self, one: Entry) -> str:
+        """Return why a reading of the monitor cannot be compared with those of the record; empty if it can."""
         own = _before(one.content)
         if self.first is None:
             c = ENTRY.c
@@ -202,20 +206,20 @@ class Ingest:
         kept: list[tuple[Entry, str]],
         refused: Mapping[str, tuple[Refusal, str | None]],
     ) -> None:
-        """Add rows to the record, and drop what was kept of estimates that these change.
+        """Add rows to the record, and drop the checkpoints that they invalidate.
 
         Parameters
         ----------
-        given : Given
-            What they come from.
+        given : FileContent
+            File that they come from.
         taking : str
-            Digest by which that is recognised.
+            Digest of the file and of the description by which it was read.
         source : int | None
-            Its id; None where the record does not have it yet.
+            Id of the file's row; None if the record does not have it yet.
         kept : list[tuple[Entry, str]]
-            Entries with their digests.
-        refused : Mapping[str, tuple[Refused, str | None]]
-            What is not taken for the first time, by its digest, with that of its entry where it has one.
+            New entries with their digests.
+        refused : Mapping[str, tuple[Refusal, str | None]]
+            Digest -> new refusal, and the digest of its entry if it has one.
         """
         moment = utc_text(now())
         if source is None:
@@ -242,7 +246,7 @@ class Ingest:
         if rows:  # estimates that went past the earliest of them do not hold it
             earliest = min(one.time for one, _ in kept)
             self.connection.execute(delete(CHECKPOINT).where(CHECKPOINT.c.time_us >= earliest))
-        told = [
+        refusals_made = [
             {
                 "sha256": key,
                 "source_id": source,
@@ -253,15 +257,15 @@ class Ingest:
             }
             for key, (one, entry) in refused.items()
         ]
-        self._insert(REFUSED, told)
+        self._insert(REFUSED, refusals_made)
 
     def _insert(self, table: Any, rows: list[dict[str, Any]]) -> None:
-        for k in range(0, len(rows), _TOGETHER):
-            self.connection.execute(insert(table), rows[k : k + _TOGETHER])
+        for k in range(0, len(rows), _BATCH):
+            self.connection.execute(insert(table), rows[k : k + _BATCH])
 
 
 def _before(content: Mapping[str, Any]) -> Before:
-    """The spots in the reference images of a reading of the monitor, those that have a sigma."""
+    """Return the spots in the reference images of a reading of the monitor, those that have a sigma."""
     out = {}
     for camera, channels in (content["numbers"].get("spots") or {}).items():
         for channel, spot in channels.items():

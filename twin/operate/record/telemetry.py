@@ -1,5 +1,6 @@
-"""Readings and events on their way into a record: from tables, row by row, and from run folders. What cannot be true is
-refused with its reason.
+"""Readings and events from tables, row by row, and from run folders.
+
+Readings that cannot be true are refused with a reason.
 """
 
 from __future__ import annotations
@@ -48,8 +49,8 @@ from twin.operate.record.entries import (
 from twin.operate.record.history import History
 
 RESULTS = {"monitor": "recovered.json", "calibration": "calibration.json", "angle": "angle.json"}
-"""Sort of reading -> file of the run folder that holds it."""
-_OF_A_STATE = (
+"""Kind of reading -> file of the run folder that holds it."""
+_STATE_KEYS = (
     "cameras",
     "intersection_angle",
     "spots",
@@ -59,33 +60,33 @@ _OF_A_STATE = (
     "centroid",
     "frames",
 )
-"""Keys of a monitor's result that tell of one state."""
+"""Keys of a monitor's result that belong to one state."""
 _IMAGES = (".tiff", ".tif", ".fits", ".fit", ".fts", ".png")
 CONFIG = "config.yaml"
 LARGEST_READING = 4_000_000
-"""Characters of what is kept of one reading."""
+"""Largest size of a stored reading, in characters."""
 
 
 def kind_of_run(folder: Path) -> str:
-    """Sort of reading that a run folder holds; empty for none."""
+    """Return the kind of reading that a run folder holds; empty if it holds none."""
     return next((kind for kind in RUNS if is_file(folder / RESULTS[kind])), "")
 
 
-def run_entries(place: Path, kind: str, moment: int, history: History, stated: bool) -> FileContent:
-    """The readings of a run folder; what is wrong with it stands in their place.
+def run_entries(place: Path, kind: str, moment: int, history: History, assume_instrument: bool) -> FileContent:
+    """Return the readings of a run folder; its errors are returned as a refusal.
 
     Parameters
     ----------
     place : Path
         The folder, or the file of results in it.
     kind : str
-        Of reading; empty for the one that it holds.
+        Kind of reading; empty for the one that the folder holds.
     moment : int
-        Of it, or of the beginning of a series, microseconds of TAI since 2000.
+        Time of the reading, or of the beginning of a series, in microseconds of TAI since 2000.
     history : History
         The record.
-    stated : bool
-        Whether somebody says that the run is of the record's instrument, of a run that does not say it itself.
+    assume_instrument : bool
+        Assume that a run which does not name its instrument is of the record's instrument.
     """
     folder = place.parent if place.name in RESULTS.values() else place
     kind = kind or kind_of_run(folder)
@@ -97,26 +98,26 @@ def run_entries(place: Path, kind: str, moment: int, history: History, stated: b
         if not kind or manifest is None or not is_file(file):
             allowed = f"a finished run folder with {names_text(RESULTS.values())}"
             raise Problem(f"no reading in {folder}", None, allowed)
-        digest, frames = digest_of(file), _frames(manifest)
-        _is_as_written(folder, file, digest, manifest)
-        _is_of(folder, history, stated and kind != "monitor")
-        items = list(_found(kind, read_json(file), moment, digest, frames))
+        digest, frames = digest_of(file), _image_digests(manifest)
+        _require_unchanged(folder, file, digest, manifest)
+        _require_instrument(folder, history, assume_instrument and kind != "monitor")
+        items = list(_run_readings(kind, read_json(file), moment, digest, frames))
     except (Problem, InputError) as error:
         items = [Refusal(one_line(error))]
     return FileContent(
-        str(file), digest or digest_of_data(str(file)), digest_of_data([kind, moment, stated]), items, frames
+        str(file), digest or digest_of_data(str(file)), digest_of_data([kind, moment, assume_instrument]), items, frames
     )
 
 
-def _frames(manifest: Manifest) -> dict[str, str]:
-    """Images from which a run found what it found, with their SHA-256: those that it read, else those that it wrote."""
+def _image_digests(manifest: Manifest) -> dict[str, str]:
+    """Return the SHA-256 of the images that a run measured: those that it read, otherwise those that it wrote."""
     read = {name: digest for name, digest in manifest.inputs.items() if name.lower().endswith(_IMAGES)}
     own = {name: digest for name, digest in manifest.sha256.items() if name.startswith("images/")}
     return read or {name: digest for name, digest in own.items() if name.endswith((".tiff", ".fits"))}
 
 
-def _is_as_written(folder: Path, file: Path, digest: str, manifest: Manifest) -> None:
-    """Refuse results that are not those that the run wrote. Raises Problem."""
+def _require_unchanged(folder: Path, file: Path, digest: str, manifest: Manifest) -> None:
+    """Raise Problem if the results are not those that the run wrote."""
     known = {file.name: digest}
     known |= {CONFIG: digest_of(folder / CONFIG)} if is_file(folder / CONFIG) else {}
     changed = [name for name, own in known.items() if manifest.sha256.get(name) != own]
@@ -125,14 +126,14 @@ def _is_as_written(folder: Path, file: Path, digest: str, manifest: Manifest) ->
         raise Problem(problem, None, "the folder as the run left it; python -m twin.verify tells more")
 
 
-def _is_of(folder: Path, history: History, stated: bool) -> None:
-    """Refuse a run of another instrument, or one that does not say of which. Raises Problem, InputError."""
+def _require_instrument(folder: Path, history: History, assume_instrument: bool) -> None:
+    """Raise Problem or InputError if a run is of another instrument, or does not name its instrument."""
     data = read_yaml(folder / CONFIG).data if is_file(folder / CONFIG) else None
     model = data.get("model", data) if isinstance(data, Mapping) else None
     instrument = model.get("instrument") if isinstance(model, Mapping) else None
     cameras = model.get("cameras") if isinstance(model, Mapping) else None
     if not isinstance(instrument, Mapping) or not isinstance(cameras, Mapping):
-        if stated:
+        if assume_instrument:
             return
         problem = f"{folder} does not say of which instrument it is"
         raise Problem(
@@ -145,8 +146,8 @@ def _is_of(folder: Path, history: History, stated: bool) -> None:
         raise Problem(problem, None, f"runs of {history.name} ({history.sha256[:12]})")
 
 
-def _found(kind: str, data: Any, moment: int, digest: str, frames: Mapping[str, str]) -> list[Entry]:
-    """One reading, or those of a series at its times. Raises Problem."""
+def _run_readings(kind: str, data: Any, moment: int, digest: str, frames: Mapping[str, str]) -> list[Entry]:
+    """Return the reading of a run, or those of a series. Raise Problem if the results are not valid."""
     if not isinstance(data, Mapping):
         raise Problem("no results", None, RESULTS[kind])
     origin = digest_of_data(sorted(frames.values())) if frames else digest
@@ -160,14 +161,14 @@ def _found(kind: str, data: Any, moment: int, digest: str, frames: Mapping[str, 
     for k, (state, seconds) in enumerate(zip(states, times, strict=True)):
         if not isinstance(state, Mapping) or "cameras" not in state or not isinstance(seconds, int | float):
             raise Problem("a state without cameras or without a time", None, RESULTS[kind])
-        numbers = {key: state[key] for key in _OF_A_STATE if key in state}
+        numbers = {key: state[key] for key in _STATE_KEYS if key in state}
         content = {"sha256": digest, "state": k, "numbers": numbers}
         out.append(_entry(kind, moment + round(seconds * MICRO), content, digest_of_data([origin, k])))
     return out
 
 
 def _entry(kind: str, moment: int, content: Mapping[str, Any], origin: str) -> Entry:
-    """A reading of a size and with numbers that a record can hold. Raises Problem."""
+    """Return a reading whose size and numbers a record can hold. Raise Problem otherwise."""
     try:
         text = canonical(content)
     except ValueError:
@@ -178,20 +179,29 @@ def _entry(kind: str, moment: int, content: Mapping[str, Any], origin: str) -> E
 
 
 LARGEST = 1 << 28
-"""Bytes of a table."""
-WITHIN = 100.0
-"""A body's temperature departs from the instrument's by less, kelvin; so does a change in a job that has no sign."""
-UNIT = 1e-3
-"""By how much the length of a quaternion may differ from 1."""
+"""Largest size of a table, in bytes."""
+MOST_DEPARTURE = 100.0
+"""Largest plausible departure of a body's temperature from the instrument's, in kelvin; a job's changes have the same
+limit.
+"""
+QUATERNION_TOLERANCE = 1e-3
+"""Largest departure of a quaternion's length from 1."""
 
 
 def read_telemetry(path: Path, history: History) -> TelemetrySpec:
-    """What tables hold, as a file says.
+    """Read the description of tables from a file.
+
+    Parameters
+    ----------
+    path : Path
+        The YAML file.
+    history : History
+        Record of the instrument that the tables have to be of.
 
     Raises
     ------
     InputError
-        It cannot be read, is not valid, or is of another instrument than the record.
+        The file cannot be read, is not valid, or is of another instrument than the record.
     """
     spec = validate(TelemetrySpec, read_yaml(path))
     digest = digest_of_job(resolve_on(spec, spec.instrument))
@@ -208,12 +218,12 @@ def read_telemetry(path: Path, history: History) -> TelemetrySpec:
 
 
 def tables_of(spec: TelemetrySpec, table: ReadingTableSpec) -> list[Path]:
-    """The files of a table that are there, by name.
+    """Return the existing files of a table, sorted by name.
 
     Raises
     ------
     InputError
-        Not the name of files.
+        The pattern does not name files.
     """
     folder = Path(spec.source.file).parent
     try:
@@ -224,18 +234,19 @@ def tables_of(spec: TelemetrySpec, table: ReadingTableSpec) -> list[Path]:
 
 
 def read_table_file(table: ReadingTableSpec, path: Path, history: History) -> FileContent:
-    """What one table holds; one that cannot be read is refused as a whole."""
+    """Return the content of one table; a table that cannot be read is refused as a whole."""
     try:
         digest = digest_of(path)
         items, frames = _items(table, path, history)
     except InputError as error:
-        items, frames = [Refusal(one_line(one), one.line) for one in error.issues], {}
+        items, frames = [Refusal(one_line(issue), issue.line) for issue in error.issues], {}
     except OSError as error:
         digest, items, frames = digest_of_data(str(path)), [Refusal(f"cannot be read: {error.strerror}")], {}
     return FileContent(str(path), digest, digest_of_data(table.plain()), items, frames)
 
 
 def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[Entry | Refusal], dict[str, str]]:
+    """Return the entries and refusals of a table, and the images of the runs that it names."""
     rows = rows_apart(path, LARGEST)
     if not rows:
         raise InputError(Issue("an empty table", str(path), 1, allowed="a row of heads, and rows below it"))
@@ -246,7 +257,7 @@ def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[
     if isinstance(cells, str):
         raise InputError(Issue(cells, str(path), line, allowed="a row of heads, and rows below it"))
     heads = [head.strip() for head in cells]
-    wanted = [table.time, *(head for one in table.columns.values() for head in one.column)]
+    wanted = [table.time, *(head for column in table.columns.values() for head in column.column)]
     wanted += [head for head in (table.name, table.detail) if head is not None]
     for head in wanted:
         if heads.count(head) != 1:
@@ -270,20 +281,23 @@ def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[
         if table.kind in VALUES:
             read = ((one, column, [row[head] for head in column.column]) for one, column in table.columns.items())
             # cells that are empty say nothing
-            items += [_tried(_reading, table, history, *one, moment, number) for one in read if any(one[2])]
+            items += [_entry_or_refusal(_reading, table, history, *one, moment, number) for one in read if any(one[2])]
         elif table.kind == EVENT:
-            items.append(_tried(_event, table, row, moment, number))
+            items.append(_entry_or_refusal(_event, table, row, moment, number))
         else:
-            found = run_entries(path.parent / row[str(table.name)], table.kind, moment, history, stated=True)
+            found = run_entries(path.parent / row[str(table.name)], table.kind, moment, history, assume_instrument=True)
             frames |= found.frames
-            items += [replace(one, line=number) for one in found.items]
+            items += [replace(item, line=number) for item in found.items]
     return items, frames
 
 
 def _keyword_items(
     table: ReadingTableSpec, rows: Sequence[tuple[int, list[str] | str]], history: History
 ) -> list[Entry | Refusal]:
-    """Lines of ``KEYWORD = TIME NUMBER``; other keywords, and lines without a number after a time, are not readings."""
+    """Return the entries of lines ``KEYWORD = TIME NUMBER``.
+
+    Other keywords are not readings.
+    """
     by_keyword = {one.column[0]: (subject, one) for subject, one in table.columns.items()}
     items: list[Entry | Refusal] = []
     for number, cells in rows:
@@ -303,12 +317,12 @@ def _keyword_items(
         except Problem as problem:
             items.append(Refusal(one_line(problem), number))
             continue
-        items.append(_tried(_reading, table, history, subject, column, [words[1]], moment, number))
+        items.append(_entry_or_refusal(_reading, table, history, subject, column, [words[1]], moment, number))
     return items
 
 
-def _tried(make: Callable[..., Entry], *of: Any) -> Entry | Refusal:
-    """Return an entry, or why there is none; the last argument is its line."""
+def _entry_or_refusal(make: Callable[..., Entry], *of: Any) -> Entry | Refusal:
+    """Return the entry that a function makes, or its Problem as a refusal; the last argument is the line."""
     try:
         return make(*of)
     except Problem as problem:
@@ -316,7 +330,7 @@ def _tried(make: Callable[..., Entry], *of: Any) -> Entry | Refusal:
 
 
 def _moment(table: ReadingTableSpec, text: str) -> int:
-    """Time of a row. Raises Problem."""
+    """Return the time of a row. Raise Problem if it is not valid."""
     if table.epoch is None:
         return micros(text, table.time_scale)
     return micros_after(table.epoch, table.time_scale, parse_quantity(f"{text} {table.time_unit}", MOMENT))
@@ -331,25 +345,26 @@ def _reading(
     moment: int,
     line: int,
 ) -> Entry:
-    """One reading in SI units. Raises Problem: no number, or one that such a body cannot have."""
-    kind, of_sigma = VALUES[table.kind]
-    sigma = parse_quantity(column.sigma, of_sigma)
+    """Return one reading in SI units. Raise Problem if it is no number, or not plausible."""
+    kind, sigma_kind = VALUES[table.kind]
+    sigma = parse_quantity(column.sigma, sigma_kind)
     unit = QUATERNION if column.unit == QUATERNION else kind.si
     if unit == QUATERNION:
         values = [_number(cell) for cell in cells]
         length = math.hypot(*values)
-        if not abs(length - 1.0) <= UNIT:
-            allowed = f"1 within {UNIT:g}; the scalar last"
+        if not abs(length - 1.0) <= QUATERNION_TOLERANCE:
+            allowed = f"1 within {QUATERNION_TOLERANCE:g}; the scalar last"
             raise Problem(f"{subject}: not a quaternion of a turn", f"length {length:.6g}", allowed)
         values = [value / length for value in values]
     else:
         values = [parse_quantity(f"{cell} {column.unit}", kind) for cell in cells]
     if table.kind == "temperature":
-        _is_warm_enough(subject, values[0], column.unit, history)
+        _require_plausible(subject, values[0], column.unit, history)
     return Entry(table.kind, subject, moment, {"values": values, "sigma": sigma, "unit": unit}, line)
 
 
 def _number(cell: str) -> float:
+    """Return a cell as a finite number. Raise Problem otherwise."""
     try:
         value = float(cell)
     except ValueError:
@@ -359,23 +374,23 @@ def _number(cell: str) -> float:
     return value
 
 
-def _is_warm_enough(subject: str, kelvin: float, unit: str, history: History) -> None:
-    """Refuse a temperature that is none of this instrument, as of a column in another unit. Raises Problem."""
+def _require_plausible(subject: str, kelvin: float, unit: str, history: History) -> None:
+    """Raise Problem for a temperature too far from the instrument's, such as of a column in another unit."""
     off = kelvin - history.temperature
-    if abs(off) <= WITHIN:
+    if abs(off) <= MOST_DEPARTURE:
         return
     meant = {"K": (273.15, "degC"), "degC": (-273.15, "K"), "celsius": (-273.15, "K"), "°C": (-273.15, "K")}.get(unit)
-    fits = meant is not None and abs(off + meant[0]) <= WITHIN
+    fits = meant is not None and abs(off + meant[0]) <= MOST_DEPARTURE
     remedy = f"the column is in {meant[1]}, it seems: unit: {meant[1]}" if fits and meant else "the unit of the column"
     raise Problem(
         f"{subject}: {kelvin:.6g} K is {abs(off):.4g} K from the instrument's {history.temperature:.6g} K",
         None,
-        f"at most {WITHIN:g} K from it; {remedy}",
+        f"at most {MOST_DEPARTURE:g} K from it; {remedy}",
     )
 
 
 def _event(table: ReadingTableSpec, row: dict[str, str], moment: int, line: int) -> Entry:
-    """One event. Raises Problem: of a name that is not known."""
+    """Return one event. Raise Problem if its name is unknown."""
     found = row[str(table.name)]
     name = table.events.get(found, found)
     if name not in EVENTS:
@@ -388,7 +403,7 @@ def _event(table: ReadingTableSpec, row: dict[str, str], moment: int, line: int)
 
 
 SETTLED = 2.0
-"""Seconds for which a file has not changed before a watching command reads it: it may still be written."""
+"""Time for which a file must be unchanged before a watching command reads it, in seconds: it may still be written."""
 
 _TIME = re.compile(r"(\d{4})-?(\d{2})-?(\d{2})T(\d{2})[:-]?(\d{2})[:-]?(\d{2}(?:\.\d+)?)Z")
 _YAML = (".yaml", ".yml")
@@ -396,8 +411,9 @@ State = tuple[int, ...]
 
 
 def time_of_name(name: str) -> int | None:
-    """Microseconds of TAI since 2000 of the UTC in the name of a run folder, ``recover-2026-03-05T03-05-00Z`` or
-    ``20260305T030500Z``; None where there is none.
+    """Return the UTC in the name of a run folder, in microseconds of TAI since 2000; None if it has none.
+
+    Examples are ``recover-2026-03-05T03-05-00Z`` and ``20260305T030500Z``.
     """
     found = _TIME.search(name)
     if found is None:
@@ -411,37 +427,37 @@ def time_of_name(name: str) -> int | None:
 
 @dataclass
 class Sources:
-    """What was named to be taken into a record.
+    """Files and folders to ingest into a record.
 
     Attributes
     ----------
     places : Sequence[Path]
-        YAML files, run folders, folders with some of these.
+        YAML files, run folders, and folders with some of these.
     moment : int | None
-        Of a run folder that is named itself, microseconds; None where its name says it.
-    stated : bool
-        Whether run folders that do not say it are of the record's instrument.
+        Time of the run folders named directly, in microseconds of TAI since 2000; None if their names contain it.
+    assume_instrument : bool
+        Assume that run folders which do not name their instrument are of the record's instrument.
     watching : bool
-        Whether it is looked at more than once, and then only what has changed since is read.
+        Whether the sources are polled repeatedly, reading only what has changed.
     seen : dict[str, State]
-        Path -> how it was when it was read.
+        Path -> modification time and size when it was read.
     """
 
     places: Sequence[Path]
     moment: int | None
-    stated: bool
+    assume_instrument: bool
     watching: bool = False
     seen: dict[str, State] = field(default_factory=dict)
 
-    def look(self, history: History) -> Iterator[FileContent]:
-        """What they hold now; of what is watched only what has changed since the last look.
+    def poll(self, history: History) -> Iterator[FileContent]:
+        """Yield the content of the files; of watched sources only of those changed since the last poll.
 
         Raises
         ------
         InputErrorText
-            Nothing is there, or a run folder that was named has no time.
+            A path does not exist, or a named run folder has no time.
         InputError
-            a YAML file is not valid.
+            A YAML file is not valid.
         """
         for place in self.places:
             if place.suffix not in _YAML and is_run_folder(place if place.is_dir() else place.parent):
@@ -461,21 +477,22 @@ class Sources:
                     yield from self._run(run, None, history)
 
     def _tables(self, file: Path, history: History, named: set[Path]) -> Iterator[FileContent]:
-        """What the tables hold that a YAML file describes; the run folders that they name are added to ``named``."""
+        """Yield the content of the tables described by a YAML file; add the run folders that they name to ``named``."""
         spec = read_telemetry(file, history)
         for table in spec.readings:
             for path in tables_of(spec, table):
                 own = _runs_named(table, path) if table.kind in RUNS else []
                 named |= {one.resolve() for one in own}
-                if not self._is_seen(path, own):
+                if not self._is_unchanged(path, own):
                     yield read_table_file(table, path, history)
 
     def _run(self, place: Path, moment: int | None, history: History) -> Iterator[FileContent]:
+        """Yield the content of a run folder."""
         folder = place if place.is_dir() else place.parent
         moment = time_of_name(folder.name) if moment is None else moment
         if moment is None and place in self.places:
             raise InputErrorText(f"{place}: a run folder does not say when it was read; --time UTC does, or its name")
-        if self._is_seen(folder / MANIFEST):
+        if self._is_unchanged(folder / MANIFEST):
             return
         if moment is None:
             reason = (
@@ -483,12 +500,10 @@ class Sources:
             )
             yield FileContent(str(folder), digest_of_data(str(folder)), "", [Refusal(f"{folder.name}: {reason}")], {})
         else:
-            yield run_entries(place, "", moment, history, self.stated)
+            yield run_entries(place, "", moment, history, self.assume_instrument)
 
-    def _is_seen(self, path: Path, named: Sequence[Path] = ()) -> bool:
-        """Whether a watched file, and the run folders that it names, are as they were when it was read, or may still be
-        written.
-        """
+    def _is_unchanged(self, path: Path, named: Sequence[Path] = ()) -> bool:
+        """Return whether a watched file, or a run folder it names, is unchanged or may still be written."""
         if not self.watching:
             return False
         states = [one.stat() for one in (path, *named)]
@@ -500,7 +515,7 @@ class Sources:
 
 
 def _runs_named(table: ReadingTableSpec, path: Path) -> list[Path]:
-    """Manifests of the run folders that a table names and that are finished."""
+    """Return the manifests of the finished run folders that a table names."""
     try:
         heads, *rows = [cells for _, cells in rows_apart(path, LARGEST) if not isinstance(cells, str)]
         column = [head.strip() for head in heads].index(str(table.name))
