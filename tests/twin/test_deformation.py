@@ -115,11 +115,11 @@ def test_warnings_name_the_body_and_what_is_wrong_with_its_mesh(gf7_pair) -> Non
     )
     assert deformation_warnings({M1: smooth}) == ()
     (finer,) = deformation_warnings({M1: replace(smooth, lost=np.full_like(smooth.lost, 5e-9))})
-    assert finer.startswith(f"{M1}: 5 nm rms of the surface's change are finer than its grid and not carried")
+    assert finer.startswith(f"{M1}: 5 nm rms of the surface's change are finer than its grid and are not modelled")
     (mesh,) = deformation_warnings({M1: smooth, M2: noisy})
-    assert mesh.startswith(f"{M2}: the mesh prints through")
+    assert mesh.startswith(f"{M2}: the mesh is too coarse for the residual")
     plane, _ = deformation_warnings({M1: smooth, M2: noisy}, [M1])
-    assert plane.startswith(f"{M1}: stray light takes faces of glass as planes")
+    assert plane.startswith(f"{M1}: stray light treats faces of glass as planes")
 
 
 STUDY = """name: deformed

@@ -50,8 +50,8 @@ def test_what_a_course_says() -> None:
     assert "jumps" not in none.to_dict()
     assert "jump" not in course_agrees(none, times)
     assert nothing.to_dict()["jumps"] == {"false_alarm": 0.01, "found": []}
-    assert course_agrees(nothing, times).endswith("No jump was found (a false one with a chance of at most 0.01).")
-    assert course_agrees(one, times).endswith(f"The series says that {jump_text(JUMP)}.")
+    assert course_agrees(nothing, times).endswith("No jump was detected (false-alarm probability at most 0.01).")
+    assert course_agrees(one, times).endswith(f"The series shows that {jump_text(JUMP)}.")
     (found,) = json.loads(json.dumps(one.to_dict()))["jumps"]["found"]
     assert found["sizes"][0] == {"name": "base/M2 shift x", "unit": "um", "size": 3.21, "sigma": 0.42}
     assert found["rivals"] == [{"body": "base/M1", "log_ratio": 31.0}, {"body": "base/M3", "log_ratio": 12.0}]

@@ -124,10 +124,10 @@ def test_impossible_sampling_sources_and_scenes_are_refused(backend) -> None:
     rays = RaySource.even(np.zeros((2, 3)), np.tile([0.0, 0.0, 1.0], (2, 1)))
     many = tuple(screen(f"s{k}", facing(0.5 + k), 1.0) for k in range(256))
     for make, words in (
-        (lambda: Sampling(floor=1.0), "impossible"),
+        (lambda: Sampling(floor=1.0), "invalid sampling"),
         (lambda: replace(source, narrow=(0.08, 0.0, 0.05)), "does not lie in"),
         (lambda: replace(source, radius=-1.0), "radius of 0 or more and a cone"),
-        (lambda: PathTracer(backend, alone).run(source, 0), "how many paths to trace, at least 1; found 0"),
+        (lambda: PathTracer(backend, alone).run(source, 0), "the number of paths must be at least 1; found 0"),
         (lambda: PathTracer(backend, alone).run(rays, 3), "a list of rays is traced as a whole"),
         (lambda: PathTracer(backend, Scenery((*glass[:3], surface, *glass[3:]), (grid,))), "do not follow each other"),
         (lambda: PathTracer(backend, Scenery((wavy, surface), (grid,))), "takes 3 aspheric terms, found 4"),
@@ -466,7 +466,7 @@ def same(one: PathResult, other: PathResult) -> None:
 
 @pytest.mark.second
 def test_light_out_and_back_has_clear_segments_everywhere(gf7_pair) -> None:
-    """From the pinhole to the area CCD there are 25 surfaces: 25 segments between them and the detector, and the first."""
+    """From the pinhole to the area CCD there are 25 surfaces: 25 segments to them and the detector, and the first."""
     scenery = build_scenery(gf7_pair, {}, IDEAL)
     families = monitor_families(scenery, gf7_pair)
     found = ClearSegments(scenery, families)

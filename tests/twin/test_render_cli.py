@@ -235,7 +235,7 @@ TOO_MUCH = {
 def test_a_perturbation_that_loses_the_light_is_explained(case, tmp_path):
     job = tmp_path / "job.yaml"
     job.write_text(HEAD + "  " + TOO_MUCH[case])
-    message = complains(run(job, "--out", tmp_path / "run"), job, "base/forward/", "make them smaller")
+    message = complains(run(job, "--out", tmp_path / "run"), job, "base/forward/", "smaller motions, which keep")
     assert "nan" not in message.lower()
     assert [path.name for path in tmp_path.iterdir()] == ["job.yaml"]
 

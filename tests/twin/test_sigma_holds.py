@@ -80,7 +80,7 @@ def test_a_run_keeps_what_it_checked_of_itself(blurred) -> None:
     numbers = recovered_numbers(blurred.run)["spots"]["forward"]["left"]["after"]
     limit = blurred.run.recovery.evidence.after.core_limit[0, 0]
     assert after.value >= numbers["core_chi_square"] / limit * (1.0 - 1e-6)
-    assert "linear readings of model against the state traced again" in found
+    assert "linear readings of model against the retraced state" in found
     assert json.loads(json.dumps(after.to_dict()))["holds"] is False
 
 
@@ -106,7 +106,7 @@ def test_a_contradicted_statement_is_no_sigma_that_holds(orbit) -> None:
     assert not shot.run.recovered_dict()["sigma_holds"]
     assert "σ does not hold" in shot.verdict
     # the spots do see it
-    assert not any("what is perturbed of it" in text for text in shot.warnings)
+    assert not any("its perturbation" in text for text in shot.warnings)
     found = orbit.recover(shot.before, shot.after)
     assert any("contradict" in text for text in found.warnings)
     outcome = {"recovered": shot.run.recovered_dict()}
@@ -120,7 +120,7 @@ def test_a_large_turn_is_read_by_the_state_traced_again(pair) -> None:
     error = told.compare(shot.truth)["in_sigma"]
     # 12 numbers beyond 5 sigma: 1e-5
     assert np.abs(error).max() < 5.0
-    (note,) = [text for text in told.warnings if "not small" in text]
+    (note,) = [text for text in told.warnings if "too large for a linear estimate" in text]
     assert "forward Δf is off by 2" in note
     assert note in shot.warnings
     assert told.sigma_holds
@@ -137,14 +137,14 @@ def test_a_reading_whose_state_cannot_be_traced_says_so(pair, blurred) -> None:
     lost = {name: replace(c, off=c.off * np.nan, rests=~c.rests) for name, c in reading.recovery.curvature.items()}
     told = replace(reading, recovery=replace(reading.recovery, curvature=lost, evidence=None))
     (text,) = told.doubts
-    assert "cannot be traced again" in text
-    assert "its light is lost" in text
+    assert "cannot be retraced" in text
+    assert "light is lost" in text
     assert told.recovered_dict()["retraced"]["model"]["off_in_sigma"] is None
 
 
 def test_what_no_spot_sees_is_a_warning(orbit, monkeypatch) -> None:
     """The line CCD alone, 20 um: d_alpha is -0.73 arcsec and read as 0; spots move by a tenth of their noise, 1e-3 px.
-    And coma of M2 at five times its sigma, which moves spots as likelier motions do.
+    And coma of M2 at five times its sigma, which moves spots as more probable motions do.
     """
     traced = systematics.traced_states
 
@@ -160,7 +160,7 @@ def test_what_no_spot_sees_is_a_warning(orbit, monkeypatch) -> None:
     assert "forward Δα changes by −0.727 arcsec" in told
     shot = orbit.perturbed({"base/forward/M2": {"figure": {"Z7": "10 nm"}}}).render(frames=2, seed=1)
     (told,) = [text for text in shot.warnings if text.startswith("base/forward/M2")]
-    assert "as likelier motions do" in told
+    assert "as more probable motions do" in told
 
 
 @pytest.mark.second
@@ -172,9 +172,9 @@ def test_a_statement_of_what_no_spot_sees_is_a_warning(pair, tmp_path) -> None:
         "  mounts: {bodies: base/<camera>, rotate: 1 arcsec, time: constant, reason: made up}\n"
     )
     shot = pair.with_disturbances(str(file)).render(frames=2, seed=1)
-    told = [text for text in shot.warnings if "its motions that are stated move no spot" in text]
+    told = [text for text in shot.warnings if "its motions in the prior move no spot" in text]
     assert len(told) == 2
-    assert "from the statement, not from the spots" in told[0]
+    assert "rest on the prior, not on the spots" in told[0]
     shares = pair.with_disturbances(str(file)).recover(shot.before, shot.after).from_statement
     assert shares["forward", "d_alpha_arcsec"] > 0.99
 

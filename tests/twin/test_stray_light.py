@@ -100,7 +100,7 @@ def test_stray_light_in_photons(backend, gf7_pair) -> None:
 
 def test_a_lost_beam_is_said_so(backend, gf7_pair) -> None:
     state = {"base/forward/M1": Motion(rotate=(0.2, 0.0, 0.0), pivot="centre")}
-    with pytest.raises(NominalPathLost, match="forward/left came back"):
+    with pytest.raises(NominalPathLost, match="forward/left returned"):
         trace_stray(gf7_pair, backend, state, 1000, 0, channels=gf7_pair.channels[:1])
 
 

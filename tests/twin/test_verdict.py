@@ -91,8 +91,8 @@ def test_noise_that_looks_like_a_change_is_called_noise(job) -> None:
     run = job("{}")
     small, large = (judge(moved(run, 0, sigmas)).verdict for sigmas in (3.2, 9.0))
     assert "1 of 12 readings of the model is beyond 3 σ" in small
-    assert "it is a chance event" in small
-    assert "look at the warnings" in large
+    assert "this is consistent with chance" in small
+    assert "check the warnings" in large
     assert any("misread" in warning for warning in judge(moved(run, 0, 9.0)).warnings)
     assert judge(moved(run, 0, 3.2)).warnings == ()
 
@@ -171,7 +171,7 @@ def test_lost_light_is_told(job) -> None:
     photons = run.photons_after.copy()
     photons[0] /= 3.0
     dimmed = judge(replace(run, photons_after=photons))
-    assert "Light is lost on the way (forward/left 33 % of the nominal light arrive)." in dimmed.more
+    assert "Spots have lost light (forward/left 33 % of the nominal light)." in dimmed.more
 
 
 @pytest.mark.second
@@ -318,7 +318,7 @@ def test_motions_far_from_what_is_stated_are_found_out(job) -> None:
         (warning,) = [text for text in told.warnings if "contradict" in text]
         assert run.reading.consistency is not None
         assert "contradict the prior launch: chi-square" in warning
-        assert f"where {run.reading.consistency.limit:.1f} is exceeded with a chance of 0.001" in warning
+        assert f"limit {run.reading.consistency.limit:.1f} at a false-alarm rate of 0.001" in warning
         assert f"motions of {run.reading.consistency.suspects[0].body} would explain them best" in warning
         assert run.reading.consistency.suspects[0].body == body
         times = float(re.search(r"with (\S+) times the standard deviations of the prior", warning)[1])
@@ -358,7 +358,7 @@ def test_full_pixels_and_lost_light_are_warnings_of_the_main_job(job) -> None:
     dim[1] *= 0.05
     full[2, 0][full[2, 0] == full[2, 0].max()] = run.experiment.detector.saturation_dn
     (lost,) = render_job_module._warnings(run.experiment, nominal, dim, run.before, run.after)
-    assert lost == "forward/right: only 5% of the nominal light reaches the CCD"
+    assert lost == "forward/right: only 5 % of the nominal light reaches the CCD"
     (bright,) = render_job_module._warnings(run.experiment, nominal, run.photons_after, run.before, full)
     assert bright.startswith("saturated pixels in the spots backward/left (after)")
 
@@ -373,7 +373,7 @@ WARNED_ELSEWHERE = {
     ("block.json", "agrees"): "twin.orbit.block.block_report",
     ("The loop closed and open", "stable"): "that of margins_hold",
     ("course.json", "sigma_holds"): "twin.monitor.time_series, and twin.main_job.systematics for single times",
-    ("What random states gave", "sigma_holds"): "twin.uncertainty.uncertainty_report",
+    ("Coverage in random states", "sigma_holds"): "twin.uncertainty.uncertainty_report",
     ("focus.json of a measured series", "curves_agree"): "twin.laboratory.focus_report",
     ("turntable.json", "heldout_agrees"): "twin.laboratory.turntable_report",
     ("The angles of one pass", "resection_agrees"): "twin.orbit.angle.angle_report",

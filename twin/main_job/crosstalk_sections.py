@@ -39,22 +39,21 @@ UNOBSERVED = 0.01
 def motion_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
     """Return the section with the spot shifts of each motion and three ways to change the principal distance."""
     caption = (
-        "Move of each spot on its area CCD in µm per unit of each motion (1 µm, 1 arcsec, 1 ppm, or 1 nm rms of a "
+        "Shift of each spot on its area CCD in µm per unit of each motion (1 µm, 1 arcsec, 1 ppm, or 1 nm rms of a "
         "figure term), of one body alone, to first order; x is along the flight direction, y along the line. Colours "
-        "are logarithmic over three decades, red is positive. 0 stands for less than 10⁻⁶. The CSV also has the "
+        "are logarithmic over three decades, red is positive. 0 means less than 10⁻⁶. The CSV also has the "
         "true change and the reading of each estimator. Four coordinates for each camera cannot separate these "
-        "motions. "
-        "The first four are the family that the papers' estimators assume. `crosstalk.json` describes in words how the "
-        "spots respond to every motion."
+        "motions. The first four are the family that the papers' estimators assume. `crosstalk.json` describes the "
+        "response of the spots to every motion."
     )
     parts: list[Artefact] = [figure(drawn, "motions", caption, full=_motions(run))]
     for k, (name, table) in enumerate(run.crosstalk.items()):
         labels = {f"{m.label} [{m.unit}]" for m in table.motions} | {m.label for m in table.motions}
         first = _pretty(table.observability.statements[0].split(": ", 1), labels)
         points = [_pretty(s.split(": ", 1), labels, keep=True) for s in table.principal_distance_statements()]
-        title = f"Three ways to change the principal distance of {name}: piston, despace, growth"
+        title = f"Three ways to change the principal distance of {name}: piston, despace, scale"
         parts.append(Text(f"focal-{k}", title, first, points, within=IN_PAGE))
-    return Section("What a motion does to the spots", (), tuple(parts), len(run.crosstalk), "motions")
+    return Section("Response of the spots to motions", (), tuple(parts), len(run.crosstalk), "motions")
 
 
 _TYPESET = (*SYMBOLS.items(), (" um", " µm"), ("[um]", "[µm]"), ('"', " arcsec"))
@@ -96,12 +95,11 @@ def crosstalk_section(run: RenderRun) -> Section:
     about = (
         "Per unit of motion: the true change of the camera (bold) and the reading of every estimator, to first order. "
         f"Underlined: wrong by more than {round(100 * WRONG)} % of the truth and by more than a hundredth of this "
-        "run's "
-        "noise, so that a hundred units of the motion would be noticed. 0 stands for less than 10⁻⁶. paper is both "
-        "paper single, eqs. (2), (3), (5), and paper joint, Table 1, which agree there."
+        "run's noise, so that a hundred units of the motion would be noticed. 0 means less than 10⁻⁶. The column paper "
+        "is both paper single, eqs. (2), (3), (5), and paper joint, Table 1, where these agree."
     )
     tables = tuple(_crosstalk(run, k) for k in range(len(run.crosstalk)))
-    return Section("Crosstalk: what every motion reads as", (about,), tables, name="crosstalk", closed=True)
+    return Section("Crosstalk: readings of each motion", (about,), tables, name="crosstalk", closed=True)
 
 
 def _crosstalk(run: RenderRun, camera: int) -> Table:
@@ -165,8 +163,8 @@ def is_wrong(reading: float, true: float, floor: float = SAME) -> bool:
 def formula_section(run: RenderRun) -> Section:
     """Return the section with the factors of the printed formulas, two columns per camera, and their explanation."""
     about = (
-        "Each printed formula is fed with the spot shifts that the exact trace gives for the one motion it was derived "
-        "for. A factor of 1 is a correct formula."
+        "Each printed formula is evaluated with the traced spot shifts of the motion for which it was derived. A "
+        "factor of 1 means that the formula is correct."
     )
     every = {name: table.factors for name, table in run.crosstalk.items()}
     symbols = {p.key: p.symbol for p in parameters.CAMERA_PARAMETERS.values()}
@@ -198,15 +196,15 @@ def formula_section(run: RenderRun) -> Section:
     for name in every:
         texts.setdefault(_factor_text(run, name), []).append(name)
     points = (
-        "Of the paper's model divides by what a thin lens would do (shift/f, the turn itself, scale × f). Of the real "
-        "camera divides by the traced change and therefore contains the camera's anamorphism fₓ/f and its distortion.",
+        "The factor of the paper's model divides by the change of a thin lens (shift/f, the rotation, scale × f). That "
+        "of the real camera divides by the traced change, and so includes its anamorphism fₓ/f and its distortion.",
         *(f"{', '.join(names)}: {text}" for text, names in texts.items()),
         "The paper's X and Y are before − after. Table 1 does not say how Y_L is signed and uses it in both Δβ and Δf; "
         "here each row takes the sign that agrees with the single-change formula beside it: Y_L = y₀₁ − y₁₁ for Δβ, "
         "y₁₁ − y₀₁ for Δf.",
     )
     notes = Text("formula-notes", "", "", points, within=IN_PAGE)
-    return Section("What the printed formulas read", (about,), (table, notes), name="formulas", closed=True)
+    return Section("Factors of the printed formulas", (about,), (table, notes), name="formulas", closed=True)
 
 
 def _factor_text(run: RenderRun, name: str) -> str:
@@ -216,9 +214,9 @@ def _factor_text(run: RenderRun, name: str) -> str:
     by_model = {(one.estimator, one.parameter): float(one.by_model) for one in factors}
     beta, alpha = geometry.field_beta_rad, geometry.field_alpha_rad
     return (
-        f"the printed Δγ, eq. (5), reads {fixed(by_model['paper_single', 'd_gamma_arcsec'], 3)} times the turn of the "
-        f"line; the joint Δf of Table 1 reads {fixed(by_model['paper_joint', 'd_f_um'], 3)} times the change. The "
-        f"anamorphism is fₓ/f = {fixed(f_x / f, 4)} (plate scale across the line {fixed(f_x, 4)} m, "
+        f"the printed Δγ, eq. (5), reads {fixed(by_model['paper_single', 'd_gamma_arcsec'], 3)} times the rotation "
+        f"of the line; the joint Δf of Table 1 reads {fixed(by_model['paper_joint', 'd_f_um'], 3)} times the change. "
+        f"The anamorphism is fₓ/f = {fixed(f_x / f, 4)} (plate scale across the line {fixed(f_x, 4)} m, "
         f"principal distance along it {fixed(f, 4)} m). Eqs. (2), (3) and Table 1 carry a cos² of angles that the "
         "paper leaves undefined; taken as the field angles of the area CCDs, "
         f"cos² β = {fixed(math.cos(beta) ** 2, 5)} at {plain(math.degrees(beta))}° and "

@@ -92,7 +92,7 @@ def _camera_side(axes: Axes, instrument: Instrument, paths: LightPaths, camera: 
     for mirror in model.mirrors:
         curve = placed.pose(f"{BASE}/{camera}/{mirror}").apply(_section(model, mirror))
         light = model.spec.mirrors[mirror].light
-        if light == "passes":  # nothing stands there but what its edges stop
+        if light == "passes":  # such a body has no surface, only an edge
             continue
         colour, width = (svg.INK, 3.0) if light is None else (_FACE, 1.5)
         axes.plot(curve[:, 0], curve[:, 2], color=colour, lw=width, solid_capstyle="butt", zorder=4)
@@ -162,7 +162,7 @@ def _focal_plane(axes: Axes, paths: LightPaths, camera: str) -> None:
     pose = paths.placed.pose(f"{BASE}/{camera}/focal_plane")
     bar = pose.apply(np.array([[-0.06, 0.0, 0.0], [0.06, 0.0, 0.0]]))
     axes.plot(bar[:, 0], bar[:, 2], color=svg.GREEN, lw=4, solid_capstyle="butt", zorder=5)
-    # beside the monitor beams, which go to the central prism
+    # the label is placed away from the monitor beams, which go to the central prism
     beside = CENTRAL_PRISM in paths.placed.index
     prism = paths.placed.pose(CENTRAL_PRISM if beside else BASE).translation
     aside = -17.0 if prism[0] > pose.translation[0] else 10.0

@@ -106,8 +106,8 @@ class MonitorReading:
         for name, found in self.recovery.curvature.items():
             if not found.holds[0]:
                 out.append(
-                    f"σ does not hold: the motions that the {self.estimators[name].title} reads are not small, and the "
-                    f"state that it stands for cannot be traced again ({self._off(name)}); readings are linear ones"
+                    f"σ does not hold: the motions read by the {self.estimators[name].title} are too large for a "
+                    f"linear estimate, and the estimated state cannot be retraced ({self._off(name)}); readings are linear"
                 )
         return (*out, *self.contradiction)
 
@@ -120,8 +120,8 @@ class MonitorReading:
     def notes(self) -> tuple[str, ...]:
         """Readings that were relinearised because they are not linear, as sentences without full stops."""
         return tuple(
-            f"the motions that the {self.estimators[name].title} reads are not small: {self._off(name)} against the "
-            "state traced again, so that its readings are those of Gauss and Newton's steps to their end"
+            f"the motions read by the {self.estimators[name].title} are too large for a linear estimate "
+            f"({self._off(name)} against the retraced state): its readings are iterated by the Gauss-Newton method"
             for name, found in self.recovery.curvature.items()
             if found.beyond[0] and found.holds[0]
         )
@@ -138,7 +138,7 @@ class MonitorReading:
         """Return the quantity whose linear reading departs most from the retraced state, and by how much, as text."""
         worst, size = self.recovery.curvature[name].worst()
         if not math.isfinite(size):
-            return "its light is lost"
+            return "light is lost"
         return f"the linear {short_text(self._quantities[worst])} is off by {size:.3g} σ"
 
     @cached_property
@@ -199,7 +199,7 @@ class MonitorReading:
         for name, table in self.crosstalk.items():
             own = [2 * i + axis for i, (camera, _) in enumerate(self.channels) if camera == name for axis in (0, 1)]
             for motion, moved in zip(table.motions, table.spot_shift.T, strict=True):
-                # what both cameras look at stands in both tables
+                # a body that both cameras see is in both tables
                 key = (motion.body, motion.kind, motion.axis)
                 columns.setdefault(key, np.zeros(len(stated.spots)))[own] = moved
         bodies = dict.fromkeys(body for body, _, _ in columns)
@@ -232,13 +232,13 @@ class MonitorReading:
             yield from _fits("spots before", evidence.before)
             yield from _fits("spots after", evidence.after)
         if self.consistency is not None:
-            yield stated_check("shifts against the stated disturbances", self.consistency)
+            yield stated_check("shifts against the prior on disturbances", self.consistency)
         for name, found in self.recovery.curvature.items():
             size = found.worst()[1]
             if math.isfinite(size):
-                done = "worked out anew" if found.beyond[0] and found.holds[0] else "linear"
-                says = f"readings are {done}; beyond {NONLINEAR_SIGMAS:g} sigma they are worked out anew, or sigma does not hold"
-                yield SelfCheck(f"linear readings of {name} against the state traced again", size, None, "sigma", says)
+                done = "relinearised" if found.beyond[0] and found.holds[0] else "linear"
+                says = f"readings are {done}; above {NONLINEAR_SIGMAS:g} sigma relinearised, else sigma does not hold"
+                yield SelfCheck(f"linear readings of {name} against the retraced state", size, None, "sigma", says)
 
     def recovered_dict(self) -> dict[str, Any]:
         """Return the contents of recovered.json."""
@@ -303,8 +303,8 @@ def contradicted(
         return ()
     return (
         f"the shifts of the spots contradict the prior {stated.name}{when}: chi-square "
-        f"{significant(found.chi_square)} of {found.degrees} coordinates where {found.limit:.1f} is exceeded with a "
-        f"chance of {rate}{_suspected(found, stated.bodies)}; σ does not hold for this measurement",
+        f"{significant(found.chi_square)} for {found.degrees} degrees of freedom, limit {found.limit:.1f} at a "
+        f"false-alarm rate of {rate}{_suspected(found, stated.bodies)}; σ does not hold for this measurement",
     )
 
 
@@ -320,7 +320,7 @@ def _suspected(found: Consistency, stated: Sequence[str]) -> str:
         )
     return (
         f"; motions of {first.body}, which the prior does not contain, would explain them best, with standard "
-        f"deviations of some {times} µm, arcsec, ppm and nm"
+        f"deviations of about {times} µm, arcsec, ppm and nm"
     )
 
 
@@ -328,7 +328,7 @@ def _fits(what: str, fits: FitStates) -> Iterator[SelfCheck]:
     """Yield the check of the worst fit among some spots: its chi-square over its limit."""
     ratio = np.fmax(fits.whole / fits.whole_limit, fits.core / fits.core_limit)
     if np.any(np.isfinite(ratio) & (ratio > 0.0)):
-        says = f"reduced chi-square over its limit; false-alarm rate {SPOT_ALARM:g} a fit; beyond 1 sigma is widened"
+        says = f"reduced chi-square over its limit; false-alarm rate {SPOT_ALARM:g} per fit; above 1, sigma is widened"
         yield SelfCheck(f"fit of the {what}", float(np.nanmax(ratio)), 1.0, "of the limit", says)
 
 
@@ -342,7 +342,7 @@ def stated_check(name: str, told: Consistency) -> SelfCheck:
     told : Consistency
         Test of the shifts against the prior.
     """
-    says = f"chi-square of {told.degrees} degrees; false-alarm rate {told.false_alarm:.2g}; a warning beyond it"
+    says = f"chi-square for {told.degrees} degrees of freedom; false-alarm rate {told.false_alarm:.2g}; else a warning"
     return SelfCheck(name, told.chi_square, told.limit, "", says)
 
 
@@ -406,7 +406,7 @@ def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
         elif isinstance(value, float) and key.endswith(_SIGMAS):
             out[key] = _to_digits(value)
         elif isinstance(value, float) and isinstance(sigma, float) and 0.0 < sigma < math.inf:
-            # adding 0.0 turns a negative zero into a plain one
+            # adding 0.0 turns a negative zero into a positive one
             out[key] = round(value, STATED - math.floor(math.log10(sigma))) + 0.0
         else:
             out[key] = value

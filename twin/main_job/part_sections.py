@@ -32,7 +32,7 @@ from twin.targets.target_images import DIRECTION_NAMES, DIRECTIONS
 from twin.targets.target_measurement import NYQUIST, BarReading, CameraTargets, EdgeReading, TargetRun
 
 _WHEN = ("before", "after")
-FREE = "the pupils are free: `obstruction: ignore`"
+FREE = "obstruction by bodies is ignored: `obstruction: ignore`"
 
 
 def quality_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
@@ -49,13 +49,13 @@ def quality_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
         bands[len(rows)] = f"Camera {name}, MTF with light of {light}, Nyquist {nyquist} cycles/mm"
         rows += _quality_rows(name, camera, quality)
     bodies = "; ".join(f"in {name} {', '.join(camera.bodies) or 'nothing'}" for name, camera in quality.cameras.items())
-    taken = f"What stands in the beams is missing in the pupils: {bodies}." if quality.obstruction else ""
+    taken = f"The pupils include the obstruction by bodies in the beams: {bodies}." if quality.obstruction else ""
     caption = (
-        "Of the light that reaches fixed pixels of each line CCD, at its middle and at its left (+Y′) and right end. "
+        "At fixed pixels of each line CCD, at its middle and at its left (+Y′) and right end. "
         f"Wavefront errors are rms over the pupil at {plain(1e9 * quality.wavelength)} nm, without piston and tilt. "
-        "Best focus counts along the light: + lies behind the CCD. The MTF is that of the traced pupil over the named "
-        "light, with the pixel and, where the camera describes them, charge diffusion and TDI. "
-        f"{taken or f'{FREE[0].upper()}{FREE[1:]} leaves out what stands in the beams.'} Means and worst: "
+        "Best focus is counted along the light: + is behind the CCD. The MTF is that of the traced pupil over the "
+        "named light, with the pixel and, where the camera describes them, charge diffusion and TDI. "
+        f"{taken or f'{FREE[0].upper()}{FREE[1:]}.'} Means and worst values: "
         f"`quality.json`. The CSV has all {len(quality.fields)} fields."
     )
     parts: list[Artefact] = [
@@ -73,13 +73,13 @@ def quality_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
     ]
     if quality.obstruction:
         caption = (
-            "Pupils as three places of each line CCD see them, in units of their mean radius, and the light that is "
-            "lost before → after. Dark: shadows of what stands in the beam, before; orange: after."
+            "Pupils seen from three places of each line CCD, in units of their mean radius, and the light that is "
+            "lost before → after. Dark: shadows of bodies in the beam, before; orange: after."
         )
         parts.append(figure(drawn, "pupils", caption))
     share, where, change = sharpness_lost(quality)
-    lost = f"At most {significant(100.0 * share, 2, floor=0.0)} % of the MTF at Nyquist are lost, {where}: {change}."
-    lost = lost if share > 0.0 else "The perturbation takes nothing of the MTF at Nyquist."
+    lost = f"The MTF at Nyquist falls by at most {significant(100.0 * share, 2, floor=0.0)} %, {where}: {change}."
+    lost = lost if share > 0.0 else "The perturbation does not lower the MTF at Nyquist."
     return Section("Image quality", (lost,), tuple(parts), name="quality")
 
 
@@ -124,10 +124,10 @@ def target_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
     images = run.resolved.job.render.target_images
     kinds = [kind for kind, image in (("edge", "knife_edge"), ("bars", "bars")) if image in images]
     about = (
-        "Targets at infinity stand still in the directions that three places of each line CCD see in the nominal "
+        "Targets at infinity are fixed in the directions that three places of each line CCD see in the nominal "
         "state. Their images are rendered through the traced pupil, over the band, with pixel, charge diffusion and "
         f"TDI; {targets.frames} frames each, bright areas at {plain(100.0 * run.resolved.targets.white)} % of the full "
-        f"well{', less what bodies in the beams take' if targets.obstruction else f'; {FREE}'}."
+        f"well{', less the light that bodies in the beams block' if targets.obstruction else f'; {FREE}'}."
     )
     if kinds:
         methods = ", ".join(METHODS[kind] for kind in kinds)
@@ -144,14 +144,14 @@ def target_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
             caption += (
                 " Lines: traced pupil and detector. Dots: measured in the images of the knife edge"
                 f"{squares}. Below each panel measured − true of the edge in thousandths, with bands of ±2 σ of the "
-                "noise; where the MTF itself vanishes, noise can only lengthen it. Dotted: Nyquist frequency."
+                "noise; where the MTF vanishes, noise can only increase it. Dotted: Nyquist frequency."
             )
         parts.append(figure(drawn, f"mtf {name}", caption, count=k))
     for k, name in enumerate(targets.cameras):
         caption = (
             f"Camera {name}: mean of {targets.frames} frames, columns along the line (+Y′ to the right), rows along "
             "the track (+X′ downward), grey from the darkest to the brightest pixel of each image, in proportion to "
-            "the signal where not said otherwise. The window follows the image by whole pixels. Files: "
+            "the signal unless noted. The window follows the image by whole pixels. Files: "
             f"`images/{name}_PLACE_TARGET_before.tiff` and `…_after.tiff`."
         )
         title = f"Images of the targets, camera {name}"
@@ -182,12 +182,11 @@ def _mtf_table(targets: TargetRun, kinds: list[str]) -> Table:
     amount = f"at most {significant(max(known), 2, floor=0.0)}" if known else "an unknown amount"
     caption = f"Below each value: (measured − true) in units of σ, ● within {FAR:g} σ, ▲ beyond."
     if "edge" in kinds:
-        caption += f" At Nyquist noise lengthens the knife edge's values by {amount} on the average, not corrected."
+        caption += f" At Nyquist, noise biases the knife edge's values by {amount} on average, which is not corrected."
     if "bars" in kinds:
         caption += (
-            " Bars are tilted at the Nyquist frequency; the levels to which their fundamental is referred are frames "
-            "with the shutter closed and of even light, for in an area beside them the tails of diffraction take a per "
-            "cent of the contrast."
+            " Bars are tilted at the Nyquist frequency; their fundamental is normalised by frames with the shutter "
+            "closed and of uniform light, since in an area beside the bars diffraction tails lower the contrast by 1 %."
         )
     heads = ["camera", "band", "place", "direction", "state", "target", "MTF at Nyquist", "sigma", "true"]
     heads += ["along the line [cycles/px]", "along the track [cycles/px]", "true on the axis"]
@@ -259,10 +258,10 @@ def stray_section(run: RenderRun) -> Section | None:
     parts: list[Artefact] = [
         Table(
             "stray-families",
-            "Strongest families on the CCD of their own channel; x, y from its middle",
-            "A ghost is named by the reflections at faces that nominal light passes, and how many they are. All "
+            "Strongest families on the CCD of their source's channel; x, y from its middle",
+            "A ghost is named by its reflections at faces that nominal light passes, and their number. All "
             "families, surface by surface: `stray.json` and the CSV.",
-            ("Area CCD", "kind", "what happens", "share", "x [µm]", "y [µm]"),
+            ("Area CCD", "kind", "events", "share", "x [µm]", "y [µm]"),
             families,
             within=IN_PAGE,
             full=FAMILY.table("stray_families", "Families", "", full, keys),
@@ -280,24 +279,23 @@ def stray_section(run: RenderRun) -> Section | None:
         Table(
             "stray_surfaces",
             "Surface by surface",
-            "Surfaces in order: > through the face, without mark reflected, * scattered, ~ diffused, ! outside of the "
-            "clear aperture.",
-            ("Area CCD", "what happens", "surfaces in order"),
+            "Surfaces in order: > transmitted, no mark reflected, * scattered, ~ diffused, ! outside the clear "
+            "aperture.",
+            ("Area CCD", "events", "surfaces in order"),
             surfaces,
             within=IN_PAGE,
         ),
     ]
     taken: list[list[Cell]] = [[o.body, o.beam, 100.0 * o.share, 100.0 * o.used] for o in run.stray.obstructions]
     if taken:
-        heads = ["prism", "beam", "takes [%]", "of it used by its channel [%]"]
-        title = "Prisms that stand in a beam, nominal instrument: what they take of its cross-section"
+        heads = ["prism", "beam", "blocked [%]", "of this used by its channel [%]"]
+        title = "Prisms that block part of a beam's cross-section, nominal instrument"
         parts.append(Table("stray_prisms", title, "", heads, taken, (None, None, 1, 1), within=IN_PAGE))
     paths = f"{after.paths:,}".replace(",", "\N{THIN SPACE}")
     about = (
         f"{paths} paths from every pinhole through the perturbed instrument, each identified by the surfaces that it "
-        "met. "
-        "The nominal path is the spot itself. All other light is part of the images and listed here, relative to the "
-        "spot."
+        "met. The nominal path is the spot itself. All other light is part of the images and listed here, relative to "
+        "the spot."
     )
     return Section("Ghosts and stray light", (about,), tuple(parts), len(parts) - 2, "stray")
 
@@ -327,8 +325,14 @@ def finish_section(run: RenderRun) -> Section | None:
                 total = scatter.table.total(float(angle))
                 unequal: Cell = "" if np.isnan(rms) else 100.0 * rms
                 rows.append((kind, float(np.degrees(angle)), 100.0 * total, 100.0 * stated, unequal))
-        heads = ("surfaces", "incidence [deg]", "total scatter [%]", "stated by the file [%]", "not reciprocal [% rms]")
-        text = "Of the incident light: the integral of the table, which is what paths scatter."
+        heads = (
+            "surfaces",
+            "incidence [deg]",
+            "total scatter [%]",
+            "specified in the file [%]",
+            "not reciprocal [% rms]",
+        )
+        text = "Shares of the incident light. Total scatter is the integral of the table, which the paths use."
         tables.append(Table("finish_scatter", "Measured scattering", text, heads, rows, (), 4))
     if measured.coatings:
         coats: list[tuple[Cell, ...]] = []
@@ -341,7 +345,7 @@ def finish_section(run: RenderRun) -> Section | None:
         columns = ("surfaces", "incidence in air [deg]", "reflected [%]", "transmitted [%]")
         text = "At the monitor's wavelength, for unpolarised light."
         tables.append(Table("finish_coatings", "Measured coatings", text, columns, coats, (), 4))
-    about = "Finishes by tables that somebody measured; all others are built in."
+    about = "Surfaces with measured scatter or coatings; all others have built-in finishes."
     return Section("Measured finishes", (about,), tuple(tables), 1)
 
 
@@ -363,7 +367,7 @@ def deformation_section(run: JobRun) -> Section | None:
 
     motion = "nodes", "nodes_not_used", "spacing_mm", "rotate_arcsec", "shift_um", "growth_ppm"
     heads = ["body", "nodes", "not used", "spacing [mm]", *(f"rotate {axis} [arcsec]" for axis in "xyz")]
-    heads += [*(f"shift {axis} [µm]" for axis in "xyz"), "growth [ppm]"]
+    heads += [*(f"shift {axis} [µm]" for axis in "xyz"), "scale [ppm]"]
     sizes = "change_rms_nm", "change_pv_nm", "residual_rms_nm", "residual_pv_nm", "not_carried_rms_nm"
     left = ["body", "change [nm rms]", "PV [nm]", "after Zernike [nm rms]", "PV [nm]", "after grid [nm rms]"]
     found = {path: BENT(face) for path, face in run.deformed.items()}
@@ -376,31 +380,31 @@ def deformation_section(run: JobRun) -> Section | None:
     parts = (
         Table(
             "deformation_motion",
-            "Rigid motion and growth",
-            "In the body's own nominal axes, about its origin. Nodes off the optical surface are not used.",
+            "Rigid motion and scale",
+            "In the body's nominal axes, about its origin. Nodes off the optical surface are not used.",
             heads,
             [[path, *_flat(told, *motion)] for path, told in found.items()],
             digits=5,
         ),
         Table(
             "deformation_figure",
-            "Change of sag, and what each step leaves",
+            "Change of sag, and residuals of the fits",
             "Over the clear aperture.",
-            [*left, "nodes left out [nm rms]"],
+            [*left, "cross-validation [nm rms]"],
             [[path, *_flat(told, *sizes, "between_nodes_rms_nm")] for path, told in found.items()],
             digits=4,
         ),
         SvgFigure(
             "deformation_maps",
             "Maps of the change of sag",
-            "At the nodes: beyond the rigid motion, after the Zernike terms, and what the grid does not carry. White "
-            "is zero; every map has its own scale.",
+            "At the nodes: without the rigid motion, after the Zernike terms, and after the grid. White is zero; every "
+            "map has its own scale.",
             deformation_svg(run.deformed),
         ),
         Table(
             "deformation_terms",
             "Zernike terms",
-            f"Noll's numbering, rms over the disk; those of {plain(1e9 * NAMED)} nm and more.",
+            f"Noll's numbering, rms over the disk; terms of at least {plain(1e9 * NAMED)} nm.",
             ("body", "term", "amplitude [nm]"),
             terms,
             digits=5,
@@ -416,7 +420,7 @@ def heat_section(run: JobRun) -> Section | None:
     keys = ["nodes", "spacing_mm", "linear_change_k", "linear_gradient_k_per_m"]
     keys += ["not_linear_rms_k", "not_linear_largest_k", "between_nodes_rms_k"]
     heads = ["body", "nodes", "spacing [mm]", "change [K]", *(f"gradient {axis} [K/m]" for axis in "xyz")]
-    heads += ["not linear [K rms]", "largest [K]", "nodes left out [K rms]", "outside [%]", "farthest [mm]"]
+    heads += ["not linear [K rms]", "largest [K]", "cross-validation [K rms]", "outside [%]", "farthest [mm]"]
     rows: list[list[Cell]] = []
     for path, told in ((path, WARMED(body)) for path, body in run.heated.items()):
         share = told["outside_share"]
@@ -431,15 +435,15 @@ def heat_section(run: JobRun) -> Section | None:
         for face, change in body.faces.items()
     ]
     caption = (
-        "Changes from the instrument's temperature. Outside: share of the body's volume beyond the nodes; farthest "
-        "from any node. Nodes left out: how well every second one is foretold by the others."
+        "Changes from the instrument's temperature. Outside: share of the body's volume beyond the nodes; farthest: "
+        "largest distance from any node. Cross-validation: error of every second node, interpolated from the others."
     )
-    title = "Temperatures, and what of them is linear"
+    title = "Temperatures, and their linear part"
     tables = [Table("temperature_tables", title, caption, heads, rows, digits=4)]
     if faces:
-        caption = "In the face's own nominal axes. Coarser elements: by how much these would differ."
+        caption = "In the face's nominal axes. Coarser elements: the difference that coarser finite elements make."
         heads = ["face", "rotate x [arcsec]", "rotate y [arcsec]", "shift z [nm]", "figure [nm rms]"]
         heads += ["not carried [nm rms]", "coarser elements [nm rms]"]
-        title = "What is not linear does to optical faces"
+        title = "Effect of the nonlinear part on optical faces"
         tables.append(Table("temperature_faces", title, caption, heads, faces, digits=4))
-    return Section("Bodies warmed by tables", (), tuple(tables), 1)
+    return Section("Bodies with tabulated temperatures", (), tuple(tables), 1)

@@ -59,7 +59,7 @@ def run_render(resolved: ResolvedJob, session: Session, frames: int | None, seed
     InputError
         The job's perturbation or its targets are not possible.
     """
-    # a second thread of linear algebra would wait for a core that the second process has
+    # a second thread of linear algebra would compete with the second process for a core
     with SecondProcess(load_drawing) as beside, one_blas_thread():
         begin = partial(begin_drawing, beside)
         run = render_job(resolved, session.backend, frames, seed, session.advance, placed=begin)
@@ -111,7 +111,7 @@ def _print_result(run: JobRun, console: Console) -> None:
 def _mtf_table(targets: TargetRun) -> Table | None:
     """Return the table of MTF at Nyquist from the knife edges, before -> after (true); None if there are none."""
     title = f"MTF at the Nyquist frequency from the knife edge ({targets.frames} frames)"
-    title += "\nbefore -> after, below it the true one"
+    title += "\nbefore -> after, true values below"
     table = result_table(title)
     for head in ("", *TARGET_PLACES):
         table.add_column(head, no_wrap=True)
@@ -183,7 +183,7 @@ def _table(run: RenderRun, wide: bool) -> Table:
             group = own.where
             table.add_row(f"[bold]{escape(group)}[/]")
         values = [own.true, *(row.value for row in same), own.sigma, *([own.noise] if wide else [])]
-        # adding 0.0 after rounding leaves no minus before a zero
+        # adding 0.0 after rounding avoids a negative zero
         cells = [_DASH if math.isnan(value) else f"{round(value, p.decimals) + 0.0:.{p.decimals}f}" for value in values]
         tail = [f"{own.error:+.{p.decimals}f}", f"{round(own.ratio, 1) + 0.0:+.1f}"]
         if math.isnan(own.sigma):

@@ -46,7 +46,7 @@ def write_results(run: JobRun, folder: RunFolder) -> None:
     folder : RunFolder
         Open run folder.
     """
-    # TIFF and netCDF are made in memory: on a full disk NumPy's writer does not say why, and HDF5 crashes the process
+    # TIFF and netCDF are made in memory: on a full disk NumPy's writer gives no reason, and HDF5 crashes the process
     folder.write_text("config.yaml", config_text(run.resolved))
     for (path, kind), name in table_names(run.resolved.job).items():
         given = getattr(run.resolved.job.perturb[path], kind)
@@ -117,7 +117,7 @@ def _write_targets(targets: TargetRun, folder: RunFolder) -> None:
             folder.write_bytes(file, content)
 
 
-_WAVELENGTH = {"units": "m", "standard_name": "radiation_wavelength", "long_name": "of the light in vacuum"}
+_WAVELENGTH = {"units": "m", "standard_name": "radiation_wavelength", "long_name": "wavelength of the light in vacuum"}
 
 
 def irradiance(run: RenderRun) -> GridData:
@@ -128,7 +128,7 @@ def irradiance(run: RenderRun) -> GridData:
     if run.stray is None:
         return images
     stray = np.stack([run.stray.before.photons, run.stray.after.photons])
-    about = {"units": "photons", "long_name": "of these, ghosts and stray light"}
+    about = {"units": "photons", "long_name": "part of the photons from ghosts and stray light"}
     apart: Gridded = (("state", "channel", "row", "column"), stray, about)
     return replace(images, variables={**images.variables, "stray_photons": apart})
 
@@ -210,42 +210,42 @@ def config_text(resolved: ResolvedJob) -> str:
 
 
 BENT: Record[NodalDeformation] = Record(
-    "What a table of displaced nodes was found to be.",
+    "Deformation of an optical face by a table of displaced nodes.",
     Quantity("nodes", lambda face: len(face.weight), "nodes on the optical surface"),
     Quantity("nodes_not_used", lambda face: face.others, "nodes off the optical surface"),
     Quantity("spacing_mm", lambda face: face.spacing, "distance of neighbouring nodes"),
     Quantity("rotate_arcsec", lambda face: face.rotate, "rigid rotation about X, Y and Z"),
     Quantity("shift_um", lambda face: face.shift, "rigid shift along X, Y and Z"),
-    Quantity("growth_ppm", lambda face: face.growth, "relative growth"),
-    Quantity("change_rms_nm", lambda face: face.rms(face.change), "change of sag beyond rigid motion and growth"),
+    Quantity("growth_ppm", lambda face: face.growth, "relative change of size"),
+    Quantity("change_rms_nm", lambda face: face.rms(face.change), "change of sag without rigid motion and scale"),
     Quantity("change_pv_nm", lambda face: face.range(face.change), "peak to valley of that change"),
     Quantity("figure_nm", lambda face: {f"Z{j}": a for j, a in face.figure.items()}, "Zernike terms of the change"),
-    Quantity("residual_rms_nm", lambda face: face.rms(face.residual), "what the Zernike terms leave"),
-    Quantity("residual_pv_nm", lambda face: face.range(face.residual), "peak to valley of what they leave"),
-    Quantity("not_carried_rms_nm", lambda face: face.rms(face.lost), "what the grid of the rest does not carry"),
-    Quantity("between_nodes_rms_nm", lambda face: face.between, "error of nodes that are foretold by the others"),
+    Quantity("residual_rms_nm", lambda face: face.rms(face.residual), "residual of the Zernike terms"),
+    Quantity("residual_pv_nm", lambda face: face.range(face.residual), "peak to valley of that residual"),
+    Quantity("not_carried_rms_nm", lambda face: face.rms(face.lost), "residual of the grid"),
+    Quantity("between_nodes_rms_nm", lambda face: face.between, "error of nodes interpolated from the others"),
     Quantity(
-        "mesh_prints_through", lambda face: face.printed_through, "whether what is left changes from node to node"
+        "mesh_prints_through", lambda face: face.printed_through, "true if the residual changes from node to node"
     ),
 )
 _WARMED_FACE: Record[HeatedFace] = Record(
-    "What temperatures that are not linear do to an optical face, in its own nominal axes.",
+    "Effect of the nonlinear part of a temperature field on an optical face, in its nominal axes.",
     Quantity("rotate_arcsec", lambda face: face.motion.rotate, "rotation about X, Y and Z"),
     Quantity("shift_nm", lambda face: face.motion.shift, "shift along X, Y and Z"),
-    Quantity("growth_ppm", lambda face: face.motion.expansion, "relative growth"),
+    Quantity("growth_ppm", lambda face: face.motion.expansion, "relative change of size"),
     Quantity("figure_nm", lambda face: {f"Z{j}": a for j, a in face.motion.figure.items()}, "Zernike terms of its sag"),
-    Quantity("not_carried_rms_nm", lambda face: face.lost, "what the Zernike terms do not carry"),
-    Quantity("coarser_elements_rms_nm", lambda face: face.unmeshed, "by how much coarser finite elements differ"),
+    Quantity("not_carried_rms_nm", lambda face: face.lost, "residual of the Zernike terms"),
+    Quantity("coarser_elements_rms_nm", lambda face: face.unmeshed, "difference that coarser finite elements make"),
 )
 WARMED: Record[HeatedBody] = Record(
-    "What a table of temperatures was found to be.",
+    "Temperature field of a body by a table of nodes.",
     Quantity("nodes", lambda body: body.nodes, "nodes of the table"),
     Quantity("spacing_mm", lambda body: body.spacing, "distance of neighbouring nodes"),
     Quantity("linear_change_k", lambda body: body.linear.change, "change at the body's origin of the linear field"),
     Quantity("linear_gradient_k_per_m", lambda body: body.linear.gradient, "gradient of the linear field"),
-    Quantity("not_linear_rms_k", lambda body: body.left[0], "what the linear field leaves, RMS over the volume"),
-    Quantity("not_linear_largest_k", lambda body: body.left[1], "what it leaves at most"),
-    Quantity("between_nodes_rms_k", lambda body: body.between, "error of nodes that are foretold by the others"),
+    Quantity("not_linear_rms_k", lambda body: body.left[0], "residual of the linear field, RMS over the volume"),
+    Quantity("not_linear_largest_k", lambda body: body.left[1], "largest residual of the linear field"),
+    Quantity("between_nodes_rms_k", lambda body: body.between, "error of nodes interpolated from the others"),
     Quantity(
         "outside_share",
         lambda body: None if body.coverage is None else body.coverage.outside,
@@ -256,7 +256,7 @@ WARMED: Record[HeatedBody] = Record(
         lambda body: None if body.coverage is None else body.coverage.farthest,
         "largest distance of the body from any node",
     ),
-    Quantity("index_path_not_carried_nm", lambda body: body.index_path, "optical path that no linear index carries"),
+    Quantity("index_path_not_carried_nm", lambda body: body.index_path, "optical path error of a linear index field"),
     Quantity("faces", lambda body: body.faces, "its optical faces", record=_WARMED_FACE),
 )
 
@@ -287,20 +287,20 @@ def deformation_warnings(faces: Mapping[str, NodalDeformation], planes: Collecti
     """
     bent = {path: 1e9 * faces[path].rms(faces[path].change) for path in planes}
     out = [
-        f"{path}: stray light takes faces of glass as planes, without the {size:.3g} nm rms by which its table bends it"
+        f"{path}: stray light treats faces of glass as planes, without the {size:.3g} nm rms of the face's table"
         for path, size in bent.items()
     ]
     for path, face in faces.items():
         rest, between, lost = (1e9 * value for value in (face.rms(face.residual), face.between, face.rms(face.lost)))
         if face.printed_through:
             out.append(
-                f"{path}: the mesh prints through: nodes left out are foretold to {between:.3g} nm rms only, of a "
-                f"residual of {rest:.3g} nm after Z{max(face.figure)}; it changes from node to node "
-                f"({1e3 * face.spacing:.3g} mm), so refine the mesh, or doubt what the residual does to images"
+                f"{path}: the mesh is too coarse for the residual of {rest:.3g} nm after Z{max(face.figure)}: it changes "
+                f"from node to node ({1e3 * face.spacing:.3g} mm), and nodes are interpolated from the others to "
+                f"{between:.3g} nm rms only; refine the mesh, or do not rely on the residual's effect on images"
             )
         if face.rms(face.lost) > max(SEEN, PRINTED * face.rms(face.residual)):
             out.append(
-                f"{path}: {lost:.3g} nm rms of the surface's change are finer than its grid and not carried; "
-                "give the nodes of the clear aperture alone, or fewer"
+                f"{path}: {lost:.3g} nm rms of the surface's change are finer than its grid and are not modelled; "
+                "give only the nodes of the clear aperture, or fewer nodes"
             )
     return tuple(out)

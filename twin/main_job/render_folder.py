@@ -85,7 +85,7 @@ def write_run(run: JobRun, session: Session, picture: bool = False, beside: Seco
     sections = [section for section in (deformation_section(run), heat_section(run)) if section is not None]
     drawn, missing = without_failed(beside.results())
     if isinstance(run, RenderRun):
-        from twin.uncertainty.uncertainty_report import limits_section  # what draws takes long to import
+        from twin.uncertainty.uncertainty_report import limits_section  # slow to import
 
         finishes = finish_section(run)
         sections += [*(() if finishes is None else (finishes,)), limits_section(run.limits, figure=drawn.get(LIMITS))]
@@ -112,21 +112,21 @@ def _pictures(run: JobRun, session: Session) -> str:
     write = session.folder.write_with
     try:
         write_pictures(run.experiment.instrument, session.backend, run.state, write, run.seed, session.advance)
-    except PictureError as error:  # what took minutes to compute is not thrown away for a picture
-        return f"the pictures are not complete: {error}"
+    except PictureError as error:  # a failed picture must not cost the computed results
+        return f"the pictures are incomplete: {error}"
     return ""
 
 
 _PICTURES = {
     "picture.png": "The instrument",
-    "picture_prisms.png": "The central prism and what is next to it",
+    "picture_prisms.png": "The central prism and its surroundings",
     "picture_focal_plane.png": "The detectors of the first camera",
 }
 """Captions of the rendered pictures."""
 _JPEG_QUALITY = 88
 AGAIN = (
-    "The run folder's own config.yaml holds everything that was resolved; with the same versions it gives the same "
-    "images bit by bit."
+    "The config.yaml of the run folder is complete, with all references resolved; with the same versions of the "
+    "software it gives identical images."
 )
 
 
@@ -193,13 +193,13 @@ def render_report(
 
 
 SIDE = (
-    "Side view in the base frame. The cameras' planes of symmetry are parallel to it. The line CCDs stand square to "
-    "the page; a focal plane is drawn wider than it is."
+    "Side view in the base frame, parallel to the cameras' planes of symmetry. The line CCDs are perpendicular to the "
+    "page; a focal plane is drawn wider than it is."
 )
 BEAMS = (
     " Monitor beams leave a pinhole beside an area CCD, go back "
-    "through the mirrors and the 180° and the 0° reflector to a mirror facet of the central prism and return the same "
-    "way; channels at both ends of the line lie in front of each other."
+    "through the mirrors and the 180° and the 0° reflector to a mirror facet of the central prism and return along "
+    "the same path; channels at both ends of the line coincide in this view."
 )
 ARROWS = " Arrows: lines of sight."
 
@@ -220,7 +220,7 @@ def _light(drawn: Mapping[str, str], monitored: bool) -> Section:
     )
     caption += (
         "; the monitor's beams, limited by the return face, use a small part off the middle, out and back. A wavefront "
-        "or focus error over that part moves the spot, which is why defocus reads as a rotation."
+        "or focus error over that part moves the spot, so that defocus is read as a rotation."
         if monitored
         else "."
     )

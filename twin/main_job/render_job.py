@@ -64,7 +64,7 @@ TARGETS = "render the targets"
 QUALITY = "image quality"
 """Progress label of a long part: image quality."""
 
-_FREE_PUPILS = "obstruction: ignore: image quality and targets are those of free pupils, whatever stands in the beams"
+_FREE_PUPILS = "obstruction: ignore: image quality and targets do not include obstruction by bodies in the beams"
 """Warning of a job that ignores obstructions."""
 
 MIN_LIGHT = 0.5
@@ -134,7 +134,7 @@ def render_job(
     shown = 0 if course is None else course.shown
     state = states[shown]
     if placed is not None:
-        with suppress(*LOST):  # what light does not get through is said in its place below
+        with suppress(*LOST):  # lost light is reported in its place below
             placed(experiment.instrument, backend, state)
     stage.begin(2)
     try:
@@ -223,15 +223,15 @@ def require_one_state(resolved: ResolvedJob) -> None:
     """
     job = resolved.job
     for asked, key, what in (
-        (job.course is not None, ("course",), "a course is followed by the monitor's spots"),
+        (job.course is not None, ("course",), "a course is measured with the monitor's spots"),
         (job.render.stray is not None, ("render", "stray"), "stray light is traced to the monitor's area CCDs"),
-        (job.disturbances is not None, ("disturbances",), "sigmas on disturbances are those of a monitor's readings"),
+        (job.disturbances is not None, ("disturbances",), "a prior on disturbances applies to a monitor's readings"),
     ):
         if asked:
-            allowed = "without it: the job's one state, with image quality and targets; or an instrument with a monitor"
+            allowed = "a job without this key, with image quality and targets; or an instrument with a monitor"
             if key == ("course",):
                 allowed = (
-                    "a study, which works out every row of a table as a state, with image quality: factors such as "
+                    "a study, which computes every row of a table as a state, with image quality: factors such as "
                     "`M2_z: {motion: M2 shift z, table: {file: course.csv, column: M2_z}}` and design: {kind: grid}, "
                     "by python -m twin.study; or an instrument with a monitor"
                 )
@@ -366,7 +366,7 @@ def _stray_warnings(experiment: MonitorExperiment, stray: StrayPair) -> Iterator
     for o in stray.obstructions:
         own = prism_of(o.body) == PRISM_180 and o.beam == f"{o.body.split('/')[1]}/imaging"
         if o.used == 0.0 and not own:
-            yield f"{o.body} stands in the beam {o.beam} and takes {100.0 * o.share:.1f}% of it"
+            yield f"{o.body} blocks {100.0 * o.share:.1f} % of the beam {o.beam}"
     if stray.measured is not None:
         yield from stray.measured.warnings()
     yield from ghost_warnings(experiment, stray.before)
@@ -385,9 +385,9 @@ def _too_large(resolved: ResolvedJob, reason: str) -> InputError:
     if resolved.job.course is not None:
         return too_large(resolved.job, resolved.job.course.shown, reason)
     moved = ", ".join(resolved.job.perturb) or "nothing"
-    allowed = "motions that keep the beams on the mirrors and the spots on their CCDs; make them smaller"
+    allowed = "smaller motions, which keep the beams on the mirrors and the spots on their CCDs"
     if any(what.deformation is not None for what in resolved.job.perturb.values()):
-        allowed += "; with a table of displaced nodes that ripples, no image quality and no targets"
+        allowed += "; with a table of rippled nodes, a job without image quality and targets"
     return resolved.job.error(
         f"the perturbed instrument cannot be rendered: {reason}",
         ("perturb",),
@@ -399,10 +399,10 @@ def _too_large(resolved: ResolvedJob, reason: str) -> InputError:
 def _no_spots(experiment: MonitorExperiment, reason: str) -> InputError:
     spec = experiment.resolved.instrument
     if spec.as_built:
-        text = f"the monitor does not work as the instrument is built, without any perturbation: {reason}"
+        text = f"the monitor of the instrument as built does not work, even without a perturbation: {reason}"
         return InputError(next(iter(spec.as_built.values())).issue(text, allowed=_mounted_facets(experiment)))
     return spec.error(
-        f"the monitor does not work even as designed, without any perturbation: {reason}",
+        f"the monitor does not work as designed, even without a perturbation: {reason}",
         ("monitor",),
         allowed="prism widths, angle_errors, pupil_offset, return_face.aperture and a sharp camera with which the "
         "beams pass the prisms twice, and an area_ccd (rows, columns, pitch) that the spots fall on",
@@ -411,14 +411,14 @@ def _no_spots(experiment: MonitorExperiment, reason: str) -> InputError:
 
 def _mounted_facets(experiment: MonitorExperiment) -> str:
     """Return the facet orientations with which the monitor of an instrument as built would work, as text."""
-    instrument, smaller = experiment.instrument, "bodies that stand nearer to the drawing"
+    instrument, smaller = experiment.instrument, "bodies closer to their design positions"
     try:
         turns = squared_facets(instrument, experiment.backend)
     except (MisplacedError, *LOST):
         return smaller
     bodies = {body.path: body for body in instrument.assembly.tree.bodies}
     stand = as_built_of(compose(instrument.as_built, turns, bodies))
-    return f"{smaller}; or facets turned as where they are mounted: {perturbation_text({path: stand[path] for path in turns})}"
+    return f"{smaller}; or facets aligned when mounted: {perturbation_text({path: stand[path] for path in turns})}"
 
 
 def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotError, focus: SpotFocus) -> InputError:
@@ -450,8 +450,8 @@ def _blurred(experiment: MonitorExperiment, focus: SpotFocus) -> tuple[str, ...]
             shift = model.focal_plane.rotation[2, 2] * focus.defocus[worst]
             out.append(
                 f"{name}: the spots of camera {model.spec.name} are out of focus as designed, "
-                f"{focus.error[worst]:.2g} waves rms in channel {channel}; they would be sharpest with image.z "
-                f"{1e3 * shift:+.3g} mm from where it is"
+                f"{focus.error[worst]:.2g} waves rms in channel {channel}; they are sharpest with image.z "
+                f"changed by {1e3 * shift:+.3g} mm"
             )
     return tuple(out)
 
@@ -472,5 +472,5 @@ def _warnings(
     for i, channel in enumerate(channels):
         share = float(photons[i].sum() / nominal[i].sum())
         if share < MIN_LIGHT:
-            out.append(f"{channel.key}: only {100 * share:.0f}% of the nominal light reaches the CCD")
+            out.append(f"{channel.key}: only {100 * share:.0f} % of the nominal light reaches the CCD")
     return tuple(out)

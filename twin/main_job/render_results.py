@@ -229,11 +229,13 @@ class RenderRun(JobRun):
         """Checks of images and readings, and of the energy balance of stray light."""
         out = [*self.experiment.path.checked.told(), *self.reading.checks]
         if self.worst_of_course is not None:
-            out.append(stated_check("worst time of the course against the statement", self.worst_of_course[1]))
+            out.append(
+                stated_check("worst time of the course against the prior on disturbances", self.worst_of_course[1])
+            )
         if self.stray is not None:
             for when, light in (("before", self.stray.before), ("after", self.stray.after)):
                 error = max((abs(path.balance.error) for path in light.traced.runs.values()), default=0.0)
-                says = "emitted light less what was absorbed, detected, escaped and given up"
+                says = "emitted light minus absorbed, detected, escaped and truncated light"
                 out.append(SelfCheck(f"balance of stray light {when}", error, None, "of the light", says))
         return tuple(out)
 

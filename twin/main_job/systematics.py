@@ -81,7 +81,7 @@ def _parts(run: RenderRun, camera: str, amounts: dict[str, np.ndarray]) -> dict[
     names = list(run.crosstalk)
     k = names.index(camera)
     gain = rows_of(run.reading.cameras[camera]) @ run.gains[run.judged][4 * k : 4 * k + 4]
-    # what weighs all motions by what is stated takes none of them as it is
+    # an estimator with a prior weighs all motions and reads none of them exactly
     known = 0 if run.estimators[run.judged].stated else _FAMILY
     out: dict[tuple[str, str, int], tuple[str, np.ndarray]] = {}
     own = {name: run.experiment.instrument.coordinates_of(name) for name in names}
@@ -93,7 +93,7 @@ def _parts(run: RenderRun, camera: str, amounts: dict[str, np.ndarray]) -> dict[
             part = (read - (table.true[:, i] if name == camera else 0.0)) * amounts[name][i]
             if not np.any(part):
                 continue
-            # what both cameras look at stands in both tables
+            # a body that both cameras see is in both tables
             key = (motion.body, motion.kind, motion.axis)
             told = _told(motion, amounts[name][i])
             told = told if name == camera or motion.body == CENTRAL_PRISM else f"{name}: {told}"
@@ -184,7 +184,7 @@ def perturbed_unseen(run: RenderRun) -> tuple[str, ...]:
     try:
         found = traced_states(run.experiment.path, run.experiment.sight, [{path: m} for path, m in moved.items()])
     except LOST:
-        # together with others the body may keep its light; alone there is nothing to be said
+        # the body may keep its light together with others; moved alone, no statement is possible
         return ()
     reading, stated = run.reading, run.reading.disturbances
     gain = run.gains[run.judged]
@@ -202,13 +202,13 @@ def perturbed_unseen(run: RenderRun) -> tuple[str, ...]:
         told = float(shift @ np.linalg.solve(spread, shift))
         if far[worst] < BLIND or (still > BLIND if stated is None else told > limit):
             continue
-        how = "moves no spot beyond its noise" if still < 1.0 else "moves the spots as likelier motions do"
+        how = "moves no spot beyond its noise" if still < 1.0 else "moves the spots as more probable motions do"
         unit = unit_text(every[worst])
         is_, read = (significant(float(rows[worst] @ value), 3) for value in (true, gain @ shift))
         out.append(
-            f"{path}: what is perturbed of it {how}; {short_text(every[worst])} changes by {is_} {unit} and {read} "
-            f"{unit} are read, wrong by {far[worst]:.1f} σ; neither σ nor a test of the shifts can show it: of this "
-            "body σ holds as far as its statement does"
+            f"{path}: its perturbation {how}; {short_text(every[worst])} changes by {is_} {unit} but is read as {read} "
+            f"{unit}, an error of {far[worst]:.1f} σ; neither σ nor the test of the shifts can show this: for this "
+            "body σ depends on the prior alone"
         )
     return tuple(out)
 
@@ -220,7 +220,7 @@ def _sigmas(rows: np.ndarray, stated: Disturbances | None, noise: np.ndarray, ga
     return np.sqrt(np.einsum("qd,de,qe->q", rows @ gain, noise, rows @ gain))
 
 
-_NOISE_ALONE = "No disturbances are stated: σ is that of the noise of the images alone"
+_NOISE_ALONE = "There is no prior on disturbances: σ contains the noise of the images only"
 """Sentence, without a full stop, for runs without a prior."""
 NOISE = "the noise of the images"
 """Name of the part of the variance that more frames lower."""
@@ -234,8 +234,8 @@ def assumed(reading: MonitorReading) -> str:
     agree = "agree with it" if found.agrees else "contradict it"
     return (
         f"σ: noise and the prior {stated.name}; the shifts {agree} (chi-square "
-        f"{significant(found.chi_square)} of {found.degrees} coordinates, limit {found.limit:.1f}, false-alarm rate "
-        f"{found.false_alarm:g}){_from_statement(reading)}"
+        f"{significant(found.chi_square)} for {found.degrees} degrees of freedom, limit {found.limit:.1f} at a "
+        f"false-alarm rate of {found.false_alarm:g}){_from_statement(reading)}"
     )
 
 
@@ -245,7 +245,7 @@ def _from_statement(reading: MonitorReading) -> str:
     if not shares:
         return ""
     ends = list(dict.fromkeys(plain(math.floor(1e3 * end) / 10.0, 4) for end in (min(shares), max(shares))))
-    return f"; {' to '.join(ends)} % of the variances come from the prior, not from the spots"
+    return f"; {' to '.join(ends)} % of the posterior variances is fixed by the prior: the spots cannot reduce it"
 
 
 def contradiction(run: RenderRun) -> tuple[str, ...]:
@@ -285,8 +285,8 @@ def _jumps_told(together: SmoothedCourse) -> tuple[str, ...]:
     if together.jumps is None:
         return ()
     if not together.jumps:
-        return (f"No jump was found (a false one with a chance of at most {together.jump_false_alarm:g}).",)
-    return tuple(f"The series says that {text}." for text in together.jump_texts())
+        return (f"No jump was detected (false-alarm probability at most {together.jump_false_alarm:g}).",)
+    return tuple(f"The series shows that {text}." for text in together.jump_texts())
 
 
 def _series_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
@@ -294,17 +294,17 @@ def _series_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
     what = f"Chi-square of all {len(times)} measurements is {found.chi_square:.4g}"
     if found.chance > 1.0 - FALSE_ALARM:
         return (
-            f"{what} where {found.degrees} are expected: the motions are smaller than the "
-            "prior, and the sigmas are too large."
+            f"{what} for {found.degrees} degrees of freedom: the motions are smaller than the prior expects, and the "
+            "sigmas are too large."
         )
     if found.agrees:
-        expected = f"{found.degrees} are expected, {found.limit:.4g} are the limit (chance {FALSE_ALARM:g})"
-        return f"{what}, in agreement with the prior: {expected}."
+        limit = f"limit {found.limit:.4g} at a false-alarm rate of {FALSE_ALARM:g}"
+        return f"{what} for {found.degrees} degrees of freedom, in agreement with the prior ({limit})."
     worst = int(np.argmax(together.innovations))
     return (
-        f"{what} where {found.degrees} are expected and {found.limit:.4g} are the limit (chance {FALSE_ALARM:g}): "
-        "the measurements contradict the prior, and the sigmas are not reliable. Look first at the measurement at "
-        f"{moment(float(times[worst]))}, which contributes {together.innovations[worst]:.3g} given those before it."
+        f"{what} for {found.degrees} degrees of freedom (limit {found.limit:.4g} at a false-alarm rate of "
+        f"{FALSE_ALARM:g}): the measurements contradict the prior, and the sigmas are not reliable. Look "
+        f"first at the measurement at {moment(float(times[worst]))}, which contributes {together.innovations[worst]:.3g} given those before it."
     )
 
 

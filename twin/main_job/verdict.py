@@ -161,12 +161,12 @@ def _nothing(run: RenderRun, found: tuple[Reading, ...], off: list[Reading]) -> 
         return f"Nothing was perturbed, and {_within(run, found, 'zero')}", _hidden(run, found)
     worst = max(off, key=lambda r: abs(r.ratio))
     chance = _chance(worst.ratio, len(found))
-    why = "look at the warnings and at the spots" if chance < FALSE_ALARM else "it is a chance event"
+    why = "check the warnings and the spots" if chance < FALSE_ALARM else "this is consistent with chance"
     return (
         f"Nothing was perturbed, but {len(off)} of {len(found)} readings of the {_told(run)} {_are(off)} beyond "
         f"{FAR:g} σ",
-        f"the worst is {worst.name}, {worst.read}, which chance alone causes in {100.0 * chance:.2g} % of such runs: "
-        f"{why}",
+        f"the worst is {worst.name}, {worst.read}; chance alone causes such a reading in {100.0 * chance:.2g} % of "
+        f"such runs: {why}",
     )
 
 
@@ -279,8 +279,8 @@ def _cause(run: RenderRun, worst: Reading, count: int) -> str:
     bias = sum(float(w @ found[name].bias[run.judged][:4]) for name, w in zip(cameras, weights, strict=True))
     chance = _chance(worst.ratio, count)
     if chance > FALSE_ALARM and abs(bias) < 0.5 * abs(worst.error):
-        advice = "look at more frames" if _noise_only(run) else "look at more measurements"
-        return f"chance alone does as much in {100.0 * chance:.2g} % of such runs, so {advice}"
+        advice = "take more frames" if _noise_only(run) else "take more measurements"
+        return f"chance alone causes such an error in {100.0 * chance:.2g} % of such runs: {advice} to decide"
     parts: dict[str, float] = {}
     for name in used:
         for text, vector in found[name].parts.items():
@@ -295,7 +295,7 @@ def _cause(run: RenderRun, worst: Reading, count: int) -> str:
                 f"{most} a motion {_unknown(run)} ({text}), read as {worst.parameter.symbol} by "
                 f"{worst.shown(part, sign=True)} {worst.parameter.unit}; more frames do not reduce it: see Crosstalk"
             )
-        return f"motions {_unknown(run)} add up to it ({_largest(parts)}): see Crosstalk"
+        return f"motions {_unknown(run)} cause it together ({_largest(parts)}): see Crosstalk"
     uncovered = joined([name for camera in used for name in found[camera].uncovered])
     if uncovered and run.estimators[run.judged].stated:
         return f"{uncovered} contribute, which the crosstalk table does not contain: see Residuals"
@@ -364,7 +364,7 @@ def _dimmed(run: RenderRun) -> str:
     if not lost:
         return ""
     names = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in lost)
-    return f"light is lost on the way ({names} of the nominal light arrive)"
+    return f"spots have lost light ({names} of the nominal light)"
 
 
 def sharpness_lost(quality: ImageQuality) -> tuple[float, str, str]:
@@ -414,8 +414,8 @@ def _unstated(run: RenderRun, found: tuple[Reading, ...], told: tuple[str, ...])
     stated = run.experiment.stated
     who = "there is no prior" if stated is None else f"the prior {stated.name} expects less"
     return (
-        f"σ does not hold for {joined([r.name for r in off])}: the job moves {largest}{more}, but {who}; a measurement "
-        "of such an instrument would not show it",
+        f"σ does not hold for {joined([r.name for r in off])}: the job moves {largest}{more}, but {who}; a real "
+        "measurement would not show this",
     )
 
 

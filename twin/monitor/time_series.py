@@ -100,7 +100,9 @@ class TimeSeries:
         It is False at all times if the measurements together contradict the prior or its time laws.
         """
         agrees = self.agrees & (self.smoothed is None or self.smoothed.consistency.agrees)
-        return agrees & np.all([self.evidence.holds, *(found.holds for found in self.curvature.values())], axis=0)
+        return agrees & np.all(
+            [self.evidence.holds, *(curvature.holds for curvature in self.curvature.values())], axis=0
+        )
 
     def doubts(self, spots: Sequence[str]) -> tuple[str, ...]:
         """Return statements on invalid sigmas and on readings recomputed because of nonlinearity, without full stops.
@@ -111,20 +113,20 @@ class TimeSeries:
             Names of the spots.
         """
         out = [] if self.smoothed is None else list(self.smoothed.contradiction)
-        told = self.evidence.course_doubt([moment(time) for time in self.times.tolist()], spots)
-        if told is not None:
-            out.append(f"course {told}")
-        for name, found in self.curvature.items():
-            lost = np.flatnonzero(~found.holds)
-            again = np.flatnonzero(found.beyond & found.holds)
-            if len(lost):
+        doubt = self.evidence.course_doubt([moment(time) for time in self.times.tolist()], spots)
+        if doubt is not None:
+            out.append(f"course {doubt}")
+        for name, curvature in self.curvature.items():
+            untraceable = np.flatnonzero(~curvature.holds)
+            recomputed = np.flatnonzero(curvature.beyond & curvature.holds)
+            if len(untraceable):
                 out.append(
-                    f"course: σ does not hold at {len(lost)} times, first at {moment(float(self.times[lost[0]]))}: the "
+                    f"course: σ does not hold at {len(untraceable)} times, first at {moment(float(self.times[untraceable[0]]))}: the "
                     f"motions that the {name} reads are not small, and the states that it stands for cannot be traced"
                 )
-            if len(again):
+            if len(recomputed):
                 out.append(
-                    f"course: at {len(again)} times, first at {moment(float(self.times[again[0]]))}, the motions that "
+                    f"course: at {len(recomputed)} times, first at {moment(float(self.times[recomputed[0]]))}, the motions that "
                     f"the {name} reads are not small, and its readings are those of Gauss and Newton's steps"
                 )
         return tuple(out)
@@ -145,16 +147,18 @@ class TimeSeries:
         name : str
             ``cameras``, ``intersection_angle`` or ``ground``.
         """
-        found, more = self.readings.groups("true"), {} if self.smoothed is None else self.smoothed.changes.groups()
+        groups, smoothed = self.readings.groups("true"), {} if self.smoothed is None else self.smoothed.changes.groups()
         if name == "cameras":
-            return {camera: own | more.get(name, {}).get(camera, {}) for camera, own in found[name].items()}
-        return found[name] | more.get(name, {}) if name in found else None
+            return {
+                camera: readings | smoothed.get(name, {}).get(camera, {}) for camera, readings in groups[name].items()
+            }
+        return groups[name] | smoothed.get(name, {}) if name in groups else None
 
 
 def _angle(course: TimeSeries) -> dict[str, Any] | None:
     """Return the readings of the intersection angle with its nominal value, or None."""
-    found = course.group("intersection_angle")
-    return None if found is None else {"nominal_deg": float(np.degrees(course.angle))} | found
+    group = course.group("intersection_angle")
+    return None if group is None else {"nominal_deg": float(np.degrees(course.angle))} | group
 
 
 _TEMPERATURES: Record[Sequence[Temperature]] = Record(
@@ -273,16 +277,22 @@ def run_series(
     record, size, done = one_detector(experiment, frames, seed), largest_piece(each * frames), 0
     how = Observing(record, job.analysis.centroid, size, keep_parts=experiment.disturbances is not None)
     try:
-        for found in observe(experiment, states, how):
-            piece, expected = slice(done, done + len(found.numbers)), found.light.photons
-            told = found.recovery, experiment.cameras, found.truth, experiment.ground, experiment.disturbances
-            tables.append(reading_table(*told))
-            recoveries.append(together.add(found.recovery))
-            angle = found.truth.angle
-            photons[piece], first[piece] = expected, found.after[:, :, 0]
+        for observation in observe(experiment, states, how):
+            piece, expected = slice(done, done + len(observation.numbers)), observation.light.photons
+            arguments = (
+                observation.recovery,
+                experiment.cameras,
+                observation.truth,
+                experiment.ground,
+                experiment.disturbances,
+            )
+            tables.append(reading_table(*arguments))
+            recoveries.append(together.add(observation.recovery))
+            angle = observation.truth.angle
+            photons[piece], first[piece] = expected, observation.after[:, :, 0]
             if piece.start <= course.shown < piece.stop:
                 shown_photons[:] = expected[course.shown - piece.start]
-            saturated[piece] = experiment.detector.saturated(found.after).pixels > 0
+            saturated[piece] = experiment.detector.saturated(observation.after).pixels > 0
             share[piece] = expected.sum(axis=(2, 3)) / experiment.nominal_photons.sum(axis=(1, 2))
             done = piece.stop
             advance(done)
@@ -297,16 +307,16 @@ def run_series(
         raise too_large(job, done + k, reason) from error
     shift = np.concatenate([r.shift for r in recoveries])
     spread = np.concatenate([r.shift_covariance for r in recoveries])
-    stated, agrees = experiment.disturbances, np.ones(len(shift), bool)
-    if stated is not None and np.any(spread):
-        agrees = chi_squares(shift, spread, stated) <= limit_of(FALSE_ALARM / len(shift), shift.shape[1])
-    moves = [motions_of(job, k) for k in range(len(states))]
+    prior, agrees = experiment.disturbances, np.ones(len(shift), bool)
+    if prior is not None and np.any(spread):
+        agrees = chi_squares(shift, spread, prior) <= limit_of(FALSE_ALARM / len(shift), shift.shape[1])
+    state_motions = [motions_of(job, k) for k in range(len(states))]
     smoothed = together.smoothed()
     jumped = () if smoothed is None else smoothed.jump_texts()
     return TimeSeries(
         times=np.array(course.times),
         temperatures={path: tuple(job.fields(k)[path] for k in range(len(states))) for path in job.fields(0)},
-        motions={path: tuple(every[path] for every in moves) for path in course.motion},
+        motions={path: tuple(every[path] for every in state_motions) for path in course.motion},
         shown=course.shown,
         angle=angle,
         readings=ReadingTable.joined(tables),
@@ -326,8 +336,8 @@ def run_series(
 def too_large(job: JobSpec, k: int, reason: str) -> InputError:
     """Return the error about the state at time number ``k``, which cannot be rendered."""
     course = _course(job)
-    given = {"temperature": list(course.temperature), "motion": list(course.motion)}
-    parts = {name: f"{name}s of {', '.join(nodes)}" for name, nodes in given.items() if nodes}
+    changed = {"temperature": list(course.temperature), "motion": list(course.motion)}
+    parts = {name: f"{name}s of {', '.join(nodes)}" for name, nodes in changed.items() if nodes}
     return course.error(
         f"the instrument at {moment(course.times[k])} of the course cannot be rendered: {reason}",
         (next(iter(parts)),),
@@ -413,7 +423,7 @@ class SmoothedCourse:
 
     def jump_texts(self) -> tuple[str, ...]:
         """Return body, time and size of each jump, as sentences without full stop."""
-        return tuple(jump_text(one) for one in self.jumps or ())
+        return tuple(jump_text(jump) for jump in self.jumps or ())
 
     @property
     def contradiction(self) -> tuple[str, ...]:
@@ -421,13 +431,13 @@ class SmoothedCourse:
 
         Each measurement may agree with the prior, while all of them contradict its evolution in time.
         """
-        found = self.consistency
-        if found.agrees:
+        test = self.consistency
+        if test.agrees:
             return ()
         return (
             f"the series contradicts the prior {self.name} or its time laws: chi-square "
-            f"{significant(found.chi_square)} of {found.degrees} coordinates where {found.limit:.1f} is exceeded with "
-            f"a chance of {FALSE_ALARM:g}; σ of filtered and smoothed changes does not hold",
+            f"{significant(test.chi_square)} for {test.degrees} degrees of freedom, limit {test.limit:.1f} at a "
+            f"false-alarm rate of {FALSE_ALARM:g}; σ of filtered and smoothed changes does not hold",
         )
 
     def between_dict(self) -> dict[str, Any]:
@@ -436,41 +446,41 @@ class SmoothedCourse:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the consistency test of the measurements with the prior, as plain data."""
-        found = self.consistency
+        test = self.consistency
         searched: dict[str, Any] = {}
         if self.jumps is not None:
-            told = [one.to_dict() for one in self.jumps]
-            searched = {"jumps": {"false_alarm": self.jump_false_alarm, "found": told}}
+            jumps = [jump.to_dict() for jump in self.jumps]
+            searched = {"jumps": {"false_alarm": self.jump_false_alarm, "found": jumps}}
         return {
             "name": self.name,
-            "chi_square": found.chi_square,
-            "degrees_of_freedom": found.degrees,
-            "limit": found.limit,
+            "chi_square": test.chi_square,
+            "degrees_of_freedom": test.degrees,
+            "limit": test.limit,
             "false_alarm": FALSE_ALARM,
-            "chance": found.chance,
-            "agrees": found.agrees,
+            "chance": test.chance,
+            "agrees": test.agrees,
             "innovations": {"chi_square": self.innovations.tolist(), "degrees_of_freedom": self.each},
             **searched,
         }
 
 
-def jump_text(one: Jump) -> str:
+def jump_text(jump: Jump) -> str:
     """Return body, time and size of a jump, as a sentence without full stop.
 
     Parameters
     ----------
-    one : Jump
+    jump : Jump
         Detected jump.
     """
-    body = one.body
+    body = jump.body
     sizes = ", ".join(
         f"{label.removeprefix(f'{body} ')} {size:+.3g} ± {sigma:.2g} {unit}"
-        for label, size, sigma, unit in zip(one.labels, one.sizes, one.sigmas, one.units, strict=True)
+        for label, size, sigma, unit in zip(jump.labels, jump.sizes, jump.sigmas, jump.units, strict=True)
     )
-    rivals = [other for other, ratio in one.rivals.items() if ratio > one.log_ratio - _AS_GOOD]
+    rivals = [other for other, ratio in jump.rivals.items() if ratio > jump.log_ratio - _AS_GOOD]
     others = f"; {names_text(rivals[:3])} would explain it nearly as well" if rivals else ""
     return (
-        f"{body} jumped between {moment(one.after)} and {moment(one.until)}: {sizes}, log ratio {one.log_ratio:.1f}; "
+        f"{body} jumped between {moment(jump.after)} and {moment(jump.until)}: {sizes}, log ratio {jump.log_ratio:.1f}; "
         f"sigmas are wide there, and smoothed changes take it for an event{others}"
     )
 
@@ -502,18 +512,18 @@ class CourseSmoother:
         self._shifts: list[np.ndarray] = []
         self._noise: SeriesNoise | None = None
 
-    def add(self, found: Recovery) -> Recovery:
+    def add(self, recovery: Recovery) -> Recovery:
         """Store shifts and noise of some states, and return the recovery without the noise maps.
 
         Parameters
         ----------
-        found : Recovery
+        recovery : Recovery
             Recovery of the next states, with the parts of their noise.
         """
-        if found.parts is None:
-            return found
-        self.take(found.shift, *found.parts)
-        return found.at(slice(None))
+        if recovery.parts is None:
+            return recovery
+        self.take(recovery.shift, *recovery.parts)
+        return recovery.at(slice(None))
 
     def take(self, shift: np.ndarray, before: NoiseParts, after: NoiseParts) -> None:
         """Store the shifts and the noise of states that were measured elsewhere.
@@ -534,32 +544,35 @@ class CourseSmoother:
 
     def smoothed(self) -> SmoothedCourse | None:
         """Return the smoothed course of all stored states; None without a prior, and for a single time."""
-        stated, noise, times = self._stated, self._noise, self._times
-        if stated is None or noise is None or len(times) < 2:
+        prior, noise, times = self._stated, self._noise, self._times
+        if prior is None or noise is None or len(times) < 2:
             return None
         steps = min(MOST_BETWEEN, LARGEST_BETWEEN // (len(times) - 1)) + 1
         shares = np.arange(1, steps) / steps
         between = (times[:-1, None] + shares * np.diff(times)[:, None]).ravel()
         with one_blas_thread():
-            found = smooth_series(stated, times, np.concatenate(self._shifts), noise, np.append(times, between))
+            series = smooth_series(prior, times, np.concatenate(self._shifts), noise, np.append(times, between))
 
         def part(which: slice) -> ReadingTable:
-            every = {"filtered": found.filtered, "smoothed": found.smoothed}
-            own = {name: (one.values[which], one.noise[which], one.total[which]) for name, one in every.items()}
-            estimated = estimates_of(own, self._cameras, self._ground)
-            return reading_table(estimated, self._cameras, None, self._ground, stated)
+            estimates = {"filtered": series.filtered, "smoothed": series.smoothed}
+            arrays = {
+                name: (estimate.values[which], estimate.noise[which], estimate.total[which])
+                for name, estimate in estimates.items()
+            }
+            estimated = estimates_of(arrays, self._cameras, self._ground)
+            return reading_table(estimated, self._cameras, None, self._ground, prior)
 
         count = len(times)
-        each = found.consistency.degrees // count
+        each = series.consistency.degrees // count
         at, rest = part(slice(count)), part(slice(count, None))
         return SmoothedCourse(
-            stated.name,
+            prior.name,
             at,
             between,
             rest,
-            found.innovations,
+            series.innovations,
             each,
-            found.consistency,
-            found.jumps,
-            stated.jump_false_alarm,
+            series.consistency,
+            series.jumps,
+            prior.jump_false_alarm,
         )

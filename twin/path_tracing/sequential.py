@@ -159,7 +159,7 @@ def make_steps(
         onward = (None if glass is not None else s.solid) if through else glass
         after = 0 if onward is None else bodies.index(onward) + 1
         step = Step(end.surface, end.aperture, segment, event, detects, front, body, after, s.clearance, form, finish)
-        # light in glass stays there up to one of its faces, all segments inside are clear, and glass is met from its front
+        # light in glass stays there up to a face, all segments inside are clear, and glass is met from its front
         sound = (s.solid == glass and segment > 0) if glass is not None else (s.solid is None or front)
         if not sound or not step.known or (through and s.solid is None):
             break

@@ -223,8 +223,8 @@ def trace_stray(
         nominal = run.of(f"{channel.key}/area_ccd", "nominal")
         if not nominal:
             raise NominalPathLost(
-                f"none of {paths} paths of {channel.key} returned to its area CCD along the nominal surfaces; trace more, or "
-                "the perturbation moves the beam off"
+                f"none of {paths} paths of {channel.key} returned to its area CCD along the nominal surfaces; trace more, "
+                "or the perturbation moves the beam off"
             )
         runs[channel.key] = run
         scale[channel.key] = channel.photons / nominal[0].energy
@@ -419,8 +419,8 @@ def ghosts(experiment: MonitorExperiment, light: StrayLight) -> tuple[Ghost, ...
             text = (
                 f"ghosts on the area CCD of {channel.key} have {100.0 * total:.2g} % of its spot's light and bias the "
                 f"spot by that share of its motion relative to them; the strongest, {100.0 * share:.2g} %, comes "
-                f"from {source} by {family_name(family.surface_events, nominal_events)}, {off:.3g} px from the spot: tilt that prism "
-                "or change the field to move it away"
+                f"from {source} by {family_name(family.surface_events, nominal_events)}, {off:.3g} px from the spot: tilt "
+                "that prism or change the field to move it away"
             )
             out.append(Ghost(channel, source, _reflecting_prism(family, nominal_events), text))
     return tuple(out)

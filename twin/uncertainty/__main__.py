@@ -29,8 +29,8 @@ def main(
         Path,
         typer.Argument(
             readable=False,
-            help="Job or instrument: an instrument's name of the library (gf7_pair), a YAML file, or the config.yaml "
-            "of a run.",
+            help="Job or instrument: the name of an instrument in the library (gf7_pair), a YAML file, or the "
+            "config.yaml of a run.",
         ),
     ],
     options: cli.Options,
@@ -38,13 +38,16 @@ def main(
         str | None,
         typer.Option(
             "--disturbances",
-            help="What is stated to move, in place of what the file says: a name of the library (orbit) or a file.",
+            help="Prior on disturbances, instead of that of the file: a name of the library (orbit) or a file.",
         ),
     ] = None,
     states: Annotated[
         int,
         typer.Option(
-            "--states", min=0, max=_MOST_STATES, help="Random states to render and recover: do the sigmas hold?"
+            "--states",
+            min=0,
+            max=_MOST_STATES,
+            help="Number of random states to render and recover, to check the coverage of the sigmas.",
         ),
     ] = 0,
 ) -> None:

@@ -125,7 +125,7 @@ class Coverage:
         level : int
             Index in ``LEVELS``.
         """
-        from scipy.stats import binom  # takes long, and only a report of random states needs it
+        from scipy.stats import binom  # slow to import, and only a report of random states needs it
 
         tail = 0.5 * FALSE / self.counts
         return np.stack([binom.ppf(end, self.measured, self.expected[estimator][level]) for end in (tail, 1.0 - tail)])
@@ -199,14 +199,14 @@ def run_states(
 
     estimators = applicable(experiment.cameras, disturbances)
     chunk = max(1, min(CHUNK, _PIXELS // experiment.nominal_photons.size))
-    # what cannot be measured is left out, and counted by the difference to what is drawn
+    # states that cannot be measured are omitted; their number is the difference to the states drawn
     how = Observing(record, experiment.resolved.job.analysis.centroid, chunk, leave=lambda number, why: None)
     for first in range(0, count, chunk):
         advance(STATES, first, count)
         states = states_of(amounts[first : first + chunk], stated.components, experiment.thermal)
         place = experiment.path.coarse_trace(states).place
         kept = np.flatnonzero(np.all(np.abs(place) <= half, axis=(0, 2)))
-        # streams of its own for each state, whichever others were lost
+        # each state has its own random streams, independent of lost states
         for found in observe(experiment, [states[k] for k in kept], how, first + kept):
             table = reading_table(
                 found.recovery, experiment.cameras, found.truth, experiment.ground, experiment.disturbances
@@ -291,7 +291,7 @@ def _chances(found: Recovery, experiment: MonitorExperiment, quantities: tuple[Q
     return out
 
 
-_SPREAD = "what is stated to move"
+_SPREAD = "prior on disturbances"
 """Progress label of the analysis of the prior."""
 
 
@@ -349,7 +349,7 @@ def run_uncertainty(
     if resolved.disturbances is None:
         raise InputError(
             Issue(
-                "there is no prior on disturbances, so that the noise alone limits the readings",
+                "there is no prior on disturbances, so that only the noise limits the readings",
                 allowed="`disturbances: NAME` in the job or the instrument, or --disturbances NAME",
             )
         )
@@ -360,7 +360,7 @@ def run_uncertainty(
     if limits is None:
         raise InputError(
             Issue(
-                "nothing that is stated to move changes a camera, so that there is nothing to be measured",
+                "no disturbance of the prior changes a camera, so that there is nothing to measure",
                 found=str(resolved.disturbances.name),
                 allowed="disturbances of cameras, their mirrors or focal planes",
             )

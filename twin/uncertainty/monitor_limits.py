@@ -171,7 +171,7 @@ class MonitorLimits:
     def known(self) -> Mapping[str, np.ndarray]:
         """Label -> (Q,) sigmas if that motion were known, for the motions listed first under the posterior."""
         names = {name for q in range(len(self.quantities)) for name, _ in self.lines(BEST, q)[:LINES]}
-        # in the order of the statement: a set has none
+        # keep the order of the prior, since a set has none
         labels = [label for label in dict.fromkeys(self.stated.labels) if label in names]
         left = limits.sigma_if_known(self.rows, self.stated, self.noise, [(label,) for label in labels])
         return dict(zip(labels, left, strict=True))
@@ -343,9 +343,8 @@ def unseen_texts(
     for body, shares in unobserved_bodies(rows, stated, noise, gain).items():
         worst = int(np.argmax(shares))
         out.append(
-            f"{body}: its motions that are stated move no spot; {100.0 * float(shares[worst]):.0f} % of the variance "
-            f"of {short_text(quantities[worst])} are from the statement, not from the spots, and nothing that is "
-            "measured can contradict it"
+            f"{body}: its motions in the prior move no spot; {100.0 * float(shares[worst]):.0f} % of the variance of "
+            f"{short_text(quantities[worst])} rest on the prior, not on the spots, and no measurement can contradict it"
         )
     return tuple(out)
 

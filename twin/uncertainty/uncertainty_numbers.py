@@ -66,16 +66,16 @@ class _Limited:
 
 
 SHARE: Record[tuple[str, float]] = Record(
-    "Share of a motion in a variance; the shares of motions that go together may be negative.",
+    "Share of a motion in a variance; shares of correlated motions may be negative.",
     Quantity("motion", itemgetter(0), "label of the motion"),
     Quantity("share", itemgetter(1), "its share of the variance"),
 )
 _SPLIT: Record[_Limited] = Record(
-    "A variance by motions.",
-    Quantity("sigma", lambda one: one.sigma, "standard deviation, whose square is shared out"),
+    "Contributions of motions to a variance.",
+    Quantity("sigma", lambda one: one.sigma, "standard deviation, whose square is divided"),
     Quantity("lines", lambda one: one.lines[:LINES], "motions with the largest shares, largest first", record=SHARE),
     Quantity("rest", lambda one: float(sum(share for _, share in one.lines[LINES:])), "share of all other motions"),
-    Quantity("noise", lambda one: one.noise, "share of the noise of the images"),
+    Quantity("noise", lambda one: one.noise, "share of the image noise"),
 )
 _AMOUNT: Record[tuple[str, float, str]] = Record(
     "A motion in a combination of motions.",
@@ -84,68 +84,75 @@ _AMOUNT: Record[tuple[str, float, str]] = Record(
     Quantity("unit", itemgetter(2), "unit of the amount"),
 )
 _SEEN_LEAST: Record[_Limited] = Record(
-    "Motions that change a quantity and that the spots see least.",
+    "Least observable motions that change a quantity.",
     Quantity("change", lambda one: one.limits.least_seen[one.q].change, "change of the quantity by all of them"),
     Quantity("motions", lambda one: one.motions, "the largest of them", record=_AMOUNT),
-    Quantity("spots_px", lambda one: one.limits.least_seen[one.q].spots, "how far they move the spots"),
-    Quantity("spots_noise_px", lambda one: one.limits.least_seen[one.q].noise, "standard deviation of their noise"),
+    Quantity("spots_px", lambda one: one.limits.least_seen[one.q].spots, "spot shifts that they cause"),
+    Quantity(
+        "spots_noise_px", lambda one: one.limits.least_seen[one.q].noise, "noise standard deviation of the shifts"
+    ),
 )
 _ELASTICITY: Record[tuple[Elasticity, int]] = Record(
-    "How the posterior's standard deviation follows a stated number.",
-    Quantity("number", lambda one: one[0].number, "name of the stated number"),
-    Quantity("stated", lambda one: one[0].size, "the number as it is stated"),
+    "Sensitivity of the posterior's standard deviation to a number of the prior.",
+    Quantity("number", lambda one: one[0].number, "name of the number"),
+    Quantity("stated", lambda one: one[0].size, "its value in the prior"),
     Quantity("unit", lambda one: one[0].unit, "unit of the number"),
-    Quantity("bodies", lambda one: len(one[0].bodies), "how many bodies it is stated for"),
+    Quantity("bodies", lambda one: len(one[0].bodies), "number of bodies that it applies to"),
     Quantity("elasticity", lambda one: float(one[0].elasticity[one[1]]), "relative change per relative change"),
     Quantity(
         "doubled",
         lambda one: float(one[0].doubled[one[1]]),
-        "standard deviation if the number is twice as large, unknown to the estimator",
+        "standard deviation if the number is twice as large, and the prior is unchanged",
     ),
     Quantity(
         "doubled_stated",
         lambda one: float(one[0].told[one[1]]),
-        "standard deviation if the number is twice as large and stated so",
+        "standard deviation if the number is twice as large, also in the prior",
     ),
 )
 _HEAVY_TAIL: Record[_Limited] = Record(
-    "Errors of the posterior if each stated number is the scale of Student's distribution.",
+    "Errors of the posterior if each number of the prior is the scale of Student's t distribution.",
     Quantity("degrees", lambda one: one.limits.heavy_tail.degrees, "degrees of freedom of that distribution"),
     Quantity("rms", lambda one: float(one.limits.heavy_tail.rms[one.q]), "root mean square of the error"),
-    Quantity("held_68", lambda one: one.held(0), "half width of the interval that holds 68.3 % of the errors"),
-    Quantity("held_95", lambda one: one.held(1), "half width of the interval that holds 95.4 % of the errors"),
-    Quantity("held_997", lambda one: one.held(2), "half width of the interval that holds 99.7 % of the errors"),
+    Quantity("held_68", lambda one: one.held(0), "half-width of the interval that contains 68.3 % of the errors"),
+    Quantity("held_95", lambda one: one.held(1), "half-width of the interval that contains 95.4 % of the errors"),
+    Quantity("held_997", lambda one: one.held(2), "half-width of the interval that contains 99.7 % of the errors"),
     Quantity(
         "beyond_3_sigma",
         lambda one: float(one.limits.heavy_tail.beyond[one.q]),
-        "chance of an error beyond 3 sigma; 0.0027 of a normal error",
+        "probability of an error beyond 3 sigma; 0.0027 for a normal error",
     ),
 )
 _LIMITED: Record[_Limited] = Record(
-    "What limits one quantity, in the unit that its key ends in.",
+    "Limits of one quantity, in the unit at the end of its key.",
     Quantity("before", lambda one: one, "variance before the measurement", record=_SPLIT),
     Quantity("after", lambda one: one.after, "variance that each estimator leaves", record=_SPLIT),
-    Quantity("known", lambda one: one.known, "standard deviation that is left if that motion is known"),
-    Quantity("least_seen", lambda one: one, "motions that hide from the spots", record=_SEEN_LEAST),
+    Quantity("known", lambda one: one.known, "remaining standard deviation if that motion is known"),
+    Quantity("least_seen", lambda one: one, "least observable motions", record=_SEEN_LEAST),
     Quantity(
         "from_statement",
         lambda one: float(one.limits.from_statement[one.q]),
-        "share of the posterior's variance that no spot constrains",
+        "share of the posterior's variance that remains without image noise",
     ),
-    Quantity("elasticities", lambda one: one.followed, "stated numbers that make most of it", record=_ELASTICITY),
-    Quantity("student_t", lambda one: one, "what a statement with heavy tails leaves", record=_HEAVY_TAIL),
+    Quantity(
+        "elasticities",
+        lambda one: one.followed,
+        "numbers of the prior with the largest elasticities",
+        record=_ELASTICITY,
+    ),
+    Quantity("student_t", lambda one: one, "errors under a prior with heavy tails", record=_HEAVY_TAIL),
 )
 _REMEDY: Record[tuple[Remedy, Sequence[limits.Quantity]]] = Record(
     "A further measurement.",
-    Quantity("what", lambda one: one[0].what, "the measurement in words"),
-    Quantity("left", lambda one: _by_quantity(one[1], one[0].sigma), "standard deviation that it leaves of a quantity"),
+    Quantity("what", lambda one: one[0].what, "description of the measurement"),
+    Quantity("left", lambda one: _by_quantity(one[1], one[0].sigma), "remaining standard deviation of each quantity"),
 )
 LIMITS: Record[MonitorLimits] = Record(
     "uncertainty.json",
     Quantity("name", lambda found: found.instrument, "the instrument"),
-    Quantity("disturbances", lambda found: found.stated.name, "what is stated to move"),
+    Quantity("disturbances", lambda found: found.stated.name, "name of the prior on disturbances"),
     Quantity("frames", lambda found: found.frames, "frames of each state"),
-    Quantity("outside", lambda found: found.outside, "chance that a spot leaves its CCD"),
+    Quantity("outside", lambda found: found.outside, "probability that a spot leaves its CCD"),
     Quantity(
         "quantities",
         lambda found: _by_quantity(found.quantities, [_Limited(found, q) for q in range(len(found.quantities))]),
@@ -155,7 +162,7 @@ LIMITS: Record[MonitorLimits] = Record(
     Quantity(
         "remedies",
         lambda found: {one.name: (one, found.quantities) for one in found.remedies},
-        "what further measurements would leave",
+        "further measurements",
         record=_REMEDY,
     ),
 )
@@ -187,26 +194,26 @@ COUNT: Record[_Counted] = Record(
         lambda one: float(one.coverage.ratio(one.estimator)[one.q]),
         "root mean square of the errors over their sigmas",
     ),
-    Quantity("held_68", lambda one: one.held(0), "share of the intervals of 68 % that hold the truth"),
-    Quantity("held_95", lambda one: one.held(1), "share of the intervals of 95 % that hold the truth"),
-    Quantity("expected_68", lambda one: one.expected(0), "share of the intervals of 68 % that should hold the truth"),
-    Quantity("expected_95", lambda one: one.expected(1), "share of the intervals of 95 % that should hold the truth"),
+    Quantity("held_68", lambda one: one.held(0), "share of the 68 % intervals that contain the truth"),
+    Quantity("held_95", lambda one: one.held(1), "share of the 95 % intervals that contain the truth"),
+    Quantity("expected_68", lambda one: one.expected(0), "expected share of the 68 % intervals that contain the truth"),
+    Quantity("expected_95", lambda one: one.expected(1), "expected share of the 95 % intervals that contain the truth"),
     Quantity("limits_68", lambda one: one.limits(0), "limits of held_68 if every sigma is right"),
     Quantity("limits_95", lambda one: one.limits(1), "limits of held_95 if every sigma is right"),
 )
 _OUTLIER: Record[tuple[str, str, str, float, int]] = Record(
-    "A count that is beyond its limits.",
-    Quantity("estimator", itemgetter(0), "who reads the quantity"),
+    "A count outside its limits.",
+    Quantity("estimator", itemgetter(0), "estimator of the quantity"),
     Quantity("group", itemgetter(1), "group of the quantity"),
     Quantity("key", itemgetter(2), "key of the quantity"),
-    Quantity("level", itemgetter(3), "share of the truths that the intervals should hold"),
-    Quantity("held", itemgetter(4), "how many intervals hold the truth"),
+    Quantity("level", itemgetter(3), "confidence level of the intervals"),
+    Quantity("held", itemgetter(4), "number of intervals that contain the truth"),
 )
 STATES: Record[Coverage] = Record(
-    "What random states gave.",
-    Quantity("drawn", lambda found: found.drawn, "states that were drawn"),
-    Quantity("measured", lambda found: found.measured, "states whose spots stay on their CCDs"),
-    Quantity("false_alarm", lambda found: FALSE, "chance that any count falls out of its limits"),
+    "Coverage in random states.",
+    Quantity("drawn", lambda found: found.drawn, "number of states drawn"),
+    Quantity("measured", lambda found: found.measured, "number of states whose spots stay on their CCDs"),
+    Quantity("false_alarm", lambda found: FALSE, "probability that any count is outside its limits by chance"),
     Quantity(
         "estimators",
         lambda found: {
@@ -216,12 +223,12 @@ STATES: Record[Coverage] = Record(
         "errors of each quantity by each estimator",
         record=COUNT,
     ),
-    Quantity("outliers", lambda found: found.outliers, "counts that are beyond their limits", record=_OUTLIER),
+    Quantity("outliers", lambda found: found.outliers, "counts outside their limits", record=_OUTLIER),
     Quantity("chi_square_mean", lambda found: float(np.mean(found.chi_square)), "mean chi-square of the shifts"),
-    Quantity("alarms", lambda found: found.alarms, "states whose chi-square is beyond its limit"),
+    Quantity("alarms", lambda found: found.alarms, "number of states whose chi-square exceeds its limit"),
     Quantity("alarms_limit", lambda found: found.alarm_limit, "largest number of alarms by chance"),
-    Quantity("doubted", lambda found: found.doubted, "states for which sigma does not hold by what is measured"),
-    Quantity("sigma_holds", lambda found: found.sigma_holds, "no count beyond its limits, no state doubted"),
+    Quantity("doubted", lambda found: found.doubted, "number of states in which the measurement contradicts sigma"),
+    Quantity("sigma_holds", lambda found: found.sigma_holds, "no count outside its limits, no state doubted"),
 )
 
 
