@@ -96,7 +96,7 @@ def test_without_a_plan_there_is_no_estimate(record: Path, life: Path) -> None:
     for words in (("forecast", record), ("ingest", record, life / "plan.yaml", "--report", life / "r.html")):
         done = run(*words)
         assert done.exit_code == 2
-        assert "keeps no plan of operation" in done.stderr
+        assert "has no plan of operation" in done.stderr
     # one that is named counts for this command alone
     told = said("status", record, life / "plan.yaml")
     assert told["estimate"]["readings"] == DAYS // EVERY
@@ -124,7 +124,7 @@ def test_status_tells_how_the_instrument_stands(record: Path, life: Path) -> Non
     text = " ".join(done.stdout.split())
     assert f"estimate at {utc_text(START + (DAYS - EVERY) * DAY)} from 30 readings of the monitor" in text
     assert f"jump of {BODY} between {utc_text(START + 60 * DAY)} and {utc_text(START + 64 * DAY)}: shift x" in text
-    assert "sensors: 1 of 2 are as they should be" in text
+    assert "sensors: 1 of 2 are in order" in text
     assert "base/backward: stuck since" in text
     assert "Δθ between the cameras 30 arcsec" in text
     assert "% within one sigma (68.3 % expected)" in text
@@ -208,7 +208,7 @@ def test_an_estimate_that_fails_does_not_hide_what_was_taken(record: Path, life:
     assert done.exit_code == 0
     assert "1 taken" in done.stdout
     said_so = " ".join(done.stderr.split())
-    assert "what was taken is in the record, and the estimate cannot be worked out: the record's plan" in said_so
+    assert "the readings are in the record, but the estimate cannot be computed:  the record's plan" in said_so
 
 
 @pytest.mark.second

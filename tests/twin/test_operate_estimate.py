@@ -489,7 +489,7 @@ def test_sensors_that_disagree_together_accuse_the_prior(known, tmp_path, togeth
     assert states == {"base/forward": "ok" if together else "doubtful", "base/backward": "ok"}
     assert any("disagree with heat" in doubt for doubt in told.warnings) == together
     texts = [one.text for one in alarms_of(plan.operation, told)]
-    assert any("sensors of several bodies together" in text for text in texts) == together
+    assert any("sensors of several bodies jointly" in text for text in texts) == together
 
 
 @pytest.mark.second

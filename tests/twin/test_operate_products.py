@@ -112,7 +112,7 @@ FIRST, LAST = ValidityLimit(START - 10**12, "first"), ValidityLimit(START + 10**
     [
         # the mean square may grow to 1.44
         (Walk(1e-3, 0.0), 440.0, "its sigma grows"),
-        (Walk(0.0, 1e-2), np.sqrt(0.44) / 1e-2, "its estimate goes on"),
+        (Walk(0.0, 1e-2), np.sqrt(0.44) / 1e-2, "its estimate changes"),
     ],
 )
 def test_an_estimate_holds_until_its_error_is_a_fifth_larger(walk: Walk, seconds: float, reason: str) -> None:
@@ -122,7 +122,7 @@ def test_an_estimate_holds_until_its_error_is_a_fifth_larger(walk: Walk, seconds
         assert 0.99 * seconds < away / MICRO <= seconds
     assert found.until_reason == found.since_reason
     assert found.until_reason.endswith(reason)
-    assert found.until_reason.startswith("intersection_angle change_arcsec")
+    assert found.until_reason.startswith("the error of intersection_angle change_arcsec")
 
 
 def test_an_estimate_does_not_hold_across_what_is_known_to_have_happened() -> None:
@@ -289,7 +289,7 @@ def test_events_jumps_and_requirements_limit_the_span(history: History) -> None:
     assert spans == [(0, 1), (1, 4), (5, 9), (9, 720)]
     broken = replace(operation, requirements=(SimpleNamespace(quantity=quantity, breaks_us=None, holds_now=False),))
     found = products_of(broken, history, START, None, load_backend())
-    assert found.warnings == ("ground height_m does not keep its requirement",)
+    assert found.warnings == ("ground height_m violates its requirement",)
 
 
 def test_what_limits_products_is_told() -> None:
@@ -304,10 +304,10 @@ def test_what_limits_products_is_told() -> None:
     found = _warnings(broken, START, START + 60 * MICRO + 1, SimpleNamespace(lines=lines), (1, 2, 3), small)
     assert found == (
         f"the scene was taken at {utc_text(START + 60 * MICRO + 1)}, and the estimate is for {utc_text(START)}",
-        "q does not keep its requirement",
+        "q violates its requirement",
         "a has no rational polynomials: too steep",
-        "state.yaml does not have 3 motions that a job cannot say",
-        "prior.yaml does not have the 2 components that matter least; none makes more than 2 percent of the variance "
+        "state.yaml omits 3 motions that a job cannot express",
+        "prior.yaml omits the 2 least important components; none contributes more than 2 % to the variance "
         "of a spot or a parameter",
     )
 
@@ -574,7 +574,7 @@ def test_a_state_has_the_temperatures_that_do_what_was_found(tmp_path: Path) -> 
     ("words", "said"),
     [
         (("--time", "yesterday"), "--time"),
-        ((), "of which time? --time UTC, or --scene FILE"),
+        ((), "no time: give --time UTC, or --scene FILE"),
         (("--scene", SCENE), "before the first reading"),
         (("--time", "2026-03-03T00:00:00Z", "--scene", SCENES / ORBIT / "angle.yaml"), "of a payload"),
         (("--time", "2026-03-03T00:00:00Z", "--scene", SCENES / ORBIT / "monitor.yaml"), "does not read this"),
@@ -600,12 +600,12 @@ def test_a_scene_that_cannot_be_flown_names_its_key(followed: Followed, tmp_path
 def test_products_that_cannot_be_written_are_told(followed: Followed) -> None:
     result = command(followed.place, "--time", utc_text(followed.time), "--out", followed.place / "record.sqlite" / "x")
     said = " ".join(result.stderr.split())
-    assert (result.exit_code, "what is there is not all of the products" in said) == (1, True), said
+    assert (result.exit_code, "not all files of the products were written" in said) == (1, True), said
 
 
 def test_a_record_without_a_plan_says_how_to_keep_one(tmp_path: Path) -> None:
     made(tmp_path / "record").close()
     (tmp_path / "there").mkdir()
-    for out, words in (("products", "init RECORD gf7_pair --plan FILE"), ("there", "is there already")):
+    for out, words in (("products", "init RECORD gf7_pair --plan FILE"), ("there", "exists already")):
         result = command(tmp_path / "record", "--time", "2026-03-03T00:00:00Z", "--out", tmp_path / out)
         assert (result.exit_code, words in result.stderr) == (2, True), result.stderr

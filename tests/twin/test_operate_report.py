@@ -24,7 +24,7 @@ from twin.operate.daily_report import _warnings, daily_report, end_of_day, state
 from twin.operate.estimate.operation_filter import Operation
 from twin.operate.estimate.operation_model import stored_plan
 from twin.operate.estimate.reported_estimate import percent
-from twin.operate.overview import Overview, coverage, readings, single_readings, span_of, spread, trend
+from twin.operate.overview import Overview, coverage, evenly_spaced, monitor_span, readings, single_readings, trend
 from twin.operate.record.entries import Alarm, Entry, micros
 from twin.operate.record.history import History, content_of, initialise_record
 
@@ -79,7 +79,7 @@ def test_the_table_has_every_quantity_with_its_requirement(overview):
     rows = {(row[0], row[1]): row for row in table.full.rows}
     broken = rows["forward", "Δα [arcsec]"]
     assert (broken[2], broken[3]) == pytest.approx((1.01375, 0.05))
-    assert [str(cell) for cell in broken[4:]] == ["±0.4", "more than 99.9999", "1.0", "no", "broken"]
+    assert [str(cell) for cell in broken[4:]] == ["±0.4", "more than 99.9999", "1.0", "no", "violated"]
     holds = rows["angle between the cameras", "Δθ [arcsec]"]
     assert (holds[7], holds[8]) == ("yes", "2026-01-29")
     assert rows["ground", "height [m]"][4] == ""
@@ -122,11 +122,11 @@ def test_the_page_needs_nothing_else_and_runs_nothing_that_a_text_brings(page):
             "ok stuck dead",
             [
                 "the newest reading is 2 d older than the end of the day",
-                "one alarm waits for an acknowledgement; the newest: alarm 0",
-                "sensors that are not in order: body1 (stuck), body2 (dead)",
+                "one alarm is open; the newest: alarm 0",
+                "faulty sensors: body1 (stuck), body2 (dead)",
             ],
         ),
-        (0, 3, "", ["3 alarms wait for an acknowledgement; the newest: alarm 0"]),
+        (0, 3, "", ["3 alarms are open; the newest: alarm 0"]),
     ],
 )
 def test_what_a_reader_has_to_know_is_told_and_nothing_else(age: int, alarms: int, states: str, told: list) -> None:
@@ -200,7 +200,7 @@ def test_points_are_what_the_readings_say(history, overview):
 def test_of_many_readings_some_are_shown_and_the_newest_is_one(history):
     found = [one["time_us"] for one in readings(history, START, START + 40 * DAY, 25)]
     assert len(found) <= 25
-    assert (START, found[-1]) == span_of(history)
+    assert (START, found[-1]) == monitor_span(history)
     assert len(set(np.diff(found))) == 1
 
 
@@ -212,7 +212,7 @@ def test_a_trend_has_times_at_both_sides_of_a_jump(history, overview):
     assert found.future.times[-1] == START + 30 * DAY
     assert (np.diff(found.past.times) > 0).all()
     assert trend(history, overview, START, overview.time - DAY).future is None
-    assert len(spread(5, 5, 10)) == 1
+    assert len(evenly_spaced(5, 5, 10)) == 1
 
 
 def test_the_past_is_without_what_came_later_and_takes_nothing(tmp_path: Path):
@@ -304,7 +304,7 @@ def test_a_place_that_cannot_be_written_and_a_record_without_a_plan_are_told(lif
     assert run(life[0], "--out", tmp_path / "no" / "r.html").exit_code == 1
     told = run(Path(history.url.removeprefix("sqlite:///")).parent)
     assert told.exit_code == 2
-    assert "keeps no plan" in told.stderr
+    assert "has no plan" in told.stderr
     made(tmp_path / "empty").close()
     told = run(tmp_path / "empty")
     assert (told.exit_code, "no reading of the monitor; ingest takes some" in told.stderr) == (2, True), told.stderr

@@ -27,7 +27,7 @@ from twin.operate.record.entries import MICRO, micros
 from twin.operate.record.history import History, content_of, initialise_record
 from twin.operate.record.telemetry import MOST_DEPARTURE
 from twin.operate.simulate import Life, Simulation, drawn_life, sensed_temperatures
-from twin.operate.simulation_run import take_files
+from twin.operate.simulation_run import ingest_files
 from twin.verify import app as verify
 
 PLAN = EXAMPLES / "operation.yaml"
@@ -219,7 +219,7 @@ def test_the_files_of_a_life_make_its_record_again(made: tuple[Path, Path, Mappi
     record, _, told = made
     initialise_record(str(tmp_path / "again"), resolve_with("gf7_pair"), simulated=True)
     with History(str(tmp_path / "again")) as history:
-        assert sum(one.new for one in take_files(history, Path(told["files"]) / "telemetry.yaml")) == told["entries"]
+        assert sum(one.new for one in ingest_files(history, Path(told["files"]) / "telemetry.yaml")) == told["entries"]
     assert [one["sha256"] for one in entries(tmp_path / "again")] == [one["sha256"] for one in entries(record)]
 
 
@@ -339,7 +339,7 @@ def test_readings_that_could_not_be_are_told(tmp_path: Path, monkeypatch: pytest
     assert (done.exit_code, "--truth: " in done.stderr, "cannot be written" in done.stderr) == (2, True, True)
     assert run("init", tmp_path / "record", "gf7_pair", "--simulated").exit_code == 0
     taken = [SimpleNamespace(refused=((3, "no such body"),)), SimpleNamespace(refused=())]
-    monkeypatch.setattr(simulation_run, "take_files", lambda *_: taken)
+    monkeypatch.setattr(simulation_run, "ingest_files", lambda *_: taken)
     done = run("simulate", PLAN, tmp_path / "record", *words, "--out", tmp_path / "refused")
     told = "1 of what was simulated was refused, the first: no such body"
     assert (done.exit_code, told in " ".join(done.stderr.split())) == (2, True), done.stderr

@@ -149,7 +149,7 @@ TWO = "\nmonitor: {angles: [0.2 arcsec, 0.2 arcsec, 2 arcsec], principal_distanc
         ("own_lines.yaml", "turned.yaml", "camera looks elsewhere than this block's; found 26 deg, not 20 deg"),
         ("backward", "rear", ": monitor_record.record: .* no camera of this name; found 'rear', allowed: forward, b"),
         ("record: record,", "record: nowhere,", ": monitor_record.record: "),
-        ("record: record, plan: plan.yaml", "record: record", "the record keeps no plan of operation"),
+        ("record: record, plan: plan.yaml", "record: record", "the record has no plan of operation"),
         (utc(PASSES[0]), "2025-01-01T03:05:00Z", "monitor_record"),
         ("plan.yaml", "other/plan.yaml", "a plan of another instrument than the record's"),
         ("plan: plan.yaml}", f"plan: plan.yaml}}{TWO}", "are both given"),

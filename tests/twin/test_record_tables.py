@@ -35,7 +35,7 @@ def test_quaternions_are_normalised_or_refused(tmp_path: Path) -> None:
         assert one.content["sigma"] == pytest.approx(2.0 * 4.84813681e-6, rel=1e-8)
     assert found[0].content["values"] == pytest.approx([0.0, 0.0, 0.6, 0.8], abs=1e-12)
     assert [one.line for one in found] == [2, 3, 4, 5, 6, 7, 8]
-    for one, reason in ((3, "not a quaternion of a turn"), (5, "not a number"), (6, "not a finite number")):
+    for one, reason in ((3, "not a unit quaternion"), (5, "not a number"), (6, "not a finite number")):
         assert reason in found[one].reason
 
 

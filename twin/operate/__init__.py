@@ -1,1 +1,1 @@
-"""One instrument through its life: the record of everything that was read of it and that happened to it."""
+"""An instrument in operation: its record, its estimated state, alarms, reports and products, and simulated lives."""

@@ -1,6 +1,6 @@
-"""The daily report of an instrument in operation: one page that needs no other file, to be kept or sent by mail.
+"""Daily report of an instrument in operation: one self-contained page, to be stored or sent by mail.
 
-Figures of an instrument in operation: courses of quantities with their bands, innovations against their limit.
+Its figures show the courses of the quantities with their bands, and the innovations against their limit.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ if TYPE_CHECKING:
     pass
 
 BANDS = ((1.9600, 0.22, "95 %"), (0.9945, 0.42, "68 %"))
-"""Sigmas, opacity and name of the bands, the wide one first."""
-_FEW = 60
-"""Single readings that are drawn with their sigma; more would hide the course."""
-_SEEN = 3.0
-"""A limit is drawn where it lies within so many times the reach of the course; farther out it would flatten it."""
+"""Multiple of sigma, opacity and name of the bands, the wide one first."""
+_MOST_ERROR_BARS = 60
+"""Largest number of single readings drawn with error bars; more would hide the course."""
+_LIMIT_EXTENTS = 3.0
+"""A limit is drawn within this multiple of the course's extent; a larger one would flatten the course."""
 
 
 def dates(times: np.ndarray) -> np.ndarray:
-    """Matplotlib's dates of times in microseconds of TAI since 2000, in UTC as it is at the first of them.
+    """Return times in microseconds of TAI since 2000 as Matplotlib dates, in the UTC of the first of them.
 
-    A leap second within a figure moves what comes after it by a second, which no figure shows.
+    A leap second within a figure shifts later times by one second, which is not visible.
     """
     if not len(times):
         return np.zeros(0)
@@ -64,20 +64,20 @@ def dates(times: np.ndarray) -> np.ndarray:
 
 
 def courses_svg(name: str, overview: Overview, trend: Trend, quantities: Sequence[Quantity], wide: int = 1) -> str:
-    """Courses of quantities over one span, a panel each.
+    """Draw the courses of quantities over one span, one panel each.
 
     Parameters
     ----------
     name : str
-        Of the figure.
+        Name of the figure.
     overview : Overview
-        Of the operation, for requirements, jumps and events.
+        Overview of the operation, for requirements, jumps and events.
     trend : Trend
-        Of all quantities.
+        Course of all quantities.
     quantities : Sequence[Quantity]
-        That are drawn.
+        Quantities to draw.
     wide : int
-        Panels beside each other.
+        Number of panels side by side.
     """
     with svg.look(f"operate-{name}"):
         height = 2.3 if wide == 1 else 1.9
@@ -90,49 +90,51 @@ def courses_svg(name: str, overview: Overview, trend: Trend, quantities: Sequenc
 
 
 def _course(axes: Axes, overview: Overview, trend: Trend, quantity: Quantity) -> None:
+    """Draw the course of one quantity with its bands, readings, jumps, events and requirement."""
     q = overview.quantities.index(quantity)
     parts = [("estimate", trend.past, svg.BLUE, svg.SKY, "-")]
     if trend.future is not None:
         parts.append(("forecast", trend.future, svg.VERMILION, svg.ORANGE, "--"))
-    reach = 0.0
+    extent = 0.0
     for what, course, line, band, style in parts:
         at, value, sigma = dates(course.times), course.values[:, q], course.sigmas[:, q]
         for times, alpha, share in BANDS:
             low, high = value - times * sigma, value + times * sigma
             axes.fill_between(at, low, high, color=band, alpha=alpha, lw=0, label=f"{share} of the {what}")
-            reach = max(reach, float(np.nanmax(np.abs(np.concatenate([low, high])), initial=0.0)))
+            extent = max(extent, float(np.nanmax(np.abs(np.concatenate([low, high])), initial=0.0)))
         axes.plot(at, value, style, color=line, lw=1.1, label=what)
     _points(axes, trend, q)
-    _happened(axes, overview, trend)
+    _mark_jumps_and_events(axes, overview, trend)
     required = overview.required(quantity)
     title = f"{group_name(quantity.group)} {quantity.parameter.label}"
     if required is not None:
-        if required.limit <= _SEEN * reach:
+        if required.limit <= _LIMIT_EXTENTS * extent:
             for sign in (1.0, -1.0):
                 label = "requirement" if sign > 0.0 else None
                 axes.axhline(sign * required.limit, color=svg.INK, lw=1.0, ls=(0, (6, 3)), label=label)
         else:
-            title += f", limit ±{required.limit:g} beyond the figure"
+            title += f", limit ±{required.limit:g} outside the plot"
     axes.axhline(0.0, color=svg.LIGHT, lw=0.8, zorder=0)
     axes.set_title(title, loc="left")
     _dated(axes)
 
 
 def _points(axes: Axes, trend: Trend, q: int) -> None:
+    """Draw the single readings of a quantity."""
     points = trend.points
     known = np.isfinite(points.values[:, q])
     if not known.any():
         return
     at, value, sigma = dates(points.times)[known], points.values[known, q], points.sigmas[known, q]
-    label = "each reading by itself"
-    if len(at) <= _FEW:
+    label = "single readings"
+    if len(at) <= _MOST_ERROR_BARS:
         axes.errorbar(at, value, sigma, fmt="o", color=svg.GREY, ms=2.5, elinewidth=0.7, label=f"{label}, ±σ")
     else:
         axes.plot(at, value, ".", color=svg.GREY, ms=2.0, alpha=0.6, label=label)
 
 
-def _happened(axes: Axes, overview: Overview, trend: Trend) -> None:
-    """Jumps as bands from the reading before to the one after, events as lines."""
+def _mark_jumps_and_events(axes: Axes, overview: Overview, trend: Trend) -> None:
+    """Draw jumps as bands between the readings before and after them, and events as lines."""
     begin, end = int(trend.past.times[0]), int(trend.past.times[-1])
     jumps = [jump for jump in overview.filter_result.jumps if begin <= jump.until_us and jump.after_us <= end]
     for k, jump in enumerate(jumps):
@@ -144,6 +146,7 @@ def _happened(axes: Axes, overview: Overview, trend: Trend) -> None:
 
 
 def _dated(axes: Axes) -> None:
+    """Format the time axis."""
     locator = AutoDateLocator(minticks=3, maxticks=9)
     axes.xaxis.set_major_locator(locator)
     axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))
@@ -152,18 +155,18 @@ def _dated(axes: Axes) -> None:
 
 
 def innovations_svg(overview: Overview) -> str:
-    """What the newest readings departed from their predictions by, chi-square with its limit."""
+    """Draw chi-square of the newest innovations with its limit."""
     with svg.look("operate-innovations"):
-        told = overview.filter_result.innovations
-        times = np.array([one[0] for one in told], np.int64)
-        chi = np.array([one[1] for one in told], np.float64)
-        degrees = np.array([one[2] for one in told], np.float64)
+        innovations = overview.filter_result.innovations
+        times = np.array([one[0] for one in innovations], np.int64)
+        chi = np.array([one[1] for one in innovations], np.float64)
+        degrees = np.array([one[2] for one in innovations], np.float64)
         limit = np.array([limit_of(FALSE_ALARM, one) for one in degrees])
         figure = svg.new_figure(2.6)
         axes = figure.subplots()
         at, above = dates(times), chi > limit
-        axes.plot(at, limit, color=svg.INK, lw=1.0, ls=(0, (6, 3)), label="limit, chance 0.1 %")
-        axes.plot(at, degrees, color=svg.GREY, lw=0.9, label="mean where predictions are right")
+        axes.plot(at, limit, color=svg.INK, lw=1.0, ls=(0, (6, 3)), label="limit (p = 0.001)")
+        axes.plot(at, degrees, color=svg.GREY, lw=0.9, label="expected")
         axes.plot(at[~above], chi[~above], ".", color=svg.BLUE, ms=4, label="reading")
         axes.plot(at[above], chi[above], "D", color=svg.VERMILION, ms=4, label="above the limit")
         axes.set_yscale("log")
@@ -177,29 +180,30 @@ def innovations_svg(overview: Overview) -> str:
 
 
 RECENT = 30 * DAY
-"""Before the newest reading, of the second figure of courses."""
+"""Span before the newest reading that the second figure of courses shows, in microseconds."""
 MOST_EXPLAINED = 4
-"""Quantities of which the lead says how much of their scatter temperatures explain."""
+"""Largest number of quantities whose explained scatter is stated in the lead."""
 MOST_MOTIONS = 12
-"""Motions of bodies that are listed."""
+"""Number of motions of bodies listed."""
 MOST_SHOWN = 40
-"""Rows of a table in which the newest are shown; CSV has them all."""
+"""Number of rows shown of a table of the newest; its CSV has all rows."""
 _NOT = "\N{EM DASH}"
+_JUMP_HEADS = ("log likelihood ratio", "false-alarm probability", "other candidates")
 
 
 def daily_report(history: History, overview: Overview, end: int) -> Report:
-    """What there is to say of a day.
+    """Return the report of a day.
 
     Parameters
     ----------
     history : History
         The record.
     overview : Overview
-        Of it, at the day's end.
+        Overview of the record at the end of the day.
     end : int
-        Of the day, microseconds of TAI since 2000.
+        End of the day, in microseconds of TAI since 2000.
     """
-    told = overview.filter_result
+    result = overview.filter_result
     begin = end - DAY
     last = min(end, overview.time)
     verdict, lead = answer(
@@ -207,7 +211,7 @@ def daily_report(history: History, overview: Overview, end: int) -> Report:
         overview.change_sentence(begin, end, f"on {day_text(begin)}"),
         *overview.break_sentences(),
         overview.score_sentence(),
-        _explained(overview),
+        _explained_sentence(overview),
     )
     sections = (
         _changed_section(overview, begin, end),
@@ -217,12 +221,12 @@ def daily_report(history: History, overview: Overview, end: int) -> Report:
         _jump_section(overview),
         _sensor_section(overview),
         _alarm_section(overview),
-        _left_out_section(history, overview),
+        _excluded_section(history, overview),
     )
     facts = (
         ("Instrument", f"{history.name} ({history.sha256[:12]})"),
         ("Record", history.url),
-        ("Readings", f"{told.readings}, the newest of {minute_text(overview.time)} UTC"),
+        ("Readings", f"{result.readings}, the newest of {minute_text(overview.time)} UTC"),
         ("Disturbances", str(overview.operation.plan.operation.disturbances)),
         ("Forecast", f"{overview.horizon / DAY:g} d"),
     )
@@ -238,12 +242,12 @@ def daily_report(history: History, overview: Overview, end: int) -> Report:
 
 
 def end_of_day(text: str | None, newest: int) -> int:
-    """The end of a day of UTC, microseconds of TAI since 2000; by default of the newest reading's.
+    """Return the end of a UTC day, in microseconds of TAI since 2000; by default of the newest reading's day.
 
     Raises
     ------
     Problem
-        Not a date.
+        The text is not a date.
     """
     name = day_text(newest) if text is None else text.strip()
     allowed = "a date of UTC: 2028-03-05"
@@ -256,9 +260,9 @@ def end_of_day(text: str | None, newest: int) -> int:
 
 
 def state_table(overview: Overview) -> Table:
-    """Every quantity now: value, sigma, requirement, chance, and when it is expected to break."""
+    """Return the table of all quantities: value, sigma, requirement, its probability, and the expected violation."""
     now = overview.filter_result.now
-    heads = ("change", "now", "σ", "limit", "beyond it [%]", "allowed [%]", "holds", "expected to break")
+    heads = ("change", "now", "σ", "limit", "P(exceeded) [%]", "allowed [%]", "holds", "expected violation")
     rows: list[list[Cell]] = []
     full: list[list[Cell]] = []
     bands: dict[int, str] = {}
@@ -272,9 +276,9 @@ def state_table(overview: Overview) -> Table:
         rows.append(row)
         full.append([group, *(str(cell) if isinstance(cell, Marked) else cell for cell in row)])
     caption = (
-        f"Changes since the reference images at {minute_text(overview.time)} UTC, with all readings until then. A "
-        "requirement holds while the chance that the size of the change is beyond its limit is not larger than what "
-        "is allowed. It is expected to break when that chance of the forecast is."
+        f"Changes since the reference images at {minute_text(overview.time)} UTC, from all readings until then. A "
+        "requirement holds while the probability that the change exceeds its limit is at most the allowed one. "
+        "The expected violation is the day from which the forecast no longer meets this."
     )
     name = "state"
     digits = Table(name, "State", "", ("of", *heads), full, within="")
@@ -282,22 +286,24 @@ def state_table(overview: Overview) -> Table:
 
 
 def _required_cells(overview: Overview, quantity: Quantity) -> list[Cell]:
-    one = overview.required(quantity)
-    if one is None:
+    """Return the cells of a quantity's requirement; empty ones without a requirement."""
+    requirement = overview.required(quantity)
+    if requirement is None:
         return ["", "", "", "", ""]
     horizon = overview.horizon / DAY
-    when = day_text(one.breaks_us) if one.breaks_us is not None else f"not within {horizon:g} d"
-    look = "text" if one.holds_now else "text wrong"
+    when = day_text(requirement.breaks_us) if requirement.breaks_us is not None else f"not within {horizon:g} d"
+    style = "text" if requirement.holds_now else "text wrong"
     return [
-        f"±{one.limit:g}",
-        percent(one.chance_now).removesuffix(" %"),
-        percent(1.0 - one.probability).removesuffix(" %"),
-        Marked("yes" if one.holds_now else "no", look=look, key=quantity.name),
-        when if one.holds_now else "broken",
+        f"±{requirement.limit:g}",
+        percent(requirement.chance_now).removesuffix(" %"),
+        percent(1.0 - requirement.probability).removesuffix(" %"),
+        Marked("yes" if requirement.holds_now else "no", look=style, key=quantity.name),
+        when if requirement.holds_now else "violated",
     ]
 
 
 def _changed_section(overview: Overview, begin: int, end: int) -> Section:
+    """Return the section on the changes of the day."""
     found = [occurrence for occurrence in overview.changed(begin, end) if not occurrence.again]
     lines = tuple(f"{minute_text(one.time)}: {one.text}" for one in found)
     what = f"Between {minute_text(begin)} and {minute_text(end)} UTC.{'' if lines else ' Nothing occurrences.'}"
@@ -306,6 +312,7 @@ def _changed_section(overview: Overview, begin: int, end: int) -> Section:
 
 
 def _trend_section(history: History, overview: Overview, last: int) -> Section:
+    """Return the section with the courses of the quantities."""
     quantities = overview.quantities
     chosen = [quantity for quantity in quantities if overview.required(quantity) is not None] or list(quantities)[:3]
     others = [quantity for quantity in quantities if quantity not in chosen]
@@ -321,8 +328,8 @@ def _trend_section(history: History, overview: Overview, last: int) -> Section:
         more = courses_svg("others", overview, recent, others, 2)
         figures.append(_figure("others", "All other changes", more))
     words = (
-        "Lines are the estimate with all readings, bands hold the true change with a chance of 68 and 95 %. Jumps "
-        "stand between the readings before and after them, events where the record has them.",
+        "Lines show the estimate from all readings; bands contain the true change with probabilities of 68 and 95 %. "
+        "Jumps are shown between the readings before and after them, events at their recorded times.",
     )
     return Section("Trends", words, tuple(figures), int(bool(others)), name="trends")
 
@@ -332,7 +339,7 @@ def _figure(name: str, title: str, svg: str) -> SvgFigure:
 
 
 def _motion_section(overview: Overview) -> Section | None:
-    """Return the motions of bodies that are known best, all causes of a motion together; None without any."""
+    """Return the section of the most significant motions of bodies, all causes together; None without any."""
     found, stated = overview.operation.motions(overview.time), overview.operation.experiment.stated
     moving = () if stated is None else [component for component in stated.components if component.kind not in HEAT]
     rows: list[tuple[float, list[Cell]]] = []
@@ -347,15 +354,16 @@ def _motion_section(overview: Overview) -> Section | None:
         return None
     best = [cells for _, cells in sorted(rows, key=lambda row: -row[0])[:MOST_MOTIONS]]
     caption = (
-        f"The {len(best)} motions of most sigmas of {len(rows)}, at {minute_text(overview.time)} UTC, with all "
+        f"The {len(best)} most significant of {len(rows)} motions at {minute_text(overview.time)} UTC, from all "
         "readings until then; twin.operate products writes all of them with their covariance."
     )
-    heads = ("motion", "now", "σ", "sigmas")
+    heads = ("motion", "now", "σ", "value / σ")
     return Section("Motions of bodies", (), (Table("motions", "", caption, heads, best, within=""),), name="motions")
 
 
 def _prediction_section(overview: Overview) -> Section:
-    told = overview.filter_result
+    """Return the section on the quality of the predictions."""
+    result = overview.filter_result
     rows: list[list[Cell]] = []
     for coverage in overview.coverages:
         if coverage.count:
@@ -364,49 +372,58 @@ def _prediction_section(overview: Overview) -> Section:
             words = Marked("yes" if coverage.holds else "no", look=look, key=f"coverage {coverage.sigmas}")
             row: list[Cell] = [f"within {coverage.sigmas}σ", DecimalNumber(100.0 * coverage.expected, 2)]
             rows.append([*row, DecimalNumber(100.0 * coverage.share, 2), interval, coverage.count, words])
-    heads = ("components", "expected [%]", "found [%]", f"interval of {100.0 * CONFIDENCE:.0f} % [%]", "of", "in it")
+    heads = (
+        "components",
+        "expected [%]",
+        "observed [%]",
+        f"{100.0 * CONFIDENCE:.0f} % confidence interval [%]",
+        "number",
+        "consistent",
+    )
     caption = (
-        "Each reading was predicted from all before it. Its components, made independent and of unit variance, lie "
-        "within 1 and 2σ as often as a normal distribution has it where the plan's disturbances are right; the "
-        "interval is the exact binomial one."
+        "Each reading was predicted from all readings before it. Its normalised, independent components lie "
+        "within 1 and 2σ as often as those of a normal distribution if the plan's disturbances are right; the "
+        "confidence interval is the exact binomial one."
     )
     artefacts: list[Artefact] = []
-    score = f"Mean log score of a reading: {told.scores.log_score:.3f}, larger is better."
-    text = [score if told.scores.readings else "Nothing was predicted yet."]
-    if told.innovations:
-        above = sum(chi > limit_of(FALSE_ALARM, degrees) for _, chi, degrees in told.innovations)
+    score = f"Mean log score per reading: {result.scores.log_score:.3f} (larger is better)."
+    text = [score if result.scores.readings else "No reading has been predicted yet."]
+    if result.innovations:
+        above = sum(chi > limit_of(FALSE_ALARM, degrees) for _, chi, degrees in result.innovations)
         text.append(
-            f"Of the last {len(told.innovations)} readings {above} "
-            f"{'is' if above == 1 else 'are'} above the limit, of {FALSE_ALARM * len(told.innovations):.1f} expected."
+            f"{above} of the last {len(result.innovations)} readings {'exceeds' if above == 1 else 'exceed'} the limit "
+            f"of chi-square; {FALSE_ALARM * len(result.innovations):.1f} are expected by chance."
         )
-        artefacts.append(_figure("innovations", "Departures from predictions", innovations_svg(overview)))
+        artefacts.append(_figure("innovations", "Innovations of the readings", innovations_svg(overview)))
     if rows:
         artefacts.append(Table("coverage", "Coverage so far", caption, heads, rows, within=""))
     return Section("Predictions", tuple(text), tuple(artefacts), name="predictions")
 
 
-def _explained(overview: Overview) -> str:
+def _explained_sentence(overview: Overview) -> str:
+    """Return the sentence on the scatter that temperatures explain; empty if it is unknown."""
     known = {name: share for name, share in overview.filter_result.explained.items() if math.isfinite(share)}
     if not known:
         return ""
     parts = [
-        f"{100.0 * known[quantity.name]:.0f} % of that of {name_of(quantity.name, overview.quantities)}"
+        f"{100.0 * known[quantity.name]:.0f} % for {name_of(quantity.name, overview.quantities)}"
         for quantity in overview.quantities
         if known.get(quantity.name, 0.0) >= 0.005
         and (overview.required(quantity) or not overview.filter_result.requirements)
     ]
     if not parts:
-        return "Temperatures explain nothing of the scatter of what is required"
-    return f"Of the readings' scatter temperatures explain {', '.join(parts[:MOST_EXPLAINED])}"
+        return "Temperatures explain none of the scatter of the required quantities"
+    return f"Temperatures explain part of the scatter of the readings: {', '.join(parts[:MOST_EXPLAINED])}"
 
 
 def _jump_section(overview: Overview) -> Section | None:
-    told = overview.filter_result
-    heads = ("came until", "told", "body", "best known part", "did to the line", "log ratio", "false alarm", "or else")
-    digits = ("after", "until", "told", "body", "part", "size", "sigma", "unit", "log ratio", "false alarm", "or else")
+    """Return the section on detected jumps and events."""
+    result = overview.filter_result
+    heads = ("occurred before", "detected", "body", "best known motion", "change of the line of sight", *_JUMP_HEADS)
+    digits = ("after", "until", "detected", "body", "motion", "size", "sigma", "unit", *_JUMP_HEADS)
     rows: list[list[Cell]] = []
     full: list[list[Cell]] = []
-    for jump in sorted(told.jumps, key=lambda one: -one.until_us):
+    for jump in sorted(result.jumps, key=lambda one: -one.until_us):
         label, unit, size, sigma = best_known_motion(jump)
         part, rivals = label.removeprefix(f"{jump.body} "), sorted(jump.rivals.items(), key=lambda one: -one[1])
         others = ", ".join(f"{body} ({ratio:.1f})" for body, ratio in rivals[:3])
@@ -417,26 +434,26 @@ def _jump_section(overview: Overview) -> Section | None:
         when = [utc_text(time) for time in (jump.after_us, jump.until_us, jump.detected_us)]
         full.append([*when, jump.body, part, size, sigma, unit, jump.log_ratio, jump.false_alarm, others])
     events = [
-        f"{minute_text(time)}: {name.replace('_', ' ')}" + (f", which may step {', '.join(causes)}" if causes else "")
+        f"{minute_text(time)}: {name.replace('_', ' ')}" + (f", which steps {', '.join(causes)}" if causes else "")
         for time, name, causes in overview.events
     ]
     artefacts: list[Artefact] = []
     if rows:
         caption = (
             "A jump is a step of one body that the readings show and no event explains, at a time between two "
-            "readings. What it did to the line is by all bodies that can have made it, which stand at the end with "
-            "their log ratios. Times are UTC."
+            "readings. Its change of the line of sight is averaged over all bodies that can have jumped; others "
+            "are listed with their log likelihood ratios. Times are UTC."
         )
-        own = Table("jumps", "Jumps that were found", "", digits, full, within="")
+        own = Table("jumps", "Detected jumps", "", digits, full, within="")
         artefacts.append(replace(_newest("jumps", own.title, caption, heads, rows), full=own))
     if events:
         artefacts.append(Text("events", "Events of the record", "", events[::-1][:MOST_SHOWN], within=""))
-    words = () if artefacts else ("No jump was found, and the record has no event.",)
+    words = () if artefacts else ("No jump was detected, and the record has no event.",)
     return Section("Jumps and events", words, tuple(artefacts), name="jumps")
 
 
 def _newest(name: str, title: str, caption: str, heads: Sequence[str], rows: list[list[Cell]]) -> Table:
-    """A table of the newest rows, which stand first, with all of them to be taken away."""
+    """Return a table of the first rows, which are the newest, with a CSV of all rows."""
     if len(rows) <= MOST_SHOWN:
         return Table(name, title, caption, heads, rows, within="")
     full = Table(name, title, "", heads, rows, within="")
@@ -445,6 +462,7 @@ def _newest(name: str, title: str, caption: str, heads: Sequence[str], rows: lis
 
 
 def _sensor_section(overview: Overview) -> Section:
+    """Return the section on the temperature sensors."""
     rows: list[list[Cell]] = [
         [
             one.body,
@@ -455,38 +473,37 @@ def _sensor_section(overview: Overview) -> Section:
         ]
         for one in sorted(overview.filter_result.sensors, key=lambda one: (one.state == "ok", one.body))
     ]
-    heads = ("body", "state", "since", "last reading", "why")
+    heads = ("body", "state", "since", "last reading", "reason")
     if not rows:
-        return Section("Sensors", ("The record has no temperature.",), name="sensors")
-    caption = (
-        "Sensors of temperatures as their own readings show them, those that are not in order first. Times are UTC."
-    )
+        return Section("Sensors", ("The record has no temperatures.",), name="sensors")
+    caption = "Condition of the temperature sensors, judged from their readings; faulty ones first. Times are UTC."
     return Section("Sensors", (), (Table("sensors", "", caption, heads, rows, within=""),), name="sensors")
 
 
 def _alarm_section(overview: Overview) -> Section:
+    """Return the section on the alarms."""
     if not overview.alarms:
         return Section("Alarms", ("No alarm has been raised.",), name="alarms")
     waiting = {id(alarm) for alarm in overview.open_alarms()}
     rows: list[list[Cell]] = []
     for one in sorted(overview.alarms, key=lambda one: (id(one) not in waiting, -int(one["time_us"]))):
         known = one["acknowledged"]
-        who = "open" if known is None else _who(known)
+        who = "open" if known is None else _acknowledged_text(known)
         state = Marked(who, look="text wrong" if known is None else "text", key=f"alarm {one['id']}")
         rows.append([minute_text(int(one["time_us"])), str(one["kind"]).replace("_", " "), str(one["text"]), state])
-    heads = ("time", "sort", "alarm", "acknowledged")
-    words = (
-        f"{len(waiting)} of {len(overview.alarms)} wait for an acknowledgement." if waiting else "All are acknowledged."
-    )
+    heads = ("time", "kind", "alarm", "acknowledged")
+    words = f"{len(waiting)} of {len(overview.alarms)} alarms are open." if waiting else "All alarms are acknowledged."
     return Section("Alarms", (words,), (_newest("alarms", "", "Times are UTC.", heads, rows),), name="alarms")
 
 
-def _who(ack: Mapping[str, Any]) -> str:
+def _acknowledged_text(ack: Mapping[str, Any]) -> str:
+    """Return who acknowledged an alarm, when, and the note."""
     note = f": {ack['note']}" if ack.get("note") else ""
     return f"{ack['by']}, {str(ack['acknowledged_utc'])[:16].replace('T', ' ')}{note}"
 
 
-def _left_out_section(history: History, overview: Overview) -> Section:
+def _excluded_section(history: History, overview: Overview) -> Section:
+    """Return the section on excluded readings and refusals."""
     rows: list[list[Cell]] = [
         [minute_text(time), kind, subject, reason]
         for time, kind, subject, reason in sorted(overview.filter_result.excluded, key=lambda one: -one[0])
@@ -495,28 +512,29 @@ def _left_out_section(history: History, overview: Overview) -> Section:
     artefacts: list[Artefact] = []
     if rows:
         caption = "In the record, but not used for the estimate. Times are UTC."
-        artefacts.append(_newest("left-out", "Left out", caption, ("time", "sort", "of", "why"), rows))
+        artefacts.append(_newest("excluded", "Excluded readings", caption, ("time", "kind", "subject", "reason"), rows))
     if refused:
         own: list[list[Cell]] = [
             [one["refused_utc"], f"{one['file']}{'' if one['line'] is None else ':' + str(one['line'])}", one["reason"]]
             for one in refused[::-1]
         ]
-        caption = "Refused when their files were taken, and not in the record."
-        artefacts.append(_newest("refused", "Refused", caption, ("refused [UTC]", "in", "why"), own))
-    words = () if artefacts else ("Nothing was left out or refused.",)
-    return Section("What was left out", words, tuple(artefacts), name="left-out")
+        caption = "Refused at the ingest of their files, and not in the record."
+        artefacts.append(_newest("refused", "Refused", caption, ("refused [UTC]", "file", "reason"), own))
+    words = () if artefacts else ("Nothing was excluded or refused.",)
+    return Section("Excluded and refused", words, tuple(artefacts), name="excluded")
 
 
 def _warnings(overview: Overview, end: int) -> tuple[str, ...]:
+    """Return the warnings of the report."""
     out = overview.filter_result.warnings
     age = (end - overview.time) / DAY
     if age > 1.0:
         out.append(f"the newest reading is {age:.0f} d older than the end of the day")
     waiting = overview.open_alarms()
     if waiting:
-        count = "one alarm waits" if len(waiting) == 1 else f"{len(waiting)} alarms wait"
-        out.append(f"{count} for an acknowledgement; the newest: {waiting[0]['text']}")
+        count = "one alarm is open" if len(waiting) == 1 else f"{len(waiting)} alarms are open"
+        out.append(f"{count}; the newest: {waiting[0]['text']}")
     bad = [sensor for sensor in overview.filter_result.sensors if sensor.state != "ok"]
     if bad:
-        out.append("sensors that are not in order: " + ", ".join(f"{one.body} ({one.state})" for one in bad))
+        out.append("faulty sensors: " + ", ".join(f"{one.body} ({one.state})" for one in bad))
     return tuple(out)

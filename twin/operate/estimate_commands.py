@@ -1,4 +1,4 @@
-"""Commands on an estimate: the forecast, alarms, decisions, products and the daily report; how an instrument stands."""
+"""Commands on an estimate: forecast, alarms, decisions, products, daily report; printed state of the instrument."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from twin.operate.terminal import (
     NewFolder,
     PlanFile,
     input_errors,
-    line,
     on_record,
+    print_line,
     require_new,
     show_table,
     utc_option,
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from twin.operate.record.history import History
 
 STEPS = 4
-"""Columns of a forecast after the first, now."""
+"""Default number of times of a forecast after the newest reading."""
 
 
 @on_record
@@ -42,12 +42,14 @@ def forecast(
     until: Annotated[
         str | None, typer.Option(metavar="UTC", help="End of the forecast. Default: the plan's horizon.")
     ] = None,
-    steps: Annotated[int, typer.Option(min=1, max=1000, help="Times of it, evenly spaced.")] = STEPS,
+    steps: Annotated[
+        int, typer.Option(min=1, max=1000, help="Number of evenly spaced times after the newest reading.")
+    ] = STEPS,
 ) -> None:
-    """Tell what is expected of every quantity until the horizon, with sigmas, and when a requirement will break.
+    """Forecast every quantity until the horizon, with sigmas, and the time at which a requirement is violated.
 
-    A forecast begins at the newest reading. Drift is forgotten with its time, seasons and trends go on, and sigma grows
-    as the plan's laws of time say.
+    A forecast begins at the newest reading. Drifts decay with their correlation times, seasons and trends continue,
+    and sigma grows by the time laws of the plan's disturbances.
 
     Example: `python -m twin.operate forecast record --until 2030-01-01T00:00:00Z`
 
@@ -55,7 +57,7 @@ def forecast(
     """
     from twin.operate.record.entries import MICRO
 
-    operation = call.followed(call.planned(plan))
+    operation = call.filtered_operation(call.resolve_plan(plan))
     result = operation.filter_readings()
     start, horizon = result.time, round(operation.plan.operation.horizon * MICRO)
     end = start + horizon if until is None else utc_option("--until", until)
@@ -71,24 +73,22 @@ def forecast(
         _show_course(course, console)
         show_requirements(result, console)
         for text in warnings:
-            line(console, f"warning: {text}")
+            print_line(console, f"warning: {text}")
 
-    call.tell({**data, "warnings": warnings}, show)
+    call.print_result({**data, "warnings": warnings}, show)
 
 
 @on_record
 def alarms(
     call: Call,
-    acknowledge: Annotated[
-        int | None, typer.Option(metavar="ID", help="Say that somebody has seen this alarm.")
-    ] = None,
-    by: Annotated[str | None, typer.Option(metavar="NAME", help="Who has seen it.")] = None,
-    note: Annotated[str, typer.Option(metavar="TEXT", help="What is done about it.")] = "",
+    acknowledge: Annotated[int | None, typer.Option(metavar="ID", help="Acknowledge this alarm.")] = None,
+    by: Annotated[str | None, typer.Option(metavar="NAME", help="Person who has seen it.")] = None,
+    note: Annotated[str, typer.Option(metavar="TEXT", help="Action taken.")] = "",
 ) -> None:
-    """List the alarms of a record, those first that nobody has acknowledged; or acknowledge one.
+    """List the alarms of a record, open ones first; or acknowledge one.
 
-    `ingest` and `status` raise an alarm once: a requirement that does not hold or is expected to break, a jump, a
-    sensor that is dead, stuck or doubtful, a reading that contradicts what is stated. No alarm is ever removed.
+    `ingest` and `status` raise an alarm once: for a requirement that is violated or is expected to be, a jump, a
+    sensor that is dead, stuck or doubtful, and a reading that contradicts the prior. Alarms are never removed.
 
     Example: `python -m twin.operate alarms record --acknowledge 1 --by Ann --note "safe mode of 5 March"`
 
@@ -96,33 +96,34 @@ def alarms(
     """
     if acknowledge is not None:
         if not (by and by.strip()):
-            raise InputErrorText("--acknowledge: who has seen the alarm? --by NAME")
+            raise InputErrorText("--acknowledge needs --by NAME, the person who has seen the alarm")
         with input_errors("--acknowledge"):
             call.history.acknowledge(acknowledge, by.strip(), note)
     elif by is not None or note:
-        raise InputErrorText("--by and --note: which alarm? --acknowledge ID")
+        raise InputErrorText("--by and --note need --acknowledge ID")
     rows = call.history.alarms()
     opened = sum(row["acknowledged"] is None for row in rows)
 
     def show(console: Console) -> None:
         print_verdict(console, f"{call.history.name}: {_open_text(opened)}, {len(rows)} in all")
         for one in sorted(rows, key=lambda one: (one["acknowledged"] is not None, -one["time_us"])):
-            line(console, alarm_line(one))
+            print_line(console, alarm_line(one))
 
-    call.tell({"open": opened, "alarms": rows}, show)
+    call.print_result({"open": opened, "alarms": rows}, show)
 
 
 @on_record
 def exclude(
     call: Call,
-    entry: Annotated[int, typer.Argument(metavar="ENTRY", min=1, help="Number of the entry, as status says.")],
-    why: Annotated[str, typer.Option(metavar="TEXT", help="The reason, which the record keeps.")],
+    entry: Annotated[int, typer.Argument(metavar="ENTRY", min=1, help="Number of the entry, as `status` shows it.")],
+    why: Annotated[str, typer.Option(metavar="TEXT", help="Reason, which is stored in the record.")],
     include: Annotated[
-        bool, typer.Option("--include", help="Include it again, or although the estimate left it out as a bad one.")
+        bool, typer.Option("--include", help="Include it, also if the estimate rejected it as an outlier.")
     ] = False,
 ) -> None:
-    """Exclude a reading from the estimate, or include it, with the reason. The record keeps the reading and all
-    decisions; the newest counts.
+    """Exclude a reading from the estimate, or include it, with a reason.
+
+    The record keeps the reading and all decisions; the newest one counts.
 
     For example:
 
@@ -137,7 +138,7 @@ def exclude(
         made = call.history.decide(entry, include, why.strip())
     text = "entry {entry}, {kind} of {subject} at {time_utc}, is ".format(**made)
     text += f"{'included' if include else 'excluded'}: {made['why']}"
-    call.tell(made, lambda console: print_verdict(console, text))
+    call.print_result(made, lambda console: print_verdict(console, text))
 
 
 @on_record
@@ -145,22 +146,23 @@ def products(
     call: Call,
     plan: PlanFile = None,
     moment: Annotated[
-        str | None,
-        typer.Option("--time", metavar="UTC", help="Of the estimate; that of the scene where it is not given."),
+        str | None, typer.Option("--time", metavar="UTC", help="Time of the estimate. Default: that of the scene.")
     ] = None,
     scene: Annotated[
         Path | None,
         typer.Option(
             readable=False,
-            help="YAML file of a test of intersection angles with the instrument, or its run folder: camera, orbit and "
-            "attitude of a scene whose camera models are wanted.",
+            help="Scene whose camera models are wanted: YAML file of a test of intersection angles with the "
+            "instrument, or its run folder, with camera, orbit and attitude.",
         ),
     ] = None,
     out: NewFolder = Path("products"),
 ) -> None:
-    """Write what the estimate says for one time: models of a scene's cameras as they were then (ISD and RPC00B with
-    ERR_BIAS and ERR_RAND), the state of the instrument as a job for twin.render (state.yaml), and what is uncertain of
-    it as a prior for twin.asbuilt (prior.yaml). products.json says from when to when they hold.
+    """Write the products of the estimate for one time.
+
+    They are models of a scene's cameras at that time (ISD and RPC00B with ERR_BIAS and ERR_RAND), the state of the
+    instrument as a job for twin.render (state.yaml), and its uncertainty as a prior for twin.asbuilt (prior.yaml).
+    products.json states their period of validity.
 
     Example: `python -m twin.operate products record --scene scenes/orbit/angle_gf7.yaml --time 2026-03-05T03:05:00Z`
 
@@ -178,13 +180,13 @@ def products(
         with input_errors("--scene"):
             time = scene_time(source)
     else:
-        raise InputErrorText("of which time? --time UTC, or --scene FILE, which has one")
-    operation = call.followed(call.planned(plan))
+        raise InputErrorText("no time: give --time UTC, or --scene FILE, which has one")
+    operation = call.filtered_operation(call.resolve_plan(plan))
     with input_errors():
         one = make_products(operation, call.history, time, source, load_backend())
     files, numbers = product_files(one)
     call.write_new(out, files, "products")
-    call.tell(numbers, lambda console: line(console, summary(one)))
+    call.print_result(numbers, lambda console: print_line(console, summary(one)))
 
 
 @on_record
@@ -192,48 +194,50 @@ def report(
     call: Call,
     plan: PlanFile = None,
     day: Annotated[
-        str | None, typer.Option(metavar="UTC", help="Day of the report, 2028-03-05. Default: of the newest reading.")
+        str | None,
+        typer.Option(metavar="UTC", help="Day of the report, 2028-03-05. Default: that of the newest reading."),
     ] = None,
     out: Annotated[
-        Path, typer.Option(metavar="FILE.html", readable=False, help="The report; a file of that name is replaced.")
+        Path,
+        typer.Option(metavar="FILE.html", readable=False, help="File of the report, which is replaced if it exists."),
     ] = Path("report.html"),
 ) -> None:
-    """Write the daily report: one page that needs no other file, to be kept or to be sent by mail.
+    """Write the daily report: one self-contained page, to be stored or sent by mail.
 
-    Two sentences say first how the instrument stands against its requirements, and what changed on the day. Then come
-    every quantity with its sigma, its requirement, its chance to keep it and the day on which it is expected to break;
-    trends, jumps, predictions and whether they came true, sensors, alarms, and what was left out and why. Of a day that
-    is past it is the report as it would have been then.
+    Its first two sentences state whether the requirements are met and what changed on the day. Then follow every
+    quantity with its sigma, its requirement, the probability that it is exceeded and the expected day of a violation;
+    trends, jumps, the quality of the predictions, sensors, alarms, and excluded readings with the reason. The report
+    of a past day is the one that would have been written then.
 
     Example: `python -m twin.operate report record --day 2028-03-05 --out report.html`
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
     from twin.operate.daily_report import end_of_day
-    from twin.operate.overview import span_of
+    from twin.operate.overview import monitor_span
     from twin.operate.record.history import History
 
-    first, newest = span_of(call.history)
+    first, newest = monitor_span(call.history)
     if not newest:
-        raise InputErrorText("the record has no reading of the monitor; ingest takes some")
+        raise InputErrorText("the record has no reading of the monitor; ingest some first")
     with input_errors("--day"):
         end = end_of_day(day, newest)
     if end <= first:
         raise InputErrorText(f"--day: the record has no reading of the monitor before the end of {day}")
     operation, _, _ = call.estimate(plan)
-    words = [call.place, *([] if plan is None else [str(plan)]), *([] if day is None else ["--day", day])]
-    with History(call.place, end) as then:
+    words = [call.location, *([] if plan is None else [str(plan)]), *([] if day is None else ["--day", day])]
+    with History(call.location, end) as then:
         own = then if end <= newest else call.history
         if own is then:  # it goes on from what was kept of the whole record before the day's end
-            operation = call.followed(operation.plan, then)
+            operation = call.filtered_operation(operation.plan, then)
         made = write_report(call, own, operation, end, words, out)
     data = {"report": str(out), "verdict": made.verdict, "warnings": list(made.warnings)}
 
     def show(console: Console) -> None:
         print_verdict(console, made.verdict)
-        line(console, f"report: {out}")
+        print_line(console, f"report: {out}")
 
-    call.tell(data, show)
+    call.print_result(data, show)
 
 
 def write_report(
@@ -244,22 +248,22 @@ def write_report(
     Parameters
     ----------
     call : Call
-        The command.
+        The running command.
     history : History
-        Its record, or that as it was.
+        Its record, or the record as of an earlier time.
     operation : Operation
-        The estimate from it.
+        Estimate of that record.
     end : int
-        Of the day, microseconds of TAI since 2000.
+        End of the day, in microseconds of TAI since 2000.
     words : Sequence[str]
-        After ``twin.operate report``, of the command that makes it again.
+        Arguments of ``twin.operate report`` that repeat the report.
     out : Path
         File, which is replaced.
 
     Raises
     ------
     typer.Exit
-        It cannot be written, which has been told.
+        The file cannot be written; the error has been printed.
     """
     from twin.framework.page import report_page
     from twin.operate.daily_report import daily_report
@@ -279,19 +283,19 @@ def _open_text(count: int) -> str:
 
 
 def alarm_line(row: Mapping[str, Any]) -> str:
-    """An alarm of the record, with who has seen it."""
+    """Return an alarm of the record in words, with its acknowledgement."""
     seen = row["acknowledged"]
     state = "open" if seen is None else f"seen by {seen['by']}{': ' if seen['note'] else ''}{seen['note']}"
     return f"alarm {row['id']}, {row['time_utc']}, {row['kind']} ({state}): {row['text']}"
 
 
 def show_estimate(result: FilterResult, rows: Sequence[Mapping[str, Any]], console: Console) -> None:
-    """The head of the estimate: now, predictions and whether they came true, jumps, sensors, what was left out, alarms.
+    """Print the estimate: present values, quality of the predictions, jumps, sensors, excluded entries and alarms.
 
     Parameters
     ----------
-    following : Following
-        What is known after all readings.
+    result : FilterResult
+        Result of filtering all readings.
     rows : Sequence[Mapping[str, Any]]
         Alarms of the record.
     console : Console
@@ -306,29 +310,31 @@ def show_estimate(result: FilterResult, rows: Sequence[Mapping[str, Any]], conso
     if scores.components:
         one, two = (100.0 * part / scores.components for part in (scores.within_one, scores.within_two))
         text = f"{one:.1f} % within one sigma (68.3 % expected), {two:.1f} % within two (95.4 %)"
-        line(console, f"predictions before the readings came: {text}; mean log score {scores.log_score:.2f}")
+        print_line(console, f"predictions of the readings: {text}; mean log score {scores.log_score:.2f}")
     for text in result.warnings:
-        line(console, f"warning: {text}")
+        print_line(console, f"warning: {text}")
     for jump in result.jumps:
-        line(console, f"jump of {jump.body} {jump.summary}")
+        print_line(console, f"jump of {jump.body} {jump.summary}")
     bad = [sensor for sensor in result.sensors if sensor.state != "ok"]
     if result.sensors:
-        line(console, f"sensors: {len(result.sensors) - len(bad)} of {len(result.sensors)} are as they should be")
+        print_line(console, f"sensors: {len(result.sensors) - len(bad)} of {len(result.sensors)} are in order")
     for sensor in bad:
-        line(console, f"  {sensor.body}: {sensor.state} since {utc_text(sensor.since_us)}: {sensor.reason}")
+        print_line(console, f"  {sensor.body}: {sensor.state} since {utc_text(sensor.since_us)}: {sensor.reason}")
     if result.excluded:
-        line(console, f"left out of the estimate: {len(result.excluded)} of the last readings and more; the newest")
+        print_line(console, f"excluded from the estimate: {len(result.excluded)} of the latest entries; the newest:")
         for time, _, subject, reason in result.excluded[-3:]:
-            line(console, f"  {utc_text(time)} {subject}: {reason}")
+            print_line(console, f"  {utc_text(time)} {subject}: {reason}")
     waiting = [row for row in rows if row["acknowledged"] is None]
     for alarm in waiting[-10:]:
-        line(console, alarm_line(alarm))
+        print_line(console, alarm_line(alarm))
     if waiting:
-        line(console, f"{_open_text(len(waiting))}; python -m twin.operate alarms RECORD --acknowledge ID --by NAME")
+        print_line(
+            console, f"{_open_text(len(waiting))}; python -m twin.operate alarms RECORD --acknowledge ID --by NAME"
+        )
 
 
 def _show_course(course: Course, console: Console) -> None:
-    """A row for each quantity, a column for each time."""
+    """Print a table with one row for each quantity and one column for each time."""
     from twin.operate.estimate.reported_estimate import name_of, with_sigma
 
     utc = course.utc
@@ -341,14 +347,14 @@ def _show_course(course: Course, console: Console) -> None:
 
 
 def show_power(found: Sequence[DetectionPower], console: Console) -> None:
-    """A row for each body: the smallest jumps that are found, over the stated sizes."""
-    heads = ("smallest jump found, over the stated", *(key.replace("_", " ") for key in found[0].plain))
+    """Print a table with the smallest detectable jumps of each body, in their stated standard deviations."""
+    heads = ("smallest detectable jump, in stated sigmas", *(key.replace("_", " ") for key in found[0].plain))
     sizes = ([one.body, *("none" if size is None else f"{size:.2g}" for size in one.plain.values())] for one in found)
     show_table(console, heads, sizes, ())
 
 
 def show_requirements(result: FilterResult, console: Console) -> None:
-    """A row for each requirement."""
+    """Print a table with one row for each requirement."""
     from twin.framework.artefact import plain
     from twin.operate.estimate.reported_estimate import name_of, percent
     from twin.operate.record.entries import utc_text
@@ -357,7 +363,7 @@ def show_requirements(result: FilterResult, console: Console) -> None:
         return
     rows = []
     for requirement in result.requirements:
-        later = "now" if not requirement.holds_now else "not in the horizon"
+        later = "now" if not requirement.holds_now else "not within the horizon"
         rows.append(
             [
                 name_of(requirement.quantity, result.now.quantities),
@@ -370,5 +376,5 @@ def show_requirements(result: FilterResult, console: Console) -> None:
                 else later,
             ]
         )
-    heads = ("has to keep", "limit", "chance beyond", "allowed", "holds now", "expected to break")
+    heads = ("requirement on", "limit", "P(exceeded)", "allowed", "holds now", "expected violation")
     show_table(console, heads, rows, (1, 2, 3, 5))

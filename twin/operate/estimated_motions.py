@@ -1,9 +1,11 @@
-"""What the stated motions of an instrument are estimated to be at one time, as files of other commands: the job of that
-state for `twin.render`, and what is still uncertain of it as a file of disturbances, a prior for `twin.asbuilt`.
+"""Estimated motions of an instrument at one time, as files of other commands.
 
-Two causes may move the same body in the same way, and about different points. A job and a file of disturbances say each
-component once: amounts add up, and a turn or a growth about another point q than the component's p is one about p with
-the shift theta x (p - q), or s (p - q), which is exact to the first order in the motion.
+The files are the job of the estimated state for `twin.render`, and its uncertainty as a file of disturbances, a prior
+for `twin.asbuilt`.
+
+Two causes may move the same body in the same way about different points. A job and a file of disturbances state each
+component once: amounts add up, and a rotation theta or a scale s about another point q than the component's pivot p
+equals one about p with the shift theta x (p - q), or s (p - q), to first order in the motion.
 """
 
 from __future__ import annotations
@@ -27,23 +29,23 @@ from scenes.specs.job_tables import TableTemperatureSpec
 from scenes.yaml.yaml_file import dump_yaml
 
 UNSUPPORTED = ("index_gradient",)
-"""Kinds of components that `perturb` of a job has no key for."""
+"""Kinds of components for which `perturb` of a job has no key."""
 PIVOTED = ("rotate", "scale")
-"""Kinds whose pivot matters."""
+"""Kinds of components that depend on a pivot."""
 
 
 @dataclass(frozen=True, eq=False)
 class EstimatedMotions:
-    """All stated motions at one time.
+    """Estimate of all stated motions at one time.
 
     Attributes
     ----------
     components : tuple[Component, ...]
-        M of them, as they are stated.
-    mean : Array
-        (M,) estimated amounts, SI.
-    covariance : Array
-        (M, M) of their errors, SI.
+        The M stated components.
+    mean : (M,) ndarray
+        Estimated amounts, in SI units.
+    covariance : (M, M) ndarray
+        Covariance of their errors, in SI units.
     """
 
     components: tuple[Component, ...]
@@ -52,21 +54,21 @@ class EstimatedMotions:
 
     @classmethod
     def in_units(cls, components: Sequence[Component], mean: Array, covariance: Array) -> EstimatedMotions:
-        """From numbers in the units in which people read components.
+        """Return the estimate from numbers in the components' display units.
 
         Parameters
         ----------
         components : Sequence[Component]
-            M of them.
-        mean : Array
-            (M,) in the components' units.
-        covariance : Array
-            (M, M) likewise.
+            The M components.
+        mean : (M,) ndarray
+            Amounts in the components' units.
+        covariance : (M, M) ndarray
+            Covariance in these units.
 
         Raises
         ------
         ValueError
-            Not as many numbers as components.
+            The numbers of amounts and components differ.
         """
         size = np.array([component.unit_size for component in components])
         if mean.shape != size.shape or covariance.shape != (len(size),) * 2:
@@ -75,26 +77,26 @@ class EstimatedMotions:
 
     @property
     def sigma(self) -> Array:
-        """(M,) standard deviations, SI."""
+        """(M,) standard deviations, in SI units."""
         return np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0))
 
 
 @dataclass(frozen=True)
 class OmittedComponent:
-    """A component that a file does not have.
+    """Component that a file omits.
 
     Attributes
     ----------
     name : str
-        Of it.
+        Body, kind and axis of the component.
     amount : float
-        What is not there: of a state the estimated amount, of a prior the standard deviation, SI.
+        Omitted amount, in SI units: the estimate for a state, the standard deviation for a prior.
     unit : str
-        In which people read it.
+        Display unit.
     unit_size : float
-        That unit in SI.
+        The display unit in SI units.
     share : float | None
-        Of the largest share of the variance of a spot or a parameter that goes with it; of a prior only.
+        For a prior, the largest share of the variance of a spot or a parameter that the component contributes.
     """
 
     name: str
@@ -105,15 +107,16 @@ class OmittedComponent:
 
 
 def perturbation(found: EstimatedMotions, thermal: ThermalModel) -> dict[str, PerturbationSpec]:
-    """The estimated amounts as `perturb` of a job: what `scenes.models.disturbances.state_of` makes of them, but for
-    components of kinds `UNSAID`.
+    """Return the estimated amounts as `perturb` of a job, without components of the kinds `UNSUPPORTED`.
+
+    The result corresponds to `scenes.models.disturbances.state_of` of the same amounts.
 
     Parameters
     ----------
     found : EstimatedMotions
-        At one time.
+        Motions at one time.
     thermal : ThermalModel
-        Of the instrument.
+        Thermal model of the instrument.
     """
     said = [k for k, component in enumerate(found.components) if component.kind not in (*HEAT, *UNSUPPORTED)]
     moves = state_of(found.mean[said], [found.components[k] for k in said], thermal)
@@ -128,6 +131,7 @@ def perturbation(found: EstimatedMotions, thermal: ThermalModel) -> dict[str, Pe
 
 
 def _perturbed(motion: Motion, heat: Temperature | None) -> PerturbationSpec:
+    """Return a body's perturbation from its motion and its temperature."""
     warm = None
     if heat is not None:
         warm = TableTemperatureSpec.model_construct(change=heat.change, gradient=heat.gradient)
@@ -145,36 +149,36 @@ def _perturbed(motion: Motion, heat: Temperature | None) -> PerturbationSpec:
 
 
 def state_file(
-    found: EstimatedMotions, thermal: ThermalModel, instrument: str, disturbances: str, remark: str
+    motions: EstimatedMotions, thermal: ThermalModel, instrument: str, disturbances: str, remark: str
 ) -> tuple[str, tuple[OmittedComponent, ...]]:
-    """Text of the job of the estimated state, and what of it a job cannot say.
+    """Return the text of the job of the estimated state, and the components that a job cannot express.
 
     Parameters
     ----------
-    found : EstimatedMotions
-        At one time.
+    motions : EstimatedMotions
+        Motions at one time.
     thermal : ThermalModel
-        Of the instrument.
+        Thermal model of the instrument.
     instrument : str
-        Its name, or absolute path of its file.
+        Name of the instrument, or absolute path of its file.
     disturbances : str
-        Likewise of the file on which sigmas rest.
+        Name or absolute path of the disturbances on which the sigmas depend.
     remark : str
-        At the top of the file, lines of comment.
+        Comment at the top of the file, one or several lines.
     """
-    job = JobSpec.model_construct(instrument=instrument, perturb=FrozenMap(perturbation(found, thermal)))
+    job = JobSpec.model_construct(instrument=instrument, perturb=FrozenMap(perturbation(motions, thermal)))
     plain = {"instrument": instrument, "perturb": _short(job.plain()["perturb"])}
     head = "".join(f"# {line}\n" for line in remark.splitlines())
-    left = tuple(
-        OmittedComponent(one.name, amount, one.unit, one.unit_size)
-        for one, amount in zip(found.components, found.mean.tolist(), strict=True)
-        if one.kind in UNSUPPORTED and amount
+    omitted = tuple(
+        OmittedComponent(component.name, amount, component.unit, component.unit_size)
+        for component, amount in zip(motions.components, motions.mean.tolist(), strict=True)
+        if component.kind in UNSUPPORTED and amount
     )
-    return head + dump_yaml({**plain, "disturbances": disturbances}), left
+    return head + dump_yaml({**plain, "disturbances": disturbances}), omitted
 
 
 def _short(perturb: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, object]]:
-    """Perturbations without what a job takes anyway."""
+    """Return perturbations without the default values of a job."""
     usual = PerturbationSpec().plain()
     return {
         body: {key: value for key, value in what.items() if key == "temperature" or value != usual.get(key)}
@@ -182,64 +186,64 @@ def _short(perturb: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, o
     }
 
 
-def merge_components(found: EstimatedMotions, instrument: Instrument) -> tuple[tuple[Component, ...], Array]:
-    """Every component of every body once, and what of them each stated motion is, (J, M).
+def merge_components(motions: EstimatedMotions, instrument: Instrument) -> tuple[tuple[Component, ...], Array]:
+    """Merge components of the same body, kind and axis, and return the (J, M) matrix from motions to merged components.
 
     Parameters
     ----------
-    found : EstimatedMotions
-        M motions.
+    motions : EstimatedMotions
+        The M motions.
     instrument : Instrument
-        Of them.
+        Their instrument.
     """
     nodes, bodies = instrument.nodes, {body.path: body for body in instrument.assembly.tree.bodies}
     components: list[Component] = []
-    places: dict[tuple[str, str, int], int] = {}
+    indices: dict[tuple[str, str, int], int] = {}
     entries: list[tuple[int, int, float]] = []
 
-    def place(body: str, kind: str, axis: int, pivot: str) -> int:
-        own = places.setdefault((body, kind, axis), len(components))
-        if own == len(components):
+    def index_of(body: str, kind: str, axis: int, pivot: str) -> int:
+        index = indices.setdefault((body, kind, axis), len(components))
+        if index == len(components):
             components.append(Component("estimate", body, kind, axis, pivot, 0.0))
-        return own
+        return index
 
-    for k, component in enumerate(found.components):
-        own = place(component.body, component.kind, component.axis, component.pivot)
-        entries.append((own, k, 1.0))
+    for k, component in enumerate(motions.components):
+        index = index_of(component.body, component.kind, component.axis, component.pivot)
+        entries.append((index, k, 1.0))
         away = (
-            _pivot_shift(bodies[component.body], component, components[own].pivot)
+            _pivot_shift(bodies[component.body], component, components[index].pivot)
             if component.kind in PIVOTED
             else np.zeros(3)
         )
         for axis in np.flatnonzero(np.abs(away) > 0.0).tolist():
-            shift = place(component.body, "shift", axis, usual_pivot(nodes[component.body]))
+            shift = index_of(component.body, "shift", axis, usual_pivot(nodes[component.body]))
             entries.append((shift, k, float(away[axis])))
-    table = np.zeros((len(components), len(found.components)))
+    table = np.zeros((len(components), len(motions.components)))
     for row, column, value in entries:
         table[row, column] += value
     return tuple(components), table
 
 
-def _pivot_shift(body: Body, one: Component, pivot: str) -> Array:
-    """Shift (3,) that a turn or a growth about its own pivot is beside one about another pivot, per unit."""
-    apart = np.array(body.pivots[pivot]) - np.array(body.pivots[one.pivot])
-    return np.asarray(np.cross(np.eye(3)[one.axis], apart) if one.kind == "rotate" else apart)
+def _pivot_shift(body: Body, component: Component, pivot: str) -> Array:
+    """Return the shift (3,), per unit, between a rotation or scale about its own pivot and one about another pivot."""
+    apart = np.array(body.pivots[pivot]) - np.array(body.pivots[component.pivot])
+    return np.asarray(np.cross(np.eye(3)[component.axis], apart) if component.kind == "rotate" else apart)
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is still uncertain of a state, as a file of disturbances.
+    """Uncertainty of an estimated state, as a file of disturbances.
 
     Attributes
     ----------
     files : Mapping[str, str]
-        Name -> text; a table of correlations beside the file where there are many components.
+        Name -> text; a table of correlations is a file of its own where there are many components.
     components : tuple[Component, ...]
-        J that the file has.
-    table : Array
-        (J, M) what of them each stated motion is.
-    left_out : tuple[LeftOut, ...]
-        What it does not have.
+        The J components of the file.
+    table : (J, M) ndarray
+        Matrix from the stated motions to these components.
+    omitted : tuple[OmittedComponent, ...]
+        Components that the file omits.
     """
 
     files: Mapping[str, str]
@@ -249,34 +253,34 @@ class Prior:
 
 
 def prior_files(
-    found: EstimatedMotions, stated: Disturbances, instrument: Instrument, stem: str, reason: str, remark: str
+    motions: EstimatedMotions, stated: Disturbances, instrument: Instrument, stem: str, reason: str, remark: str
 ) -> Prior:
-    """The covariance of the estimated motions as `joint` of a file of disturbances.
+    """Return the covariance of the estimated motions as `joint` of a file of disturbances.
 
-    A file holds `MOST_JOINT` components at most. Of more, those stay that make the largest share of the variance of
-    some spot or parameter, were they alone.
+    A file holds at most `MOST_JOINT` components. If there are more, those that alone would contribute the largest share
+    to the variance of some spot or parameter are selected.
 
     Parameters
     ----------
-    found : EstimatedMotions
-        M motions at one time.
+    motions : EstimatedMotions
+        The M motions at one time.
     stated : Disturbances
-        The same motions with what they do to spots and parameters.
+        Effect of the same motions on spots and parameters.
     instrument : Instrument
-        Of them.
+        Their instrument.
     stem : str
         Name of the file.
     reason : str
-        Where its numbers come from.
+        Source of its numbers.
     remark : str
-        At its top, lines of comment.
+        Comment at the top of the file, one or several lines.
     """
-    components, table = merge_components(found, instrument)
-    covariance = table @ found.covariance @ table.T
-    share = largest_shares(found, stated)
+    components, table = merge_components(motions, instrument)
+    covariance = table @ motions.covariance @ table.T
+    share = largest_shares(motions, stated)
     weight = np.array([share[table[j] != 0.0].max(initial=0.0) for j in range(len(components))])
     kept = np.sort(np.argsort(-weight, kind="stable")[:MOST_JOINT])
-    gone = sorted(set(range(len(components))) - set(kept.tolist()))
+    dropped = sorted(set(range(len(components))) - set(kept.tolist()))
     sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     spec = joint_disturbances(
         stem,
@@ -286,28 +290,28 @@ def prior_files(
         reason,
         f"What is not known of {instrument.spec.name} at one time of its operation, about the state that is estimated.",
     )
-    left = [
+    omitted = [
         OmittedComponent(
             components[j].name, float(sigma[j]), components[j].unit, components[j].unit_size, float(weight[j])
         )
-        for j in gone
+        for j in dropped
     ]
-    own = tuple(replace(components[j], sigma=float(sigma[j])) for j in kept)
-    return Prior(FrozenMap(joint_files(spec, stem, remark)), own, table[kept], tuple(left))
+    selected = tuple(replace(components[j], sigma=float(sigma[j])) for j in kept)
+    return Prior(FrozenMap(joint_files(spec, stem, remark)), selected, table[kept], tuple(omitted))
 
 
-def largest_shares(found: EstimatedMotions, stated: Disturbances) -> Array:
-    """(M,) largest share of the variance of a spot or a parameter that each motion would make if it were alone.
+def largest_shares(motions: EstimatedMotions, stated: Disturbances) -> Array:
+    """Return the largest share (M,) of the variance of a spot or a parameter that each motion alone contributes.
 
     Parameters
     ----------
-    found : EstimatedMotions
-        M motions at one time.
+    motions : EstimatedMotions
+        The M motions at one time.
     stated : Disturbances
-        What one standard deviation of each does.
+        Effects of one standard deviation of each.
     """
-    size = np.array([component.unit_size for component in found.components]) * stated.sigmas
+    size = np.array([component.unit_size for component in motions.components]) * stated.sigmas
     rows = np.concatenate([stated.spots, stated.parameters]) / np.where(size > 0.0, size, np.inf)
-    own = rows**2 * found.sigma**2
-    total = own.sum(axis=1, keepdims=True)
-    return np.asarray(np.max(own / np.where(total > 0.0, total, np.inf), axis=0, initial=0.0))
+    variance = rows**2 * motions.sigma**2
+    total = variance.sum(axis=1, keepdims=True)
+    return np.asarray(np.max(variance / np.where(total > 0.0, total, np.inf), axis=0, initial=0.0))

@@ -1,10 +1,8 @@
-"""A simulated life followed reading by reading, as it would have been, and what was said of it held against the truth.
+"""Comparison of the estimates of a simulated life with its truth, as numbers, a table and a figure.
 
-Four ways to know the cameras are compared at every reading: the calibration on the ground, kept; each reading by
-itself; the operation with the readings up to then; and the operation with all readings. What was forecast at a reading
-is compared with what came. The truth is read after all that.
-
-What was said of a simulated life against its truth, as numbers, a table and a figure.
+The life is filtered reading by reading. Four estimates of the cameras are compared at every reading: the ground
+calibration, the single reading, the filtered estimate from the readings so far, and the smoothed estimate from all
+readings. Forecasts are compared with what happened. The truth is read only after that.
 """
 
 from __future__ import annotations
@@ -37,17 +35,17 @@ from twin.operate.record.telemetry import RESULTS, read_table_file, read_telemet
 
 FOLLOW = "follow the readings"
 METHODS = {
-    "ground": "calibration on the ground, kept",
-    "single": "each reading by itself",
-    "filtered": "operation, readings so far",
-    "smoothed": "operation, all readings",
+    "ground": "ground calibration",
+    "single": "single readings",
+    "filtered": "filtered estimate",
+    "smoothed": "smoothed estimate",
 }
-"""Way to know the cameras -> what it is called."""
+"""Key of an estimate of the cameras -> its name."""
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What one way says at T times: values and standard deviations, (T, Q) in each quantity's unit; NaN for nothing."""
+    """Values and standard deviations (T, Q) of one estimate at T times, in each quantity's unit; NaN where unknown."""
 
     values: Array
     sigmas: Array
@@ -55,28 +53,28 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class JudgedLife:
-    """Four ways to know a simulated instrument, and the truth.
+    """Four estimates of a simulated instrument, and the truth.
 
     Attributes
     ----------
-    times : NDArray[np.int64]
-        (T,) microseconds of TAI since 2000 of the readings.
+    times : (T,) ndarray of int64
+        Times of the readings, in microseconds of TAI since 2000.
     quantities : tuple[Quantity, ...]
-        Q of them.
-    true : Array
-        (T, Q) in each quantity's unit.
-    ways : Mapping[str, Estimate | Course]
-        As `WAYS` -> what it says.
+        The Q quantities.
+    true : (T, Q) ndarray
+        True changes, in each quantity's unit.
+    methods : Mapping[str, Estimate | Course]
+        Key in `METHODS` -> estimate.
     horizon : float
-        Of the forecasts, seconds.
+        Horizon of the forecasts, in seconds.
     forecast : Estimate
-        Made at each reading for the first reading that is not nearer than the horizon, (T, Q).
-    came : Array
-        (T, Q) what then was; NaN where the life is over before.
-    interrupted : NDArray[np.bool_]
-        (T,) whether an event came in between, which no forecast knows of.
-    following : Following
-        After the last reading.
+        Forecast (T, Q) made at each reading for the first reading at least a horizon later.
+    outcomes : (T, Q) ndarray
+        True changes at the forecast times; NaN where the life ends before.
+    interrupted : (T,) ndarray of bool
+        Whether an event, which no forecast can know of, occurred between the reading and the forecast time.
+    filter_result : FilterResult
+        Result of filtering all readings.
     """
 
     times: NDArray[np.int64]
@@ -89,36 +87,36 @@ class JudgedLife:
     interrupted: NDArray[np.bool_]
     filter_result: FilterResult
 
-    def errors(self, way: str) -> Array:
-        """(T, Q) of one way, in each quantity's unit."""
-        return self.methods[way].values - self.true
+    def errors(self, method: str) -> Array:
+        """Return the errors (T, Q) of an estimate, in each quantity's unit."""
+        return self.methods[method].values - self.true
 
     def number(self, group: str, key: str) -> int:
-        """Of a quantity.
+        """Return the index of a quantity.
 
         Parameters
         ----------
         group : str
             Camera, ``intersection_angle`` or ``ground``.
         key : str
-            Which of its readings.
+            Key of the quantity in the group.
         """
         return next(k for k, quantity in enumerate(self.quantities) if (quantity.group, quantity.key) == (group, key))
 
 
 def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance: Advance) -> JudgedLife:
-    """Follow a life in a record of its own, reading by reading.
+    """Estimate a life reading by reading in a temporary record.
 
     Parameters
     ----------
     plan : OperationSetup
-        Of the operation.
+        Plan of the operation.
     files : Path
-        That says what the tables of the life hold.
+        YAML file that describes the tables of the life.
     truth : Mapping[str, Any]
-        Of the life, plain data of its file.
+        Truth of the life, plain data of its file.
     advance : Advance
-        Told of the progress.
+        Called with the progress.
     """
     with tempfile.TemporaryDirectory() as place:
         initialise_record(place, plan.model, simulated=True)
@@ -162,25 +160,30 @@ def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance:
 
 
 def _prior(operation: Operation, times: NDArray[np.int64]) -> Estimate:
-    """What is known without any reading: nothing has changed, but for what is stated to move."""
+    """Return the estimate without any reading: no change, with the uncertainty of the prior."""
     series_filter, rows = operation.model.series_filter, operation.model.rows
     seconds = ((times - times[0]) / MICRO).tolist()
     start = series_filter.start(seconds[0])
-    found = [series_filter.parameters(start, time) for time in seconds]
-    values = np.array([mean for mean, _ in found]) @ rows.T
-    spread = np.array([covariance for _, covariance in found])
+    estimates = [series_filter.parameters(start, time) for time in seconds]
+    values = np.array([mean for mean, _ in estimates]) @ rows.T
+    spread = np.array([covariance for _, covariance in estimates])
     return Estimate(values, np.sqrt(np.einsum("qi,tij,qj->tq", rows, spread, rows)))
 
 
 class StepwiseIngest:
-    """The files of a life, taken into a record up to one moment after the other.
+    """Files of a life, ingested into a record up to one time after the other.
 
     Parameters
     ----------
     history
         The record.
     file
-        That says what the tables hold.
+        YAML file that describes the tables.
+
+    Attributes
+    ----------
+    times
+        (T,) times of the readings of the monitor, in microseconds of TAI since 2000.
     """
 
     def __init__(self, history: History, file: Path) -> None:
@@ -193,12 +196,12 @@ class StepwiseIngest:
         self.times = np.array(sorted(every), np.int64)
 
     def take(self, until: int) -> None:
-        """Take what came since the last time.
+        """Ingest the entries since the last call.
 
         Parameters
         ----------
         until : int
-            Microseconds of TAI since 2000.
+            Time of the newest entry, in microseconds of TAI since 2000.
         """
         for given in self._given:
             own = [entry for entry in _entries(given) if self._taken < entry.time <= until]
@@ -212,16 +215,16 @@ def _entries(given: FileContent) -> list[Entry]:
 
 
 def true_changes(truth: Mapping[str, Any], quantities: Sequence[Quantity], times: NDArray[np.int64]) -> Array:
-    """(T, Q) true changes in each quantity's unit.
+    """Return the true changes (T, Q) in each quantity's unit.
 
     Parameters
     ----------
     truth : Mapping[str, Any]
-        Plain data of a life's file.
+        Truth of the life, plain data of its file.
     quantities : Sequence[Quantity]
-        Q of them.
-    times : NDArray[np.int64]
-        (T,) at which it is known, microseconds of TAI since 2000.
+        The Q quantities.
+    times : (T,) ndarray of int64
+        Times at which the truth is known, in microseconds of TAI since 2000.
     """
     at = {moment: k for k, moment in enumerate(truth["times_us"])}
     own = [at[moment] for moment in times.tolist()]
@@ -235,27 +238,27 @@ def true_changes(truth: Mapping[str, Any], quantities: Sequence[Quantity], times
 
 
 def _single(readings: Sequence[Mapping[str, Any]], quantities: Sequence[Quantity]) -> Estimate:
-    """What each reading says by itself: that of the best estimator for stated disturbances."""
+    """Return the estimate from each reading alone, by the best estimator under the stated disturbances."""
     values, sigmas = [], []
     for read in readings:
         groups = {**read["cameras"], **{name: read[name] for name in (ANGLE_GROUP, GROUND_GROUP) if name in read}}
-        own = [groups[quantity.group]["posterior"] for quantity in quantities]
-        values.append([found[one.key] for found, one in zip(own, quantities, strict=True)])
-        sigmas.append([found[f"{one.key}_sigma"] for found, one in zip(own, quantities, strict=True)])
+        estimates = [groups[quantity.group]["posterior"] for quantity in quantities]
+        values.append([found[one.key] for found, one in zip(estimates, quantities, strict=True)])
+        sigmas.append([found[f"{one.key}_sigma"] for found, one in zip(estimates, quantities, strict=True)])
     return Estimate(np.array(values), np.array(sigmas))
 
 
 def covered(error: Array, sigma: Array, times: float) -> tuple[int, int]:
-    """How many errors lie within so many sigmas, and of how many; NaN is left out.
+    """Return the number of errors within a multiple of sigma, and the number of known errors.
 
     Parameters
     ----------
-    error : Array
-        Of any shape.
-    sigma : Array
-        likewise.
+    error : ndarray
+        Errors; NaN is ignored.
+    sigma : ndarray
+        Their standard deviations, of the same shape.
     times : float
-        sigmas.
+        Multiple of sigma.
     """
     ratio = np.abs(error / sigma)
     known = np.isfinite(ratio)
@@ -263,43 +266,46 @@ def covered(error: Array, sigma: Array, times: float) -> tuple[int, int]:
 
 
 def rms(error: Array) -> float:
-    """Root mean square of what is known of errors."""
+    """Return the root mean square of errors, ignoring NaN."""
     return float(np.sqrt(np.nanmean(np.square(error)))) if np.any(np.isfinite(error)) else math.nan
 
 
 SHARES = {1.0: math.erf(math.sqrt(0.5)), 2.0: math.erf(math.sqrt(2.0))}
-"""Sigmas -> share of normal errors within so many."""
+"""Multiple of sigma -> share of normal errors within it."""
 CHANCE = 1e-3
-"""That a share of independent normal numbers lies beyond the limits that are told."""
+"""Probability that a share of independent normal numbers lies outside the reported limits."""
 SHOWN = ((ANGLE_GROUP, "change_arcsec"), (GROUND_GROUP, "height_m"))
-"""Group and key of what the figure shows, of instruments that have it, beside a camera's change of focal length."""
+"""Group and key of the quantities in the figure, where the instrument has them, beside a camera's change of focal
+length.
+"""
 _DAY = 86_400 * MICRO
 _YEAR = 365.25 * _DAY
 FORECAST = "forecast"
 _COVERED = ("filtered", FORECAST)
-"""Of which the table tells how often sigma holds."""
+"""Estimates whose coverage the table contains."""
 
 
 def judged_numbers(life: JudgedLife) -> dict[str, Any]:
-    """As plain data: for each quantity and way the RMS error, errors and sigmas at all readings and the shares within
-    one and two sigmas, those of the forecasts, and what the operation said of its predictions, of temperatures, sensors
-    and jumps.
+    """Return the comparison as plain data.
+
+    It holds, for each quantity and estimate, the RMS error, errors and sigmas at all readings and the shares within one
+    and two sigmas; the same of the forecasts; and the scores, explained scatter, sensors and jumps of the filter.
 
     Parameters
     ----------
     life : JudgedLife
-        That was followed.
+        The compared life.
     """
-    told: dict[str, dict[str, Any]] = {}
+    out_by_group: dict[str, dict[str, Any]] = {}
     for number, quantity in enumerate(life.quantities):
         own = {
-            way: _error_summary(life.errors(way)[:, number], said.sigmas[:, number])
-            for way, said in life.methods.items()
+            method: _error_summary(life.errors(method)[:, number], estimate.sigmas[:, number])
+            for method, estimate in life.methods.items()
         }
         for name, which in ((FORECAST, ~life.interrupted), ("forecast_over_events", life.interrupted)):
             error = (life.forecast.values - life.updated)[which, number]
             own[name] = _error_summary(error, life.forecast.sigmas[which, number])
-        told.setdefault(quantity.group, {})[quantity.key] = own
+        out_by_group.setdefault(quantity.group, {})[quantity.key] = own
     filter_result = life.filter_result.to_dict()
     scores = life.filter_result.scores
     return {
@@ -308,14 +314,14 @@ def judged_numbers(life: JudgedLife) -> dict[str, Any]:
         "last_utc": utc_text(int(life.times[-1])),
         "times_utc": [utc_text(int(time)) for time in life.times],
         "horizon_s": life.horizon,
-        "quantities": told,
+        "quantities": out_by_group,
         "predictions": {
             "components": scores.components,
             "within_one": scores.within_one / scores.components,
             "within_one_limits": list(likely_shares(scores.components, 1.0)),
             "within_two": scores.within_two / scores.components,
             "within_two_limits": list(likely_shares(scores.components, 2.0)),
-            "limits_hold_but_for": CHANCE,
+            "limits_exceedance_probability": CHANCE,
         },
         "explained_by_temperatures": filter_result["explained"],
         "sensors": filter_result["sensors"],
@@ -324,7 +330,7 @@ def judged_numbers(life: JudgedLife) -> dict[str, Any]:
 
 
 def _error_summary(error: Any, sigma: Any) -> dict[str, Any]:
-    """RMS and coverage of what is known."""
+    """Return RMS and coverage of errors, ignoring NaN."""
     value = rms(error)
     out: dict[str, Any] = {"rms": value if math.isfinite(value) else None}
     out |= {"errors": _rounded(error), "sigmas": _rounded(sigma)}
@@ -336,37 +342,39 @@ def _error_summary(error: Any, sigma: Any) -> dict[str, Any]:
 
 
 def _rounded(values: Any) -> list[float | None]:
-    """To four digits, with nothing where nothing is known."""
+    """Return values rounded to four digits; None for NaN."""
     return [float(f"{value:.4g}") if math.isfinite(value) else None for value in np.asarray(values).tolist()]
 
 
 def likely_shares(count: int, times: float) -> tuple[float, float]:
-    """Least and largest share of independent normal numbers within so many sigmas, but for a chance of ``CHANCE``.
+    """Return the limits of the share of independent normal numbers within a multiple of sigma.
+
+    The share lies outside them with the probability ``CHANCE``.
 
     Parameters
     ----------
     count : int
-        Of the numbers.
+        Number of independent numbers.
     times : float
-        sigmas.
+        Multiple of sigma.
     """
     low, high = binom.ppf([0.5 * CHANCE, 1.0 - 0.5 * CHANCE], count, SHARES[times])
     return float(low) / count, float(high) / count
 
 
 def judged_report(life: JudgedLife, name: str) -> Report:
-    """The report.
+    """Return the report of the comparison.
 
     Parameters
     ----------
     life : JudgedLife
-        That was followed.
+        The compared life.
     name : str
-        Of the instrument.
+        Name of the instrument.
     """
     numbers = judged_numbers(life)
     shown = _shown(life)
-    verdict, lead = answer(*_sentences(life, numbers, shown))
+    verdict, lead = answer(*_verdict_sentences(life, numbers, shown))
     years = (int(life.times[-1]) - int(life.times[0])) / _YEAR
     facts = (
         ("instrument", name),
@@ -374,36 +382,43 @@ def judged_report(life: JudgedLife, name: str) -> Report:
         ("forecasts", f"{life.horizon / 86_400.0:.3g} days ahead"),
     )
     caption = (
-        "Errors are estimate minus truth. The instrument has changed since its calibration on the ground; a reading "
-        "by itself is read with what is stated to move; the operation follows readings, temperatures and events. "
-        "Errors at neighbouring times are alike: shares scatter more than those of as many independent errors."
+        "Errors are estimate minus truth. The ground calibration ignores all changes since; a single reading uses the "
+        "prior of the motions; the filtered and the smoothed estimate use readings, temperatures and events. Errors "
+        "at neighbouring times are correlated: shares scatter more than those of as many independent errors."
     )
-    figure = SvgFigure("with_and_without", "With and without the twin's operation", caption, judged_svg(life, shown))
+    figure = SvgFigure("with_and_without", "Errors of four estimates", caption, judged_svg(life, shown))
     section = Section("Errors over the years", (), (figure,), name="errors")
-    return Report(f"{name}: what was said of a simulated life", verdict, lead, facts, _table(life), (section,))
+    return Report(
+        f"{name}: estimates of a simulated life against its truth",
+        verdict,
+        lead,
+        facts,
+        _methods_table(life),
+        (section,),
+    )
 
 
 def _shown(life: JudgedLife) -> tuple[tuple[str, str], ...]:
-    """Group and key of what the figure shows."""
+    """Return group and key of the quantities in the figure."""
     names = [(quantity.group, quantity.key) for quantity in life.quantities]
     focal = next(name for name in names if name[1] == "d_f_um")
     return (*(one for one in SHOWN if one in names), focal)
 
 
-def _sentences(life: JudgedLife, numbers: dict[str, Any], shown: Sequence[tuple[str, str]]) -> list[str]:
-    told = []
+def _verdict_sentences(life: JudgedLife, numbers: dict[str, Any], shown: Sequence[tuple[str, str]]) -> list[str]:
+    """Return the sentences of the verdict and the lead."""
+    out_by_group = []
     for group, key in shown[-2:] if len(shown) > 1 else shown:
-        one, said = life.quantities[life.number(group, key)], numbers["quantities"][group][key]
-        values = " / ".join(_short(said[way]["rms"]) for way in METHODS)
-        told.append(f"{group} {one.parameter.symbol} {values} {one.parameter.unit}")
+        one, estimate = life.quantities[life.number(group, key)], numbers["quantities"][group][key]
+        values = " / ".join(_short(estimate[method]["rms"]) for method in METHODS)
+        out_by_group.append(f"{group} {one.parameter.symbol} {values} {one.parameter.unit}")
     made = numbers["predictions"]
     low, high = made["within_one_limits"]
     out = [
-        f"RMS errors with the calibration on the ground / each reading by itself / the operation / all its readings: "
-        f"{', '.join(told)}",
-        f"of {made['components']} predictions of a reading before it came {100 * made['within_one']:.1f} % are within "
-        f"1 σ and {100 * made['within_two']:.1f} % within 2 σ; chance allows {100 * low:.1f} to {100 * high:.1f} % "
-        "within 1 σ",
+        f"RMS errors of ground calibration / single readings / filtered / smoothed estimate: {', '.join(out_by_group)}",
+        f"{100 * made['within_one']:.1f} % of the {made['components']} components of the readings are within 1 σ of "
+        f"their predictions and {100 * made['within_two']:.1f} % within 2 σ; chance allows {100 * low:.1f} to "
+        f"{100 * high:.1f} % within 1 σ",
     ]
     group, key = shown[-1]
     explained = numbers["explained_by_temperatures"].get(f"{group} {key}")
@@ -415,21 +430,21 @@ def _sentences(life: JudgedLife, numbers: dict[str, Any], shown: Sequence[tuple[
     return out
 
 
-def _table(life: JudgedLife) -> Table:
-    """RMS errors by way, and shares within one and two sigmas."""
-    heads = ("quantity", *("RMS: " + way for way in METHODS), "forecast")
-    heads += tuple(f"{way} within {n} σ [%]" for way in _COVERED for n in (1, 2))
+def _methods_table(life: JudgedLife) -> Table:
+    """Return the table of RMS errors, and of shares within one and two sigmas, of each estimate."""
+    heads = ("quantity", *("RMS: " + method for method in METHODS), "forecast")
+    heads += tuple(f"{method} within {n} σ [%]" for method in _COVERED for n in (1, 2))
     rows: list[list[Cell]] = []
     quantities = judged_numbers(life)["quantities"]
     for quantity in life.quantities:
-        said = quantities[quantity.group][quantity.key]
+        estimate = quantities[quantity.group][quantity.key]
         row: list[Cell] = [f"{quantity.group} {quantity.parameter.label}"]
-        row += [_cell(said[way]["rms"]) for way in (*METHODS, FORECAST)]
-        for way in _COVERED:
-            row += [_cell(said[way][key], 100.0) for key in ("within_one", "within_two")]
+        row += [_cell(estimate[method]["rms"]) for method in (*METHODS, FORECAST)]
+        for method in _COVERED:
+            row += [_cell(estimate[method][key], 100.0) for key in ("within_one", "within_two")]
         rows.append(row)
-    caption = "RMS errors against the truth by four ways to know the cameras, and how often sigma holds them."
-    return Table("ways", "Four ways to know the cameras", caption, heads, rows, digits=3)
+    caption = "RMS errors of four estimates of the cameras against the truth, and shares of errors within 1 and 2 σ."
+    return Table("methods", "Four estimates of the cameras", caption, heads, rows, digits=3)
 
 
 def _cell(value: float | None, times: float = 1.0) -> Cell:
@@ -441,14 +456,14 @@ def _short(value: float | None) -> str:
 
 
 def judged_svg(life: JudgedLife, quantities: Sequence[tuple[str, str]]) -> str:
-    """Errors of some quantities by four ways to know them, with one and two sigmas, over the years.
+    """Draw the errors of quantities over the years for each estimate, with one and two sigmas.
 
     Parameters
     ----------
     life : JudgedLife
-        That was followed.
+        The compared life.
     quantities : Sequence[tuple[str, str]]
-        Group and key of each, one column for each.
+        Group and key of each quantity; one column of the figure each.
     """
     with svg.look("operation"):
         figure = svg.new_figure(8.4)
@@ -457,10 +472,10 @@ def judged_svg(life: JudgedLife, quantities: Sequence[tuple[str, str]]) -> str:
             number = life.number(*name)
             one = life.quantities[number]
             own = "" if one.group in (ANGLE_GROUP, GROUND_GROUP) else f"{one.group} "
-            for row, (way, title) in enumerate(METHODS.items()):
+            for row, (method, title) in enumerate(METHODS.items()):
                 axes = grid[row, column]
-                _panel(axes, life, way, number)
-                size = f"RMS {rms(life.errors(way)[:, number]):.2g} {one.parameter.unit}"
+                _panel(axes, life, method, number)
+                size = f"RMS {rms(life.errors(method)[:, number]):.2g} {one.parameter.unit}"
                 axes.set_title(f"{title}: {size}", loc="left", fontsize=8.0)
                 axes.set_ylabel(f"error of {own}{one.parameter.label}")
                 if row > 2:  # the operation's two panels are compared with each other
@@ -471,10 +486,10 @@ def judged_svg(life: JudgedLife, quantities: Sequence[tuple[str, str]]) -> str:
         return svg.to_svg(figure)
 
 
-def _panel(axes: Any, life: JudgedLife, way: str, number: int) -> None:
-    """Errors of one way with its sigma, when events came, and between which readings jumps that were told."""
+def _panel(axes: Any, life: JudgedLife, method: str, number: int) -> None:
+    """Draw the errors of one estimate with its sigma, the events, and the intervals of the detected jumps."""
     years = (life.times - life.times[0]) / _YEAR
-    error, sigma = life.errors(way)[:, number], life.methods[way].sigmas[:, number]
+    error, sigma = life.errors(method)[:, number], life.methods[method].sigmas[:, number]
     svg.gridded(axes)
     axes.axhline(0.0, color=svg.GREY, lw=0.7)
     for times, colour, name in ((2.0, svg.SHADE, "±2σ"), (1.0, svg.LIGHT, "±σ")):
@@ -484,5 +499,5 @@ def _panel(axes: Any, life: JudgedLife, way: str, number: int) -> None:
         axes.axvline((moment - life.times[0]) / _YEAR, color=svg.ORANGE, lw=0.9, ls="--", label="" if k else "event")
     for k, jump in enumerate(life.filter_result.jumps):
         low, high = ((moment - life.times[0]) / _YEAR for moment in (jump.after_us, jump.until_us))
-        axes.axvspan(low, high, color=svg.PURPLE, alpha=0.5, lw=1.0, label="" if k else "jump that was told")
+        axes.axvspan(low, high, color=svg.PURPLE, alpha=0.5, lw=1.0, label="" if k else "detected jump")
     axes.plot(years, error, color=svg.BLUE, lw=1.1, label="estimate minus truth")

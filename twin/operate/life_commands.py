@@ -1,4 +1,4 @@
-"""Commands on a simulated life: it is drawn, rendered and written; it is followed and held against its truth."""
+"""Commands on a simulated life: draw, render and write it; estimate it and compare the estimates with its truth."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from twin.framework import durable
 from twin.framework.cli import LARGEST_SEED, InputErrorText, Options, check_backend, with_options
 from twin.framework.command import Result, finished, progress_shown, run_command
 from twin.framework.procedure import Session
-from twin.operate.terminal import line, tell, told
+from twin.operate.terminal import errors_reported, print_line, print_result
 
 if TYPE_CHECKING:
     from scenes.specs.operation import OperationSetup
@@ -26,35 +26,39 @@ def simulate(
         typer.Argument(metavar="PLAN.yaml", readable=False, help="Plan of the operation, or a life's config.yaml."),
     ],
     options: Options,
-    start: Annotated[str, typer.Option("--from", help="UTC of the first reading; laws of time count from it.")],
-    days: Annotated[float, typer.Option(help="How long the life takes, in days.")],
+    start: Annotated[str, typer.Option("--from", help="UTC of the first reading; time laws count from it.")],
+    days: Annotated[float, typer.Option(help="Length of the life, in days.")],
     every: Annotated[str, typer.Option(help="Time from one reading to the next, with its unit: 6d, 12h.")],
     record: Annotated[
-        str | None, typer.Argument(metavar="[DIR_OR_URL]", help="Record to make. Without it there are the files alone.")
+        str | None, typer.Argument(metavar="[DIR_OR_URL]", help="Record to create. Without it only files are written.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of everything that is drawn.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of all random numbers.")] = 1,
     frames: Annotated[int, typer.Option(min=1, max=1000, help="Frames of every exposure.")] = 10,
     coefficient_error: Annotated[
-        str, typer.Option(help="By how much heat does more or less to light than computed, one sigma: 30%.")
+        str, typer.Option(help="Relative sigma of the factor between the true and the computed effect of heat: 30%.")
     ] = "0%",
     sensor_sigma: Annotated[str, typer.Option(help="Sigma of every sensor of temperature.")] = "0.05 K",
     sensor: Annotated[
-        list[str] | None, typer.Option(help="Body with a sensor; once for each. Default: all that get warmer.")
+        list[str] | None,
+        typer.Option(help="Body with a sensor; repeatable. Default: all bodies with a stated temperature."),
     ] = None,
-    dead: Annotated[list[str] | None, typer.Option(metavar="BODY@UTC", help="Sensor that then falls silent.")] = None,
+    dead: Annotated[
+        list[str] | None, typer.Option(metavar="BODY@UTC", help="Sensor that fails silently at this time.")
+    ] = None,
     stuck: Annotated[
-        list[str] | None, typer.Option(metavar="BODY@UTC", help="Sensor that then repeats its last reading.")
+        list[str] | None,
+        typer.Option(metavar="BODY@UTC", help="Sensor that repeats its last reading from this time on."),
     ] = None,
     event: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME@UTC", help="Event; once for each. Default: each of the plan's once, at a drawn date."
+            metavar="NAME@UTC", help="Event; repeatable. Default: each event of the plan once, at a random date."
         ),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
-            readable=False, help="Folder for the files. Default: `simulated` in the record's, or runs/life-001."
+            readable=False, help="Folder for the files. Default: `simulated` in the record's folder, or runs/life-001."
         ),
     ] = None,
     truth: Annotated[
@@ -62,18 +66,18 @@ def simulate(
         typer.Option(readable=False, help="File for the truth, or none. Default: life.json among the files."),
     ] = None,
 ) -> None:
-    """Simulate the life of an instrument into a new record: motions are drawn by the plan's laws of time, every reading
-    of the monitor is traced, rendered with noise and recovered, sensors read temperatures, and events come.
+    """Simulate the life of an instrument into a new record.
 
-    What a real instrument would send down is written as files, which the record takes as it takes any others. The truth
-    stands in a file of its own, which nothing of the operation reads.
+    Motions are drawn by the plan's time laws, every reading of the monitor is traced, rendered with noise and
+    recovered, sensors read temperatures, and events occur. The telemetry of a real instrument is written as files and
+    ingested like any others. The truth is written to a separate file, which the operation never reads.
 
     Example: `python -m twin.operate simulate scenes/examples/operation.yaml life --from 2027-01-01T00:00:00Z
     --days 1096 --every 6d --coefficient-error 30%`
 
     Exit codes: 0 success, 2 bad input, 1 anything else.
     """
-    with told() as errors, durable.exit_on_terminate():
+    with errors_reported() as errors, durable.exit_on_terminate():
         check_backend(options.backend)
         from optics.numerics.backend import load_backend
         from twin.operate.simulation_run import simulate_into, simulation
@@ -87,7 +91,9 @@ def simulate(
         place = done["record"] or done["files"]
         text = f"{done['readings']} readings of the monitor in {place}"
         lost = "".join(f"\nwarning: {one}" for one in done["lost"])
-        tell(errors, options, done, lambda console: line(console, f"{text}; truth: {done['truth']}{lost}"))
+        print_result(
+            errors, options, done, lambda console: print_line(console, f"{text}; truth: {done['truth']}{lost}")
+        )
 
 
 @with_options("seed", "export", "backend", "strict")
@@ -98,9 +104,10 @@ def judge(
         Path | None, typer.Option(readable=False, help="File of the truth. Default: life.json among its files.")
     ] = None,
 ) -> None:
-    """Follow a simulated life reading by reading, as it would have been, and hold what was said against the truth: by
-    the calibration on the ground, by each reading itself, and by the operation with the readings so far and with all of
-    them; and what was forecast against what came.
+    """Estimate a simulated life reading by reading, and compare the estimates and forecasts with the truth.
+
+    Four estimates are compared: the ground calibration, single readings, the filtered estimate (readings so far) and
+    the smoothed one (all readings).
 
     Example: `python -m twin.operate judge life`
 
@@ -115,23 +122,23 @@ def judge(
         from twin.operate.simulate import FOLDER, LIFE, TELEMETRY
 
         files = life / FOLDER if (life / FOLDER).is_dir() else life
-        known = files / f"{LIFE}.json" if truth is None else truth
+        truth_file = files / f"{LIFE}.json" if truth is None else truth
         if not (files / TELEMETRY).is_file():
             raise InputErrorText(f"no simulated life in {life}; python -m twin.operate simulate makes one")
-        if not known.is_file():
-            raise InputErrorText(f"no truth in {known}; --truth names the file that simulate wrote")
-        _truth(known)  # a wrong one is told before anything is followed
-        return validate(OperationSetup, read_yaml(files / "config.yaml")), files / TELEMETRY, known
+        if not truth_file.is_file():
+            raise InputErrorText(f"no truth in {truth_file}; --truth names the file that simulate wrote")
+        _truth(truth_file)  # a wrong truth is reported before the life is estimated
+        return validate(OperationSetup, read_yaml(files / "config.yaml")), files / TELEMETRY, truth_file
 
-    def work(given: tuple[OperationSetup, Path, Path], session: Session) -> Result:
+    def work(inputs: tuple[OperationSetup, Path, Path], session: Session) -> Result:
         from twin.operate.judged_life import judged, judged_numbers, judged_report
 
-        plan, telemetry, known = given
-        done = judged(plan, telemetry, _truth(known), session.advance)
+        plan, telemetry, truth_file = inputs
+        done = judged(plan, telemetry, _truth(truth_file), session.advance)
         facts: dict[str, Any] = {
             "config": dump_yaml(plan.plain()),
             "command": "judge",
-            "input_paths": (telemetry, known),
+            "input_paths": (telemetry, truth_file),
         }
         facts["again"] = ("twin.operate", "judge", str(life), *(() if truth is None else ("--truth", str(truth))))
         report = judged_report(done, plan.model.instrument.name)
@@ -141,7 +148,7 @@ def judge(
 
 
 def _truth(file: Path) -> dict[str, Any]:
-    """Plain data of a truth. Raises InputErrorText, InputError: it cannot be read, or is none."""
+    """Return the plain data of a truth. Raise InputErrorText or InputError if it cannot be read or is not one."""
     data = read_json(file)
     if not isinstance(data, dict) or not {"times_us", "cameras"} <= set(data):
         raise InputErrorText(f"{file}: not the truth of a simulated life")

@@ -1,12 +1,9 @@
-"""A block of scenes whose cameras a monitor watches in operation: its record says how they stood in every pass.
+"""Block adjustment of scenes whose cameras a monitor observes in operation.
 
-The room of the block knows no record; this one hands it what the record's estimate says of all passes together.
-
-What an operation's estimate says of several times together, such as of one pass: with how the errors of one time go
-together with those of another.
-
-Between two readings nearly all of an error is common to the times of a pass; what is not is what moves meanwhile by the
-stated laws in time. An adjustment of images that takes the estimate as readings of the cameras needs both.
+The record's estimate at several times, with the covariance between times, gives the cameras' prior in every pass.
+Between two readings nearly all of an error is common to the times of a pass; the rest is what moves meanwhile by the
+stated time laws. An adjustment of images that uses the estimate as readings of the cameras needs both. The code of the
+block adjustment itself does not depend on records.
 """
 
 from __future__ import annotations
@@ -44,14 +41,14 @@ class Posterior:
 
     Attributes
     ----------
-    times : NDArray[np.int64]
-        (T,) microseconds of TAI since 2000.
+    times : (T,) ndarray of int64
+        Microseconds of TAI since 2000.
     quantities : tuple[Quantity, ...]
-        Q, each with its group (a camera, `intersection_angle` or `ground`), key and unit.
-    mean : Array
-        (T, Q) changes since the calibration, in each one's unit, with the signs of docs/conventions.md.
-    covariance : Array
-        (T, Q, T, Q) of their errors, those of one time with those of another, in these units.
+        The Q quantities, each with its group (a camera, `intersection_angle` or `ground`), key and unit.
+    mean : (T, Q) ndarray
+        Changes since the calibration, in each quantity's unit, with the signs of docs/conventions.md.
+    covariance : (T, Q, T, Q) ndarray
+        Covariance of the errors, also between times, in these units.
     """
 
     times: NDArray[np.int64]
@@ -61,11 +58,11 @@ class Posterior:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Group and key of each: ``forward d_alpha_arcsec``."""
+        """Group and key of each quantity, such as ``forward d_alpha_arcsec``."""
         return tuple(quantity.name for quantity in self.quantities)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data: times, names and numbers."""
+        """Return times, names and numbers as plain data."""
         return {
             "times_utc": [utc_text(int(time)) for time in self.times],
             "quantities": list(self.names),
@@ -77,18 +74,18 @@ class Posterior:
 def posterior(
     operation: Operation, times_us: Sequence[int] | NDArray[np.int64], names: Sequence[str] | None = None
 ) -> Posterior:
-    """What all readings say of quantities at several times together.
+    """Return the joint posterior of quantities at several times, from all readings.
 
-    The work is that of one look at the past, and T^2 times the square of the states beside it: some hundred times of a
-    pass are a matter of seconds.
+    The work is that of one smoothing pass, plus T^2 times the square of the number of states: some hundred times of a
+    pass take seconds.
 
     Parameters
     ----------
     operation : Operation
-        That follows the record.
-    times_us : Sequence[int] | NDArray[np.int64]
-        (T,) microseconds of TAI since 2000, each later than the one before and none before the first reading;
-        `twin.operate.record.entries.micros` makes them of UTC. Of times after the newest reading it is the forecast.
+        Estimate of the record.
+    times_us : (T,) sequence of int
+        Microseconds of TAI since 2000, ascending and not before the first reading; `twin.operate.record.entries.micros`
+        converts UTC. After the newest reading the result is the forecast.
     names : Sequence[str] | None
         Quantities by group and key, as a plan of operation names them: ``forward d_alpha_arcsec``. By default d_alpha,
         d_beta, d_gamma and d_f of all cameras.
@@ -96,7 +93,7 @@ def posterior(
     Raises
     ------
     Problem
-        Times out of order or before all readings, or a quantity that is not read.
+        Times are not ascending or before all readings, or a quantity does not exist.
     """
     times = np.asarray(times_us, np.int64)
     late = np.flatnonzero(np.diff(times) <= 0)
@@ -104,12 +101,12 @@ def posterior(
         raise Problem("times out of order", utc_text(int(times[late[0] + 1])), "each time later than the one before")
     known = {quantity.name: quantity for quantity in operation.quantities}
     cameras = dict.fromkeys(camera for camera, _ in operation.model.spots)
-    wanted = [name for name, one in known.items() if one.group in cameras] if names is None else list(names)
-    for name in wanted:
+    chosen = [name for name, one in known.items() if one.group in cameras] if names is None else list(names)
+    for name in chosen:
         if name not in known:
             raise Problem("no such quantity", name, f"one of: {', '.join(known)}")
-    quantities = tuple(known[name] for name in wanted)
-    rows = np.array([quantity.row for quantity in quantities]).reshape(len(wanted), -1)
+    quantities = tuple(known[name] for name in chosen)
+    rows = np.array([quantity.row for quantity in quantities]).reshape(len(chosen), -1)
     values, covariance = operation.smooth_jointly(times)
     return Posterior(
         times, quantities, values @ rows.T, np.einsum("qi,tiuj,rj->tqur", rows, covariance, rows, optimize=True)
@@ -117,35 +114,39 @@ def posterior(
 
 
 KEYS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
+"""Keys of a camera's change, in the order of the block adjustment's parameters."""
 UNITS = np.array([ARCSEC, ARCSEC, ARCSEC, 1e-6])
+"""Units of these keys in rad and m."""
 _NEAR = 0.02
-"""Share by which the focal length of a camera of the record may differ from the line's, of look angles radians."""
+"""Largest difference between a camera of the record and the block's line: relative for focal lengths, in radians for
+look angles.
+"""
 
 
 def run_operated_block(
     setup: AnyAdjust, backend: Backend | None, seed: int, advance: Advance = silent, pool: Pool | None = None
 ) -> BlockRun:
-    """Draw or read a block and adjust it, with the record of its monitor where the file names one.
+    """Draw or read a block and adjust it, with the record of its monitor if the file names one.
 
     Parameters
     ----------
     setup : AnyAdjust
-        What the file says.
+        Setup read from the file.
     backend : Backend | None
         Not used.
     seed : int
-        Of all that is drawn.
+        Seed of all random numbers.
     advance : Advance
-        Told of the progress.
+        Called with the progress.
     pool : Pool | None
-        Processes that reduce the points; None for this one alone.
+        Processes that reduce the points; None for this process alone.
 
     Raises
     ------
     InputError
-        Tables or a record that cannot be used.
+        A table or the record cannot be used.
     BenchError
-        No such orbit, or a block that cannot be adjusted.
+        The orbit does not exist, or the block cannot be adjusted.
     """
     spec = setup.test.monitor_record
     if spec is None:
@@ -154,7 +155,7 @@ def run_operated_block(
 
     def monitor(epochs: Mapping[str, str], lines: Sequence[str]) -> JointCameraPrior:
         try:
-            return _recorded(setup, named, epochs, lines, advance)
+            return _prior_of_record(setup, named, epochs, lines, advance)
         except Problem as problem:
             raise setup.test.error(problem, ("monitor_record",)) from None
         except (RecordFailed, NotARecord) as error:
@@ -164,16 +165,17 @@ def run_operated_block(
     return run_adjustment(setup, backend, seed, advance, pool, monitor)
 
 
-def _recorded(
+def _prior_of_record(
     setup: AnyAdjust, spec: MonitorRecordSpec, epochs: Mapping[str, str], lines: Sequence[str], advance: Advance
 ) -> JointCameraPrior:
+    """Return the prior of the cameras in every pass from the record's estimate."""
     with History(spec.record) as history:
         try:
             plan = stored_plan(history) if spec.plan is None else read_plan(Path(spec.plan), history)
         except InputError as error:
             raise Problem(str(error), spec.plan, "a plan of the record's instrument", within=("plan",)) from None
         if plan is None:
-            raise Problem("the record keeps no plan of operation", None, "`plan: FILE`", within=("plan",))
+            raise Problem("the record has no plan of operation", None, "`plan: FILE`", within=("plan",))
         mounted = plan.model.instrument.cameras
         for line in lines:
             if line not in mounted:
@@ -181,7 +183,7 @@ def _recorded(
                 raise unknown(text, line, tuple(mounted), ("record",))
             look = setup.camera.lines[line].look
             if abs(mounted[line].look - look) > _NEAR:
-                text = f"the record is of {history.name}, whose {line} camera looks elsewhere than this block's"
+                text = f"the record is of {history.name}, whose {line} camera has another look angle than this block's"
                 found = f"{np.degrees(mounted[line].look):.4g} deg, not {np.degrees(look):.4g} deg"
                 raise Problem(text, found, "the record of the instrument that took the images", within=("record",))
         operation = Operation(history, plan, lambda done, of: advance("follow the record", done, of))
@@ -196,28 +198,28 @@ def _recorded(
         times = {name: micros(epoch) for name, epoch in epochs.items()}
         order = sorted(set(times.values()))
         names = [f"{line} {key}" for line in lines for key in KEYS]
-        said = posterior(operation, order, names)
-        return cameras_of(said, lines, [order.index(time) for time in times.values()])
+        estimate = posterior(operation, order, names)
+        return camera_prior(estimate, lines, [order.index(time) for time in times.values()])
 
 
-def cameras_of(said: Posterior, cameras: Sequence[str], passes: Sequence[int]) -> JointCameraPrior:
-    """What is said of cameras, as a block of scenes takes it.
+def camera_prior(estimate: Posterior, cameras: Sequence[str], passes: Sequence[int]) -> JointCameraPrior:
+    """Return the estimate of cameras as a prior of a block adjustment.
 
     Parameters
     ----------
-    said : Posterior
-        d_alpha, d_beta, d_gamma and d_f of each camera in turn.
+    estimate : Posterior
+        d_alpha, d_beta, d_gamma and d_f of one camera after the other.
     cameras : Sequence[str]
-        C names.
-    passes : Sequence[int]
-        (P,) number of the time of each pass.
+        The C names.
+    passes : (P,) sequence of int
+        Index of the time of each pass.
     """
     scale = np.tile(UNITS, len(cameras))
-    where = np.array(passes)
-    mean = (said.mean * scale)[where].reshape(len(where), len(cameras), 4).swapaxes(0, 1)
-    spread = said.covariance * scale[:, None, None] * scale
-    spread = spread[where][:, :, where]
-    shape = (len(where), len(cameras), 4)
-    spread = spread.reshape(*shape, *shape).transpose(1, 0, 2, 4, 3, 5)
+    pass_times = np.array(passes)
+    mean = (estimate.mean * scale)[pass_times].reshape(len(pass_times), len(cameras), 4).swapaxes(0, 1)
+    covariance = estimate.covariance * scale[:, None, None] * scale
+    covariance = covariance[pass_times][:, :, pass_times]
+    shape = (len(pass_times), len(cameras), 4)
+    covariance = covariance.reshape(*shape, *shape).transpose(1, 0, 2, 4, 3, 5)
     size = int(np.prod(shape))
-    return JointCameraPrior(tuple(cameras), mean, spread.reshape(size, size))
+    return JointCameraPrior(tuple(cameras), mean, covariance.reshape(size, size))

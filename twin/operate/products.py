@@ -1,19 +1,20 @@
-"""What others get of an operation's estimate for the time of a scene: the camera models with which its images are
-located, the state of the instrument as a job, and what is still uncertain of it as a prior.
+"""Products of an operation's estimate for the time of a scene.
 
-Motions whose stated law in time is `white` are others in every image and every reading, such as what differs from one
-orbit to the next. No reading tells them for an image that was not taken just then, and none is: an image takes seconds.
-Camera models are not corrected by them, and their stated sizes make ERR_RAND, the error that images do not have in
-common. All else is corrected as estimated, and what is uncertain of it makes ERR_BIAS.
+They are the camera models that locate its images, the state of the instrument as a job, and its uncertainty as a prior.
 
-They hold from one time to another. Used at another time t', the estimate p(t) of a time t is wrong by p(t) - P(t'),
-P the truth. p(t') is the mean of P(t') given the same readings and p(t) follows from these readings, so that the mean
-square of the error is exactly
+Motions whose stated time law is `white` differ in every image and every reading, such as the differences between
+orbits. No reading determines them for an image taken at another moment, and an image takes seconds. Camera models are
+not corrected for them, and their stated sizes make ERR_RAND, the error that images do not share. All other motions are
+corrected as estimated, and their uncertainty makes ERR_BIAS.
+
+The products have a period of validity. The estimate p(t) of a time t, used at another time t', has the error p(t) -
+P(t'), where P is the truth. p(t') is the mean of P(t') given the same readings, and p(t) depends on these readings, so
+that the mean square error is exactly
 
     sigma(t')^2 + (p(t') - p(t))^2.
 
-The estimate holds as long as the root of this is at most 1 + `SHARE` times sigma(t) for every quantity, within the
-readings and the forecast, and not across what is known to have changed the instrument.
+The estimate is valid as long as the root of this is at most 1 + `SHARE` times sigma(t) for every quantity, within the
+readings and the forecast, and not across a known change of the instrument.
 """
 
 from __future__ import annotations
@@ -53,24 +54,25 @@ if TYPE_CHECKING:
     from twin.orbit.export.export_run import ExportSource
 
 SHARE = 0.2
-"""By which an error may be larger than at the time of the estimate."""
+"""Relative growth of the error that ends the validity of an estimate."""
 _FIRST = MICRO
-"""Microseconds: the shortest time that is looked at."""
+"""Shortest time from the estimate that is examined, in microseconds."""
 _STEPS = 48
-"""Times on either side, one after the other by equal factors; then as often between the last that holds and the first
-that does not."""
+"""Number of times examined on either side, in geometric progression; then as many evenly spaced times between the last
+valid one and the first invalid one.
+"""
 
 
 @dataclass(frozen=True)
 class ValidityLimit:
-    """What an estimate does not hold across.
+    """Time that limits the validity of an estimate.
 
     Attributes
     ----------
     time : int
         Microseconds of TAI since 2000.
     reason : str
-        In words.
+        Reason in words.
     """
 
     time: int
@@ -79,14 +81,14 @@ class ValidityLimit:
 
 @dataclass(frozen=True)
 class Validity:
-    """Span in which an estimate holds.
+    """Period of validity of an estimate.
 
     Attributes
     ----------
     since, until : int
-        Microseconds of TAI since 2000.
+        Beginning and end, in microseconds of TAI since 2000.
     since_reason, until_reason : str
-        Why it does not hold before and after.
+        Reasons why it is not valid before and after.
     """
 
     since: int
@@ -100,42 +102,44 @@ def validity(
     time: int,
     first: ValidityLimit,
     last: ValidityLimit,
-    marks: Sequence[ValidityLimit] = (),
+    limits: Sequence[ValidityLimit] = (),
     beside: Course | None = None,
 ) -> Validity:
-    """The span in which the estimate of a time holds.
+    """Return the period of validity of an estimate.
 
     Parameters
     ----------
     estimates : Callable[[Sequence[int]], Course]
-        At times in ascending order.
+        Function that returns the estimate at ascending times.
     time : int
-        Of the estimate.
-    first : Mark
-        From when on there are estimates.
-    last : Mark
-        Until when.
-    marks : Sequence[Mark]
-        What lies between; one at the time itself counts as before it.
+        Time of the estimate.
+    first : ValidityLimit
+        Earliest time with an estimate.
+    last : ValidityLimit
+        Latest time with an estimate.
+    limits : Sequence[ValidityLimit]
+        Limits in between; one at the time itself counts as before it.
     beside : Course | None
-        The estimate just beside the time, in place of that at it.
+        Estimate just after the time, used in place of that at the time.
     """
-    low = max((one for one in (first, *marks) if one.time <= time), key=lambda one: one.time)
-    high = min((one for one in (last, *marks) if one.time > time), key=lambda one: one.time, default=last)
-    here = beside or estimates([time])
+    low = max((one for one in (first, *limits) if one.time <= time), key=lambda one: one.time)
+    high = min((one for one in (last, *limits) if one.time > time), key=lambda one: one.time, default=last)
+    estimate = beside or estimates([time])
     ends = {-1: time - low.time, 1: high.time - time}
-    found = _limits_of_validity(estimates, here, time, {sign: (0, _distances(0, span)) for sign, span in ends.items()})
-    again = {sign: (good, _distances(good, bad, evenly=True)) for sign, (good, bad, _) in found.items()}
-    found |= _limits_of_validity(estimates, here, time, again)
+    ends_found = _limits_of_validity(
+        estimates, estimate, time, {sign: (0, _distances(0, span)) for sign, span in ends.items()}
+    )
+    again = {sign: (good, _distances(good, bad, evenly=True)) for sign, (good, bad, _) in ends_found.items()}
+    ends_found |= _limits_of_validity(estimates, estimate, time, again)
     since, until = (
-        ValidityLimit(time + sign * found[sign][0], found[sign][2]) if sign in found else mark
+        ValidityLimit(time + sign * ends_found[sign][0], ends_found[sign][2]) if sign in ends_found else mark
         for sign, mark in ((-1, low), (1, high))
     )
     return Validity(since.time, until.time, since.reason, until.reason)
 
 
 def _distances(good: int, end: int, evenly: bool = False) -> NDArray[np.int64]:
-    """Distances beyond one at which an estimate holds, up to an end, microseconds, increasing."""
+    """Return increasing distances, in microseconds, from one at which an estimate is valid to an end."""
     if end <= good:
         return np.empty(0, np.int64)
     if evenly:
@@ -147,84 +151,87 @@ def _distances(good: int, end: int, evenly: bool = False) -> NDArray[np.int64]:
 
 def _limits_of_validity(
     estimates: Callable[[Sequence[int]], Course],
-    here: Course,
+    estimate: Course,
     time: int,
     sides: Mapping[int, tuple[int, NDArray[np.int64]]],
 ) -> dict[int, tuple[int, int, str]]:
-    """Where the estimate ceases to hold, by the sign of the side: the last distance at which it holds and the first at
-    which it does not, microseconds, and why; sides on which it holds are missing.
+    """Return the ends of the validity by the sign of the side; sides without an end are missing.
+
+    Each is the last valid distance and the first invalid one, in microseconds, and the reason.
 
     Parameters
     ----------
     estimates : Callable[[Sequence[int]], Course]
-        Asked once for the times of all sides.
-    here : Course
+        Function that returns the estimate at ascending times; called once for all sides.
+    estimate : Course
         The estimate.
     time : int
-        Of it.
-    sides : Mapping[int, tuple[int, NDArray[np.int64]]]
-        Sign -> a distance at which it holds, and those to look at, (T,), increasing.
+        Time of the estimate.
+    sides : Mapping[int, tuple[int, ndarray]]
+        Sign -> a valid distance, and the increasing distances (T,) to examine.
     """
-    times = np.unique(np.concatenate([np.empty(0, np.int64), *(time + sign * own for sign, (_, own) in sides.items())]))
+    times = np.unique(
+        np.concatenate([np.empty(0, np.int64), *(time + sign * distances for sign, (_, distances) in sides.items())])
+    )
     if not len(times):
         return {}
     course = estimates(times.tolist())
-    sigma = np.where(here.sigmas[0] > 0.0, here.sigmas[0], np.inf)
-    error = np.hypot(course.sigmas, course.values - here.values[0]) / sigma
+    sigma = np.where(estimate.sigmas[0] > 0.0, estimate.sigmas[0], np.inf)
+    error = np.hypot(course.sigmas, course.values - estimate.values[0]) / sigma
     out = {}
-    for sign, (good, own) in sides.items():
-        at = np.searchsorted(times, time + sign * own)
+    for sign, (good, distances) in sides.items():
+        at = np.searchsorted(times, time + sign * distances)
         over = np.flatnonzero(np.max(error[at], axis=1, initial=0.0) > 1.0 + SHARE)
         if not over.size:
             continue
         k = int(over[0])
         q = int(np.argmax(error[at[k]]))
-        one = here.quantities[q]
-        moved = abs(course.values[at[k], q] - here.values[0, q]) > course.sigmas[at[k], q] - here.sigmas[0, q]
-        what = "its estimate goes on" if moved else "its sigma grows"
-        reason = f"{one.name} would be wrong by {100.0 * SHARE:g} percent more: {what}"
-        out[sign] = int(own[k - 1]) if k else good, int(own[k]), reason
+        quantity = estimate.quantities[q]
+        moved = abs(course.values[at[k], q] - estimate.values[0, q]) > course.sigmas[at[k], q] - estimate.sigmas[0, q]
+        what = "its estimate changes" if moved else "its sigma grows"
+        reason = f"the error of {quantity.name} would grow by more than {100.0 * SHARE:g} %: {what}"
+        out[sign] = int(distances[k - 1]) if k else good, int(distances[k]), reason
     return out
 
 
 STATE, PRIOR = "state", "prior"
 """Names of the files."""
 APART = 60 * MICRO
-"""Microseconds: a scene that was taken further from the time of the estimate is worth a warning."""
+"""Difference between the times of the scene and of the estimate that gives a warning, in microseconds."""
 
 
 @dataclass(frozen=True, eq=False)
 class Products:
-    """All products of one time.
+    """Products of the estimate for one time.
 
     Attributes
     ----------
     history : History
         The record.
     time : int
-        Of the estimate, microseconds of TAI since 2000.
+        Time of the estimate, in microseconds of TAI since 2000.
     scene_time : int | None
-        When the scene was taken, likewise; None without a scene.
-    following : Following
-        What the estimate says now, with the readings that it rests on.
+        Time of the scene; None without a scene.
+    filter_result : FilterResult
+        Result of filtering all readings.
     version : str
-        SHA-256 of the last entry of the record, of the plan and of the program's version.
+        SHA-256 of the record's last entry, of the plan and of the program's version.
     course : Course
-        The estimate at that time.
+        Estimate at that time.
     validity : Validity
-        Span in which it holds.
+        Period of validity.
     changes : Mapping[str, EstimatedChange]
         Camera -> its estimated change.
     export : Export | None
-        Camera models of the scene; None without one.
+        Camera models of the scene; None without a scene.
     state : str
         Text of the job of the estimated state.
-    state_left_out : tuple[LeftOut, ...]
-        What a job cannot say.
+    omitted_from_state : tuple[OmittedComponent, ...]
+        Components that a job cannot express.
     prior : Prior
-        What is uncertain of the state.
+        Uncertainty of the state.
     warnings : tuple[str, ...]
-        In words.
+        Warnings in words.
     """
 
     history: History
@@ -243,17 +250,17 @@ class Products:
 
 
 def scene_time(scene: ExportSource) -> int:
-    """When a scene was taken, microseconds of TAI since 2000.
+    """Return the time of a scene, in microseconds of TAI since 2000.
 
     Parameters
     ----------
     scene : ExportSource
-        As `twin.orbit.export.export_run.read_source` reads it.
+        Scene read by `twin.orbit.export.export_run.read_source`.
 
     Raises
     ------
     Problem
-        It is not one moment.
+        The source does not have one moment.
     """
     setup = scene.setup
     if not isinstance(setup, AngleSetup):
@@ -264,27 +271,27 @@ def scene_time(scene: ExportSource) -> int:
 def make_products(
     operation: Operation, history: History, time: int, scene: ExportSource | None, backend: Backend
 ) -> Products:
-    """The products of a time.
+    """Return the products for a time.
 
     Parameters
     ----------
     operation : Operation
-        That follows the record.
+        Estimate of the record.
     history : History
         The record.
     time : int
         Microseconds of TAI since 2000.
     scene : ExportSource | None
-        Whose camera models are wanted; None for none.
+        Scene whose camera models are wanted; None for none.
     backend : Backend
-        Where the cameras' lines are traced.
+        Backend that traces the cameras' lines.
 
     Raises
     ------
     Problem
-        Nothing is known of that time, or the scene is of another instrument.
+        There is no estimate for that time, or the scene is of another instrument.
     InputError
-        The scene cannot be flown or modelled.
+        The scene cannot be simulated or modelled.
     """
     at = None if scene is None else scene_time(scene)
     if scene is not None:
@@ -293,17 +300,15 @@ def make_products(
     ends = _ends(operation, history, result)
     if not ends[0].time <= time <= ends[1].time:
         early = time < ends[0].time
-        text = "nothing is known of a time before the first reading" if early else "the forecast does not go so far"
+        text = "the time is before the first reading" if early else "the time is beyond the forecast"
         allowed = f"a time from {utc_text(ends[0].time)} to {utc_text(ends[1].time)}"
-        remedy = "" if early else "; take newer readings, or a longer horizon in the plan"
+        remedy = "" if early else "; ingest newer readings, or lengthen the plan's horizon"
         raise Problem(text, utc_text(time), allowed + remedy)
     # at the very moment of a reading white motions are known, and a microsecond later they are not
     both = operation.smoothed([time, min(time + 1, ends[1].time)])
     course, beside = _at(both, 0), _at(both, 1)
     far = round(operation.plan.operation.horizon * MICRO)
-    limits = [
-        ValidityLimit(time + sign * far, "longer than the plan's horizon nothing is looked at") for sign in (-1, 1)
-    ]
+    limits = [ValidityLimit(time + sign * far, "the plan's horizon") for sign in (-1, 1)]
     held = validity(operation.smoothed, time, *ends, [*_validity_limits(result), *limits], beside)
     motions = operation.motions(time, acting=True)
     disturbances = operation.model.series_filter.stated
@@ -315,7 +320,7 @@ def make_products(
     plan, instrument = operation.plan.operation, operation.experiment.instrument
     state, left = state_file(found, operation.experiment.thermal, plan.instrument, plan.disturbances, remark)
     prior = prior_files(
-        found, disturbances, instrument, PRIOR, about, f"{remark}\nWhat is uncertain of the state in {STATE}.yaml"
+        found, disturbances, instrument, PRIOR, about, f"{remark}\nUncertainty of the state in {STATE}.yaml"
     )
     export = None if scene is None else _exported(scene, backend, changes)
     warnings = _warnings(result, time, at, export, left, prior)
@@ -323,16 +328,16 @@ def make_products(
 
 
 def _components(operation: Operation) -> list[Component]:
-    """What is stated, in the order of the model: it may have been traced under the same plan in another order."""
+    """Return the stated components in the order of the model, which may have been traced in another order."""
     stated = operation.experiment.stated
     assert stated is not None, "a plan states what moves"
-    own = {(component.cause, component.name): component for component in stated.components}
-    of = operation.model.series_filter.stated
-    return [own[key] for key in zip(of.causes, of.labels, strict=True)]
+    by_key = {(component.cause, component.name): component for component in stated.components}
+    disturbances = operation.model.series_filter.stated
+    return [by_key[key] for key in zip(disturbances.causes, disturbances.labels, strict=True)]
 
 
 def _require_same_instrument(scene: ExportSource, history: History) -> None:
-    """Refuse a scene of another instrument. Raises Problem."""
+    """Raise Problem if a scene is of another instrument than the record."""
     plain = scene.setup.plain()
     allowed = f"a scene of {history.name} ({history.sha256[:12]}), which the record is of: camera: {history.name}"
     if not isinstance(plain.get("instrument"), Mapping):
@@ -344,7 +349,7 @@ def _require_same_instrument(scene: ExportSource, history: History) -> None:
 
 
 def _ends(operation: Operation, history: History, result: FilterResult) -> tuple[ValidityLimit, ValidityLimit]:
-    """The first reading, and the end of the forecast. Raises Problem: there are no readings."""
+    """Return the first reading and the end of the forecast. Raise Problem if there are no readings."""
     first = history.first("monitor")
     if first is None or not result.readings:
         raise Problem("the record has no reading of the monitor", None, "python -m twin.operate ingest RECORD RUN")
@@ -355,31 +360,32 @@ def _ends(operation: Operation, history: History, result: FilterResult) -> tuple
 
 
 def _at(course: Course, k: int) -> Course:
-    """The estimate at one of its times."""
+    """Return the estimate at one of its times."""
     names = ("times", "values", "sigmas", "changes", "covariance")
     return replace(course, **{name: getattr(course, name)[k : k + 1] for name in names})
 
 
 def _validity_limits(result: FilterResult) -> list[ValidityLimit]:
-    """What an estimate does not hold across."""
+    """Return the events, jumps and violations that limit the validity of an estimate."""
     marks = [
-        ValidityLimit(moment, f"the event {name}, with which {', '.join(causes)} step")
+        ValidityLimit(moment, f"the event {name}, which steps {', '.join(causes)}")
         for moment, name, causes in result.events
         if causes
     ]
     for jump in result.jumps:
         marks += [
-            ValidityLimit(moment, f"a jump of {jump.body} was found") for moment in (jump.after_us, jump.until_us)
+            ValidityLimit(moment, f"a jump of {jump.body} was detected") for moment in (jump.after_us, jump.until_us)
         ]
     for requirement in result.requirements:
         if requirement.breaks_us is not None:
             marks.append(
-                ValidityLimit(requirement.breaks_us, f"{requirement.quantity} no longer keeps its requirement")
+                ValidityLimit(requirement.breaks_us, f"{requirement.quantity} violates its requirement from then on")
             )
     return marks
 
 
 def _version(operation: Operation, history: History) -> str:
+    """Return the version of the products."""
     query = select(ENTRY.c.sha256).order_by(ENTRY.c.id.desc()).limit(1)
     with history.reading() as connection:
         last = connection.execute(query).scalar()
@@ -388,21 +394,21 @@ def _version(operation: Operation, history: History) -> str:
 
 
 def _changes(
-    operation: Operation, course: Course, found: EstimatedMotions, notes: tuple[str, ...]
+    operation: Operation, course: Course, motions: EstimatedMotions, notes: tuple[str, ...]
 ) -> dict[str, EstimatedChange]:
-    """Camera -> its change at the course's one time, without white motions."""
+    """Return each camera's change at the course's only time, without white motions."""
     stated = operation.model.series_filter.stated
     white = np.array([law.white for law in stated.laws])
-    size = np.array([component.unit_size for component in found.components]) * stated.sigmas
+    size = np.array([component.unit_size for component in motions.components]) * stated.sigmas
     rows = stated.parameters / np.where(size > 0.0, size, np.inf)  # (4 K, M) per SI unit of each motion
-    other, own = rows * ~white, rows * white
+    other_rows, white_rows = rows * ~white, rows * white
     # p = p_other + p_white: their covariance goes out with that of the white part
-    across = own @ found.covariance @ other.T
-    constant = course.covariance[0] - own @ found.covariance @ own.T - across - across.T
+    across = white_rows @ motions.covariance @ other_rows.T
+    constant = course.covariance[0] - white_rows @ motions.covariance @ white_rows.T - across - across.T
     # ERR_RAND comes from here alone: the stated sizes of motions that are white in time
     prior = stated.parameters * white
     random = prior @ stated.correlation @ prior.T
-    values = course.changes[0] - own @ found.mean
+    values = course.changes[0] - white_rows @ motions.mean
     out = {}
     for k, name in enumerate(dict.fromkeys(camera for camera, _ in operation.model.spots)):
         four = slice(4 * k, 4 * k + 4)
@@ -410,17 +416,18 @@ def _changes(
     return out
 
 
-def _notes(time: int, held: Validity, result: FilterResult, version: str) -> tuple[str, ...]:
+def _notes(time: int, valid: Validity, result: FilterResult, version: str) -> tuple[str, ...]:
+    """Return notes on readings, validity and version for the camera models."""
     return (
         f"The camera is as estimated for {utc_text(time)} from {result.readings} readings up to "
-        f"{utc_text(result.time)}; the estimate holds from {utc_text(held.since)} ({held.since_reason}) to "
-        f"{utc_text(held.until)} ({held.until_reason}).",
+        f"{utc_text(result.time)}; the estimate holds from {utc_text(valid.since)} ({valid.since_reason}) to "
+        f"{utc_text(valid.until)} ({valid.until_reason}).",
         f"Version {version}.",
     )
 
 
 def _exported(scene: ExportSource, backend: Backend, changes: Mapping[str, EstimatedChange]) -> Export:
-    """Camera models of a scene. Raises InputError."""
+    """Return the camera models of a scene. Raise InputError if they cannot be made."""
     test = scene.setup.test
     # what a test perturbs is what it pretends to be the truth; here the record says what the cameras are
     setup = scene.setup.model_copy(update={"test": test.model_copy(update={"perturb": FrozenMap()})})
@@ -431,7 +438,10 @@ def _exported(scene: ExportSource, backend: Backend, changes: Mapping[str, Estim
 
 
 def _heights(scene: ExportSource) -> tuple[float, float] | None:
-    """Lowest and highest ground that models are fitted to, metres: the usual heights, and a scene's terrain beyond."""
+    """Return the lowest and the highest ground for fitting the models, in metres.
+
+    They are the usual heights, extended by the scene's terrain.
+    """
     if not isinstance(scene.setup, AngleSetup):
         return None
     terrain = scene.setup.test.terrain
@@ -440,7 +450,7 @@ def _heights(scene: ExportSource) -> tuple[float, float] | None:
 
 
 _RELIEFS = 4.0
-"""Standard deviations of a terrain that its models reach over."""
+"""Number of standard deviations of a terrain that its models cover."""
 
 
 def _warnings(
@@ -448,137 +458,147 @@ def _warnings(
     time: int,
     scene: int | None,
     export: Export | None,
-    left: Sequence[OmittedComponent],
+    omitted: Sequence[OmittedComponent],
     prior: Prior,
 ) -> tuple[str, ...]:
+    """Return the warnings of the products."""
     out = list(result.warnings)
     if scene is not None and abs(scene - time) > APART:
         out.append(f"the scene was taken at {utc_text(scene)}, and the estimate is for {utc_text(time)}")
     for requirement in result.requirements:
         if not requirement.holds_now:
-            out.append(f"{requirement.quantity} does not keep its requirement")
-    for name, line in (export.lines if export is not None else {}).items():
-        if line.polynomial is None:
-            out.append(f"{name} has no rational polynomials: {line.refused}")
-    if left:
-        out.append(f"{STATE}.yaml does not have {len(left)} motions that a job cannot say")
+            out.append(f"{requirement.quantity} violates its requirement")
+    for name, model in (export.lines if export is not None else {}).items():
+        if model.polynomial is None:
+            out.append(f"{name} has no rational polynomials: {model.refused}")
+    if omitted:
+        out.append(f"{STATE}.yaml omits {len(omitted)} motions that a job cannot express")
     if prior.omitted:
         most = max(one.share or 0.0 for one in prior.omitted)
-        text = f"{PRIOR}.yaml does not have the {len(prior.omitted)} components that matter least"
-        out.append(f"{text}; none makes more than {100.0 * most:.2g} percent of the variance of a spot or a parameter")
+        text = f"{PRIOR}.yaml omits the {len(prior.omitted)} least important components"
+        out.append(f"{text}; none contributes more than {100.0 * most:.2g} % to the variance of a spot or a parameter")
     return tuple(out)
 
 
 NUMBERS = "products.json"
 
 
-def _cameras(one: Products) -> dict[str, dict[str, float]]:
-    """Group -> its quantities with their sigmas, in the units that their keys end in."""
+def _cameras(products: Products) -> dict[str, dict[str, float]]:
+    """Return group -> quantities with their sigmas, in the units given by the ends of the keys."""
     out: dict[str, dict[str, float]] = {}
-    for k, quantity in enumerate(one.course.quantities):
+    for k, quantity in enumerate(products.course.quantities):
         group = out.setdefault(quantity.group, {})
-        group[quantity.key] = float(one.course.values[0, k])
-        group[f"{quantity.key}_sigma"] = float(one.course.sigmas[0, k])
+        group[quantity.key] = float(products.course.values[0, k])
+        group[f"{quantity.key}_sigma"] = float(products.course.sigmas[0, k])
     return out
 
 
 OMITTED: Record[OmittedComponent] = Record(
-    "A component that a file does not have.",
-    Quantity("component", lambda one: one.name, "body, kind and axis"),
-    Quantity("amount", lambda one: one.amount / one.unit_size, "estimated amount, of a prior its standard deviation"),
-    Quantity("unit", lambda one: one.unit, "of the amount"),
+    "Component that a file omits.",
+    Quantity("component", lambda component: component.name, "body, kind and axis"),
     Quantity(
-        "share", lambda one: one.share, "largest of the variance of a spot or a parameter, of a prior", where_known=True
+        "amount",
+        lambda component: component.amount / component.unit_size,
+        "estimated amount; for a prior its standard deviation",
+    ),
+    Quantity("unit", lambda component: component.unit, "unit of the amount"),
+    Quantity(
+        "share",
+        lambda component: component.share,
+        "for a prior, its largest share of the variance of a spot or a parameter",
+        where_known=True,
     ),
 )
 STATE_FILE: Record[Products] = Record(
-    "The job of the estimated state.",
-    Quantity("file", lambda one: f"{STATE}.yaml", "for python -m twin.render"),
-    Quantity("omitted", lambda one: list(one.omitted_from_state), "motions that a job cannot express", record=OMITTED),
+    "Job of the estimated state.",
+    Quantity("file", lambda p: f"{STATE}.yaml", "file for python -m twin.render"),
+    Quantity("omitted", lambda p: list(p.omitted_from_state), "motions that a job cannot express", record=OMITTED),
 )
 PRIOR_FILE: Record[Products] = Record(
-    "What is uncertain of that state.",
-    Quantity("file", lambda one: f"{PRIOR}.yaml", "for disturbances of a job or of python -m twin.asbuilt"),
-    Quantity("components", lambda one: len(one.prior.components), "that it has"),
-    Quantity("omitted", lambda one: list(one.prior.omitted), "components that it omits", record=OMITTED),
+    "Uncertainty of that state.",
+    Quantity("file", lambda p: f"{PRIOR}.yaml", "file for disturbances of a job or of python -m twin.asbuilt"),
+    Quantity("components", lambda p: len(p.prior.components), "number of its components"),
+    Quantity("omitted", lambda p: list(p.prior.omitted), "components that it omits", record=OMITTED),
 )
 PRODUCTS: Record[Products] = Record(
-    "products.json. What an operation's estimate says for one time.",
-    Quantity("record", lambda one: one.history.url, "of the instrument"),
-    Quantity("instrument", lambda one: one.history.name, "of the record"),
-    Quantity("instrument_sha256", lambda one: one.history.sha256, "by which it is recognised"),
-    Quantity("time_utc", lambda one: utc_text(one.time), "of the estimate"),
+    "products.json. Estimate of an operation for one time.",
+    Quantity("record", lambda p: p.history.url, "address of the record"),
+    Quantity("instrument", lambda p: p.history.name, "instrument of the record"),
+    Quantity("instrument_sha256", lambda p: p.history.sha256, "SHA-256 that identifies the instrument"),
+    Quantity("time_utc", lambda p: utc_text(p.time), "time of the estimate"),
     Quantity(
         "scene_utc",
-        lambda one: None if one.scene_time is None else utc_text(one.scene_time),
-        "when the scene was taken, where there is one",
+        lambda p: None if p.scene_time is None else utc_text(p.scene_time),
+        "time of the scene, if there is one",
         where_known=True,
     ),
-    Quantity("valid_from_utc", lambda one: utc_text(one.validity.since), "from when on it holds"),
-    Quantity("valid_until_utc", lambda one: utc_text(one.validity.until), "until when it holds"),
-    Quantity("valid_from_reason", lambda one: one.validity.since_reason, "why not before"),
-    Quantity("valid_until_reason", lambda one: one.validity.until_reason, "why not after"),
-    Quantity("valid_within_percent", lambda one: SHARE, "by which errors may be larger than at the time itself"),
-    Quantity("version", lambda one: one.version, "SHA-256 of the record's last entry, the plan and the program"),
-    Quantity("program", lambda one: f"{WRITER} {importlib.metadata.version(WRITER)}", "that wrote it"),
-    Quantity("readings", lambda one: one.filter_result.readings, "of the monitor that the estimate rests on"),
-    Quantity("newest_utc", lambda one: utc_text(one.filter_result.time), "time of the newest of them"),
-    Quantity("estimate", _cameras, "every quantity of every camera and of both together, with its sigma"),
+    Quantity("valid_from_utc", lambda p: utc_text(p.validity.since), "beginning of its validity"),
+    Quantity("valid_until_utc", lambda p: utc_text(p.validity.until), "end of its validity"),
+    Quantity("valid_from_reason", lambda p: p.validity.since_reason, "why it is not valid before"),
+    Quantity("valid_until_reason", lambda p: p.validity.until_reason, "why it is not valid after"),
+    Quantity(
+        "valid_within_percent", lambda p: SHARE, "growth of errors, relative to the time itself, that ends the validity"
+    ),
+    Quantity("version", lambda p: p.version, "SHA-256 of the record's last entry, the plan and the program"),
+    Quantity("program", lambda p: f"{WRITER} {importlib.metadata.version(WRITER)}", "program that wrote it"),
+    Quantity("readings", lambda p: p.filter_result.readings, "number of readings of the monitor in the estimate"),
+    Quantity("newest_utc", lambda p: utc_text(p.filter_result.time), "time of the newest of them"),
+    Quantity("estimate", _cameras, "every quantity of every camera and of the pair, with its sigma"),
     Quantity(
         "changes",
-        lambda one: {name: np.asarray(change.values) for name, change in one.changes.items()},
-        "camera -> d_alpha, d_beta, d_gamma in rad and d_f in m that its models have been corrected by",
+        lambda p: {name: np.asarray(change.values) for name, change in p.changes.items()},
+        "camera -> corrections d_alpha, d_beta, d_gamma in rad and d_f in m of its models",
         converted=False,
     ),
-    Quantity("cameras", lambda one: list(one.changes), "in the order of the covariance"),
+    Quantity("cameras", lambda p: list(p.changes), "cameras in the order of the covariance"),
     Quantity(
         "covariance",
-        lambda one: one.course.covariance[0],
-        "of the changes of one camera after the other, rad and m",
+        lambda p: p.course.covariance[0],
+        "covariance of the changes of one camera after the other, in rad and m",
         converted=False,
     ),
     Quantity(
         "models",
-        lambda one: None if one.export is None else one.export.lines,
+        lambda p: None if p.export is None else p.export.lines,
         "camera -> its models of the scene",
         record=LINE,
         where_known=True,
     ),
     Quantity("state", STATE_FILE, "the estimated state as a job"),
-    Quantity("prior", PRIOR_FILE, "what is uncertain of it"),
-    Quantity("warnings", lambda one: list(one.warnings), "in words"),
+    Quantity("prior", PRIOR_FILE, "uncertainty of that state as a prior"),
+    Quantity("warnings", lambda p: list(p.warnings), "warnings"),
 )
 
 
-def product_files(one: Products) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Path in the folder -> contents, and the numbers of `NUMBERS`, which tells the checksums of all others.
+def product_files(products: Products) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """Return the files of the products by path, and the numbers of products.json.
+
+    products.json contains the checksums of the other files.
 
     Parameters
     ----------
-    one : Products
-        All products of a time.
+    products : Products
+        Products for one time.
     """
-    files: dict[str, bytes] = {} if one.export is None else export_files(one.export)
-    files[f"{STATE}.yaml"] = one.state.encode()
-    files |= {name: text.encode() for name, text in one.prior.files.items()}
+    files: dict[str, bytes] = {} if products.export is None else export_files(products.export)
+    files[f"{STATE}.yaml"] = products.state.encode()
+    files |= {name: text.encode() for name, text in products.prior.files.items()}
     digests: Mapping[str, str] = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
-    numbers = {**described("products", PRODUCTS(one)), "sha256": dict(digests)}
+    numbers = {**described("products", PRODUCTS(products)), "sha256": dict(digests)}
     files[NUMBERS] = (json.dumps(numbers, indent=1, allow_nan=False) + "\n").encode()
     return files, numbers
 
 
-def summary(one: Products) -> str:
-    """What there is, for the terminal."""
+def summary(products: Products) -> str:
+    """Return the products in words, for the terminal."""
     lines = [
-        f"{one.history.name} at {utc_text(one.time)}, from {one.filter_result.readings} readings up to "
-        f"{utc_text(one.filter_result.time)}",
-        f"holds from {utc_text(one.validity.since)}: {one.validity.since_reason}",
-        f"holds until {utc_text(one.validity.until)}: {one.validity.until_reason}",
+        f"{products.history.name} at {utc_text(products.time)}, from {products.filter_result.readings} readings up to "
+        f"{utc_text(products.filter_result.time)}",
+        f"valid from {utc_text(products.validity.since)}: {products.validity.since_reason}",
+        f"valid until {utc_text(products.validity.until)}: {products.validity.until_reason}",
     ]
-    for name, line in (one.export.lines if one.export is not None else {}).items():
-        if line.ground is not None:
-            text = f"{name}: wrong on the ground by {line.ground.bias_m:.2f} m (ERR_BIAS)"
-            lines.append(
-                f"{text} and by {line.ground.random_m:.2f} m otherwise in every image (ERR_RAND), without the orbit"
-            )
-    return "\n".join([*lines, *(f"warning: {text}" for text in one.warnings)])
+    for name, model in (products.export.lines if products.export is not None else {}).items():
+        if model.ground is not None:
+            text = f"{name}: ground error {model.ground.bias_m:.2f} m common to all images (ERR_BIAS)"
+            lines.append(f"{text} and {model.ground.random_m:.2f} m random per image (ERR_RAND), without the orbit")
+    return "\n".join([*lines, *(f"warning: {text}" for text in products.warnings)])

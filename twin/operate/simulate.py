@@ -1,12 +1,11 @@
-"""An instrument in operation without one: its life is drawn, every reading is rendered and recovered, and what a real
-instrument would send down is written as files, which the record takes as it takes any others.
+"""Simulated life of an instrument in operation.
 
-What only a simulation knows stands in a file of its own, which nothing of the operation reads.
+Amounts of every stated motion are drawn over time by the laws of their disturbances; every reading is rendered and
+recovered; and the telemetry of a real instrument is written as files, which the record ingests like any others. The
+truth is written to a file of its own, which the operation never reads.
 
-A life that could have been: amounts of every stated motion over time, drawn by the laws of their disturbances.
-
-Laws without steps are drawn by `scenes.models.drawn_motions`; steps come by chance at a stated mean rate, or at the
-dates of events. Nothing here uses the filter or the smoother that such lives test.
+Laws without steps are drawn by `scenes.models.drawn_motions`; steps occur at random at a stated mean rate, or at the
+dates of events. The filter and the smoother, which such lives test, are not used here.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from twin.main_job.monitor_reading import MonitorReading, stated
 from twin.monitor.crosstalk import CameraCrosstalk, crosstalk
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import largest_piece
-from twin.monitor.observation import Observation, Observing, observe, one_detector
+from twin.monitor.observation import Observation, ObservationOptions, observe, shared_detector
 from twin.monitor.reading_table import ReadingTable, reading_table
 from twin.operate.record.entries import MICRO, utc_text
 from twin.operate.record.telemetry import CONFIG, RESULTS
@@ -43,26 +42,25 @@ Moments = NDArray[np.int64]
 _MOTIONS, _JUMPS, _EVENTS, _DATES, _COEFFICIENTS = 10, 11, 12, 13, 14
 """Random streams of a seed; the exposures of the detectors have the first ones (`MonitorExperiment.frames_after`)."""
 _MARGIN = 0.1
-"""Part of a life at its beginning and its end in which no date of an event is drawn: something has to be seen of what
-it does."""
+"""Share of a life at its beginning and its end without random dates of events, so that their effect can be observed."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """Motions that stepped at one moment.
+    """Step of motions at one moment.
 
     Attributes
     ----------
     time : int
         Microseconds of TAI since 2000.
     cause : str
-        Of the disturbances file.
+        Cause in the disturbances file.
     body : str
-        Whose motions; empty where those of all bodies of the cause stepped, by an event.
+        Body that stepped; empty if those of all bodies of the cause stepped, by an event.
     event : str
-        That made them step; empty for a jump at a time that nobody knows.
-    sizes : Array
-        (M,) SI, zero for what did not step.
+        Event of the step; empty for a jump at an unknown time.
+    sizes : (M,) ndarray
+        Sizes in SI units, zero for components that did not step.
     """
 
     time: int
@@ -74,22 +72,22 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Life:
-    """What every stated motion of an instrument does at T times.
+    """Course of every stated motion of an instrument at T times.
 
     Attributes
     ----------
-    times : Moments
-        (T,) microseconds of TAI since 2000, rising.
+    times : (T,) ndarray of int64
+        Microseconds of TAI since 2000, ascending.
     components : tuple[Component, ...]
-        M of them.
-    drawn : Array
-        (T, M) SI, as the laws say and without steps.
+        The M components.
+    drawn : (T, M) ndarray
+        Amounts by the time laws, without steps, in SI units.
     steps : tuple[Step, ...]
-        In the order of time.
+        Steps in the order of time.
     dates : tuple[tuple[int, str], ...]
-        When which event came: microseconds, name.
+        (time in microseconds, name) of every event.
     coefficients : Mapping[str, float]
-        Body with a temperature -> by which part its temperature does more to light than is computed.
+        Body with a temperature -> relative excess of the effect of its temperature on light over the computed one.
     """
 
     times: Moments
@@ -101,7 +99,7 @@ class Life:
 
     @cached_property
     def amounts(self) -> Array:
-        """(T, M) SI, steps included."""
+        """(T, M) amounts including steps, in SI units."""
         out = self.drawn.copy()
         for step in self.steps:
             out[self.times >= step.time] += step.sizes
@@ -109,15 +107,13 @@ class Life:
 
     @cached_property
     def acting(self) -> Array:
-        """(T, M) SI as they act on light: of a temperature that a sensor would read, more or less of it by the body's
-        coefficient.
-        """
+        """(T, M) amounts as they act on light, in SI units: temperatures are scaled by their body's coefficient."""
         factor = [1.0 + self.coefficients.get(c.body, 0.0) * (c.kind == "temperature") for c in self.components]
         return np.asarray(self.amounts * np.array(factor))
 
     @cached_property
     def temperatures(self) -> dict[str, Array]:
-        """Body -> (T,) change of its temperature against the instrument's, kelvin."""
+        """Body -> (T,) change of its temperature against the instrument's, in kelvin."""
         out: dict[str, Array] = {}
         for k, component in enumerate(self.components):
             if component.kind == "temperature":
@@ -134,24 +130,24 @@ def drawn_life(
     dates: Sequence[tuple[int, str]] | None = None,
     coefficient_error: float = 0.0,
 ) -> Life:
-    """Draw what every motion does.
+    """Draw the course of every motion.
 
     Parameters
     ----------
     stated : StatedMotions
-        The motions and their laws of time.
-    times : Moments
-        (T,) microseconds of TAI since 2000, rising.
+        The motions and their time laws.
+    times : (T,) ndarray of int64
+        Microseconds of TAI since 2000, ascending.
     zero : int
-        From which the laws count their seconds, likewise.
+        Origin of the time laws, in microseconds of TAI since 2000.
     seed : int
-        Of everything that is drawn; what one cause draws does not depend on the others.
+        Seed of all random numbers; those of one cause do not depend on the others.
     causes : Mapping[str, Sequence[str]]
-        Event -> names of the causes whose motions step when it comes.
+        Event -> causes whose motions step when it occurs.
     dates : Sequence[tuple[int, str]] | None
-        When which event comes; None to draw one date for each.
+        (time, event) of every event; None to draw one date for each.
     coefficient_error : float
-        Standard deviation of what a body's temperature does to light beyond what is computed, relative.
+        Relative standard deviation of the factor between the true and the computed effect of a body's temperature.
     """
     seconds = (times - zero) / MICRO
     drawn = drawn_motions(stated, seconds, lambda number: np.random.default_rng(stream(seed, _MOTIONS, number)))
@@ -170,21 +166,21 @@ def drawn_life(
 
 
 def _jumps(
-    stated: StatedMotions, cause: str, where: Sequence[int], times: Moments, rng: np.random.Generator
+    stated: StatedMotions, cause: str, motions: Sequence[int], times: Moments, rng: np.random.Generator
 ) -> Iterator[Step]:
-    """Steps of a cause whose law is a jump with a mean time between two: those of one body come together."""
-    every = stated.laws[where[0]].jump
-    if every is None:
+    """Yield the steps of a cause whose law has jumps at a mean interval; the motions of one body step together."""
+    mean_interval = stated.laws[motions[0]].jump
+    if mean_interval is None:
         return
     span = (int(times[-1]) - int(times[0])) / MICRO
-    for body in dict.fromkeys(stated.components[k].body for k in where):
-        own = [k for k in where if stated.components[k].body == body]
-        for second in np.sort(rng.uniform(0.0, span, rng.poisson(span / every))).tolist():
+    for body in dict.fromkeys(stated.components[k].body for k in motions):
+        own = [k for k in motions if stated.components[k].body == body]
+        for second in np.sort(rng.uniform(0.0, span, rng.poisson(span / mean_interval))).tolist():
             yield Step(int(times[0]) + round(second * MICRO), cause, body, "", _step(stated, own, rng))
 
 
 def _step(stated: StatedMotions, where: Sequence[int], rng: np.random.Generator) -> Array:
-    """(M,) SI by which some motions step, together as they are correlated; others by nothing."""
+    """Return random sizes (M,) of a step of some motions in SI units, correlated as stated; zero for the others."""
     out = np.zeros(len(stated.components))
     root = covariance_root(stated.correlation[np.ix_(where, where)])
     out[list(where)] = rng.standard_normal(len(where)) @ root * stated.sigma[list(where)]
@@ -192,7 +188,7 @@ def _step(stated: StatedMotions, where: Sequence[int], rng: np.random.Generator)
 
 
 def _drawn_dates(events: Sequence[str], times: Moments, seed: int) -> tuple[tuple[int, str], ...]:
-    """One date for each event, as likely at any time of a life but for its ends."""
+    """Return one date for each event, uniform over the life except for its margins."""
     first, span = int(times[0]), int(times[-1]) - int(times[0])
     rng = np.random.default_rng(stream(seed, _DATES))
     shares = rng.uniform(_MARGIN, 1.0 - _MARGIN, len(events)).tolist()
@@ -200,48 +196,52 @@ def _drawn_dates(events: Sequence[str], times: Moments, seed: int) -> tuple[tupl
 
 
 def _when(step: Step) -> tuple[int, str, str]:
+    """Return the sort key of a step."""
     return step.time, step.cause, step.body
 
 
 FOLDER = "simulated"
-"""Of a record in a folder: the files that its readings are taken from."""
+"""Subfolder of a record with the files of its simulated readings."""
 TELEMETRY, LIFE = "telemetry.yaml", "life"
 TEMPERATURES, PASSES, EVENTS = "temperatures.csv", "passes.csv", "events.csv"
 RENDER = "render and recover"
 _SENSORS = 15
 """Random stream of the sensors' errors."""
 _KELVIN = 4
-"""Decimals of a temperature in kelvin: sensors show no more, and few less."""
+"""Number of decimals of a sensor's temperature in kelvin; real sensors show as many or fewer."""
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """What is simulated.
+    """Parameters of a simulated life.
 
     Attributes
     ----------
     start : int
-        Of the first reading, microseconds of TAI since 2000; the laws of time count from it.
+        Time of the first reading and origin of the time laws, in microseconds of TAI since 2000.
     seconds : float
-        That the life takes.
+        Length of the life, in seconds.
     every : float
-        From one reading of the monitor to the next, seconds; the temperatures are read with it.
+        Interval between readings of the monitor, in seconds; temperatures are read at the same times.
     seed : int
-        Of everything that is drawn.
+        Seed of all random numbers.
     frames : int
-        Of each exposure.
+        Number of frames of each exposure.
     coefficient_error : float
-        Standard deviation, from body to body, of what a temperature does to light beyond what is computed, relative.
+        Relative standard deviation, from body to body, of the factor between the true and the computed effect of a
+        temperature.
     sensor_sigma : float
-        Of a sensor of temperature, kelvin.
+        Standard deviation of a temperature sensor, in kelvin.
     sensors : tuple[str, ...] | None
-        Bodies that have one; None for all that are stated to get warmer.
+        Bodies with a sensor; None for all bodies with a stated temperature.
     dead : Mapping[str, int]
-        Body -> moment from which on its sensor says nothing; stuck: from which on it repeats what it said last.
+        Body -> time from which its sensor gives no readings.
+    stuck : Mapping[str, int]
+        Body -> time from which its sensor repeats its last reading.
     dates : tuple[tuple[int, str], ...] | None
-        When which event came; None to draw one date for each of the plan's.
+        (time, event) of every event; None to draw one date for each event of the plan.
     words : tuple[str, ...]
-        By which a command asks for it, all but the seed.
+        Command-line options of the simulation, without the seed.
     """
 
     start: int
@@ -259,27 +259,27 @@ class Simulation:
 
     @property
     def times(self) -> np.ndarray:
-        """(T,) microseconds of TAI since 2000 of the readings, before the life is over."""
+        """(T,) times of the readings within the life, in microseconds of TAI since 2000."""
         count = max(1, math.ceil(self.seconds / self.every - 1e-9))
         return self.start + np.array([round(k * self.every * MICRO) for k in range(count)], np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRecord:
-    """What came of a simulated life.
+    """Result of a simulated life.
 
     Attributes
     ----------
     life : Life
-        As it was drawn.
-    times : np.ndarray
-        (R,) microseconds of TAI since 2000 of the readings of the monitor.
+        The drawn life.
+    times : (R,) ndarray of int64
+        Times of the readings of the monitor, in microseconds of TAI since 2000.
     readings : tuple[dict[str, Any], ...]
-        What recovered.json has of each.
+        Content of recovered.json for each reading.
     truth : Mapping[str, Any]
-        What the cameras truly did at these times, as JSON files nest it.
+        True changes of the cameras at these times, nested as in JSON files.
     lost : tuple[tuple[int, str], ...]
-        Moment of a reading that could not be, and why.
+        Time of each impossible reading, and the reason.
     """
 
     life: Life
@@ -292,25 +292,25 @@ class SimulatedRecord:
 def simulate_record(
     plan: OperationSetup, experiment: MonitorExperiment, what: Simulation, advance: Advance
 ) -> SimulatedRecord:
-    """Draw a life, trace and render its states, and recover what the monitor reads of them.
+    """Draw a life, trace and render its states, and recover the monitor's readings.
 
     Parameters
     ----------
     plan : OperationSetup
-        Of the operation: what moves, and what events do.
+        Plan of the operation: the disturbances, and the effects of events.
     experiment : MonitorExperiment
-        On its instrument, with its disturbances.
+        Monitor experiment of its instrument with its disturbances.
     what : Simulation
-        Is simulated.
+        Parameters of the simulation.
     advance : Advance
-        Told of the progress.
+        Called with the progress.
     """
     motions = experiment.stated
     assert motions is not None  # a plan states them
     causes = plan.operation.events
     life = drawn_life(motions, what.times, what.start, what.seed, causes, what.dates, what.coefficient_error)
     lost: list[tuple[int, str]] = []
-    record = one_detector(experiment, what.frames, what.seed)
+    record = shared_detector(experiment, what.frames, what.seed)
     chunk = largest_piece(what.frames * math.prod(experiment.nominal_photons.shape))
 
     def leave(number: int, why: str) -> None:
@@ -320,67 +320,71 @@ def simulate_record(
     readings: list[dict[str, Any]] = []
     numbers: list[int] = []
     suspects: Mapping[str, CameraCrosstalk] | None = None
-    how = Observing(record, chunk=chunk, leave=leave)
+    how = ObservationOptions(record, chunk=chunk, omit=leave)
     advance(RENDER, 0, len(life.times))
     for first in range(0, len(life.times), chunk):
         piece = np.arange(first, min(first + chunk, len(life.times)))
         states = states_of(life.acting[piece], life.components, experiment.thermal)
-        for found in observe(experiment, states, how, piece):
-            suspects = crosstalk(experiment, found.recovery.shift_covariance[0]) if suspects is None else suspects
-            readings += _readings(experiment, found, what.frames, suspects)
+        for observation in observe(experiment, states, how, piece):
+            suspects = crosstalk(experiment, observation.recovery.shift_covariance[0]) if suspects is None else suspects
+            readings += _readings(experiment, observation, what.frames, suspects)
             tables.append(
                 reading_table(
-                    found.recovery, experiment.cameras, found.truth, experiment.ground, experiment.disturbances
+                    observation.recovery,
+                    experiment.cameras,
+                    observation.truth,
+                    experiment.ground,
+                    experiment.disturbances,
                 )
             )
-            numbers += found.numbers.tolist()
+            numbers += observation.numbers.tolist()
         advance(RENDER, int(piece[-1]) + 1, len(life.times))
     truth = ReadingTable.joined(tables).true() if tables else {}
     return SimulatedRecord(life, life.times[numbers], tuple(readings), truth, tuple(lost))
 
 
 def _readings(
-    experiment: MonitorExperiment, found: Observation, frames: int, suspects: Mapping[str, CameraCrosstalk]
+    experiment: MonitorExperiment, observation: Observation, frames: int, suspects: Mapping[str, CameraCrosstalk]
 ) -> Iterator[dict[str, Any]]:
-    """What recovered.json has of each state."""
+    """Yield the content of recovered.json for each state."""
     channels = tuple((channel.camera, channel.name) for channel in experiment.path.channels)
-    told = channels, experiment.cameras, experiment.ground, experiment.disturbances
+    common = channels, experiment.cameras, experiment.ground, experiment.disturbances
     centroid = experiment.resolved.job.analysis.centroid
-    for k in range(len(found.numbers)):
-        one = MonitorReading(*told, found.recovery.at(slice(k, k + 1)), suspects, frames, centroid)
-        yield stated(one.recovered_dict())
+    for k in range(len(observation.numbers)):
+        reading = MonitorReading(*common, observation.recovery.at(slice(k, k + 1)), suspects, frames, centroid)
+        yield stated(reading.recovered_dict())
 
 
 def write_simulated(
-    folder: RunFolder, plan: OperationSetup, experiment: MonitorExperiment, what: Simulation, found: SimulatedRecord
+    folder: RunFolder, plan: OperationSetup, experiment: MonitorExperiment, what: Simulation, simulated: SimulatedRecord
 ) -> None:
-    """Write what the instrument would send down, and a file that says what its tables hold; not the truth.
+    """Write the telemetry of the life, and the file that describes its tables; not the truth.
 
     Parameters
     ----------
     folder : RunFolder
-        open.
+        Open folder.
     plan : OperationSetup
-        Of the operation.
+        Plan of the operation.
     experiment : MonitorExperiment
-        On its instrument.
+        Monitor experiment of its instrument.
     what : Simulation
-        Was simulated.
-    found : Recorded
-        What came of it.
+        Parameters of the simulation.
+    simulated : SimulatedRecord
+        Result of the simulation.
     """
     folder.write_text(CONFIG, dump_yaml(plan.plain()))
-    seconds = ((found.times - found.times[0]) / MICRO).tolist()
-    last = found.readings[-1]
-    numbers = {**last, "times_s": seconds, "series": list(found.readings)}
+    seconds = ((simulated.times - simulated.times[0]) / MICRO).tolist()
+    last = simulated.readings[-1]
+    numbers = {**last, "times_s": seconds, "series": list(simulated.readings)}
     folder.write_json(RESULTS["monitor"], described("recovered", numbers))
-    folder.write_text(PASSES, f"UTC,run\n{utc_text(int(found.times[0]))},.\n")
-    events = "".join(f"{utc_text(moment)},{name}\n" for moment, name in found.life.dates)
+    folder.write_text(PASSES, f"UTC,run\n{utc_text(int(simulated.times[0]))},.\n")
+    events = "".join(f"{utc_text(moment)},{name}\n" for moment, name in simulated.life.dates)
     folder.write_text(EVENTS, f"UTC,what\n{events}")
-    sensed = sensed_temperatures(experiment.instrument.spec.temperature, what, found.life)
+    sensed = sensed_temperatures(experiment.instrument.spec.temperature, what, simulated.life)
     heads = {body: f"T_{body.removeprefix('base/').replace('/', '_')}" for body in sensed}
     rows = [",".join(("UTC", *heads.values()))]
-    for k, moment in enumerate(found.life.times.tolist()):
+    for k, moment in enumerate(simulated.life.times.tolist()):
         cells = ("" if math.isnan(own[k]) else f"{own[k]:.{_KELVIN}f}" for own in sensed.values())
         rows.append(",".join((utc_text(moment), *cells)))
     folder.write_text(TEMPERATURES, "\n".join(rows) + "\n")
@@ -395,47 +399,48 @@ def write_simulated(
 
 
 def sensed_temperatures(reference: float, what: Simulation, life: Life) -> dict[str, np.ndarray]:
-    """Body -> (T,) what its sensor says, kelvin; NaN where it says nothing.
+    """Return body -> (T,) readings of its sensor in kelvin; NaN where it gives none.
 
     Parameters
     ----------
     reference : float
-        Temperature of the instrument, kelvin.
+        Temperature of the instrument, in kelvin.
     what : Simulation
-        Is simulated.
+        Parameters of the simulation.
     life : Life
-        As it was drawn.
+        The drawn life.
     """
     out: dict[str, np.ndarray] = {}
     for number, (body, change) in enumerate(life.temperatures.items()):
         if what.sensors is not None and body not in what.sensors:
             continue
         rng = np.random.default_rng(stream(what.seed, _SENSORS, number))
-        said = np.round(reference + change + what.sensor_sigma * rng.standard_normal(len(change)), _KELVIN)
+        values = np.round(reference + change + what.sensor_sigma * rng.standard_normal(len(change)), _KELVIN)
         if body in what.stuck:
             late = life.times >= what.stuck[body]
             before = np.flatnonzero(~late)
-            said[late] = said[before[-1]] if len(before) else said[0]
+            values[late] = values[before[-1]] if len(before) else values[0]
         if body in what.dead:
-            said[life.times >= what.dead[body]] = np.nan
-        out[body] = said
+            values[life.times >= what.dead[body]] = np.nan
+        out[body] = values
     return out
 
 
-def truth_numbers(plan: OperationSetup, what: Simulation, found: SimulatedRecord) -> dict[str, Any]:
-    """What only the simulation knows, as plain data: changes of cameras, angle and ground by the exact trace, steps,
-    coefficients and temperatures.
+def truth_numbers(plan: OperationSetup, what: Simulation, simulated: SimulatedRecord) -> dict[str, Any]:
+    """Return the truth as plain data.
+
+    It holds the traced changes of cameras, angle and ground, steps, coefficients and temperatures.
 
     Parameters
     ----------
     plan : OperationSetup
-        Of the operation.
+        Plan of the operation.
     what : Simulation
-        Was simulated.
-    found : Recorded
-        What came of it.
+        Parameters of the simulation.
+    simulated : SimulatedRecord
+        Result of the simulation.
     """
-    life = found.life
+    life = simulated.life
     steps = [
         {
             "time_utc": utc_text(step.time),
@@ -455,9 +460,9 @@ def truth_numbers(plan: OperationSetup, what: Simulation, found: SimulatedRecord
         "instrument": plan.model.instrument.name,
         "disturbances": plan.disturbances.name,
         "seed": what.seed,
-        "times_us": found.times.tolist(),
-        "times_utc": [utc_text(moment) for moment in found.times.tolist()],
-        **found.truth,
+        "times_us": simulated.times.tolist(),
+        "times_utc": [utc_text(moment) for moment in simulated.times.tolist()],
+        **simulated.truth,
         "steps": steps,
         "events": [{"time_utc": utc_text(moment), "event": name} for moment, name in life.dates],
         "coefficients": dict(life.coefficients),
@@ -465,5 +470,5 @@ def truth_numbers(plan: OperationSetup, what: Simulation, found: SimulatedRecord
         "temperature_changes_K": {body: own.tolist() for body, own in life.temperatures.items()},
         "sensors_dead": {body: utc_text(moment) for body, moment in what.dead.items()},
         "sensors_stuck": {body: utc_text(moment) for body, moment in what.stuck.items()},
-        "lost": [{"time_utc": utc_text(moment), "reason": why} for moment, why in found.lost],
+        "lost": [{"time_utc": utc_text(moment), "reason": why} for moment, why in simulated.lost],
     }

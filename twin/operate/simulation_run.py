@@ -1,4 +1,4 @@
-"""A simulated life from the words of a command to a record: what is asked for, checked, computed, written and taken."""
+"""Run of a simulated life: options of the command, checks, computation, files and ingest into a record."""
 
 from __future__ import annotations
 
@@ -30,34 +30,33 @@ from twin.operate.simulate import FOLDER, LIFE, TELEMETRY, Simulation, simulate_
 from twin.operate.terminal import input_errors, utc_option
 
 PROGRAM = "twin.operate"
-CALIBRATE, TAKE = "calibrate", "take into the record"
+CALIBRATE, INGEST = "calibrate", "ingest into the record"
 NO_TRUTH = "none"
-"""In place of the truth's file: it is not written."""
+"""Value of --truth for which no truth is written."""
 MOST = 100_000
-"""Readings of the monitor in one life: some hours, and a gigabyte of results."""
+"""Largest number of monitor readings in one life: they take some hours, and give a gigabyte of results."""
 _READING = 2e5
-"""Bytes of a reading: of numbers that are kept beside its frames."""
+"""Memory of a reading in bytes, for the numbers kept beside its frames."""
 DAY = 86_400.0
 
 
 def simulation(options: Mapping[str, str], several: Mapping[str, Sequence[str]], seed: int) -> Simulation:
-    """What the options of the command ask for.
+    """Return the parameters of a simulation from the options of the command.
 
     Parameters
     ----------
     options : Mapping[str, str]
-        By name, as they were written: ``--from``, ``--days``, ``--every``, ``--frames``, ``--coefficient-error``,
+        Option -> its text: ``--from``, ``--days``, ``--every``, ``--frames``, ``--coefficient-error``,
         ``--sensor-sigma``.
     several : Mapping[str, Sequence[str]]
-        Likewise those that may be given more than once: ``--sensor`` BODY, ``--dead`` and ``--stuck`` BODY@UTC,
-        ``--event`` NAME@UTC.
+        Repeatable options: ``--sensor`` BODY, ``--dead`` and ``--stuck`` BODY@UTC, ``--event`` NAME@UTC.
     seed : int
-        Of everything that is drawn.
+        Seed of all random numbers.
 
     Raises
     ------
     InputErrorText
-        An option that means nothing, by its name.
+        An option is not valid.
     """
     every, days = options["--every"], float(options["--days"])
     step = _quantity("--every", every, MOMENT)
@@ -70,9 +69,13 @@ def simulation(options: Mapping[str, str], several: Mapping[str, Sequence[str]],
     if error < 0.0:
         raise InputErrorText(f"--coefficient-error: {options['--coefficient-error']} is below zero; write 30%, or 0%")
     if not sigma > 0.0:
-        raise InputErrorText(f"--sensor-sigma: {options['--sensor-sigma']} is no standard deviation; write 0.05 K")
+        raise InputErrorText(
+            f"--sensor-sigma: {options['--sensor-sigma']} is not a standard deviation above zero; write 0.05 K"
+        )
     start = utc_option("--from", options["--from"])
-    dates = tuple((moment, name) for name, moment in (_at("--event", text, EVENTS) for text in several["--event"]))
+    dates = tuple(
+        (moment, name) for name, moment in (_name_and_time("--event", text, EVENTS) for text in several["--event"])
+    )
     return Simulation(
         start,
         days * DAY,
@@ -82,8 +85,8 @@ def simulation(options: Mapping[str, str], several: Mapping[str, Sequence[str]],
         error,
         sigma,
         tuple(several["--sensor"]) or None,
-        dict(_at("--dead", text) for text in several["--dead"]),
-        dict(_at("--stuck", text) for text in several["--stuck"]),
+        dict(_name_and_time("--dead", text) for text in several["--dead"]),
+        dict(_name_and_time("--stuck", text) for text in several["--stuck"]),
         dates or None,
         (*(word for pair in options.items() for word in pair), *_words(several)),
     )
@@ -100,25 +103,25 @@ def _quantity(option: str, text: str, kind: Kind) -> float:
         return parse_quantity(text, kind)
 
 
-def _at(option: str, text: str, known: Collection[str] | None = None) -> tuple[str, int]:
-    """Name and moment of ``NAME@UTC``."""
+def _name_and_time(option: str, text: str, known: Collection[str] | None = None) -> tuple[str, int]:
+    """Return name and time of ``NAME@UTC``."""
     name, sign, moment = text.partition("@")
     if not sign:
-        raise InputErrorText(f"{option}: {text!r} does not say when; write {name or 'NAME'}@2027-06-01T00:00:00Z")
+        raise InputErrorText(f"{option}: {text!r} has no time; write {name or 'NAME'}@2027-06-01T00:00:00Z")
     if known is not None:
-        _known(option, name, known)
+        _require_name(option, name, known)
     return name, utc_option(option, moment)
 
 
-def _known(option: str, name: str, names: Collection[str]) -> None:
-    """Raises InputErrorText: none of these names."""
+def _require_name(option: str, name: str, names: Collection[str]) -> None:
+    """Raise InputErrorText if a name is unknown."""
     with input_errors(option):
         if name not in names:
             raise unknown("no such name", name, sorted(names))
 
 
 class _Options:
-    """Options of the command."""
+    """Options of the command, as the source of a memory error."""
 
     def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> InputErrorText:
         return InputErrorText(f"{key[0]}: {problem}; {found} readings, allowed: {allowed}")
@@ -134,39 +137,39 @@ def simulate_into(
     backend: Backend,
     advance: Advance,
 ) -> dict[str, Any]:
-    """Simulate a life, write its files and take them into a record, which is made where there is none.
+    """Simulate a life, write its files and ingest them into a record, which is created if it does not exist.
 
     Parameters
     ----------
     file : Path
-        Plan of the operation, which the record keeps; or config.yaml of a life, which holds all that a plan refers to.
+        Plan of the operation, which the record stores; or config.yaml of a life, which contains all files of a plan.
     record : str | None
-        Folder, or address of a database; None for the files alone.
+        Folder, or address of a database; None to write only files.
     out : Path | None
-        Folder for what the instrument would send down; None for one in the record's, or the next free run folder.
+        Folder for the telemetry; None for a subfolder of the record, or the next free run folder.
     truth : Path | None
-        File for what only the simulation knows; None for one in that folder, ``none`` for no file.
+        File for the truth; None for one in the folder of the telemetry, ``none`` for no file.
     force : bool
-        Replace the folder, if it is that of such files.
+        Replace the folder if it holds such files.
     what : Simulation
-        Is simulated.
+        Parameters of the simulation.
     backend : Backend
-        Where to trace.
+        Backend that traces.
     advance : Advance
-        Told of the progress.
+        Called with the progress.
 
     Returns
     -------
     dict[str, Any]
-        What was done, as plain data.
+        Summary of the run as plain data.
 
     Raises
     ------
     InputErrorText
-        a record that holds readings already, or is not of simulated ones; no place for the files; an unknown body; more
-        memory than there is.
+        The record holds readings already, or is not one of simulated readings; there is no place for the files; a body
+        is unknown; or the memory does not suffice.
     InputError, RunFolderError, NotARecord, RecordFailed
-        Of the plan, the instrument, the folder, the record.
+        The plan, the instrument, the folder or the record cannot be used.
     """
     started, clock = time.time(), time.monotonic()
     text = read_yaml(file)
@@ -183,96 +186,98 @@ def simulate_into(
     experiment = MonitorExperiment(plan.model, backend)
     experiment.nominal_focus  # noqa: B018 - an instrument without spots is told first
     # before there is a record, which is never altered
-    _are_stated(experiment, what)
+    _require_known_sensors(experiment, what)
     with ExitStack() as open_record:
         history = None
         if record is not None:
             initialise_record(record, plan.model, simulated=True)
             history = open_record.enter_context(History(record))
-            _is_empty(history)
+            _require_empty(history)
             # requirements are checked against the instrument; those of a life were when it was simulated
             store_plan(plan if complete else read_plan(file, history), file, history)
         folder = RunFolder(target, force)
         advance(CALIBRATE, 1, 1)
-        found = simulate_record(plan, experiment, what, advance)
-        if not found.readings:
-            raise InputErrorText(f"no state can be read, the first since {found.lost[0][1]}")
+        simulated = simulate_record(plan, experiment, what, advance)
+        if not simulated.readings:
+            raise InputErrorText(f"the monitor can read no state; the first because: {simulated.lost[0][1]}")
         advance(WRITE, 0, 1)
-        life = described(LIFE, truth_numbers(plan, what, found))
-        told = [f"no reading at {utc_text(moment)}: {why}" for moment, why in found.lost]
+        life = described(LIFE, truth_numbers(plan, what, simulated))
+        lost_readings = [f"no reading at {utc_text(moment)}: {why}" for moment, why in simulated.lost]
         with folder:
-            write_simulated(folder, plan, experiment, what, found)
+            write_simulated(folder, plan, experiment, what, simulated)
             if truth is None:
                 folder.write_json(f"{LIFE}.json", life)
-            facts = {"backend": backend.name, "seed": what.seed, "frames": what.frames, "warnings": told}
+            facts = {"backend": backend.name, "seed": what.seed, "frames": what.frames, "warnings": lost_readings}
             facts["again"] = list(_again(truth, what, backend))
             write_manifest(folder, PROGRAM, started, time.monotonic() - clock, test="simulate", **facts)
         if truth is not None and str(truth) != NO_TRUTH:
-            _write(truth, json_text(life))
-        advance(TAKE, 0, 1)
-        taken = [] if history is None else take_files(history, folder.target / TELEMETRY)
-        advance(TAKE, 1, 1)
-    refused = [reason for one in taken for _, reason in one.refused]
+            _write_truth(truth, json_text(life))
+        advance(INGEST, 0, 1)
+        ingested = [] if history is None else ingest_files(history, folder.target / TELEMETRY)
+        advance(INGEST, 1, 1)
+    refused = [reason for one in ingested for _, reason in one.refused]
     if refused:
-        raise InputErrorText(f"{len(refused)} of what was simulated was refused, the first: {refused[0]}")
+        raise InputErrorText(f"{len(refused)} simulated readings were refused, the first: {refused[0]}")
     return {
         "record": None if history is None else history.url,
         "instrument": plan.model.instrument.name,
         "files": str(folder.target),
         "truth": str(truth or folder.target / f"{LIFE}.json"),
-        "readings": len(found.readings),
-        "entries": sum(one.new for one in taken),
-        "steps": len(found.life.steps),
-        "lost": told,
+        "readings": len(simulated.readings),
+        "entries": sum(one.new for one in ingested),
+        "steps": len(simulated.life.steps),
+        "lost": lost_readings,
         "seconds": time.monotonic() - clock,
     }
 
 
 def _again(truth: Path | None, what: Simulation, backend: Backend) -> Iterator[str]:
-    """Words of the command that makes the files again in their folder."""
+    """Yield the words of the command that repeats the files in their folder."""
     yield from (PROGRAM, "simulate", CONFIG, *what.words, "--seed", str(what.seed), "--backend", backend.name)
     if truth is not None:  # nothing outside of the folder is written by who makes a run again
         yield from ("--truth", NO_TRUTH)
 
 
-def take_files(history: History, file: Path) -> list[IngestResult]:
-    """Take all tables that a file names into a record.
+def ingest_files(history: History, file: Path) -> list[IngestResult]:
+    """Ingest all tables that a file describes into a record.
 
     Parameters
     ----------
     history : History
         The record.
     file : Path
-        That says what the tables hold.
+        YAML file that describes the tables.
     """
     spec = read_telemetry(file, history)
-    every = ((table, path) for table in spec.readings for path in tables_of(spec, table))
-    return [history.ingest(read_table_file(table, path, history)) for table, path in every]
+    table_files = ((table, path) for table in spec.readings for path in tables_of(spec, table))
+    return [history.ingest(read_table_file(table, path, history)) for table, path in table_files]
 
 
-def _is_empty(history: History) -> None:
-    """Raises InputErrorText: a record to which simulated readings do not belong."""
+def _require_empty(history: History) -> None:
+    """Raise InputErrorText if a record is not an empty one of simulated readings."""
     if not history.simulated:
         text = "the record is not one of simulated readings; init --simulated makes such a record in another folder"
         raise InputErrorText(f"{history.url}: {text}")
     if history.status()["entries"]:
-        raise InputErrorText(f"{history.url}: the record holds readings already; a life begins in a record without any")
+        raise InputErrorText(
+            f"{history.url}: the record holds readings already; a simulated life needs an empty record"
+        )
 
 
-def _are_stated(experiment: MonitorExperiment, what: Simulation) -> None:
-    """Raises InputErrorText: a sensor on a body that is not stated to get warmer, or that has none."""
+def _require_known_sensors(experiment: MonitorExperiment, what: Simulation) -> None:
+    """Raise InputErrorText for a sensor on a body without a stated temperature, or a faulty sensor that is missing."""
     assert experiment.stated is not None  # a plan states something
     warm = {component.body for component in experiment.stated.components if component.kind == "temperature"}
     for body in what.sensors or ():
-        _known("--sensor", body, warm)
+        _require_name("--sensor", body, warm)
     options: Mapping[str, Mapping[str, int]] = {"--dead": what.dead, "--stuck": what.stuck}
     for option, bodies in options.items():
         for body in bodies:
-            _known(option, body, warm if what.sensors is None else what.sensors)
+            _require_name(option, body, warm if what.sensors is None else what.sensors)
 
 
-def _write(place: Path, text: str) -> None:
-    """Raises InputErrorText: the file cannot be written."""
+def _write_truth(place: Path, text: str) -> None:
+    """Write the truth. Raise InputErrorText if it cannot be written."""
     try:
         write_safely(place, text.encode())
     except OSError as error:

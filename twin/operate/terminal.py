@@ -1,4 +1,4 @@
-"""What the commands of `twin.operate` share: the record, the estimate under its plan, errors and results in words."""
+"""Functions shared by the commands of `twin.operate`: the record, the estimate under its plan, errors and output."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from twin.operate.record.entries import Alarm
     from twin.operate.record.history import History
 
-Place = Annotated[
+RecordLocation = Annotated[
     str,
     typer.Argument(
         metavar="DIR_OR_URL", help="Folder of the record, or address of a database: postgresql://host/name."
@@ -37,13 +37,13 @@ PlanFile = Annotated[
     typer.Argument(metavar="[PLAN.yaml]", readable=False, help="Plan of operation. Default: that of the record."),
 ]
 json_and_quiet = cli.with_options("out", "seed", "export", "backend", "force", "strict")
-"""What gives a command the options ``--json`` and ``--quiet``."""
+"""Decorator that gives a command the options ``--json`` and ``--quiet``."""
 NewFolder = Annotated[Path, typer.Option(readable=False, help="Folder for them; it must not be there yet.")]
 
 
 @contextmanager
-def told() -> Iterator[Console]:
-    """Errors as one sentence and an exit code."""
+def errors_reported() -> Iterator[Console]:
+    """Report errors as one sentence, and end the command with their exit code."""
     errors = Console(stderr=True)
     with cli.explained(errors):
         try:
@@ -51,13 +51,13 @@ def told() -> Iterator[Console]:
         except NotARecord as error:
             raise InputErrorText(str(error)) from None
         except RecordFailed as error:
-            print_error(errors, f"the database cannot do it: {error}; what was not told as taken is not in the record")
+            print_error(errors, f"the database failed: {error}; only files reported as taken are in the record")
             raise typer.Exit(FAILURE) from None
 
 
 @contextmanager
 def input_errors(what: str = "") -> Iterator[None]:
-    """Raise InputErrorText for a Problem of what a command was asked for: an option with its dashes, or its place."""
+    """Raise a Problem as InputErrorText about an option (with its dashes) or a path."""
     try:
         yield
     except Problem as problem:
@@ -66,19 +66,19 @@ def input_errors(what: str = "") -> Iterator[None]:
 
 
 def utc_option(option: str, text: str) -> int:
-    """Microseconds of TAI since 2000 of a UTC that a command was given.
+    """Return the UTC given to an option, in microseconds of TAI since 2000.
 
     Parameters
     ----------
     option : str
-        With its dashes.
+        Option with its dashes.
     text : str
-        After it.
+        Its value.
 
     Raises
     ------
     InputErrorText
-        Not a date and time.
+        The value is not a date and time.
     """
     from twin.operate.record.entries import micros
 
@@ -86,34 +86,34 @@ def utc_option(option: str, text: str) -> int:
         return micros(text)
 
 
-def tell(errors: Console, options: cli.Options, data: Any, show: Callable[[Console], None]) -> None:
-    """Print a result, as JSON or as a reader wants it.
+def print_result(errors: Console, options: cli.Options, data: Any, show: Callable[[Console], None]) -> None:
+    """Print a result, as JSON or in words.
 
     Parameters
     ----------
     errors : Console
-        Where it is told that standard output is gone.
+        Console for the error that standard output is closed.
     options : cli.Options
-        Whether ``data`` are printed, or nothing is.
+        Options that choose JSON, words or nothing.
     data : Any
-        Plain data.
+        Plain data of the result.
     show : Callable[[Console], None]
-        Prints it for a reader.
+        Function that prints the result in words.
     """
-    with to_stdout(errors, "the record is as it was told"):
+    with to_stdout(errors, "the record is complete"):
         if options.as_json:
             print_json(data)
         elif not options.quiet:
             show(Terminal())
 
 
-def line(console: Console, text: str) -> None:
-    """Print a line as it is."""
+def print_line(console: Console, text: str) -> None:
+    """Print a line without markup."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def show_table(console: Console, heads: Sequence[str], rows: Iterable[Sequence[str]], right: Sequence[int]) -> None:
-    """Print a table, the columns of these numbers flush right."""
+    """Print a table; the columns of the given numbers are aligned to the right."""
     table = cli.result_table()
     for k, head in enumerate(heads):
         table.add_column(head, justify="right" if k in right else "left")
@@ -124,50 +124,58 @@ def show_table(console: Console, heads: Sequence[str], rows: Iterable[Sequence[s
 
 @dataclass(frozen=True)
 class Call:
-    """A command at work on a record.
+    """Running command on a record.
 
     Attributes
     ----------
-    place : str
+    location : str
         Folder or address of the record.
     history : History
         The record.
     errors : Console
-        Where errors and the progress are told.
+        Console for errors and progress.
     options : cli.Options
-        ``as_json`` and ``quiet``.
+        Options ``as_json`` and ``quiet``.
     """
 
-    place: str
+    location: str
     history: History
     errors: Console
     options: cli.Options
 
-    def tell(self, data: Any, show: Callable[[Console], None]) -> None:
-        """Print a result; arguments as of `tell`."""
-        tell(self.errors, self.options, data, show)
+    def print_result(self, data: Any, show: Callable[[Console], None]) -> None:
+        """Print a result; see the function `print_result`."""
+        print_result(self.errors, self.options, data, show)
 
-    def planned(self, plan: Path | None) -> OperationSetup:
-        """Return the plan in a file, or that of the record. Raises InputError; InputErrorText: the record has none."""
+    def resolve_plan(self, plan: Path | None) -> OperationSetup:
+        """Return the plan in a file, or the one stored in the record.
+
+        Raises
+        ------
+        InputError
+            The plan is not valid.
+        InputErrorText
+            The record has no plan.
+        """
         from twin.operate.estimate.operation_model import read_plan, stored_plan
 
         setup = stored_plan(self.history) if plan is None else read_plan(plan, self.history)
         if setup is None:
             raise InputErrorText(
-                f"the record keeps no plan of operation; name one, or keep one: python -m twin.operate init RECORD "
+                f"the record has no plan of operation; name one, or store one: python -m twin.operate init RECORD "
                 f"{self.history.name} --plan FILE"
             )
         return setup
 
-    def followed(self, setup: OperationSetup, history: History | None = None) -> Operation:
-        """Return the estimate of the record under a plan, with all readings; how far it is is told now and then.
+    def filtered_operation(self, setup: OperationSetup, history: History | None = None) -> Operation:
+        """Return the estimate of the record under a plan from all readings; progress is printed.
 
         Parameters
         ----------
         setup : OperationSetup
             The plan.
         history : History | None
-            The record as it was at an earlier time, in place of the command's.
+            The record as of an earlier time, in place of the command's.
 
         Raises
         ------
@@ -178,9 +186,9 @@ class Call:
 
         position, history = cli.WorkProgress("follow the record"), history or self.history
         with input_errors(history.url), cli.heartbeat(self.errors, position.__str__, self.options.silent):
-            made = Operation(history, setup, lambda done, of: position.advance("readings", done, of))
-            made.filter_readings()
-        return made
+            operation = Operation(history, setup, lambda done, of: position.advance("readings", done, of))
+            operation.filter_readings()
+        return operation
 
     @property
     def has_estimate(self) -> bool:
@@ -188,10 +196,10 @@ class Call:
         return self.history.plan() is not None and self.history.first("monitor") is not None
 
     def estimate(self, plan: Path | None = None) -> tuple[Operation, FilterResult, list[Alarm]]:
-        """Return the estimate under a plan, what it says, and the alarms that are new, which are then in the record."""
+        """Return the estimate under a plan, its result, and its new alarms, which are added to the record."""
         from twin.operate.estimate.reported_estimate import raise_alarms
 
-        operation = self.followed(self.planned(plan))
+        operation = self.filtered_operation(self.resolve_plan(plan))
         filter_result = operation.filter_readings()
         return operation, filter_result, raise_alarms(self.history, operation.plan.operation, filter_result)
 
@@ -203,49 +211,49 @@ class Call:
         out : Path
             The folder, see `require_new`.
         files : Mapping[str, bytes]
-            Path in it -> content.
+            Path in the folder -> content.
         what : str
-            They are.
+            Name of the files for an error.
 
         Raises
         ------
         typer.Exit
-            They cannot be written, which has been told.
+            The files cannot be written; the error has been printed.
         """
         try:
             for folder in sorted({out, *((out / name).parent for name in files)}):
                 durable.make_folders(folder)
             durable.write_all_safely((out / name, content) for name, content in files.items())
         except OSError as error:
-            print_error(self.errors, f"{out}: {error.strerror or error}; what is there is not all of the {what}")
+            print_error(self.errors, f"{out}: {error.strerror or error}; not all files of the {what} were written")
             raise typer.Exit(FAILURE) from None
 
 
 def require_new(out: Path) -> None:
-    """Refuse a folder that is there. Raises InputErrorText."""
+    """Raise InputErrorText if a folder exists."""
     if out.exists():
-        raise InputErrorText(f"--out: {out} is there already; name a folder that is not")
+        raise InputErrorText(f"--out: {out} exists already; name a new folder")
 
 
 def on_record(work: Callable[..., None]) -> Callable[..., None]:
-    """Return the command that opens a record and does some work on it.
+    """Return the command that opens a record and calls a function with it.
 
     Parameters
     ----------
     work : Callable[..., None]
-        Called with a `Call` and with the options of its signature; the record comes before them, ``--json`` and
-        ``--quiet`` after them.
+        Function of a `Call` and of the command's options. The command has the record as its first argument, and
+        ``--json`` and ``--quiet`` as its last options.
     """
 
-    def command(record: str, options: cli.Options, **given: Any) -> None:
-        with told() as errors:
+    def command(record: str, options: cli.Options, **arguments: Any) -> None:
+        with errors_reported() as errors:
             if (file := file_of(record)) is not None:
                 require_file(file)  # before what reads a database is imported
             from twin.operate.record.history import History
 
             with History(record) as history:
-                work(Call(record, history, errors, options), **given)
+                work(Call(record, history, errors, options), **arguments)
 
-    _, *own = signature(work, eval_str=True).parameters.values()
-    place = Parameter("record", Parameter.POSITIONAL_OR_KEYWORD, annotation=Place)
-    return json_and_quiet(cli.with_parameters(wraps(work)(command), [place, *own]))
+    _, *parameters = signature(work, eval_str=True).parameters.values()
+    location = Parameter("record", Parameter.POSITIONAL_OR_KEYWORD, annotation=RecordLocation)
+    return json_and_quiet(cli.with_parameters(wraps(work)(command), [location, *parameters]))

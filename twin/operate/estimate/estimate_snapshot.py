@@ -206,7 +206,7 @@ class Sensor:
                 f"no reading for {silence:.3g} days; it normally reports every {usual / MICRO / 86_400.0:.3g} days",
             )
         if self.outliers >= DOUBTFUL_OUTLIERS and alone:
-            text = f"{self.outliers} of the last {len(self.recent)} readings are over {OUTLIER_SIGMAS:g} sigma from their predictions"
+            text = f"{self.outliers} of the last {len(self.recent)} readings are over {OUTLIER_SIGMAS:g} sigma off"
             return "doubtful", self.last_us, text
         return "ok", self.first_us, ""
 

@@ -125,8 +125,7 @@ class Operation:
                 self._previous, self._saved = (known.get("estimator_state"), previous._newest), previous._saved
 
     def updated(self) -> Operation:
-        """Return the estimate of the same record under the same plan with the newest readings; faster than a new one.
-        """
+        """Return the same estimate with the newest readings of the record; faster than a new one."""
         return Operation(self.history, self.plan, self._advance, self)
 
     @cached_property
@@ -305,7 +304,11 @@ class Operation:
 
     def _understated_causes(self) -> tuple[str, ...]:
         """Return the causes of the temperatures of bodies whose sensors jointly disagree with the prior."""
-        stated, heat, disagreeing = self.model.series_filter.stated, self.model.series_filter.heat, self.estimator_state.disagreeing
+        stated, heat, disagreeing = (
+            self.model.series_filter.stated,
+            self.model.series_filter.heat,
+            self.estimator_state.disagreeing,
+        )
         if heat is None:
             return ()
         lasting = (k for k in heat.motions.tolist() if stated.bodies[k] in disagreeing and not stated.laws[k].white)
@@ -477,7 +480,9 @@ class Operation:
             The time is before the first reading.
         """
         stated = self.model.series_filter.stated
-        series_filter = replace(self._entry_filter.series_filter, steps=(*self._entry_filter.series_filter.steps, *self._steps()))
+        series_filter = replace(
+            self._entry_filter.series_filter, steps=(*self._entry_filter.series_filter.steps, *self._steps())
+        )
         since = self._entry_filter.seconds(self.epoch)
         found = self._states_at(
             np.array([time_us], np.int64),
@@ -568,7 +573,9 @@ class Operation:
         filter_state = (entry_filter.start(self._begin()) if start is None else start).filter_state
         filter_state = _without_search(filter_state)
         knowing = replace(entry_filter.series_filter, steps=steps, window=0)
-        filter_state, with_hints = with_hinted_jumps(entry_filter.series_filter, knowing, filter_state, observed, list(left))
+        filter_state, with_hints = with_hinted_jumps(
+            entry_filter.series_filter, knowing, filter_state, observed, list(left)
+        )
         return knowing, filter_state, observed, with_hints
 
     def _used_entries(self, after_us: int | None) -> tuple[NDArray[np.int64], Array]:
@@ -603,9 +610,7 @@ class Operation:
         return min(int(one["time_us"]) for kind in USED if (one := self.history.first(kind)) is not None)
 
     def _checkpoint_before(self, time: int) -> EstimatorState | None:
-        """Return the newest permanent checkpoint before a time and before all later-detected jumps; None if there is
-        none.
-        """
+        """Return the newest permanent checkpoint before a time and before all jumps detected since; or None."""
         last = self.estimator_state
         while True:
             kept = self.history.checkpoint(self.key, before_us=time, valid=True)

@@ -296,7 +296,9 @@ class FilterResult:
         if self.too_many_jumps:
             out.append(f"{len(self.jumps)} jumps are more than the plan states: other motions, or larger ones, occur")
         if self.undecided:
-            out.append(f"the newest reading may be an outlier: {self.bad_readings[-1][1]}; until then sigmas allow for both")
+            out.append(
+                f"the newest reading may be an outlier: {self.bad_readings[-1][1]}; until then sigmas allow for both"
+            )
         if len(self.bad_readings) > MOST_BAD:
             text = "either the readings are worse than usual, or the prior is too small"
             out.append(f"{len(self.bad_readings)} readings were rejected as outliers: {text}")
@@ -471,24 +473,25 @@ def percent(chance: float) -> str:
     return f"{fixed(100.0 * chance, decimals_for(100.0 * rest))} %"
 
 
-def _of_requirement(one: RequirementStatus, time: int, quantities: Sequence[Quantity]) -> Alarm:
+def _of_requirement(requirement: RequirementStatus, time: int, quantities: Sequence[Quantity]) -> Alarm:
     """Return the alarm of a requirement that is violated or will be."""
-    name, allowed = name_of(one.quantity, quantities), percent(1.0 - one.probability)
-    limit = f"{plain(one.limit)} {one.unit}"
-    if not one.holds_now:
-        text = f"{name} exceeds {limit} with a probability of {percent(one.chance_now)}; {allowed} is allowed"
-        return Alarm(BROKEN, one.quantity, time, text, one.to_dict())
-    assert one.breaks_us is not None
-    text = f"{name} is expected to exceed {limit} with a probability above {allowed} from {utc_text(one.breaks_us)} on"
-    return Alarm(BREAKS, one.quantity, time, text, one.to_dict())
+    name, allowed = name_of(requirement.quantity, quantities), percent(1.0 - requirement.probability)
+    limit = f"{plain(requirement.limit)} {requirement.unit}"
+    if not requirement.holds_now:
+        text = f"{name} exceeds {limit} with a probability of {percent(requirement.chance_now)}; {allowed} is allowed"
+        return Alarm(BROKEN, requirement.quantity, time, text, requirement.to_dict())
+    assert requirement.breaks_us is not None
+    since = utc_text(requirement.breaks_us)
+    text = f"{name} is expected to exceed {limit} with a probability above {allowed} from {since} on"
+    return Alarm(BREAKS, requirement.quantity, time, text, requirement.to_dict())
 
 
-def _of_jump(one: DetectedJump) -> Alarm:
+def _of_jump(jump: DetectedJump) -> Alarm:
     """Return the alarm of a detected jump."""
-    near = [body for body, ratio in one.rivals.items() if ratio > one.log_ratio - _CLOSE][:3]
-    rivals = f"; {', '.join(near)} would explain it nearly as well" if near else ""
-    content = {**one.to_dict(), "after_us": one.after_us, "until_us": one.until_us}
-    return Alarm(JUMP, one.body, one.until_us, f"{one.body} jumped {one.summary}{rivals}", content)
+    rivals_near = [body for body, ratio in jump.rivals.items() if ratio > jump.log_ratio - _CLOSE][:3]
+    rivals = f"; {', '.join(rivals_near)} would explain it nearly as well" if rivals_near else ""
+    content = {**jump.to_dict(), "after_us": jump.after_us, "until_us": jump.until_us}
+    return Alarm(JUMP, jump.body, jump.until_us, f"{jump.body} jumped {jump.summary}{rivals}", content)
 
 
 def with_sigma(value: float, sigma: float, unit: str, sign: bool = False) -> str:
@@ -511,14 +514,22 @@ def _contradictions(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm
     before it.
     """
     spans = [(jump.after_us, jump.detected_us) for jump in result.jumps]
-    told = result.innovations
+    innovations = result.innovations
     # the first of all has no other before it, and a chance of a false alarm of its own
-    befores = [told[0][0] - round(plan.mission * MICRO) if result.readings == len(told) else told[0][0]] if told else []
-    befores += [time for time, _, _ in told[:-1]]
-    for before, (time, chi_square, degrees) in zip(befores, told, strict=True):
-        share = min((time - before) / (plan.mission * MICRO), 1.0)
+    previous_times = (
+        [innovations[0][0] - round(plan.mission * MICRO) if result.readings == len(innovations) else innovations[0][0]]
+        if innovations
+        else []
+    )
+    previous_times += [time for time, _, _ in innovations[:-1]]
+    for previous, (time, chi_square, degrees) in zip(previous_times, innovations, strict=True):
+        share = min((time - previous) / (plan.mission * MICRO), 1.0)
         chance = float(chance_beyond(chi_square, degrees))
-        if share <= 0.0 or chance >= FALSE_ALARM * share or any(after < time <= told for after, told in spans):
+        if (
+            share <= 0.0
+            or chance >= FALSE_ALARM * share
+            or any(after < time <= innovations for after, innovations in spans)
+        ):
             continue
         limit = float(limit_of(FALSE_ALARM * share, degrees))
         text = (

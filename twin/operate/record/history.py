@@ -1,4 +1,6 @@
-"""Record of one instrument in a database: ingest, decisions, queries, also as of an earlier time. Entries never change.
+"""Record of one instrument in a database: ingest, decisions and queries, also as of an earlier time.
+
+Entries never change.
 """
 
 from __future__ import annotations
@@ -43,8 +45,8 @@ from twin.operate.record.schema import (
     SOURCE,
     database_errors,
     engine_of,
-    opened,
     message_of,
+    opened,
     url_of,
     writing,
 )
@@ -240,7 +242,9 @@ class History:
             Check the digests of all entries, instead of the newest ones only.
         """
         with self.reading() as connection:
-            streams = [(kind, subject, *_stream_extent(connection, kind, subject)) for kind, subject in _streams(connection)]
+            streams = [
+                (kind, subject, *_stream_extent(connection, kind, subject)) for kind, subject in _streams(connection)
+            ]
             sources = int(connection.execute(select(func.count()).select_from(SOURCE)).scalar_one())
             guarded = schema.guarded(connection)
             checked, altered = schema.altered(connection, None if check_all_entries else schema.LAST_CHECKED)

@@ -63,8 +63,16 @@ TABLES: Mapping[str, Record[Row]] = {
         "Attitudes of star trackers.",
         _key("subject", "star tracker"),
         Quantity("form", lambda row: row["content"]["unit"], "quaternion, or rad for three angles"),
-        *(Quantity(f"component_{k + 1}", _value(k), "component of the quaternion (scalar last), or angle") for k in range(4)),
-        Quantity("angle_arcsec_sigma", lambda row: in_unit(_sigma(row), "arcsec"), "standard deviation about each axis", converted=False),
+        *(
+            Quantity(f"component_{k + 1}", _value(k), "component of the quaternion (scalar last), or angle")
+            for k in range(4)
+        ),
+        Quantity(
+            "angle_arcsec_sigma",
+            lambda row: in_unit(_sigma(row), "arcsec"),
+            "standard deviation about each axis",
+            converted=False,
+        ),
     ),
     "event": _readings(
         "Events of the instrument.",
@@ -90,7 +98,11 @@ TABLES: Mapping[str, Record[Row]] = {
         *(
             _number(f"{name}{end}", said)
             for name in ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
-            for end, said in (("", "change"), ("_sigma", "its total sigma"), ("_sigma_noise", "its sigma from image noise"))
+            for end, said in (
+                ("", "change"),
+                ("_sigma", "its total sigma"),
+                ("_sigma_noise", "its sigma from image noise"),
+            )
         ),
     ),
     "intersection_angle": _readings(

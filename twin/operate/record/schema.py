@@ -213,7 +213,7 @@ def altered(connection: Connection, newest: int | None) -> tuple[int, list[str]]
     c = ENTRY.c
     rows = connection.execute(select(*c).order_by(c.id.desc()).limit(newest)).mappings().all()
     wrong = [
-        f"entry {row['id']}, {row['kind']} of {row['subject']} at {row['time_utc']}, is not as it was taken"
+        f"entry {row['id']}, {row['kind']} of {row['subject']} at {row['time_utc']}, was altered after its ingest"
         for row in rows
         if _digest_of(row) != row["sha256"] or row["time_utc"] != utc_text(row["time_us"])
     ]
@@ -257,9 +257,7 @@ def version(connection: Connection) -> int:
 def require_version(found: int) -> None:
     """Raise NotARecord if another version of the program made the record."""
     if found != VERSION:
-        raise NotARecord(
-            f"the record is of version {found}, this program knows {VERSION}; use the program that made it"
-        )
+        raise NotARecord(f"the record has version {found}, this program needs {VERSION}; use the program that made it")
 
 
 WAIT = 60.0
@@ -296,10 +294,10 @@ def engine_of(url: URL) -> Engine:
     try:
         engine = create_engine(url, **more)
     except NoSuchModuleError:
-        raise NotARecord(f"no such kind of database: {url.drivername}; sqlite or postgresql") from None
+        raise NotARecord(f"no such kind of database: {url.drivername}; allowed: sqlite, postgresql") from None
     except ModuleNotFoundError as error:
         raise NotARecord(
-            f"{error.name} is not installed, which speaks to this database; for PostgreSQL: "
+            f"the driver {error.name} of this database is not installed; for PostgreSQL: "
             ".venv/bin/python -m pip install -e .[postgres]"
         ) from None
     if engine.dialect.name == "sqlite":
@@ -309,7 +307,9 @@ def engine_of(url: URL) -> Engine:
 
 
 def _on_connect(connection: Any, record: object) -> None:
-    """Configure a connection: SQLAlchemy begins the transactions, and each is on the disk with its folder when it ends.
+    """Configure a connection so that SQLAlchemy begins the transactions.
+
+    Each is on the disk, with its folder, when it ends.
     """
     connection.isolation_level = None
     for pragma in ("journal_mode = DELETE", "synchronous = EXTRA", "foreign_keys = ON", "trusted_schema = OFF"):

@@ -144,13 +144,13 @@ class Ingest:
         c, stream = ENTRY.c, (one.kind, one.subject)
         if not self.simulated and one.time > now() + AHEAD:
             return (
-                f"{utc_text(one.time)} is still to come: the clock of the file, its time_scale or its epoch is wrong; "
+                f"{utc_text(one.time)} is in the future: the clock of the file, its time_scale or its epoch is wrong; "
                 "a record of simulated readings is made with init --simulated"
             )
         if one.origin:
             query = select(c.time_utc).where(c.origin == one.origin, c.time_us != one.time).limit(1)
             if (other := self.connection.execute(query).scalar()) is not None:
-                return f"found from the same frames as the reading of {other}; give it that time, or its own frames"
+                return f"measured in the same frames as the reading of {other}; give it that time, or its own frames"
         if one.kind == "monitor" and (reason := self._reference_conflict(one)):
             return reason
         if stream not in self.newest:
@@ -159,13 +159,13 @@ class Ingest:
         newest, before = self.newest[stream], self.seen.get(stream)
         if before is not None and one.time < before:
             text = f"the clock runs backwards: {utc_text(one.time)} after {utc_text(before)}"
-            return f"{text}; sort the rows, or leave out those before the clock was set"
+            return f"{text}; sort the rows, or remove those before the clock was set"
         if before is not None and one.time == before:
             return f"another reading of {one.subject} at {utc_text(one.time)} in this file; one of them is wrong"
         if newest is not None and one.time <= newest:
             query = select(c.id).where(c.kind == one.kind, c.subject == one.subject, c.time_us == one.time).limit(1)
             if self.connection.execute(query).scalar() is not None:
-                return f"the record has other numbers of {one.subject} at {utc_text(one.time)}, which stay"
+                return f"the record has another reading of {one.subject} at {utc_text(one.time)}, which is kept"
             if not self.late:
                 text = f"{utc_text(one.time)} is before the newest reading of {one.subject}, {utc_text(newest)}"
                 return f"{text}: a clock that was set back, or a reading that comes late; --late takes it"
@@ -194,8 +194,8 @@ class Ingest:
         if apart <= SAME_IMAGES:
             return ""
         return (
-            f"found against other reference images than the reading of {when}, whose spots before are {apart:.2g} "
-            "sigma from these; recover the frames against its images before, or begin another record"
+            f"measured against other reference images than the reading of {when}: their spots differ by {apart:.2g} "
+            "sigma; recover the frames against its reference images, or begin another record"
         )
 
     def write(

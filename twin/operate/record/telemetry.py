@@ -123,7 +123,7 @@ def _require_unchanged(folder: Path, file: Path, digest: str, manifest: Manifest
     changed = [name for name, own in known.items() if manifest.sha256.get(name) != own]
     if changed:
         problem = f"{folder}: changed since its run: {names_text(changed)}"
-        raise Problem(problem, None, "the folder as the run left it; python -m twin.verify tells more")
+        raise Problem(problem, None, "the folder as the run left it; python -m twin.verify lists the changes")
 
 
 def _require_instrument(folder: Path, history: History, assume_instrument: bool) -> None:
@@ -135,10 +135,8 @@ def _require_instrument(folder: Path, history: History, assume_instrument: bool)
     if not isinstance(instrument, Mapping) or not isinstance(cameras, Mapping):
         if assume_instrument:
             return
-        problem = f"{folder} does not say of which instrument it is"
-        raise Problem(
-            problem, None, "a run whose config.yaml holds the instrument, or --instrument NAME, which says it"
-        )
+        problem = f"{folder} does not name its instrument"
+        raise Problem(problem, None, "a run whose config.yaml holds the instrument, or --instrument NAME")
     found = instrument_digest(instrument, {k: v for k, v in cameras.items() if isinstance(v, Mapping)})
     if found != history.sha256:
         name = instrument.get("name", "without a name")
@@ -156,7 +154,7 @@ def _run_readings(kind: str, data: Any, moment: int, digest: str, frames: Mappin
         return [_entry(kind, moment, {"sha256": digest, "numbers": content}, origin)]
     states, times = data.get("series") or [data], data.get("times_s") or [0.0]
     if not isinstance(states, list) or not isinstance(times, list) or len(states) != len(times):
-        raise Problem("times and states that do not belong together", None, RESULTS[kind])
+        raise Problem("times and states differ in number", None, RESULTS[kind])
     out = []
     for k, (state, seconds) in enumerate(zip(states, times, strict=True)):
         if not isinstance(state, Mapping) or "cameras" not in state or not isinstance(seconds, int | float):
@@ -249,13 +247,13 @@ def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[
     """Return the entries and refusals of a table, and the images of the runs that it names."""
     rows = rows_apart(path, LARGEST)
     if not rows:
-        raise InputError(Issue("an empty table", str(path), 1, allowed="a row of heads, and rows below it"))
+        raise InputError(Issue("an empty table", str(path), 1, allowed="a header row, and rows below it"))
     if table.form == "keywords":
         return _keyword_items(table, rows, history), {}
     frames: dict[str, str] = {}
     line, cells = rows[0]
     if isinstance(cells, str):
-        raise InputError(Issue(cells, str(path), line, allowed="a row of heads, and rows below it"))
+        raise InputError(Issue(cells, str(path), line, allowed="a header row, and rows below it"))
     heads = [head.strip() for head in cells]
     wanted = [table.time, *(head for column in table.columns.values() for head in column.column)]
     wanted += [head for head in (table.name, table.detail) if head is not None]
@@ -354,7 +352,7 @@ def _reading(
         length = math.hypot(*values)
         if not abs(length - 1.0) <= QUATERNION_TOLERANCE:
             allowed = f"1 within {QUATERNION_TOLERANCE:g}; the scalar last"
-            raise Problem(f"{subject}: not a quaternion of a turn", f"length {length:.6g}", allowed)
+            raise Problem(f"{subject}: not a unit quaternion", f"length {length:.6g}", allowed)
         values = [value / length for value in values]
     else:
         values = [parse_quantity(f"{cell} {column.unit}", kind) for cell in cells]
@@ -396,7 +394,7 @@ def _event(table: ReadingTableSpec, row: dict[str, str], moment: int, line: int)
     if name not in EVENTS:
         known = (*table.events, *EVENTS)
         raise unknown(
-            "unknown event", found, known, allowed=f"{names_text(known)}; others stand in events: NAME: EVENT"
+            "unknown event", found, known, allowed=f"{names_text(known)}; map other names in events: NAME: EVENT"
         )
     detail: dict[str, Any] = {} if table.detail is None else {"detail": row[table.detail]}
     return Entry(EVENT, name, moment, detail, line)
@@ -467,7 +465,7 @@ class Sources:
             runs = sorted(one for one in place.iterdir() if is_run_folder(one)) if place.is_dir() else []
             if not described and not runs and not (self.watching and place.is_dir()):
                 raise InputErrorText(
-                    f"{place}: neither a run folder nor one with a YAML file that says what tables hold"
+                    f"{place}: neither a run folder nor a folder with a YAML file that describes tables"
                 )
             named: set[Path] = set()
             for file in described:
@@ -491,13 +489,11 @@ class Sources:
         folder = place if place.is_dir() else place.parent
         moment = time_of_name(folder.name) if moment is None else moment
         if moment is None and place in self.places:
-            raise InputErrorText(f"{place}: a run folder does not say when it was read; --time UTC does, or its name")
+            raise InputErrorText(f"{place}: the run folder has no time; give --time UTC, or put the UTC into its name")
         if self._is_unchanged(folder / MANIFEST):
             return
         if moment is None:
-            reason = (
-                "a run folder does not say when it was read; put the UTC into its name, recover-2026-03-05T03-05-00Z"
-            )
+            reason = "the run folder has no time; put the UTC into its name: recover-2026-03-05T03-05-00Z"
             yield FileContent(str(folder), digest_of_data(str(folder)), "", [Refusal(f"{folder.name}: {reason}")], {})
         else:
             yield run_entries(place, "", moment, history, self.assume_instrument)
