@@ -66,7 +66,7 @@ def within(setup):
 def test_images_are_those_of_the_general_renderer():
     """Between the nodes over the field, against a table of that very image and another Fourier sum."""
     b = bench()
-    test, turn = b.setup.test, 0.37 * b.turn[-1]
+    test, turn = b.setup.test, 0.37 * b.field_angle[-1]
     place = np.array([[108.2 * UM, 112.9 * UM]])
     images = b.images(turn, place)[0]
     about_x = np.array([[1, 0, 0], [0, np.cos(turn), -np.sin(turn)], [0, np.sin(turn), np.cos(turn)]])
@@ -93,7 +93,7 @@ def test_noise_of_the_spots_is_as_stated():
     table = TurntableModel(b.setup.turntable, 5)
     record, truth = b.record(table, 5)
     spots = locate_spots(record.frames, record.column, b.middle_column, b.ccd.band.pitch, b.noise, b.radius)
-    off = spots.position - truth.place[..., 0]
+    off = spots.position - truth.position[..., 0]
     # sets of one point stand within 1 um: on the same columns, so that only temporal noise differs
     good = ~truth.gross
     scatter = np.sum((off - np.mean(off, axis=1, where=good, keepdims=True)) ** 2, where=good)
@@ -104,7 +104,7 @@ def test_noise_of_the_spots_is_as_stated():
     assert low < scatter / expected < high + 2.0 * np.mean(spots.fixed**2) / np.mean(spots.temporal**2)
     # and what does not vary is the pattern of the columns, beside the smooth error of some 10 nm
     means = np.mean(off, axis=1, where=good)
-    rest = means - np.polyval(np.polyfit(b.turn, means, 3), b.turn)
+    rest = means - np.polyval(np.polyfit(b.field_angle, means, 3), b.field_angle)
     low, high = stats.chi2.ppf([FALSE_ALARM, 1 - FALSE_ALARM], 51) / 51
     assert low < np.var(rest) * 55 / 51 / np.mean(spots.fixed**2 + spots.temporal**2 / 10) < high
 
@@ -139,7 +139,7 @@ def test_bench_that_cannot_be_built(changes, key, text):
 def test_test_that_cannot_be_measured(changes, key, text):
     b, few = within(altered(**changes)), [0, 20, 40, 54]
     with pytest.raises(BenchError, match=text) as error:
-        measure(replace(b, turn=b.turn[few], design_offset=b.design_offset[few]), 3)
+        measure(replace(b, field_angle=b.field_angle[few], design_offset=b.design_offset[few]), 3)
     assert error.value.key == (key,)
     assert error.value.remedy
     assert ("less light" in error.value.remedy) is (text == "saturated")
@@ -147,12 +147,12 @@ def test_test_that_cannot_be_measured(changes, key, text):
     if key == "reach":
         # with the reach that is advised all spots stay on the line; with another hundredth of it they do not
         for share in (0.99, 1.01):
-            turn = share * float(error.value.remedy.split()[3]) / b.setup.test.reach * b.turn[few]
+            turn = share * float(error.value.remedy.split()[3]) / b.setup.test.reach * b.field_angle[few]
             if share < 1.0:
-                measure(replace(b, turn=turn, design_offset=b.design_offset[few]), 3)
+                measure(replace(b, field_angle=turn, design_offset=b.design_offset[few]), 3)
             else:
                 with pytest.raises(BenchError, match=text):
-                    measure(replace(b, turn=turn, design_offset=b.design_offset[few]), 3)
+                    measure(replace(b, field_angle=turn, design_offset=b.design_offset[few]), 3)
 
 
 @pytest.mark.second
@@ -171,7 +171,7 @@ def test_a_narrow_collimator_and_a_coarse_calibration():
 def test_fewer_points_than_unknowns():
     b = bench()
     few = [0, 27, 54]
-    b = replace(b, turn=b.turn[few], design_offset=b.design_offset[few], true_offset=b.true_offset[few])
+    b = replace(b, field_angle=b.field_angle[few], design_offset=b.design_offset[few], true_offset=b.true_offset[few])
     with pytest.raises(BenchError, match="3 different angles for 4 unknowns") as error:
         measure(b, 1)
     assert error.value.key == ("points",)
@@ -190,8 +190,8 @@ def turntable_score(setup, seed: int) -> list[float]:
     wanted = np.linspace(-0.0204, 0.0204, test.points)[:, None]
     reading = spec.camera_angle + wanted + rng.normal(0.0, test.setting, shape)
     shock = rng.choice([-1.0, 0.0, 1.0], shape, p=[0.004, 0.992, 0.004]) * spec.reference.gross_error
-    start = float(table.stand(np.array(spec.camera_angle)))
-    turn = table.stand(reading, rng) + shock - start - rng.normal(0.0, test.zero)
+    start = float(table.true_angle(np.array(spec.camera_angle)))
+    turn = table.true_angle(reading, rng) + shock - start - rng.normal(0.0, test.zero)
     place = f * np.tan(turn) + radial * np.tan(turn) ** 3
     seen = place + rng.normal(0.0, 10 * NM, shape) + rng.normal(0.0, 17 * NM, (test.points, 1))
     spots = Spots(seen, np.full(shape, 10 * NM), np.full(shape, 17 * NM), np.zeros(shape))
@@ -226,18 +226,18 @@ def with_plan(**changes: object) -> TurntableTestSpec:
 def test_sign_and_inverse() -> None:
     model = TurntableModel(SPEC, 2)
     reading = np.radians(np.linspace(92.0, 112.0, 501))
-    np.testing.assert_allclose(reading - model.stand(reading), model.error(reading), rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(reading - model.true_angle(reading), model.error(reading), rtol=0.0, atol=1e-15)
     # rounding of angles of 2 rad, and of their 144 000-fold in the subdivision error
-    np.testing.assert_allclose(model.read(model.stand(reading)), reading, rtol=0.0, atol=2e-15)
+    np.testing.assert_allclose(model.reading(model.true_angle(reading)), reading, rtol=0.0, atol=2e-15)
     series = model.calibrate()
     # the mean of comparisons is reading - true angle, to its noise and the reference's: 5 sigma
     assert np.max(np.abs(series.mean - model.error(series.angle))) < 5.0 * np.max(series.sigma)
     assert np.std(model.error(series.angle)) > 5.0 * np.max(series.sigma)
-    scatter = model.stand(np.full(4000, 1.7), np.random.default_rng(1)) - model.stand(1.7)
+    scatter = model.true_angle(np.full(4000, 1.7), np.random.default_rng(1)) - model.true_angle(1.7)
     # 4000 values: 1.1%, 4 sigma
     assert np.std(scatter) == pytest.approx(SPEC.dividing_error.repeatability, rel=0.045)
     # the subdivision's slope enlarges it by some hundredths
-    scatter = model.read(np.full(4000, 1.7), np.random.default_rng(2)) - model.read(1.7)
+    scatter = model.reading(np.full(4000, 1.7), np.random.default_rng(2)) - model.reading(1.7)
     assert np.std(scatter) == pytest.approx(SPEC.dividing_error.repeatability, rel=0.1)
 
 

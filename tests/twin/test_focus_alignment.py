@@ -33,7 +33,7 @@ from twin.framework.procedure import BenchError
 from twin.laboratory import focus_run
 from twin.laboratory.focus_bench import VERTEX_ERROR, BudgetLine, FocusBench, Recorder, Site, in_focus, scan
 from twin.laboratory.focus_report import focus_report as report
-from twin.laboratory.focus_run import FocusRun, SimulatedFocus, align, align_files, line_turn, mount_of, plan_shims
+from twin.laboratory.focus_run import FocusRun, SimulatedFocus, align, align_files, line_rotation, mount_of, plan_shims
 from twin.sensors.line_ccd import band_wavelengths
 from twin.targets.target_images import ALONG, DIRECTIONS, TABLE_REACH, TRACK, EdgeImager
 
@@ -97,7 +97,7 @@ def test_sense_of_a_turn() -> None:
     # the line turns about +Z' from +Y' toward -X'
     turned = rotation_matrix(np.array([0.0, 0.0, 5.0 * ARCMIN]))
     assert turned[0, 1] < 0.0
-    assert line_turn(Pose(turned)) == pytest.approx(5.0 * ARCMIN, abs=1e-15)
+    assert line_rotation(Pose(turned)) == pytest.approx(5.0 * ARCMIN, abs=1e-15)
 
 
 @pytest.mark.second
@@ -112,7 +112,7 @@ def test_what_cannot_be_done_names_the_key(bench) -> None:
     ("lost", "key", "remedy"),
     [
         (TooNarrowError("the beam is 598 mm wide"), ("collimator", "aperture"), "a wider collimator"),
-        (AimError("no ray"), ("as_built",), "a camera whose whole beam gets through"),
+        (AimError("no ray"), ("as_built",), "a camera whose beam passes without vignetting"),
     ],
 )
 def test_a_bench_without_light_names_what_takes_it(monkeypatch, lost, key, remedy) -> None:
@@ -230,7 +230,7 @@ def test_rows_with_gross_errors_are_named_and_do_not_count(tmp_path):
     assert len(named) > 0.4 * len(wrong)
     assert abs(piston_pull(run)) < 4.0
     assert run.chi_square[0] < 1.3 * run.chi_square[1]
-    assert f"{len(named)} rows do not count" in " ".join(report(run).warnings)
+    assert f"{len(named)} rows are excluded" in " ".join(report(run).warnings)
 
 
 def scanned(best, search, misled=0.0, seen=lambda mtf: (mtf, SIGMA)):
@@ -262,8 +262,12 @@ def test_a_peak_that_the_first_scan_misses_is_looked_for_again(best, search, mis
 @pytest.mark.parametrize(
     ("best", "seen", "said"),
     [
-        (-500.0, lambda mtf: (mtf, SIGMA), "of P at field 0.5 is not inside the scan: most contrast at the lower end"),
-        (500.0, lambda mtf: (mtf, SIGMA), "most contrast at the upper end"),
+        (
+            -500.0,
+            lambda mtf: (mtf, SIGMA),
+            "of P at field 0.5 is not inside the scan: contrast is highest at the lower end",
+        ),
+        (500.0, lambda mtf: (mtf, SIGMA), "contrast is highest at the upper end"),
         (0.0, lambda mtf: (0.0, np.inf), "cannot be measured anywhere through focus in P at field 0.5: too dark"),
     ],
 )

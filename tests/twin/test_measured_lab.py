@@ -365,7 +365,7 @@ def test_distortion_agrees_with_scipy(folder: Path) -> None:
     head, *body = rows_of(folder / "spots.csv")
     write(folder / "spots.csv", [head, *(row for row in body if row[1] == body[0][1])])
     in_unit(folder / "spots.csv", "sigma [um]", "sigma [um]", 0.0)
-    with pytest.raises(InputError, match=r"spots.csv:\d+: sigma .*one set of points without sigmas"):
+    with pytest.raises(InputError, match=r"spots.csv:\d+: sigma .*a single set of points without sigmas"):
         distortion_of(folder)
     table = np.array(body, float)
     points, sets = int(table[:, 0].max()), int(table[:, 1].max())

@@ -229,7 +229,7 @@ def test_an_image_in_uneven_light_is_named(stack: Path) -> None:
     with (stack / "images.csv").open() as stream:
         line = next(k for k, text in enumerate(stream, 1) if "2_along_4" in text)
     assert [fault.line for fault in run.readings.uneven] == [line]
-    assert f"1 images have a sigma that does not hold (lines {line} of" in " ".join(focus_report(run).warnings)
+    assert f"1 images have a doubtful sigma (lines {line} of" in " ".join(focus_report(run).warnings)
 
 
 def more(*columns: tuple[str, str]) -> Callable[[Path], None]:

@@ -1,1 +1,1 @@
-"""Laboratory tests, simulated: focal-plane alignment, distortion, turntable (paper 004); two autocollimators (001)."""
+"""Laboratory tests, simulated and measured: focal-plane alignment, distortion, turntable, autocollimators."""

@@ -1,13 +1,13 @@
-"""The bench of the distortion test: a camera on a turntable looks at a pinhole in a collimator.
+"""Simulated bench of the distortion test: a camera on a turntable views a pinhole in a collimator.
 
-The transfer function of an image about its chief ray changes slowly over the field. So its product with the pinhole's
-spectrum and the line CCD's transfer is worked out at a few Chebyshev nodes and interpolated by the polynomial through
-them. An image is then a Fourier sum at the pixel centres, shifted exactly.
+The transfer function of an image about its chief ray varies slowly over the field. Its product with the pinhole's
+spectrum and the line CCD's transfer function is therefore computed at a few Chebyshev nodes and interpolated with the
+polynomial through them. An image is then a Fourier sum at the pixel centres, shifted exactly.
 
-World = camera frame. When the table turns by W the light's direction turns by +W about the table's axis, the camera's
-X but for a tilt: from (0, 0, -1) to (0, sin W, -cos W), whose image lies at L = +f tan W along the line. W counts from
-the true angle of the table at which the as-built camera images the pinhole to the middle of the line. The image is read
-out where the line's scan sees it: over the field its rows drift by the smile of the mapping.
+World frame = camera frame. When the table rotates by W the light's direction rotates by +W about the table's axis,
+which is the camera's X but for a tilt: from (0, 0, -1) to (0, sin W, -cos W), whose image lies at L = +f tan W along
+the line. W counts from the true angle of the table at which the as-built camera images the pinhole to the middle of the
+line. The image is read out where the line's scan sees it: over the field its rows drift by the smile of the mapping.
 """
 
 from __future__ import annotations
@@ -36,37 +36,41 @@ from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.target_path import TargetPath
 
 NODES = 10
-"""Chebyshev nodes over the field: images of gf7 between them are right to 1e-5 of their peak, their centres to 1 nm."""
+"""Number of Chebyshev nodes over the field: between them, images of gf7 are accurate to 1e-5 of their peak and their
+centroids to 1 nm.
+"""
 
 GUARD = 160.0
-"""Distance between the window and the copies of the spot in the Fourier sum, in units of 1/cut-off. The irradiance of a
-clear pupil falls as 1/distance^3: over the pan line's window a copy is below 1e-6 of the peak, and nearly even.
+"""Distance between the window and the periodic copies of the spot in the Fourier sum, in units of 1/cut-off. The
+irradiance of a clear pupil falls as 1/distance^3: over the window of the pan line a copy is below 1e-6 of the peak, and
+nearly even.
 """
 
 _RIM = np.pi * np.arange(16) / 16
+"""Azimuths at which the cut-off frequency of a pupil is evaluated, radians."""
 
 
 @dataclass(frozen=True, eq=False)
 class PinholeImages:
-    """Spots of a pinhole over the field.
+    """Images of a pinhole on the line CCD over the field.
 
     Attributes
     ----------
-    reach : float
-        Largest turn of the camera either way, radians.
-    fx, fy : np.ndarray
-        Frequencies along the line (half of them, from zero) and along the track, (U,), (V,), cycles/m.
-    spectra : np.ndarray
-        At the nodes over the field, complex (nodes, V, U); a wide bright area would have level 1.
+    half_field : float
+        Largest rotation of the camera to either side, radians.
+    fx, fy : ndarray
+        Frequencies along the line (non-negative half) and along the track, (U,), (V,), cycles/m.
+    spectra : (nodes, V, U) ndarray of complex
+        Spectra at the nodes of the field; a large uniform bright area would have level 1.
     pitch : float
-        Of the pixels, metres.
+        Pixel pitch, metres.
     window : int
-        Pixels of an image either way.
+        Side of an image, pixels.
     diameter : float
-        Of the pinhole's geometric image along the line in the middle of the field, metres.
+        Diameter of the pinhole's geometric image along the line in the middle of the field, metres.
     """
 
-    reach: float
+    half_field: float
     fx: np.ndarray
     fy: np.ndarray
     spectra: np.ndarray
@@ -80,39 +84,39 @@ class PinholeImages:
         path: TargetPath,
         state: State,
         directions: Callable[[np.ndarray], np.ndarray],
-        reach: float,
+        half_field: float,
         target: Target,
         ccd: LineCcd,
         window: int,
         progress: Callable[[int, int], None] = lambda done, total: None,
     ) -> PinholeImages:
-        """Work out the spectra.
+        """Compute the spectra at the nodes of the field.
 
         Parameters
         ----------
         path : TargetPath
-            From the target to the line CCD's plane.
+            Light path from the target to the plane of the line CCD.
         state : State
-            Of the camera.
-        directions : Callable[[np.ndarray], np.ndarray]
-            Turns of the camera (M,) to directions of the light (M, 3), world.
-        reach : float
-            Of the turns, radians.
+            State of the camera.
+        directions : callable
+            Function from rotations of the camera (M,), radians, to directions of the light (M, 3) in the world frame.
+        half_field : float
+            Largest rotation of the camera to either side, radians.
         target : Target
-            The pinhole, one disk.
+            Pinhole, a single disk.
         ccd : LineCcd
-            The line CCD.
+            Line CCD.
         window : int
-            pixels.
-        progress : Callable[[int, int], None]
-            Told (done, total).
+            Side of an image, pixels.
+        progress : callable
+            Called with (done, total) nodes.
 
         Raises
         ------
         BeamMissedError, AimError, ValueError
-            The beam does not get through, or its wavefront is too bad for a fit.
+            The beam does not pass, or its wavefront is too irregular for a fit.
         """
-        light = directions(reach * _nodes())
+        light = directions(half_field * _nodes())
         pupils = path.pupils(state, light, path.places(state, light))
         wavelengths, weights = band_wavelengths(ccd.band)
         rim = np.stack([np.cos(_RIM), np.sin(_RIM)], axis=-1)
@@ -126,36 +130,36 @@ class PinholeImages:
         common = ccd.transfer(*grid) * np.where(fx > 0.0, 2.0, 1.0) / period**2
         ((_, hole),) = target.parts
         assert isinstance(hole, Disk)
-        spectra, middle = np.empty((NODES, len(fy), len(fx)), complex), 0.0
-        for n, (pupil, one) in enumerate(zip(pupils, light, strict=True)):
-            image = hole.mapped(path.local_map(state, one, 1.5 * hole.radius))
+        spectra, diameter = np.empty((NODES, len(fy), len(fx)), complex), 0.0
+        for n, (pupil, direction) in enumerate(zip(pupils, light, strict=True)):
+            image = hole.mapped(path.local_map(state, direction, 1.5 * hole.radius))
             table = TransferTable.build(pupil, wavelengths, weights)
             spectra[n] = image.spectrum(*grid) * table(*grid) * common
-            middle = _width(image) if n == NODES // 2 else middle
+            diameter = _extent_x(image) if n == NODES // 2 else diameter
             progress(n + 1, NODES)
-        return cls(reach, fx, fy, spectra, pitch, window, middle)
+        return cls(half_field, fx, fy, spectra, pitch, window, diameter)
 
-    def __call__(self, turn: float, place: np.ndarray) -> np.ndarray:
-        """Images at one place of the field.
+    def __call__(self, field_angle: float, position: np.ndarray) -> np.ndarray:
+        """Return images at one field angle.
 
         Parameters
         ----------
-        turn : float
-            Of the camera, radians.
-        place : np.ndarray
-            Of the chief rays from the centre of the window's first pixel, (S, 2) (along, across), metres.
+        field_angle : float
+            Rotation of the camera, radians.
+        position : (S, 2) ndarray
+            Chief rays (along, across) relative to the centre of the window's first pixel, metres.
 
         Returns
         -------
-        np.ndarray
-            (S, window, window), rows along the track.
+        (S, window, window) ndarray
+            Images, rows along the track; a large uniform bright area would have level 1.
         """
-        spectrum = np.tensordot(_share(turn / self.reach), self.spectra, 1)
+        spectrum = np.tensordot(_node_weights(field_angle / self.half_field), self.spectra, 1)
         pixel = self.pitch * np.arange(self.window)
-        along = np.exp(2j * np.pi * self.fx[:, None, None] * (pixel - place[:, :1]))
-        across = np.exp(2j * np.pi * (pixel - place[:, 1:])[..., None] * self.fy)
+        along = np.exp(2j * np.pi * self.fx[:, None, None] * (pixel - position[:, :1]))
+        across = np.exp(2j * np.pi * (pixel - position[:, 1:])[..., None] * self.fy)
         with one_blas_thread():
-            half = (spectrum @ along.reshape(len(self.fx), -1)).reshape(len(self.fy), len(place), self.window)
+            half = (spectrum @ along.reshape(len(self.fx), -1)).reshape(len(self.fy), len(position), self.window)
             return np.asarray((across @ half.swapaxes(0, 1)).real)
 
     @property
@@ -165,10 +169,10 @@ class PinholeImages:
 
 
 def centroid_offset(path: TargetPath, state: State, directions: np.ndarray) -> np.ndarray:
-    """Energy centroid of the image of a point minus its chief ray along the line, (F,), metres: the mean slope of the
-    wavefront over the pupil, which is the same for all wavelengths.
+    """Return the energy centroid of the image of a point minus its chief ray along the line, (F,), metres.
 
-    From the phase of the transfer function at a ten-thousandth of the cut-off.
+    It is the mean slope of the wavefront over the pupil, the same for all wavelengths, and is computed from the phase
+    of the transfer function at a ten-thousandth of the cut-off frequency.
     """
     pupils: tuple[PupilFunction, ...] = path.pupils(state, directions, path.places(state, directions))
     wavelength, along = path.model.spec.wavelength, np.array([[1.0, 0.0]])
@@ -180,87 +184,88 @@ def centroid_offset(path: TargetPath, state: State, directions: np.ndarray) -> n
     return np.array(out)
 
 
-def at_nodes(reach: float) -> np.ndarray:
-    """Turns (NODES,) at which something smooth over the field is worked out for ``between``, radians."""
-    return np.asarray(reach * _nodes())
+def field_nodes(half_field: float) -> np.ndarray:
+    """Return the field angles (NODES,) of the nodes to which ``interpolated`` refers, radians."""
+    return np.asarray(half_field * _nodes())
 
 
-def between(values: np.ndarray, reach: float, turn: np.ndarray) -> np.ndarray:
-    """Values (M,) at turns (M,) of the polynomial through values (NODES,) at the nodes."""
-    return np.array([_share(one / reach) @ values for one in turn])
+def interpolated(values: np.ndarray, half_field: float, field_angle: np.ndarray) -> np.ndarray:
+    """Evaluate the polynomial through values (NODES,) at the nodes at field angles (M,); returns (M,)."""
+    return np.array([_node_weights(angle / half_field) @ values for angle in field_angle])
 
 
 def _nodes() -> np.ndarray:
-    """Chebyshev nodes on -1 ... 1, from the left."""
+    """Return the Chebyshev nodes on -1 ... 1 in increasing order."""
     return np.asarray(-np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES))
 
 
-def _share(place: float) -> np.ndarray:
-    """What each node gives to the polynomial at a place on -1 ... 1, (NODES,)."""
+def _node_weights(position: float) -> np.ndarray:
+    """Return the weight of each node's value in the polynomial at a position on -1 ... 1, (NODES,)."""
     order = np.polynomial.chebyshev.chebvander(_nodes(), NODES - 1)
-    return np.linalg.solve(order.T, np.polynomial.chebyshev.chebvander(np.array([place]), NODES - 1)[0])
+    return np.linalg.solve(order.T, np.polynomial.chebyshev.chebvander(np.array([position]), NODES - 1)[0])
 
 
-def _width(image: Disk | Polygon) -> float:
-    """Size of a shape along x, metres."""
+def _extent_x(image: Disk | Polygon) -> float:
+    """Return the size of a shape along x, metres."""
     low, high, _, _ = image.bounds
     return high - low
 
 
-LEAST_WIDTH = 2.0
-"""Diameter of the pinhole's image, pixels, below which pixel sampling moves an energy centroid by more than 0.001 of
-a pixel.
+MIN_WIDTH = 2.0
+"""Diameter of the pinhole's image, pixels, below which pixel sampling moves an energy centroid by more than 0.001
+pixel.
 """
 
 MARGIN = 6
-"""Pixels between the centroid's window and the image's edge: four rows of background, and the spot's place between
-pixels."""
+"""Pixels between the centroid's window and the edge of the image: four rows of background, and room for the spot's
+position between pixels.
+"""
 
 BLUR = 3.0
-"""Pixels around the pinhole's geometric image that the centroid's window has to hold as well."""
+"""Pixels around the pinhole's geometric image that the centroid's window must also contain."""
 
 _BENCH, _SETTING, _READING, _PATTERN, _NOISE = range(10, 15)
-"""Numbers of the seed's random streams; those below belong to the turntable."""
+"""Numbers of the random streams of the seed; those below 10 belong to the turntable."""
 
 
 @dataclass(frozen=True, eq=False)
 class DistortionTruth:
-    """What the analysis must not see, for N points and S sets.
+    """True values that the analysis must not see, for N points and S sets.
 
     Attributes
     ----------
     zero : float
         True angle of the table at which the line's middle is imaged, minus the one at which the table reads
         ``camera_angle``, radians.
-    axis : np.ndarray
-        Of the table in the camera frame, unit, (3,).
-    turn : np.ndarray
-        W of each exposure, (N, S), radians.
-    place : np.ndarray
-        (along, across) of the chief ray, (N, S, 2), metres.
-    gross : np.ndarray
-        Exposures that a shock spoiled, (N, S).
+    axis : (3,) ndarray
+        Axis of the table in the camera frame, unit vector.
+    field_angle : (N, S) ndarray
+        Field angle W of each exposure, radians.
+    position : (N, S, 2) ndarray
+        Position (along, across) of the chief ray, metres.
+    gross : (N, S) ndarray of bool
+        Exposures with a gross error from a shock.
     """
 
     zero: float
     axis: np.ndarray
-    turn: np.ndarray
-    place: np.ndarray
+    field_angle: np.ndarray
+    position: np.ndarray
     gross: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class DistortionRecord:
-    """What a test leaves for the analysis: N points, S sets.
+    """Measurements that a test gives to the analysis: N points, S sets.
 
     Attributes
     ----------
-    reading : np.ndarray
-        Of the table, (N, S), radians.
-    frames : np.ndarray
-        uint16 (N, S, frames, rows, columns).
-    column : np.ndarray
-        Of the line, first of each region that was kept, (N, S).
+    reading : (N, S) ndarray
+        Readings of the turntable, radians.
+    frames : (N, S, frames, rows, columns) ndarray of uint16
+        Recorded frames, DN.
+    column : (N, S) ndarray of int
+        First column of each recorded window on the line.
     """
 
     reading: np.ndarray
@@ -270,29 +275,30 @@ class DistortionRecord:
 
 @dataclass(frozen=True, eq=False)
 class DistortionBench:
-    """Everything that does not change from one test to the next.
+    """Bench with all that stays the same from test to test.
 
     Attributes
     ----------
     setup : DistortionSetup
-        The test with all it refers to.
+        Test with all files that it refers to.
     path : TargetPath
-        From the collimator to the image.
+        Light path from the collimator to the image.
     as_built : State
-        State of the camera.
+        As-built state of the camera.
     ccd : LineCcd
-        Of the band.
+        Line CCD of the band.
     images : PinholeImages
-        Of the pinhole.
-    turn : np.ndarray
-        Nominal W of the points, (N,), radians, increasing.
-    middle : np.ndarray
-        Direction of the light that is imaged to the middle of the line, (3,).
-    design_offset : np.ndarray
-        Energy centroid minus chief ray along the line at the points, by the design, (N,), metres: known to the
-        analysis, as every laboratory has the prescription.
-    true_offset : np.ndarray
-        The same of the as-built camera in this collimator; the analysis does not know it.
+        Images of the pinhole.
+    field_angle : (N,) ndarray
+        Nominal field angles W of the points, radians, increasing.
+    centre_direction : (3,) ndarray
+        Direction of the light that is imaged to the middle of the line.
+    design_offset : (N,) ndarray
+        Energy centroid minus chief ray along the line at the points, by the design, metres. The analysis knows it, as
+        every laboratory has the prescription.
+    true_offset : (N,) ndarray
+        Energy centroid minus chief ray of the as-built camera in this collimator, metres; the analysis does not know
+        it.
     """
 
     setup: DistortionSetup
@@ -300,21 +306,21 @@ class DistortionBench:
     as_built: State
     ccd: LineCcd
     images: PinholeImages
-    turn: np.ndarray
-    middle: np.ndarray
+    field_angle: np.ndarray
+    centre_direction: np.ndarray
     design_offset: np.ndarray
     true_offset: np.ndarray
 
     @classmethod
     def build(cls, setup: DistortionSetup, backend: Backend, advance: Advance = silent) -> DistortionBench:
-        """Trace the camera and work out the spectra of its spots.
+        """Trace the camera and compute the spectra of its spots.
 
         Raises
         ------
         InputError
-            ``as_built`` names what the camera does not have.
+            ``as_built`` names a body that the camera does not have.
         BenchError
-            The beam does not get through, the pinhole is too small or too large, or points lie beyond the turntable's
+            The beam does not pass, the pinhole is too small or too large, or points lie beyond the turntable's
             calibration.
         """
         test = setup.test
@@ -324,38 +330,42 @@ class DistortionBench:
         band = setup.camera.bands[test.band]
         ccd = LineCcd.from_specs(band, setup.detectors[band.detector])
         _check_pinhole(setup, camera.model.line_principal_distance)
-        half = 0.5 * band.pixels * band.pitch
-        turn = np.arctan(test.reach * half / camera.model.line_principal_distance) * np.linspace(-1.0, 1.0, test.points)
-        _check_table(setup, turn)
+        half_length = 0.5 * band.pixels * band.pitch
+        field_angle = np.arctan(test.reach * half_length / camera.model.line_principal_distance) * np.linspace(
+            -1.0, 1.0, test.points
+        )
+        _check_table(setup, field_angle)
         try:
-            middle = _aim(path, camera.as_built, band.offset)
+            centre_direction = _aim(path, camera.as_built, band.offset)
 
             def directions(angle: np.ndarray) -> np.ndarray:
-                return _turned(np.array([1.0, 0.0, 0.0]), angle, middle)
+                return _rotated(np.array([1.0, 0.0, 0.0]), angle, centre_direction)
 
-            reach = float(turn[-1])
+            half_field = float(field_angle[-1])
             images = PinholeImages.build(
                 path,
                 camera.as_built,
                 directions,
-                reach,
+                half_field,
                 pinhole(test.pinhole),
                 ccd,
                 test.window,
                 lambda done, total: advance("spectra of the spots", done, total),
             )
-            nodes = directions(at_nodes(reach))
-            offsets = [centroid_offset(*way, nodes) for way in ((design, {}), (path, camera.as_built))]
+            nodes = directions(field_nodes(half_field))
+            offsets = [centroid_offset(*light, nodes) for light in ((design, {}), (path, camera.as_built))]
         except (AimError, BeamMissedError, ValueError) as error:
             raise BenchError(
-                f"the camera's beam cannot be traced: {error}", ("collimator",), "a wider one, or smaller `as_built`"
+                f"the camera's beam cannot be traced: {error}",
+                ("collimator",),
+                "a wider collimator, or smaller `as_built`",
             ) from error
-        known, true = (between(offset, reach, turn) for offset in offsets)
-        return cls(setup, path, camera.as_built, ccd, images, turn, middle, known, true)
+        known, true = (interpolated(offset, half_field, field_angle) for offset in offsets)
+        return cls(setup, path, camera.as_built, ccd, images, field_angle, centre_direction, known, true)
 
     @property
     def noise(self) -> NoiseModel:
-        """Noise of one frame."""
+        """Noise model of one frame."""
         return self.ccd.noise
 
     @property
@@ -368,10 +378,10 @@ class DistortionBench:
         """Column of the line's middle, where L = 0."""
         return 0.5 * (self.ccd.band.pixels - 1)
 
-    def places(self, axis: np.ndarray, turn: np.ndarray) -> np.ndarray:
-        """Where chief rays meet the focal plane, (..., 2) (along, across), metres, for turns (...) about an axis."""
-        light = _turned(axis, np.ravel(turn), self.middle)
-        return self.path.places(self.as_built, light).reshape(*np.shape(turn), 2)
+    def positions(self, axis: np.ndarray, field_angle: np.ndarray) -> np.ndarray:
+        """Return chief rays on the focal plane, (..., 2) (along, across), metres, for rotations (...) about an axis."""
+        light = _rotated(axis, np.ravel(field_angle), self.centre_direction)
+        return self.path.places(self.as_built, light).reshape(*np.shape(field_angle), 2)
 
     def record(
         self, table: TurntableModel, seed: int, advance: Advance = silent
@@ -381,48 +391,49 @@ class DistortionBench:
         Parameters
         ----------
         table : TurntableModel
-            That turns the camera.
+            Turntable that rotates the camera.
         seed : int
-            Of everything else that is drawn.
+            Seed of everything else that is drawn.
         advance : Advance
-            Told how many points are done.
+            Called with the number of recorded points.
 
         Raises
         ------
         BenchError
-            a spot falls beside the line.
+            A spot falls beside the line.
         """
         test, spec = self.setup.test, self.setup.turntable
         rng = {key: np.random.default_rng(stream(seed, key)) for key in (_BENCH, _READING)}
         zero = float(rng[_BENCH].normal(0.0, test.zero))
         tilt = rng[_BENCH].normal(0.0, test.axis_tilt, 2)
         axis = np.array([1.0, *tilt]) / np.sqrt(1.0 + tilt @ tilt)
-        shape = len(self.turn), test.sets
+        shape = len(self.field_angle), test.sets
         setting = np.random.default_rng(stream(seed, _SETTING))
-        reading = spec.camera_angle + self.turn[:, None] + setting.normal(0.0, test.setting, shape)
+        reading = spec.camera_angle + self.field_angle[:, None] + setting.normal(0.0, test.setting, shape)
         shock = rng[_READING].random(shape) < spec.reference.gross_probability
         push = shock * rng[_READING].choice([-1.0, 1.0], shape) * spec.reference.gross_error
-        start = float(table.stand(np.array(spec.camera_angle))) + zero
-        turn = table.stand(reading, rng[_READING]) + push - start
-        place = self.places(axis, turn)
-        frames, column = self._expose(place, seed, advance)
-        return DistortionRecord(reading, frames, column), DistortionTruth(zero, axis, turn, place, shock)
+        start = float(table.true_angle(np.array(spec.camera_angle))) + zero
+        field_angle = table.true_angle(reading, rng[_READING]) + push - start
+        position = self.positions(axis, field_angle)
+        frames, column = self._expose(position, seed, advance)
+        return DistortionRecord(reading, frames, column), DistortionTruth(zero, axis, field_angle, position, shock)
 
-    def _expose(self, place: np.ndarray, seed: int, advance: Advance) -> tuple[np.ndarray, np.ndarray]:
+    def _expose(self, position: np.ndarray, seed: int, advance: Advance) -> tuple[np.ndarray, np.ndarray]:
+        """Expose frames of all spots; return them with the first column of each window."""
         test, pitch = self.setup.test, self.ccd.band.pitch
-        spot = place / pitch + np.array([self.middle_column, 0.0])
+        spot = position / pitch + np.array([self.middle_column, 0.0])
         first = np.rint(spot).astype(int) - test.window // 2
         column = first[..., 0]
         if np.min(column) < 0 or np.max(column) + test.window > self.ccd.band.pixels:
-            beside = 0.5 * test.window + np.max(np.abs(place[..., 0])) / pitch - 0.5 * self.ccd.band.pixels
-            most = test.reach - 2.0 * max(beside, 0.0) / self.ccd.band.pixels
+            overshoot = 0.5 * test.window + np.max(np.abs(position[..., 0])) / pitch - 0.5 * self.ccd.band.pixels
+            most = test.reach - 2.0 * max(overshoot, 0.0) / self.ccd.band.pixels
             raise BenchError(
                 "the first or last spot falls beside the line",
                 ("reach",),
-                f"at most about {most:.4f} with this zero of the table",
+                f"at most about {most:.4f} for this zero of the table",
             )
         inside = (spot - first) * pitch
-        light = np.stack([self.images(w, at) for w, at in zip(self.turn, inside, strict=True)])
+        light = np.stack([self.images(w, at) for w, at in zip(self.field_angle, inside, strict=True)])
         # far tails of the Fourier sum may ring below zero by rounding
         photons = np.maximum(light, 0.0) * (self.ccd.white_photons(test.light) / np.max(light))
         pattern = self.ccd.pattern(stream(seed, _PATTERN))
@@ -430,41 +441,41 @@ class DistortionBench:
         frames = np.empty((count, sets, test.frames, test.window, test.window), np.uint16)
         for i in range(count):
             for s in range(sets):
-                own = stream(seed, _NOISE, i, s)
-                frames[i, s] = self.ccd.expose(photons[i, s], int(column[i, s]), pattern, test.frames, own)
+                noise_seed = stream(seed, _NOISE, i, s)
+                frames[i, s] = self.ccd.expose(photons[i, s], int(column[i, s]), pattern, test.frames, noise_seed)
             advance("exposures", i + 1, count)
         return frames, column
 
 
-def _turned(axis: np.ndarray, turn: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Directions of the light (M, 3) after turns (M,) about an axis (3,)."""
-    return np.asarray(rotation_matrix(turn[:, None] * axis) @ middle)
+def _rotated(axis: np.ndarray, field_angle: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Return directions of the light (M, 3) after rotations (M,), radians, about an axis (3,)."""
+    return np.asarray(rotation_matrix(field_angle[:, None] * axis) @ direction)
 
 
 def _aim(path: TargetPath, state: State, offset: float) -> np.ndarray:
-    """Direction of the light that is imaged to the middle of the line, by Newton's steps with finite differences."""
-    slope, step, wanted = np.zeros(2), 1e-6, np.array([0.0, offset])
+    """Return the direction of the light that is imaged to the middle of the line, by Newton's method."""
+    slope, step, target = np.zeros(2), 1e-6, np.array([0.0, offset])
     for _ in range(6):
         around = slope + step * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
         # light that travels along -Z + t has its image at +f t; slopes are (along, across)
         light = np.stack([around[:, 1], around[:, 0], -np.ones(3)], axis=-1)
         light /= np.linalg.norm(light, axis=1)[:, None]
-        seen = path.places(state, light)
-        slope = slope + np.linalg.solve((seen[1:] - seen[0]).T / step, wanted - seen[0])
+        positions = path.places(state, light)
+        slope = slope + np.linalg.solve((positions[1:] - positions[0]).T / step, target - positions[0])
     out = np.array([slope[1], slope[0], -1.0])
     return np.asarray(out / np.linalg.norm(out))
 
 
 def _check_pinhole(setup: DistortionSetup, focal_length: float) -> None:
+    """Raise BenchError if the pinhole's image is too small for the pixels or too large for the window."""
     test, pitch = setup.test, setup.camera.bands[setup.test.band].pitch
     per_pixel = pitch * test.collimator.focal_length / focal_length
     width = test.pinhole / per_pixel
     most = 2.0 * (0.5 * test.window - MARGIN - BLUR)
-    allowed = f"{1e6 * LEAST_WIDTH * per_pixel:.0f} um to {1e6 * most * per_pixel:.0f} um"
-    if width < LEAST_WIDTH:
+    allowed = f"{1e6 * MIN_WIDTH * per_pixel:.0f} um to {1e6 * most * per_pixel:.0f} um"
+    if width < MIN_WIDTH:
         raise BenchError(
-            f"the pinhole's image is {width:.2g} pixels wide: too small for these pixels, which would bias its "
-            "centroid",
+            f"the pinhole's image is {width:.2g} pixels wide: too small, the pixels would bias its centroid",
             ("pinhole",),
             allowed,
         )
@@ -476,13 +487,15 @@ def _check_pinhole(setup: DistortionSetup, focal_length: float) -> None:
         )
 
 
-def _check_table(setup: DistortionSetup, turn: np.ndarray) -> None:
+def _check_table(setup: DistortionSetup, field_angle: np.ndarray) -> None:
+    """Raise BenchError if the field exceeds the calibrated region of the turntable."""
     plan, angle = setup.turntable.calibration, setup.turntable.camera_angle
-    room = min(angle - plan.first, plan.last - angle) - 6.0 * setup.test.setting
-    if turn[-1] > room:
+    margin = min(angle - plan.first, plan.last - angle) - 6.0 * setup.test.setting
+    if field_angle[-1] > margin:
         raise BenchError(
-            f"the camera's field needs +-{np.rad2deg(turn[-1]):.3f} deg of the turntable, but about its camera_angle "
-            f"only +-{np.rad2deg(max(room, 0.0)):.3f} deg are calibrated",
+            f"the camera's field requires +-{np.rad2deg(field_angle[-1]):.3f} deg of the turntable, but about its "
+            "camera_angle "
+            f"only +-{np.rad2deg(max(margin, 0.0)):.3f} deg are calibrated",
             ("reach",),
-            "a smaller share, or a turntable file that is calibrated over the field",
+            "a smaller reach, or a turntable file that is calibrated over the field",
         )

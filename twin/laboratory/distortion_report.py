@@ -1,6 +1,4 @@
-"""Report of a distortion test: what was found, how well, and what limits it; of a simulated bench also beside its
-truth.
-"""
+"""Report of a distortion test: results, accuracy and its limits; of a simulated bench also the truth."""
 
 from __future__ import annotations
 
@@ -30,13 +28,13 @@ if TYPE_CHECKING:
 
 RAW, COMPENSATED = "angles as read", "compensated angles"
 SHOWN = 3
-"""Points whose frames are kept: first, middle, last."""
+"""Number of points whose frames are saved: first, middle, last."""
 ZERO_SHARE = 0.3
-"""Share of the principal point's sigma; the report mentions a zero of the angles that moves the point by more."""
+"""Fraction of the principal point's sigma beyond which the report mentions the shift by the zero of the angles."""
 
 
 def distortion_report(run: DistortionRun) -> Report:
-    """Report of a distortion test."""
+    """Build the report of a distortion test."""
     data = DISTORTION(run)
     verdict, more = _verdict(run, data)
     simulated = run if isinstance(run, SimulatedDistortion) else None
@@ -58,7 +56,7 @@ def distortion_report(run: DistortionRun) -> Report:
 
 
 def _frames(run: SimulatedDistortion) -> tuple[dict[str, np.ndarray], dict[str, FrameFacts]]:
-    """Frames that are kept of a simulated bench, and what is known of them."""
+    """Return the frames of a simulated bench that are saved, and their facts."""
     test = run.setup.test
     facts = FrameFacts(f"{test.camera}, line CCD {test.band}", run.bench.ccd.band.pitch, note="spot of the pinhole")
     numbers = np.linspace(0, len(run.reading) - 1, SHOWN).astype(int)
@@ -67,19 +65,20 @@ def _frames(run: SimulatedDistortion) -> tuple[dict[str, np.ndarray], dict[str, 
 
 
 def _facts(run: DistortionRun, data: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    """Return the facts about the test, as pairs of label and text."""
     count, sets = run.reading.shape
     first, last = np.degrees([np.min(run.compensated.fit.angle), np.max(run.compensated.fit.angle)])
     facts = [("points, sets", f"{count} from {first:.3f}° to {last:.3f}°, {sets} sets, {np.sum(run.present)} spots")]
     if run.compensation is not None:
-        angles = f"compensated by {FIT_NAMES[run.compensation.fit.name]} of the turntable's calibration"
+        angles = f"compensated with the {FIT_NAMES[run.compensation.fit.name]} of the turntable's calibration"
     if isinstance(run.test, MeasuredDistortionSpec):
         files = run.test.measured
         if run.compensation is None:
-            angles = f"as read, each good to {format_quantity(files.angle_sigma or 0.0, ANGLE)}"
+            angles = f"as read, each with σ = {format_quantity(files.angle_sigma or 0.0, ANGLE)}"
         facts += [
             ("angles", f"{angles}; the line's middle is imaged at {format_quantity(files.zero, ANGLE)}"),
-            ("principal distance, about", format_quantity(run.approximate_f, LENGTH)),
-            *(("file", f"{one['file']}, {one['rows']} rows") for one in data["files"]),
+            ("approximate principal distance", format_quantity(run.approximate_f, LENGTH)),
+            *(("file", f"{file['file']}, {file['rows']} rows") for file in data["files"]),
         ]
     if isinstance(run, SimulatedDistortion):
         test = run.setup.test
@@ -94,59 +93,64 @@ def _facts(run: DistortionRun, data: Mapping[str, Any]) -> tuple[tuple[str, str]
             ),
             (
                 "spots along the track",
-                f"over {data['truth']['row_smile_um']:.0f} µm: smile of the mapping and tilt of the axis",
+                f"range {data['truth']['row_smile_um']:.0f} µm, from smile of the mapping and tilt of the axis",
             ),
         ]
     return (*facts, ("description", run.test.description))
 
 
 def _limit(run: DistortionRun) -> str:
-    """What makes most of the principal distance's sigma."""
+    """Return the largest contribution to the variance of the principal distance, as text."""
     fit = run.compensated.fit
     k = fit.terms.index("principal_distance")
     parts = _shares(run)
-    name = max(parts, key=lambda one: parts[one])
+    name = max(parts, key=lambda cause: parts[cause])
     share = parts[name] / fit.covariance[k, k]
-    return f"{name}, {100.0 * share:.0f} % of its variance"
+    return f"{name} ({100.0 * share:.0f} % of its variance)"
 
 
 def _shares(run: DistortionRun) -> dict[str, float]:
-    """Variance of the principal distance by its causes, square metres."""
+    """Return the variance of the principal distance by cause, square metres."""
     fit, means = run.compensated.fit, run.means
     k = fit.terms.index("principal_distance")
     row = gain(design(fit.angle, fit.terms))[k]
     angles = fit.noise - np.diag(np.hypot(means.sigma, run.compensated.white) ** 2)
     return {
         "the scatter between the sets": float(row**2 @ means.sigma**2),
-        "the angles' covariance": float(row @ angles @ row),
-        "what points scatter about a smooth curve": float(np.sum(row**2) * run.compensated.white**2),
+        "the errors of the angles": float(row @ angles @ row),
+        "the scatter of the points about a smooth curve": float(np.sum(row**2) * run.compensated.white**2),
     }
 
 
 def _verdict(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
+    """Return the verdict and the sentences that follow it."""
     noise, f, sigma = data["noise"], data["principal_distance_mm"], data["principal_distance_mm_sigma"]
     expected, truth = noise["rejected_expected_by_chance"], data.get("truth")
-    distortion_text = f"distortion is known to {1e6 * float(np.sqrt(np.mean(run.compensated.sigma**2))):.2f} µm"
+    distortion_text = f"distortion has σ = {1e6 * float(np.sqrt(np.mean(run.compensated.sigma**2))):.2f} µm"
     truth_text = ""
     if truth is not None:
         ratio = abs(f - truth["principal_distance_mm"]) / sigma
         within = "within" if ratio <= FAR else "outside"
         truth_text = f", {within} {FAR:g} σ of the truth ({truth['principal_distance_mm']:.4f} mm, {ratio:.1f} σ)"
         with_it, without = truth["error_rms_compensated_um"], truth["error_rms_raw_um"]
-        gain = "compensating them helps" if with_it < without else "compensating them does not help"
-        distortion_text += f" and wrong by {with_it:.2f} µm rms, with uncompensated angles by {without:.2f} µm: {gain}"
+        gain = "compensation helps" if with_it < without else "compensation does not help"
+        distortion_text += (
+            f" and true errors of {with_it:.2f} µm rms, with uncompensated angles {without:.2f} µm: {gain}"
+        )
     return answer(
         f"The balanced principal distance is {f:.4f} ± {sigma:.4f} mm{truth_text}, limited by {_limit(run)}",
         distortion_text,
-        f"points lie within {data['rms_compensated_um']:.2f} µm rms of a smooth curve",
-        f"chi-square is {data['chi_square']:.1f} for {data['degrees_of_freedom']} degrees of freedom with stated noise",
-        f"of {int(np.sum(run.present))} spots {noise['rejected']} were rejected, where {expected:.0f} are expected "
-        "without gross errors: see the noise",
+        f"points scatter by {data['rms_compensated_um']:.2f} µm rms about a smooth curve",
+        f"chi-square is {data['chi_square']:.1f} for {data['degrees_of_freedom']} degrees of freedom with the "
+        "specified noise",
+        f"{noise['rejected']} of {int(np.sum(run.present))} spots were rejected, {expected:.0f} expected by chance: "
+        "see "
+        "the noise",
     )
 
 
 def _typeset(text: str) -> str:
-    """A statement of the analysis, which is plain ASCII, as the report and the terminal show it."""
+    """Convert a plain ASCII statement of the analysis to the symbols of report and terminal."""
     for plain, shown in (
         ("+-", "±"),
         ("tan^2", "tan²"),
@@ -161,27 +165,29 @@ def _typeset(text: str) -> str:
 
 
 def _warnings(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the warnings of the report."""
     out = []
     fit = run.compensated.fit
     f, sigma = fit.value("principal_distance"), fit.sigma("principal_distance")
     if isinstance(run, SimulatedDistortion):
         kept = int(np.sum(run.truth.gross & run.means.keep))
         if kept:
-            out.append(f"gross errors that Chauvenet's criterion does not find and that stay in the means: {kept}")
+            out.append(f"gross errors that Chauvenet's criterion does not reject and that remain in the means: {kept}")
         left = run.bench.true_offset - run.bench.design_offset
         slope = float(np.polyfit(np.tan(run.bench.field_angle), left, 1)[0])
         if abs(slope) > 0.5 * sigma:
             out.append(
-                "as-built coma that grows over the field moves energy centroids against chief rays and f by "
-                f"{1e6 * slope:.0f} µm, which no sigma holds ({1e6 * sigma:.0f} µm): measure the wavefront at several "
+                "as-built coma that increases over the field shifts energy centroids against chief rays and f by "
+                f"{1e6 * slope:.0f} µm, which is not in the sigma of f ({1e6 * sigma:.0f} µm): measure the wavefront "
+                "at several "
                 "fields"
             )
     if run.readings is not None:
         out += run.readings.file.doubts
         if not run.readings.numbered and run.reading.shape[1] > 1:
             out.append(
-                "spots of a point have no set numbers and count as independent exposures, so that the sigma of a mean"
-                " of four is half of one's: a column 'set' tells which belong together"
+                "spots of a point have no set numbers and count as independent exposures: the sigma of a mean of four"
+                " is half that of a single one; add a column 'set' if they belong to sets"
             )
     moved = abs(fit.value("constant"))
     if isinstance(run.test, MeasuredDistortionSpec) and moved > ZERO_SHARE * fit.sigma("principal_point"):
@@ -189,29 +195,32 @@ def _warnings(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, ...]:
         zero = run.test.measured.zero + sense * run.compensated.zero
         out.append(
             f"the line's middle is imaged {run.compensated.zero / ARCSEC:.3g} arcsec from `zero`, which moves the "
-            f"principal point by {1e3 * moved:.3g} mm and is in no sigma: with zero: {np.degrees(zero):.9f} deg it is "
-            "gone"
+            f"principal point by {1e3 * moved:.3g} mm and is not in the sigmas; zero: {np.degrees(zero):.9f} deg "
+            "removes "
+            "this shift"
         )
     if abs(f / run.approximate_f - 1.0) > 0.05:
         out.append(
             f"the principal distance is {f:.4g} m, but `principal_distance` says {run.approximate_f:.4g} m: are the "
-            "units of angles and places right?"
+            "units of angles and positions right?"
         )
     if data["probability"] < DOUBTFUL:
         out.append(
-            "the points scatter about a smooth curve more than the stated noise allows; the excess, "
-            f"{data['noise']['white_compensated_um']:.2f} µm, is in all sigmas as if it were independent from point to "
+            "the points scatter about a smooth curve more than the specified noise allows; the excess, "
+            f"{data['noise']['white_compensated_um']:.2f} µm, is included in all sigmas as independent from point to "
             "point"
         )
     if run.compensation is None:
         out.append(
-            "no calibration of the turntable: a dividing error with long waves passes for distortion, and no sigma "
-            "holds it but `angle_sigma`"
+            "no calibration of the turntable: a dividing error of long period is not distinguishable from distortion, "
+            "and "
+            "only `angle_sigma` covers it"
         )
     return tuple(out)
 
 
 def _summary(run: DistortionRun, data: Mapping[str, Any]) -> Table:
+    """Return the table of the main results."""
     truth = data.get("truth")
     keys = ["principal_distance_mm", "principal_point_mm", "correlation", "radial3_mm", "rms_compensated_um"]
     keys += [*(["rms_raw_um"] * (run.compensation is not None)), "chi_square", "degrees_of_freedom"]
@@ -219,7 +228,7 @@ def _summary(run: DistortionRun, data: Mapping[str, Any]) -> Table:
     if truth:
         rows += [(*row, None, None) for row in TRUTH.lines(truth, ("error_rms_raw_um", "error_rms_compensated_um"))]
     caption = (
-        "f and p by least squares with a constant, which is the unknown zero of the angles. Balanced: the f that "
+        "f and p by least squares with a constant for the unknown zero of the angles. Balanced: the f that "
         "leaves the smallest distortion over the points; with the radial term use the joint model."
     )
     heads = ("", "measured", "sigma", "truth")[: len(rows[0])]
@@ -227,39 +236,41 @@ def _summary(run: DistortionRun, data: Mapping[str, Any]) -> Table:
 
 
 def _curve(run: DistortionRun, data: Mapping[str, Any]) -> Section:
+    """Return the section on distortion over the field."""
     text, caption = [], "Means of the sets."
     if isinstance(run, SimulatedDistortion):
-        with_it, without = (rms(run.error(one) / one.sigma) for one in (run.compensated, run.raw))
+        with_it, without = (rms(run.error(d) / d.sigma) for d in (run.compensated, run.raw))
         text.append(
             f"The errors are {with_it:.2f} sigma rms with compensated angles, {without:.2f} with angles as read."
         )
-        caption += " Line: by exact chief rays of the as-built camera."
+        caption += " Line: exact chief rays of the as-built camera."
     keys = ["point", "reading_deg", "field_deg", "position_mm", "distortion_compensated_um"]
     keys += ["distortion_compensated_um_sigma", "residual_compensated_um", "sets_kept"]
     artefacts: tuple[Artefact, ...] = (
         SvgFigure("distortion-curve", "Distortion over the field", caption, _curve_svg(run)),
-        POINTS.table("distortion-points", "Point by point", "Means of the sets kept.", data["points"], keys),
+        POINTS.table("distortion-points", "Point by point", "Means of the accepted sets.", data["points"], keys),
     )
     return Section("Distortion", tuple(text), artefacts, folded=1)
 
 
 def _compensation(run: DistortionRun) -> Section:
+    """Return the section that compares raw and compensated angles."""
     raw, compensated = run.raw, run.compensated
     pairs = {
-        "distance from the smooth curve": (raw.smooth.residual, compensated.smooth.residual),
+        "residual from the smooth curve": (raw.smooth.residual, compensated.smooth.residual),
         "RMS of distortion over the sets": (raw.rms_over_sets, compensated.rms_over_sets),
     }
     if isinstance(run, SimulatedDistortion):
         pairs["error of the distortion (needs the truth)"] = (run.error(raw), run.error(compensated))
     rows: list[tuple[Cell, ...]] = []
     for name, values in pairs.items():
-        before, after = (1e6 * rms(one) for one in values)
-        largest = [1e6 * float(np.max(np.abs(one))) for one in values]
+        before, after = (1e6 * rms(value) for value in values)
+        largest = [1e6 * float(np.max(np.abs(value))) for value in values]
         rows.append((name, before, after, 100.0 * (1.0 - after / before) if before else None, *largest))
     table = Table(
         "distortion-reduction",
-        "What compensation brings",
-        "RMS over the points, and the largest.",
+        "Effect of the compensation",
+        "RMS over the points, and largest absolute value.",
         ("quantity", "raw [µm]", "compensated [µm]", "reduction [%]", "largest raw [µm]", "largest compensated [µm]"),
         rows,
         (None, 2, 2, 0, 1, 1),
@@ -272,28 +283,28 @@ ESTIMATES = {
     "eq3": "(3): balanced f, p = 0",
     "eq4": "(4): p, with balanced f of (3)",
     "eq2_zero_from_constant": "(2), W counted from the fitted zero",
-    "constant": "constant, balanced f, p (taken)",
+    "constant": "constant, balanced f, p (adopted)",
     "constant_radial3": "constant, f, p, radial (joint)",
 }
-"""Estimate -> what it is, for readers."""
+"""Name of an estimate -> its description for readers."""
 
 
 def _joint(joint: Mapping[str, Any]) -> Section:
-    """The terms of one model that belong together, as they reproduce the spots and as a payload's file has them.
+    """Return the section on the joint model with a radial term, as fitted and as a line of a payload's file.
 
     Parameters
     ----------
-    joint : Mapping[str, Any]
-        Of distortion.json.
+    joint : mapping
+        Record ``joint`` of distortion.json.
     """
-    text = ("Terms of one table belong together: with a radial term f is the slope in the middle of the field.",)
+    text = ("Use the terms of one table together: with a radial term f is the slope in the middle of the field.",)
 
     def table(name: str, title: str, caption: str, part: Mapping[str, Any], suffix: str, shown: list[str]) -> Table:
         size, sigma = np.array(part[f"values{suffix}"]), np.array(part[f"values{suffix}_sigma"])
         spread = np.array(part["covariance_mm2" if suffix else "covariance"]) / np.outer(sigma, sigma)
         rows: list[tuple[Cell, ...]] = [
-            (label, *(DecimalNumber(v, decimals_for(own)) for v in (value, own)), *(float(v) for v in row))
-            for label, value, own, row in zip(shown, size, sigma, spread, strict=True)
+            (label, *(DecimalNumber(v, decimals_for(s)) for v in (value, s)), *(float(v) for v in row))
+            for label, value, s, row in zip(shown, size, sigma, spread, strict=True)
         ]
         heads = ("", "measured", "sigma", *(f"correlation: {label.split(' [')[0]}" for label in shown))
         return Table(name, title, caption, heads, rows, (None, None, None, *(3 for _ in shown)))
@@ -307,8 +318,9 @@ def _joint(joint: Mapping[str, Any]) -> Section:
             table("distortion-joint", "Joint model", f"{_typeset(joint['model'])}.", joint, "_mm", names),
             table(
                 "distortion-line",
-                "The same as a line of a payload's file",
-                "tan θ = (y − y0) (1 + k1 (y − y0)²) / f from the camera's Z, which stands at `axis` from the zero of "
+                "Joint model as a line of a payload's file",
+                "tan θ = (y − y0) (1 + k1 (y − y0)²) / f from the camera's Z, which is at the angle `axis` from the "
+                "zero of "
                 "the angles; principal_distance, principal_point: [0 mm, y0] and k1 as in a payload's file.",
                 joint["line"],
                 "",
@@ -319,30 +331,35 @@ def _joint(joint: Mapping[str, Any]) -> Section:
 
 
 def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
-    heads, digits = (["estimate", *(one.shown_head for one in ESTIMATE)], [None, *(one.decimals for one in ESTIMATE)])
-    rows: list[tuple[Cell, ...]] = [(ESTIMATES[name], *one.values()) for name, one in data["estimates"].items()]
+    """Return the section on the estimators and on what can be observed."""
+    heads, digits = (["estimate", *(q.shown_head for q in ESTIMATE)], [None, *(q.decimals for q in ESTIMATE)])
+    rows: list[tuple[Cell, ...]] = [(ESTIMATES[name], *record.values()) for name, record in data["estimates"].items()]
     constant_text = (
-        "Equations (1) to (4) (Li et al., doi 10.3788/IRLA20200143) have no constant: W has to count exactly from the "
-        f"direction that is imaged to the line's middle. The constant finds it {run.compensated.zero / ARCSEC:.3f} "
-        "arcsec from the zero that was given"
+        "Equations (1) to (4) (Li et al., doi 10.3788/IRLA20200143) have no constant: W must count exactly from the "
+        "direction that is imaged to the line's middle. The fitted constant places it "
+        f"{run.compensated.zero / ARCSEC:.3f} "
+        "arcsec from the specified zero"
     )
     text, caption = [f"{constant_text}."], "All with compensated angles." if run.compensation is not None else ""
     if isinstance(run, SimulatedDistortion):
         zero_error = (run.compensated.zero - run.truth.zero) / ARCSEC
         text = [
-            f"{constant_text}, {zero_error:+.3f} arcsec from the truth: the middle was put on the pinhole to "
-            f"{run.truth.zero / ARCSEC:.2f} arcsec, and the compensation at that reading has an error of its own."
+            f"{constant_text}, {zero_error:+.3f} arcsec from the truth: the middle was aligned to the pinhole within "
+            f"{run.truth.zero / ARCSEC:.2f} arcsec, and the compensation at that reading has an error, too."
         ]
-        caption += " Errors are against the same estimate from exact chief rays at the true angles."
+        caption += " Errors: difference from the same estimate with exact chief rays at the true angles."
         heads, digits = [*heads, "error of f [mm]", "error of p [mm]", "error of D, rms [µm]"], [*digits, 3, 2, 2]
-        pairs = [(one, run.true_estimates[name]) for name, one in run.estimates.items()]
+        pairs = [(estimate, run.true_estimates[name]) for name, estimate in run.estimates.items()]
         errors = [(1e3 * (e.f - t.f), 1e3 * (e.p - t.p), 1e6 * rms(e.distortion - t.distortion)) for e, t in pairs]
         rows = [(*row, *error) for row, error in zip(rows, errors, strict=True)]
     terms = [name.replace("_", " ") for name in data["covariance_terms"]]
-    title, note = "Equations (1) to (4) and fits with a constant", "Square millimetres, noise that is stated and found."
+    title, note = (
+        "Equations (1) to (4) and fits with a constant",
+        "Square millimetres, from specified noise and observed scatter.",
+    )
     covariance: list[tuple[Cell, ...]] = [(n, *row) for n, row in zip(terms, data["covariance_mm2"], strict=True)]
     return Section(
-        "Estimators and what can be observed",
+        "Estimators and observability",
         (*text, _typeset(run.compensated.fit.point.statement)),
         (
             Table("distortion-estimates", title, caption, heads, rows, digits),
@@ -352,12 +369,13 @@ def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
 
 
 def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
+    """Return the section on noise and rejected spots."""
     noise, stated = data["noise"], data["specified_exposure_um"]
     text = [
         f"One spot scatters by {noise['exposure_um']:.3f} µm "
-        + ("between the sets" if run.reading.shape[1] > 1 else "by its stated sigmas")
-        + (f"; noise of its place makes {stated:.3f} µm of it" if stated > 0.0 else "")
-        + f". Beyond what is stated, points scatter by {noise['white_compensated_um']:.3f} µm about a smooth curve"
+        + ("between the sets" if run.reading.shape[1] > 1 else "by its specified sigmas")
+        + (f", of which noise of its position is {stated:.3f} µm" if stated > 0.0 else "")
+        + f". Beyond the specified noise, points scatter by {noise['white_compensated_um']:.3f} µm about a smooth curve"
         + ("." if run.compensation is None else f", {noise['white_raw_um']:.3f} µm with angles as read.")
     ]
     if data["across_range_um"] is not None:
@@ -371,7 +389,7 @@ def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
         Table(
             "distortion-causes",
             "What limits the principal distance",
-            "Standard deviation by cause; their squares add up.",
+            "Standard deviation by cause; the variances add up.",
             ("cause", "sigma of f [mm]", "share of variance [%]"),
             rows,
             (None, 4, 1),
@@ -380,17 +398,19 @@ def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
     if isinstance(run, SimulatedDistortion):
         repeatability = run.setup.turntable.dividing_error.repeatability
         text.append(
-            f"The table's repeatability, {format_quantity(repeatability, ANGLE)}, makes "
-            f"{1e6 * run.compensated.fit.value('principal_distance') * repeatability:.2f} µm of the scatter between the sets; "
-            f"{data['truth']['gross_errors']} exposures had a gross error. Differences of the line's columns move a "
+            f"The table's repeatability, {format_quantity(repeatability, ANGLE)}, contributes "
+            f"{1e6 * run.compensated.fit.value('principal_distance') * repeatability:.2f} µm of the scatter between "
+            "the sets; "
+            f"{data['truth']['gross_errors']} exposures had a gross error. Non-uniformity of the line's columns shifts "
+            "a "
             f"spot by {noise['centroid_columns_um']:.3f} µm."
         )
         artefacts.append(
             SvgFigure(
                 "distortion-spot",
                 "A spot, enlarged",
-                "Mean of the frames of one exposure in the middle of the field; the cross is the energy centroid, the "
-                "circle its window.",
+                "Mean of the frames of one exposure in the middle of the field. Cross: energy centroid; "
+                "circle: its window.",
                 _spot_svg(run),
             )
         )
@@ -400,12 +420,12 @@ def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
     ):
         if rejected := data.get(key):
             artefacts.append(rejected_table(record, f"distortion-{key.replace('_', '-')}", what, rejected))
-    folded = len([one for one in artefacts if one.name.startswith("distortion-rejected")])
-    return Section("Noise, and what was rejected", tuple(text), tuple(artefacts), folded)
+    folded = len([artefact for artefact in artefacts if artefact.name.startswith("distortion-rejected")])
+    return Section("Noise and rejected spots", tuple(text), tuple(artefacts), folded)
 
 
 def _curve_svg(run: DistortionRun) -> str:
-    """Distortion over the field, what is left of a smooth curve, and of a simulated bench the error."""
+    """Draw distortion over the field, residuals from a smooth curve and, for a simulated bench, the error."""
     with look("distortion-curve"):
         known = isinstance(run, SimulatedDistortion)
         figure = new_figure(8.0 if known else 6.0)
@@ -415,14 +435,14 @@ def _curve_svg(run: DistortionRun) -> str:
             panels[0].plot(field, 1e6 * run.true_distortion, color=INK, lw=1.0, label="exact chief rays")
             panels[2].set_title("Measured − true, with the total sigma", loc="left")
         series = [(run.raw, RAW, ORANGE, "s", -0.005), (run.compensated, COMPENSATED, BLUE, "o", 0.005)]
-        for one, name, colour, marker, shift in series if run.compensation is not None else series[:1]:
+        for data, name, colour, marker, shift in series if run.compensation is not None else series[:1]:
             style = {"fmt": marker, "color": colour, "ms": 3.5, "lw": 0.8, "label": name}
-            panels[0].errorbar(field + shift, 1e6 * one.distortion, 1e6 * one.sigma, **style)
-            panels[1].errorbar(field + shift, 1e6 * one.smooth.residual, 1e6 * one.means.sigma, **style)
+            panels[0].errorbar(field + shift, 1e6 * data.distortion, 1e6 * data.sigma, **style)
+            panels[1].errorbar(field + shift, 1e6 * data.smooth.residual, 1e6 * data.means.sigma, **style)
             if isinstance(run, SimulatedDistortion):
-                panels[2].errorbar(field + shift, 1e6 * run.error(one), 1e6 * one.sigma, **style)
+                panels[2].errorbar(field + shift, 1e6 * run.error(data), 1e6 * data.sigma, **style)
         panels[0].set_title("Distortion D = L − c − f tan W + p tan² W, with its total sigma", loc="left")
-        panels[1].set_title("Distance from the smooth curve, with the sigma of the sets", loc="left")
+        panels[1].set_title("Residual from the smooth curve, with the sigma of the means", loc="left")
         panels[-1].set_xlabel("field angle W [deg]")
         for axes in panels:
             axes.set_ylabel("µm")
@@ -433,7 +453,7 @@ def _curve_svg(run: DistortionRun) -> str:
 
 
 def _spot_svg(run: SimulatedDistortion) -> str:
-    """The spot in the middle of the field, and the row through its centre."""
+    """Draw the spot in the middle of the field, and the row through its centre."""
     with look("distortion-spot"):
         figure = new_figure(3.6)
         picture, profile = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
@@ -459,7 +479,7 @@ def _spot_svg(run: SimulatedDistortion) -> str:
 
 
 def _dress(axes: Axes, columns: int = 3) -> None:
-    """A light grid, a legend and room for it; columns: of the legend."""
+    """Add a light grid, and a legend of some columns with room above the data."""
     low, high = axes.get_ylim()
     # room for the legend above the data
     axes.set_ylim(low, high + 0.18 * (high - low))

@@ -1,11 +1,11 @@
 """Interior orientation and distortion by paper 004 (section 3), from the turntable's calibration to distortion.json.
 
 The analysis gets frames, readings, the calibration of the table and what a laboratory knows beforehand: the pixels,
-their noise, and by how much the energy centroid of a spot departs from its chief ray by the camera's design; or spots
-and readings from files of measurements. The truth of a simulated bench comes from exact chief rays of the as-built
-camera at the true angles, and is put through the same definitions.
+their noise, and the energy centroid of a spot minus its chief ray by the camera's design; or spots and readings from
+files of measurements. The truth of a simulated bench comes from exact chief rays of the as-built camera at the true
+angles, and is put through the same definitions.
 
-Numbers of a distortion test, as distortion.json has them.
+The records at the end define the contents of distortion.json.
 """
 
 from __future__ import annotations
@@ -51,29 +51,31 @@ from twin.laboratory.measured_readings import (
 from twin.laboratory.turntable_run import TurntableModel, rms, usable_fits
 
 CLOSED_FORMS = tuple(name for name in FITS if name != "network")
-"""Fits of the dividing error that compete for the compensation. The network takes minutes to train; the turntable test
-ranks it.
+"""Fits of the dividing error that compete for the compensation. The network, which takes minutes to train, is ranked by
+the turntable test only.
 """
-WIDEST = np.radians(40.0)
-"""Angle from the middle of the line beyond which a reading is a mistake; the model's tangents end at 45 deg."""
+MAX_FIELD_ANGLE = np.radians(40.0)
+"""Angle from the middle of the line, radians, beyond which a reading is taken for a mistake; the model's tangents end
+at 45 deg.
+"""
 _EXACT = 1e-9
-"""Metres: stands for the noise of the truth, whose estimates do not depend on it."""
+"""Nominal noise of the true positions, metres; the estimates from them do not depend on it."""
 _GREY, _SPOT_PIXEL = 2.0, 33.0
 """Bytes per pixel of a frame, and of the mean image of a spot."""
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """One way to f, p and distortion.
+    """Estimate of principal distance, principal point and distortion.
 
     Attributes
     ----------
     f, p : float
-        Metres; p is zero where it is not fitted.
-    distortion : Array
-        Of the points, (N,), metres.
-    f_sigma, p_sigma : float | None
-        Metres, None where an equation gives none.
+        Principal distance and principal point, metres; p is zero where it is not fitted.
+    distortion : (N,) ndarray
+        Distortion of the points, metres.
+    f_sigma, p_sigma : float or None
+        Standard deviations, metres; None where an equation gives none.
     """
 
     f: float
@@ -85,41 +87,41 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DistortionRun:
-    """One test, on a simulated bench or on measured angles and spots.
+    """Distortion test on a simulated bench or on measured angles and spots.
 
     Attributes
     ----------
-    test : DistortionTestSpec | MeasuredDistortionSpec
-        What its file says.
+    test : DistortionTestSpec or MeasuredDistortionSpec
+        Specification from the test's file.
     seed : int
-        Of what was drawn.
-    about : float
-        Principal distance, about, metres; it serves to see the scatter between sets.
-    reading : Array
-        Of the turntable, (N, S), radians.
-    present : NDArray[np.bool_]
-        Which exposures there are, (N, S).
-    calibration : CalibrationSeries | None
-        Of the turntable; None if angles count as read.
-    compensation : DividingCompensation | None
-        Of its dividing error; None likewise.
-    spots : interior.Spots
-        As located.
-    means : interior.PointMeans
-        How sets are reduced.
-    raw, compensated : interior.Distortion
-        With angles as read, and freed from the dividing error; without a calibration the same.
-    stated : interior.InteriorOrientation
-        The smooth model's fit with nothing but the stated noise, for its chi-square.
-    readings : SpotReadings | None
-        The table of spots as read from files; None for a simulated bench.
-    tables : tuple[Comparisons, ...]
-        Of the turntable's calibration, as read from files.
+        Seed of all that was drawn.
+    approximate_f : float
+        Approximate principal distance, metres, used to compare sets with each other.
+    reading : (N, S) ndarray
+        Readings of the turntable, radians.
+    present : (N, S) ndarray of bool
+        Exposures that were made.
+    calibration : CalibrationSeries or None
+        Calibration of the turntable; None if angles count as read.
+    compensation : DividingCompensation or None
+        Compensation of the dividing error; None without a calibration.
+    spots : Spots
+        Measured spots on the line.
+    means : PointMeans
+        Reduction of the sets to one mean per point.
+    raw, compensated : Distortion
+        Distortion with angles as read, and with angles corrected for the dividing error; equal without a calibration.
+    specified_fit : InteriorOrientation
+        Fit of the smooth model with the specified noise alone, for its chi-square.
+    readings : SpotReadings or None
+        Table of spots that was read; None for a simulated bench.
+    tables : tuple of Comparisons
+        Tables of the turntable's calibration that were read.
     """
 
     test: DistortionTestSpec | MeasuredDistortionSpec
     seed: int
-    about: float
+    approximate_f: float
     reading: Array
     present: NDArray[np.bool_]
     calibration: CalibrationSeries | None
@@ -128,42 +130,44 @@ class DistortionRun:
     means: interior.PointMeans
     raw: interior.Distortion
     compensated: interior.Distortion
-    stated: interior.InteriorOrientation
+    specified_fit: interior.InteriorOrientation
     readings: SpotReadings | None = None
     tables: tuple[Comparisons, ...] = ()
 
     @property
     def rejected(self) -> NDArray[np.bool_]:
-        """Exposures that Chauvenet's criterion takes out, (N, S)."""
+        """Exposures that Chauvenet's criterion rejects, (N, S)."""
         return self.present & ~self.means.keep
 
     @cached_property
     def line(self) -> interior.LineOrientation:
-        """The joint model with compensated angles in the terms of a payload's line."""
+        """Joint model with compensated angles in the terms of a payload's line."""
         return interior.line_orientation(self.compensated.smooth)
 
     @cached_property
     def estimates(self) -> Mapping[str, Estimate]:
-        """The printed equations and the fits with a constant, all with compensated angles."""
+        """Estimates by the printed equations and by the fits with a constant, all with compensated angles."""
         return _estimates(self.compensated.fit, self.compensated.smooth, self.compensated.zero)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulatedDistortion(DistortionRun):
-    """A test on the simulated bench, which also knows the truth.
+    """Distortion test on the simulated bench, with its truth.
 
     Attributes
     ----------
     bench : DistortionBench
-        With all that was set up.
+        Bench of the test.
     record : DistortionRecord
-        What the analysis got.
+        Measurements that the analysis got.
     truth : DistortionTruth
-        What it did not get.
+        True values that the analysis did not get.
     table : TurntableModel
-        The turntable; holds the truth of its dividing error.
-    calibration, compensation : CalibrationSeries
-        There are always.
+        Turntable with its true dividing error.
+    calibration : CalibrationSeries
+        Calibration of the turntable.
+    compensation : DividingCompensation
+        Compensation of the dividing error.
     """
 
     calibration: CalibrationSeries
@@ -175,21 +179,21 @@ class SimulatedDistortion(DistortionRun):
 
     @property
     def setup(self) -> DistortionSetup:
-        """The test with all it refers to."""
+        """Test with all files that it refers to."""
         return self.bench.setup
 
     def true_fit(self, terms: Sequence[str] = interior.CALIBRATED) -> interior.InteriorOrientation:
-        """Fit of the exact chief rays at the true angles, with the terms and exposures of the measurement."""
-        where, turned = self.means.mean(self.truth.place[..., 0]), self.means.mean(self.truth.turn)
-        return interior.fit_interior_orientation(where, turned, _EXACT, terms)
+        """Fit the exact chief rays at the true angles, with the terms and exposures of the measurement."""
+        position, angles = self.means.mean(self.truth.position[..., 0]), self.means.mean(self.truth.field_angle)
+        return interior.fit_interior_orientation(position, angles, _EXACT, terms)
 
     @cached_property
     def true_distortion(self) -> Array:
-        """D of the chief rays, (N,), metres."""
+        """True distortion of the chief rays, (N,), metres."""
         return self.true_fit().residual
 
     def error(self, measured: interior.Distortion) -> Array:
-        """Measured minus true distortion, (N,), metres."""
+        """Return measured minus true distortion, (N,), metres."""
         return np.asarray(measured.distortion - self.true_distortion)
 
     @cached_property
@@ -201,28 +205,33 @@ class SimulatedDistortion(DistortionRun):
 def _estimates(
     fit: interior.InteriorOrientation, smooth: interior.InteriorOrientation, zero: float
 ) -> dict[str, Estimate]:
-    """Equations (2), (3) and (4), and the fits; of (4) with f of (3), and of (2) once more with angles from `zero`."""
-    where, turned = fit.position, fit.angle
+    """Return the estimates by equations (2), (3) and (4), and by the fits.
+
+    Equation (4) uses the f of (3); equation (2) is evaluated once more with angles counted from `zero`.
+    """
+    position, angles = fit.position, fit.angle
 
     def printed(f: Array | float, p: Array | float, angle: Array) -> Estimate:
-        return Estimate(float(f), float(p), interior.distortion(where, angle, f, p))
+        return Estimate(float(f), float(p), interior.distortion(position, angle, f, p))
 
-    alone = interior.principal_distance(where, turned)
+    balanced_f = interior.principal_distance(position, angles)
     out = {
-        "eq2": printed(*interior.principal_distance_and_point(where, turned), turned),
-        "eq3": printed(alone, 0.0, turned),
-        "eq4": printed(alone, interior.principal_point(where, turned, alone), turned),
-        "eq2_zero_from_constant": printed(*interior.principal_distance_and_point(where, turned - zero), turned - zero),
+        "eq2": printed(*interior.principal_distance_and_point(position, angles), angles),
+        "eq3": printed(balanced_f, 0.0, angles),
+        "eq4": printed(balanced_f, interior.principal_point(position, angles, balanced_f), angles),
+        "eq2_zero_from_constant": printed(
+            *interior.principal_distance_and_point(position, angles - zero), angles - zero
+        ),
     }
     f, p = "principal_distance", "principal_point"
-    for name, own in (("constant", fit), ("constant_radial3", smooth)):
-        left = own.position - _calibrated(own)
-        out[name] = Estimate(own.value(f), own.value(p), left, own.sigma(f), own.sigma(p))
+    for name, model in (("constant", fit), ("constant_radial3", smooth)):
+        residual = model.position - _calibrated(model)
+        out[name] = Estimate(model.value(f), model.value(p), residual, model.sigma(f), model.sigma(p))
     return out
 
 
 def _calibrated(fit: interior.InteriorOrientation) -> Array:
-    """What distortion is counted from: c + f tan W - p tan^2 W of a fit at its angles, (N,), metres."""
+    """Return c + f tan W - p tan^2 W of a fit at its angles, from which distortion counts, (N,), metres."""
     tangent = np.tan(fit.angle)
     c, f, p = (fit.value(term) for term in interior.CALIBRATED)
     return np.asarray(c + f * tangent - p * tangent**2)
@@ -234,7 +243,7 @@ def measure(bench: DistortionBench, seed: int, advance: Advance = silent) -> Sim
     Raises
     ------
     BenchError
-        What was recorded cannot be measured.
+        The recorded spots cannot be measured, or the calibration has too few angles.
     """
     setup = bench.setup
     table = TurntableModel(setup.turntable, seed)
@@ -246,8 +255,8 @@ def measure(bench: DistortionBench, seed: int, advance: Advance = silent) -> Sim
         raise BenchError(str(error), ("turntable",), "a turntable file with a finer or longer calibration") from error
     record, truth = bench.record(table, seed, advance)
     spots = _locate(bench, record)
-    # the line's middle was put on the pinhole at the camera's angle; the prescription's focal length serves to see
-    # scatter only
+    # the line's middle was aligned to the pinhole at the camera's angle; the prescription's focal length serves to
+    # compare sets only
     args = record.reading, spots, setup.turntable.camera_angle, bench.path.model.line_principal_distance
     try:
         return SimulatedDistortion(
@@ -271,83 +280,85 @@ def reduce(
     reading: Array,
     spots: interior.Spots,
     zero: float,
-    about: float,
+    approximate_f: float,
     compensation: DividingCompensation | None,
     angle_sigma: float = 0.0,
     reverse: bool = False,
     present: NDArray[np.bool_] | None = None,
 ) -> dict[str, Any]:
-    """Readings and spots to interior orientation and distortion, whichever bench they come from.
+    """Reduce readings and spots of a simulated or real bench to interior orientation and distortion.
 
     Parameters
     ----------
-    reading : Array
-        Of the turntable, (N, S), radians.
-    spots : interior.Spots
-        On the line.
+    reading : (N, S) ndarray
+        Readings of the turntable, radians.
+    spots : Spots
+        Spots on the line.
     zero : float
         Reading at which the middle of the line is imaged, radians.
-    about : float
-        Principal distance, about, metres; it serves to see scatter only.
-    compensation : DividingCompensation | None
-        Of the turntable; None for angles as read.
+    approximate_f : float
+        Approximate principal distance, metres, used to compare sets with each other.
+    compensation : DividingCompensation or None
+        Compensation of the turntable; None for angles as read.
     angle_sigma : float
-        Of the angles as read without a compensation, radians.
+        Standard deviation of the angles as read, without a compensation, radians.
     reverse : bool
-        Readings rise where places on the line fall.
-    present : NDArray[np.bool_] | None
-        Which exposures there are, (N, S); None for all.
+        Readings increase where positions on the line decrease.
+    present : (N, S) ndarray of bool, optional
+        Exposures that were made; by default all.
 
     Returns
     -------
-    dict[str, Any]
-        The attributes of a `DistortionRun` that follow from readings and spots.
+    dict
+        Attributes of a `DistortionRun` that follow from readings and spots.
 
     Raises
     ------
-    interior.OrientationError
-        Fewer points than unknowns, or angles that do not determine them.
+    OrientationError
+        There are fewer points than unknowns, or the angles do not determine them.
     """
     sense = -1.0 if reverse else 1.0
-    read = sense * (reading - zero)
+    raw_angles = sense * (reading - zero)
     if compensation is None:
-        means = interior.reduce_sets(read, spots, about, 0.0, present)
+        means = interior.reduce_sets(raw_angles, spots, approximate_f, 0.0, present)
         common = angle_sigma**2 * np.eye(len(reading))
-        raw = compensated = interior.Distortion.measure(read, spots, means, common)
+        raw = compensated = interior.Distortion.measure(raw_angles, spots, means, common)
     else:
-        corrected = sense * (compensation.correct(reading) - float(compensation.correct(zero)))
-        means = interior.reduce_sets(corrected, spots, about, about * compensation.repeatability, present)
-        # the white part is left to the test's own residuals, which see it at more angles than the calibration's did
+        corrected_angles = sense * (compensation.correct(reading) - float(compensation.correct(zero)))
+        means = interior.reduce_sets(
+            corrected_angles, spots, approximate_f, approximate_f * compensation.repeatability, present
+        )
+        # the residuals of this test estimate the white part at more angles than the calibration did
         common = replace(compensation, white=0.0).covariance(means.mean(reading))
         raw, compensated = (
-            interior.Distortion.measure(read, spots, means),
-            interior.Distortion.measure(corrected, spots, means, common),
+            interior.Distortion.measure(raw_angles, spots, means),
+            interior.Distortion.measure(corrected_angles, spots, means, common),
         )
     fit = compensated.fit
     return {
         "reading": reading,
         "spots": spots,
-        "about": about,
+        "approximate_f": approximate_f,
         "present": np.ones(reading.shape, bool) if present is None else present,
         "means": means,
         "raw": raw,
         "compensated": compensated,
-        "stated": interior.fit_interior_orientation(
+        "specified_fit": interior.fit_interior_orientation(
             fit.position, fit.angle, means.sigma, interior.SMOOTH, angle_covariance=common
         ),
     }
 
 
 def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
-    """Read the angles and spots, and do the same with them.
+    """Read measured angles and spots, and reduce them.
 
     Raises
     ------
     InputError
-        a table cannot be used, or does not determine what is asked for.
+        A table cannot be used, or does not determine the unknowns.
     """
     files = spec.measured
-    found = read_spots(files)
+    readings = read_spots(files)
     compensation, series, zero = None, None, files.zero
     tables: tuple[Comparisons, ...] = ()
     if files.turntable is not None:
@@ -356,51 +367,54 @@ def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
         series = cal.series
         # whole turns between the calibration's readings and those of the test
         turns = unwrapped(np.array([files.zero]), 0.5 * float(series.angle[0] + series.angle[-1]))[0] - files.zero
-        zero, found = files.zero + turns, replace(found, reading=found.reading + turns)
-        _check_region(files, found, series, zero)
+        zero, readings = files.zero + turns, replace(readings, reading=readings.reading + turns)
+        _check_region(files, readings, series, zero)
         names, _ = usable_fits(files.turntable, cal, CLOSED_FORMS)
         choice = choose(series, seed, names, files.turntable.folds)
         compensation = compensate(series, choice, held[0].series if held else None)
-    _check_angles(files, found, zero)
-    scatter = files.angle_sigma or 0.0, files.reversed, found.present
+    _check_angles(files, readings, zero)
+    scatter = files.angle_sigma or 0.0, files.reversed, readings.present
     try:
-        reduced = reduce(found.reading, found.spots, zero, spec.principal_distance, compensation, *scatter)
+        reduced = reduce(readings.reading, readings.spots, zero, spec.principal_distance, compensation, *scatter)
     except interior.OrientationError as error:
         text = str(error).removeprefix("interior orientation: ")
         allowed = "reversed: true, where readings rise as places fall" if "opposite senses" in text else None
         raise files.error(text, ("spots",), allowed=allowed) from error
     return DistortionRun(
-        test=spec, seed=seed, calibration=series, compensation=compensation, readings=found, tables=tables, **reduced
+        test=spec, seed=seed, calibration=series, compensation=compensation, readings=readings, tables=tables, **reduced
     )
 
 
-def _check_region(files: DistortionFiles, found: SpotReadings, series: CalibrationSeries, zero: float) -> None:
-    """InputError unless the turntable is calibrated wherever it was read."""
+def _check_region(files: DistortionFiles, readings: SpotReadings, series: CalibrationSeries, zero: float) -> None:
+    """Raise InputError if a reading lies outside of the calibrated region of the turntable."""
     allowed = f"{calibrated_text(series.angle)}, where the turntable is calibrated"
     if not covered(series.angle, zero):
         shown = f"{np.degrees(files.zero):.9g} deg"
         raise files.error("outside of the calibrated readings", ("zero",), found=shown, allowed=allowed)
-    beyond = ~covered(series.angle, found.reading) & (found.lines > 0)
+    beyond = ~covered(series.angle, readings.reading) & (readings.lines > 0)
     if np.any(beyond):
         place = np.argwhere(beyond)[0]
-        shown = f"{np.degrees(found.reading[tuple(place)]):.9g} deg"
-        line = int(found.lines[tuple(place)])
+        shown = f"{np.degrees(readings.reading[tuple(place)]):.9g} deg"
+        line = int(readings.lines[tuple(place)])
         text = "outside of the calibrated readings"
-        raise InputError(Issue(text, found.file.file, line, (found.head,), shown, allowed))
+        raise InputError(Issue(text, readings.file.file, line, (readings.head,), shown, allowed))
 
 
-def _check_angles(files: DistortionFiles, found: SpotReadings, zero: float) -> None:
-    """InputError for readings that are far from the zero, which is a mistaken zero or unit."""
-    off = np.abs(found.reading - zero) * (found.lines > 0)
-    if np.max(off) > WIDEST:
-        place = np.unravel_index(int(np.argmax(off)), off.shape)
-        shown = f"{np.degrees(found.reading[place]):.9g} deg, {np.degrees(off[place]):.4g} deg from the zero"
-        allowed = f"within {np.degrees(WIDEST):.0f} deg of `zero`, the reading at which the line's middle is imaged"
-        line = int(found.lines[place])
-        raise InputError(Issue("an angle beyond any field", found.file.file, line, (found.head,), shown, allowed))
+def _check_angles(files: DistortionFiles, readings: SpotReadings, zero: float) -> None:
+    """Raise InputError for readings far from the zero, which point to a mistaken zero or unit."""
+    distance = np.abs(readings.reading - zero) * (readings.lines > 0)
+    if np.max(distance) > MAX_FIELD_ANGLE:
+        index = np.unravel_index(int(np.argmax(distance)), distance.shape)
+        shown = f"{np.degrees(readings.reading[index]):.9g} deg, {np.degrees(distance[index]):.4g} deg from the zero"
+        allowed = (
+            f"within {np.degrees(MAX_FIELD_ANGLE):.0f} deg of `zero`, the reading at which the line's middle is imaged"
+        )
+        line = int(readings.lines[index])
+        raise InputError(Issue("an angle beyond any field", readings.file.file, line, (readings.head,), shown, allowed))
 
 
 def _locate(bench: DistortionBench, record: DistortionRecord) -> interior.Spots:
+    """Measure the spots in the recorded frames; raise BenchError if any cannot be measured."""
     try:
         return interior.locate_spots(
             record.frames,
@@ -413,7 +427,9 @@ def _locate(bench: DistortionBench, record: DistortionRecord) -> interior.Spots:
         )
     except SpotError as error:
         reason = next(iter(error.reasons.values()))
-        problem = f"{len(error.reasons)} of {record.column.size} spots cannot be measured; the first: {reason}"
+        problem = (
+            f"{len(error.reasons)} of {record.column.size} spots cannot be measured; reason for the first: {reason}"
+        )
         remedy = "less light: 30 to 80 percent is good" if "saturated" in reason else "more light or more frames"
         raise BenchError(problem, ("light",), remedy) from error
 
@@ -421,14 +437,14 @@ def _locate(bench: DistortionBench, record: DistortionRecord) -> interior.Spots:
 def run_distortion(
     setup: ExperimentSetup[Any], backend: Backend, seed: int, advance: Advance = silent
 ) -> DistortionRun:
-    """``python -m twin.lab distortion``.
+    """Run ``python -m twin.lab distortion``.
 
     Raises
     ------
     InputError
-        ``as_built`` names what the camera does not have; a table of measurements cannot be used.
+        ``as_built`` names a body that the camera does not have, or a table of measurements cannot be used.
     BenchError
-        The test cannot be carried out or measured as its file says.
+        The test cannot be carried out or measured as its file specifies.
     """
     if isinstance(setup, MeasuredDistortionSetup):
         advance("read and fit", 0, 1)
@@ -442,22 +458,29 @@ def run_distortion(
 
 JOINT_MODEL = "L = constant + principal_distance tan W - principal_point tan^2 W + radial3 tan^3 W"
 _LINE_UNIT = np.array([1.0 / ARCSEC, MM_PER_M, MM_PER_M, 1.0])
+"""Factors from SI units to the units of `LINE`: arcsec, mm, mm, 1/m^2."""
 
 POINTS: Record[DistortionRun] = Record(
-    "One point of the line: means of the sets that Chauvenet's criterion keeps.",
+    "One point of the line: means of the sets that Chauvenet's criterion accepts.",
     Quantity("point", lambda r: np.arange(len(r.reading)) + 1, "number along the line"),
     Quantity("reading_deg", lambda r: r.means.mean(r.reading), "reading of the turntable", decimals=5),
     Quantity("field_deg", lambda r: r.compensated.fit.angle, "W, the camera's angle", "W", 5),
-    Quantity("position_mm", lambda r: r.compensated.fit.position, "L, the spot's place along the line", "L", 4),
+    Quantity("position_mm", lambda r: r.compensated.fit.position, "L, the spot's position along the line", "L", 4),
     Quantity("distortion_raw_um", lambda r: r.raw.distortion, "D with angles as read"),
     Quantity("distortion_compensated_um", lambda r: r.compensated.distortion, "D", "D", 2),
     Quantity("distortion_raw_um_sigma", lambda r: r.raw.sigma, "standard deviation of D with angles as read"),
     Quantity("distortion_compensated_um_sigma", lambda r: r.compensated.sigma, "standard deviation of D", "sigma", 2),
-    Quantity("residual_raw_um", lambda r: r.raw.smooth.residual, "from a smooth curve, with angles as read"),
-    Quantity("residual_compensated_um", lambda r: r.compensated.smooth.residual, "from a curve", "from smooth", 2),
+    Quantity("residual_raw_um", lambda r: r.raw.smooth.residual, "residual from a smooth curve, angles as read"),
+    Quantity(
+        "residual_compensated_um",
+        lambda r: r.compensated.smooth.residual,
+        "residual from a smooth curve",
+        "from smooth",
+        2,
+    ),
     Quantity("rms_over_sets_raw_um", lambda r: r.raw.rms_over_sets, "RMS of D of single sets, angles as read"),
     Quantity("rms_over_sets_compensated_um", lambda r: r.compensated.rms_over_sets, "RMS of D of single sets"),
-    Quantity("sets_kept", lambda r: r.means.keep.sum(axis=1), "sets that are kept"),
+    Quantity("sets_kept", lambda r: r.means.keep.sum(axis=1), "number of sets that are accepted"),
 )
 CORRELATIONS: Record[interior.InteriorOrientation] = Record(
     "Correlations of the terms of a fit.",
@@ -466,25 +489,25 @@ CORRELATIONS: Record[interior.InteriorOrientation] = Record(
 )
 LINE: Record[interior.LineOrientation] = Record(
     "The joint model as a line of a payload's file: tan of the angle from the camera's Z is (y - y0) times "
-    "(1 + k1 (y - y0)^2) / f, with y the place along the line. Units: axis, the camera's Z from the zero of the "
+    "(1 + k1 (y - y0)^2) / f, with y the position along the line. Units: axis, the camera's Z from the zero of the "
     "angles, arcsec; principal_distance and principal_point mm; k1 1/m^2; the covariance in these.",
     Quantity("terms", lambda line: interior.LINE_TERMS, "names of the unknowns"),
     Quantity("values", lambda line: line.values * _LINE_UNIT, "unknowns"),
     Quantity("values_sigma", lambda line: line.sigma * _LINE_UNIT, "standard deviations"),
-    Quantity("covariance", lambda line: line.covariance * np.outer(_LINE_UNIT, _LINE_UNIT), "of the unknowns"),
+    Quantity("covariance", lambda line: line.covariance * np.outer(_LINE_UNIT, _LINE_UNIT), "covariance matrix"),
 )
 JOINT: Record[DistortionRun] = Record(
-    "Constant, f, p and radial term of one model, which belong together and reproduce the spots. Its f is the slope in "
+    "Constant, f, p and radial term of one model, to be used together. Its f is the slope in "
     "the middle of the field, not the balanced one.",
     Quantity("model", lambda r: JOINT_MODEL, "formula"),
     Quantity("terms", lambda r: r.compensated.smooth.terms, "names of the unknowns"),
     Quantity("values_mm", lambda r: r.compensated.smooth.values, "unknowns"),
     Quantity("values_mm_sigma", lambda r: np.sqrt(np.diagonal(r.compensated.smooth.covariance)), "standard deviations"),
-    Quantity("covariance_mm2", lambda r: r.compensated.smooth.covariance, "of the unknowns"),
-    Quantity("line", lambda r: r.line, "of a payload's file", record=LINE),
+    Quantity("covariance_mm2", lambda r: r.compensated.smooth.covariance, "covariance matrix"),
+    Quantity("line", lambda r: r.line, "as a line of a payload's file", record=LINE),
 )
 ESTIMATE: Record[Estimate] = Record(
-    "One way to f, p and distortion; no sigma where an equation gives none.",
+    "Estimate of f, p and distortion; no sigma where an equation gives none.",
     Quantity("principal_distance_mm", lambda e: e.f, "f", "f", 4),
     Quantity("principal_distance_mm_sigma", lambda e: e.f_sigma, "standard deviation of f", "sigma of f", 3),
     Quantity("principal_point_mm", lambda e: e.p, "p; zero where it is not fitted", "p", 3),
@@ -492,24 +515,28 @@ ESTIMATE: Record[Estimate] = Record(
     Quantity("distortion_rms_um", lambda e: rms(e.distortion), "RMS over the points", "D, rms", 2),
 )
 NOISE: Record[DistortionRun] = Record(
-    "What scatters, RMS.",
-    Quantity("centroid_um", lambda r: rms(r.spots.temporal), "noise of one spot's place"),
-    Quantity("centroid_columns_um", lambda r: rms(r.spots.fixed), "part that stays from set to set"),
+    "Noise and scatter, RMS.",
+    Quantity("centroid_um", lambda r: rms(r.spots.temporal), "noise of one spot's position"),
+    Quantity("centroid_columns_um", lambda r: rms(r.spots.fixed), "part that is the same in all sets"),
     Quantity("exposure_um", lambda r: r.means.scatter, "scatter of one spot between the sets"),
-    Quantity("white_raw_um", lambda r: r.raw.white, "points about a smooth curve beyond stated noise, angles as read"),
-    Quantity("white_compensated_um", lambda r: r.compensated.white, "points about a smooth curve beyond stated noise"),
-    Quantity("rejected", lambda r: int(np.sum(r.rejected)), "spots that Chauvenet's criterion takes out"),
-    Quantity("rejected_expected_of_good", lambda r: expected_rejections(r.present.sum(axis=1)), "average of good ones"),
+    Quantity(
+        "white_raw_um", lambda r: r.raw.white, "scatter about a smooth curve beyond specified noise, angles as read"
+    ),
+    Quantity(
+        "white_compensated_um", lambda r: r.compensated.white, "scatter about a smooth curve beyond specified noise"
+    ),
+    Quantity("rejected", lambda r: int(np.sum(r.rejected)), "spots that Chauvenet's criterion rejects"),
+    Quantity("rejected_expected_by_chance", lambda r: expected_rejections(r.present.sum(axis=1)), "expected by chance"),
 )
 COMPENSATION: Record[DividingCompensation] = Record(
-    "The turntable's dividing error, as it is compensated.",
+    "Compensation of the turntable's dividing error.",
     Quantity("fit", lambda table: table.fit.name, "fit that cross-validation chooses"),
     Quantity("repeatability_arcsec", lambda table: table.repeatability, "standard deviation of one comparison"),
     *turntable_run.COMPENSATION,
 )
 _Pair: TypeAlias = tuple[Estimate, Estimate]
 TRUE_ESTIMATE: Record[_Pair] = Record(
-    "The same estimate from exact chief rays at the true angles.",
+    "Estimate from exact chief rays at the true angles.",
     Quantity("principal_distance_mm", lambda e: e[1].f, "true f"),
     Quantity("principal_point_mm", lambda e: e[1].p, "true p"),
     Quantity("distortion_error_rms_um", lambda e: rms(e[0].distortion - e[1].distortion), "measured minus true D, RMS"),
@@ -517,12 +544,14 @@ TRUE_ESTIMATE: Record[_Pair] = Record(
 
 
 def _f_error(run: SimulatedDistortion) -> float:
+    """Return the error of the balanced principal distance in its sigmas."""
     fit = run.compensated.fit
     error = fit.value("principal_distance") - run.true_fit().value("principal_distance")
     return float(error / fit.sigma("principal_distance"))
 
 
 def _correlation(run: DistortionRun) -> float:
+    """Return the correlation of principal distance and principal point."""
     fit = run.compensated.fit
     return float(fit.correlation[fit.terms.index("principal_distance"), fit.terms.index("principal_point")])
 
@@ -533,6 +562,7 @@ def _read(run: DistortionRun) -> SpotReadings:
 
 
 def _across(run: DistortionRun) -> float | None:
+    """Return the range of the spots across the line, metres, or None if it was not measured."""
     across = None if run.readings is None else run.readings.across
     return None if across is None else float(np.ptp(across))
 
@@ -542,17 +572,18 @@ def _files(run: DistortionRun) -> list[DataFile] | None:
 
 
 def _from_mean(run: DistortionRun) -> Array:
-    """Rejected exposures minus the mean of their point, in what the sets are compared by, metres."""
-    rest = run.compensated.position - run.about * np.tan(run.compensated.angle)
+    """Return rejected exposures minus the mean of their point, in the quantity in which sets are compared, metres."""
+    rest = run.compensated.position - run.approximate_f * np.tan(run.compensated.angle)
     return np.asarray((rest - run.means.mean(rest)[:, None])[run.rejected])
 
 
 def _paired(run: SimulatedDistortion) -> dict[str, _Pair]:
-    return {name: (found, run.true_estimates[name]) for name, found in run.estimates.items()}
+    """Return each estimate with the corresponding estimate from the truth."""
+    return {name: (estimate, run.true_estimates[name]) for name, estimate in run.estimates.items()}
 
 
 TRUTH: Record[SimulatedDistortion] = Record(
-    "What the analysis does not know.",
+    "Truth, which the analysis does not know.",
     Quantity("principal_distance_mm", lambda r: r.true_fit().value("principal_distance"), "true balanced f"),
     Quantity("principal_point_mm", lambda r: r.true_fit().value("principal_point"), "true p"),
     Quantity("zero_arcsec", lambda r: r.truth.zero, "error of the zero of the angles"),
@@ -560,25 +591,33 @@ TRUTH: Record[SimulatedDistortion] = Record(
     Quantity("distortion_um", lambda r: r.true_distortion, "true D of the points"),
     Quantity("error_rms_raw_um", lambda r: rms(r.error(r.raw)), "RMS error of D with angles as read", decimals=3),
     Quantity("error_rms_compensated_um", lambda r: rms(r.error(r.compensated)), "RMS error of D", decimals=3),
-    Quantity("reduction", lambda r: 1.0 - rms(r.error(r.compensated)) / rms(r.error(r.raw)), "share that is gone"),
+    Quantity(
+        "reduction",
+        lambda r: 1.0 - rms(r.error(r.compensated)) / rms(r.error(r.raw)),
+        "reduction of the RMS error by the compensation, as a fraction",
+    ),
     Quantity("principal_distance_error_sigma", _f_error, "error of the balanced f in its sigmas"),
     Quantity("gross_errors", lambda r: int(np.sum(r.truth.gross)), "exposures with a gross error"),
-    Quantity("gross_errors_kept", lambda r: int(np.sum(r.truth.gross & r.means.keep)), "those that stay in the means"),
-    Quantity("row_smile_um", lambda r: float(np.ptp(r.truth.place[..., 1])), "range of the spots along the track"),
-    Quantity("estimates", _paired, "name -> the same by exact chief rays", record=TRUE_ESTIMATE),
     Quantity(
-        "centroid_minus_chief_ray_left_um",
+        "gross_errors_kept",
+        lambda r: int(np.sum(r.truth.gross & r.means.keep)),
+        "exposures with a gross error that was not rejected",
+    ),
+    Quantity("row_smile_um", lambda r: float(np.ptp(r.truth.position[..., 1])), "range of the spots along the track"),
+    Quantity("estimates", _paired, "name -> estimate from exact chief rays", record=TRUE_ESTIMATE),
+    Quantity(
+        "centroid_minus_chief_ray_residual_um",
         lambda r: r.bench.true_offset - r.bench.design_offset,
         "energy centroid minus chief ray of the as-built camera beyond that of the design",
     ),
 )
 REJECTED: Record[DistortionRun] = Record(
-    "An exposure that Chauvenet's criterion takes out, and where it stands.",
+    "Exposure that Chauvenet's criterion rejects, and its line in the file.",
     Quantity("file", lambda r: [_read(r).file.file] * int(np.sum(r.rejected)), "path of the table"),
     Quantity("line", lambda r: _read(r).lines[r.rejected], "line in this file"),
     Quantity("point", lambda r: np.nonzero(r.rejected)[0] + 1, "number of the point"),
     Quantity("reading_deg", lambda r: r.reading[r.rejected], "reading", decimals=6),
-    Quantity("from_mean_um", _from_mean, "minus the mean of those that stay", "from the mean", 3),
+    Quantity("from_mean_um", _from_mean, "difference from the mean of the accepted exposures", "from the mean", 3),
 )
 DISTORTION: Record[DistortionRun] = Record(
     "distortion.json. Without a calibration of the turntable raw and compensated are the same.",
@@ -592,9 +631,17 @@ DISTORTION: Record[DistortionRun] = Record(
     Quantity("principal_point_mm_sigma", lambda r: r.compensated.fit.sigma("principal_point"), "sigma of p"),
     Quantity("correlation", _correlation, "correlation of the two", decimals=3),
     Quantity("principal_point_observable", lambda r: bool(r.compensated.fit.point.observable), "sigma within 10 um"),
-    Quantity("principal_point_statement", lambda r: r.compensated.fit.point.statement, "what can be said of p"),
-    Quantity("rms_raw_um", lambda r: rms(r.raw.smooth.residual), "RMS from a smooth curve, angles as read", decimals=3),
-    Quantity("rms_compensated_um", lambda r: rms(r.compensated.smooth.residual), "RMS from a smooth curve", decimals=3),
+    Quantity(
+        "principal_point_statement",
+        lambda r: r.compensated.fit.point.statement,
+        "statement about p and its observability",
+    ),
+    Quantity(
+        "rms_raw_um", lambda r: rms(r.raw.smooth.residual), "RMS about a smooth curve, angles as read", decimals=3
+    ),
+    Quantity(
+        "rms_compensated_um", lambda r: rms(r.compensated.smooth.residual), "RMS about a smooth curve", decimals=3
+    ),
     Quantity("zero_arcsec", lambda r: r.compensated.zero, "error of the zero of the angles, from the constant"),
     Quantity("joint", lambda r: r, "model with a radial term", record=JOINT),
     Quantity("points", POINTS.rows, "points of the line"),
@@ -602,24 +649,30 @@ DISTORTION: Record[DistortionRun] = Record(
         "radial3_mm", lambda r: r.compensated.smooth.value("radial3"), "radial term of the joint model", decimals=3
     ),
     Quantity("radial3_mm_sigma", lambda r: r.compensated.smooth.sigma("radial3"), "standard deviation"),
-    Quantity("correlations", lambda r: r.compensated.smooth, "of `joint`", record=CORRELATIONS),
+    Quantity("correlations", lambda r: r.compensated.smooth, "correlations of `joint`", record=CORRELATIONS),
     Quantity("estimates", lambda r: r.estimates, "name -> printed equation or fit", record=ESTIMATE),
-    Quantity("noise", lambda r: r, "what scatters", record=NOISE),
-    Quantity("compensation", lambda r: r.compensation, "of the turntable", record=COMPENSATION),
-    Quantity("chi_square", lambda r: r.stated.chi_square, "chi-square with stated noise", decimals=1),
-    Quantity("degrees_of_freedom", lambda r: r.stated.degrees_of_freedom, "degrees of freedom, points minus unknowns"),
-    Quantity("probability", lambda r: r.stated.probability, "of such a chi-square or a larger one"),
+    Quantity("noise", lambda r: r, "noise and scatter", record=NOISE),
+    Quantity("compensation", lambda r: r.compensation, "compensation of the turntable", record=COMPENSATION),
+    Quantity("chi_square", lambda r: r.specified_fit.chi_square, "chi-square with the specified noise", decimals=1),
+    Quantity(
+        "degrees_of_freedom", lambda r: r.specified_fit.degrees_of_freedom, "degrees of freedom, points minus unknowns"
+    ),
+    Quantity("probability", lambda r: r.specified_fit.probability, "p-value of this chi-square"),
     Quantity("covariance_terms", lambda r: r.compensated.fit.terms, "rows and columns of `covariance_mm2`"),
-    Quantity("covariance_mm2", lambda r: r.compensated.fit.covariance, "of constant, balanced f and p"),
-    Quantity("stated_exposure_um", lambda r: np.sqrt(np.mean(r.spots.temporal**2, where=r.present)), "noise of a spot"),
+    Quantity("covariance_mm2", lambda r: r.compensated.fit.covariance, "covariance of constant, balanced f and p"),
+    Quantity(
+        "specified_exposure_um",
+        lambda r: np.sqrt(np.mean(r.spots.temporal**2, where=r.present)),
+        "specified noise of a spot",
+    ),
     Quantity("across_range_um", _across, "range of the spots across the line"),
-    Quantity("rejected_readings", lambda r: r.readings and REJECTED.rows(r), "of spots", where_known=True),
+    Quantity("rejected_readings", lambda r: r.readings and REJECTED.rows(r), "rejected spots", where_known=True),
     Quantity(
         "rejected_comparisons",
         lambda r: r.readings and turntable_run.rejected_rows(r.tables),
-        "in files",
+        "rejected comparisons of the turntable",
         where_known=True,
     ),
-    Quantity("files", _files, "that were read", record=turntable_run.DATA_FILE, where_known=True),
+    Quantity("files", _files, "files that were read", record=turntable_run.DATA_FILE, where_known=True),
     Quantity("truth", lambda r: r if isinstance(r, SimulatedDistortion) else None, record=TRUTH, where_known=True),
 )

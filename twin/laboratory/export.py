@@ -1,8 +1,7 @@
-"""``--export DIR``: what a simulated bench leaves, written as files of measurements, with a test's file that reads them
-back.
+"""Export of a simulated bench's measurements as files, with a test's file that reads them back (``--export DIR``).
 
-The files are exactly those that a real bench would fill: nothing of the truth is in them. Their numbers are in SI units
-with all digits, so that what is read back is the same to the bit.
+The files are exactly those that a real bench would fill and contain nothing of the truth. Their numbers are in SI units
+with all digits, so that reading them back reproduces every bit.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ COMPARISONS, HELD_OUT, SPOTS = "comparisons.csv", "held_out.csv", "spots.csv"
 
 
 def export_turntable(run: TurntableRun) -> Files:
-    """Comparisons, held-out comparisons of a simulated bench and ``turntable.yaml``."""
+    """Return comparisons and held-out comparisons of a simulated bench, and ``turntable.yaml``."""
     spec = run.spec
     assert isinstance(spec, TurntableTestSpec)
     assert run.held_out is not None
@@ -43,7 +42,7 @@ def export_turntable(run: TurntableRun) -> Files:
 
 
 def export_distortion(run: SimulatedDistortion) -> Files:
-    """Spots with readings, the turntable's calibration, and ``distortion.yaml``."""
+    """Return the spots with readings, the turntable's calibration, and ``distortion.yaml``."""
     setup = run.setup
     out: dict[str, str | bytes] = {}
     turntable = _turntable_files(out, setup.turntable, run.calibration, run.table.held_out())
@@ -75,8 +74,9 @@ def export_distortion(run: SimulatedDistortion) -> Files:
 
 
 def export_focus(run: SimulatedFocus) -> Files:
-    """Every standing of the assembly, before and after each round: frames of all edges, a table of them and of their
-    MTF, and a test's file for each table.
+    """Return the measurements of a focus alignment before and after each round.
+
+    They are the frames of all edges, a table of the frames and one of their MTF, and a test's file for each table.
     """
     mount = run.bench.setup.test.mount
     out: dict[str, str | bytes] = {}
@@ -88,16 +88,16 @@ def export_focus(run: SimulatedFocus) -> Files:
             out[table] = csv_table(rows)
             out[f"focus_{stem}_{name}.yaml"] = _text(_focus_test(run, state, {name: table}, shims))
         if number < len(run.shimmings):
-            shims = tuple(float(one) for one in run.shimmings[number].plan.thickness)
+            shims = tuple(float(thickness) for thickness in run.shimmings[number].plan.thickness)
     return out
 
 
 def _focus_tables(
     run: SimulatedFocus, state: SimulatedState, number: int, stem: str, out: dict[str, str | bytes]
 ) -> tuple[list[Sequence[Any]], list[Sequence[Any]]]:
-    """Tables of images and of MTF values; the images are put into ``out``."""
+    """Return the tables of images and of MTF values; the images are put into ``out``."""
     bench = run.bench
-    recorder = recorder_of(bench, state.standing, run.seed, number)
+    recorder = recorder_of(bench, state.placement, run.seed, number)
     where = ("band", "x [m]", "y [m]", "edge", "shift [m]")
     images: list[Sequence[Any]] = [(*where, "file")]
     values: list[Sequence[Any]] = [(*where, "mtf", "sigma")]
@@ -111,7 +111,7 @@ def _focus_tables(
                 file = f"{stem}/{site.band}_field{field}_{edge}_{k + 1:02d}.tiff"
                 out[file] = bytes(tiff(recorder.frames(i, edge, float(at), scan.take + k), facts))
                 images.append((*place, file))
-                # where no edge was measured there is no value
+                # images without a measured edge have no value
                 if np.isfinite(scan.sigma[edge][k]):
                     values.append((*place, float(scan.mtf[edge][k]), float(scan.sigma[edge][k])))
     return images, values
@@ -120,17 +120,18 @@ def _focus_tables(
 def _focus_test(
     run: SimulatedFocus, state: SimulatedState, table: dict[str, str], shims: tuple[float, ...]
 ) -> camera_tests.MeasuredFocusSpec:
+    """Return the test's file for one table of measurements."""
     noise = {}
     for name, ccd in run.bench.ccds.items():
-        # noise beyond EMVA 1288's model has no place in the file: it is then estimated from the images
+        # the file cannot express noise beyond the model of EMVA 1288: it is then estimated from the images
         if not ccd.noise.further:
             numbers: dict[str, Any] = {
                 field: float(getattr(ccd.noise, field)) for field in camera_tests.NoiseSpec.model_fields
             }
             noise[name] = camera_tests.NoiseSpec.model_construct(**numbers)
-    given: dict[str, Any] = {"mtf": None, "images": None, **table}
+    tables: dict[str, Any] = {"mtf": None, "images": None, **table}
     files = camera_tests.FocusFiles.model_construct(
-        **given,
+        **tables,
         moved="image",
         per_shift=None,
         frequency=0.5,
@@ -152,15 +153,16 @@ def _focus_test(
 def _turntable_files(
     out: dict[str, str | bytes], spec: TurntableTestSpec, series: CalibrationSeries, held_out: CalibrationSeries
 ) -> TurntableFiles:
-    """Both tables are put into ``out``."""
-    for name, one in ((COMPARISONS, series), (HELD_OUT, held_out)):
-        out[name] = csv_table(_comparisons(one))
+    """Put the tables of both series into ``out`` and return the section that refers to them."""
+    for name, comparisons in ((COMPARISONS, series), (HELD_OUT, held_out)):
+        out[name] = csv_table(_comparisons(comparisons))
     return TurntableFiles.model_construct(
         comparisons=COMPARISONS, held_out=HELD_OUT, reference=spec.reference.calibration, folds=spec.calibration.folds
     )
 
 
 def _comparisons(series: CalibrationSeries) -> Iterator[Sequence[Any]]:
+    """Yield the rows of a table of comparisons, its head first."""
     yield "reading [rad]", "repeat", "difference [rad]"
     for angle, row in zip(series.angle, series.comparisons, strict=True):
         yield from ((float(angle), k + 1, float(value)) for k, value in enumerate(row))

@@ -1,10 +1,11 @@
-"""The bench of the focal-plane alignment: a collimator with a slanted edge, the camera, its line CCDs.
+"""Simulated bench of the focal-plane alignment: a collimator with a slanted edge, the camera, its line CCDs.
 
-Frame of all numbers: the focal-plane frame of the camera as its prescription has it (X' flight direction, Y' along the
-line, Z' along the light). The focal-plane assembly stands in it at a ``Pose``, and each band's chip at a height above
-the assembly.
+Frame of all numbers: the focal-plane frame of the camera's prescription (X' flight direction, Y' along the line, Z'
+along the light). A ``Pose`` places the focal-plane assembly in it, and the chip of each band lies at a height above the
+assembly.
 
-Through-focus measurement of all sites: move the target, record the edge, measure its MTF, find the vertex.
+Through-focus measurement of all sites: move the target, record the edge, measure its MTF, fit the vertex of the MTF
+curve.
 """
 
 from __future__ import annotations
@@ -35,31 +36,31 @@ if TYPE_CHECKING:
     from scenes.specs.resolved import FocusSetup
 
 _SEARCH = 0.3e-3
-"""Defocus up to which best focus is looked for, metres."""
+"""Largest defocus to either side in the search for best focus, metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class Site:
-    """One place of the focal plane where the edge is imaged.
+    """Position on the focal plane where the edge is imaged.
 
     Attributes
     ----------
     band : str
-        Whose line CCD.
+        Name of the band whose line CCD lies there.
     field : float
-        Share of half the line.
-    place : np.ndarray
-        (X', Y') on the nominal focal plane, metres.
-    point, direction : np.ndarray
-        Of the chief ray in the focal-plane frame, (3,), metres and unit.
-    imagers : Mapping[str, EdgeImager]
-        Edge -> its images.
-    defocus_per_shift : Mapping[str, float]
-        Edge -> defocus of the image per metre of the target's move, as the edge's direction sees it: (f / collimator's
-        f)^2 with the focal length in the direction of the edge's normal.
-    nominal_per_shift : Mapping[str, float]
-        The same of the prescription, which the analysis may know.
-    edge_focus : Mapping[str, float]
+        Position along the line as a fraction of half the line.
+    place : (2,) ndarray
+        Position (X', Y') on the nominal focal plane, metres.
+    point, direction : (3,) ndarray
+        Point (metres) and unit direction of the chief ray in the focal-plane frame.
+    imagers : mapping
+        Edge -> imager of that edge.
+    defocus_per_shift : mapping
+        Edge -> true defocus of the image per metre of target shift, in the direction of the edge's normal: (f of the
+        camera / f of the collimator)^2, with the camera's f in that direction.
+    nominal_per_shift : mapping
+        Edge -> the corresponding ratio of the prescription, which the analysis may know.
+    edge_focus : mapping
         Edge -> Z' at which its MTF at the Nyquist frequency is largest, metres.
     """
 
@@ -75,7 +76,7 @@ class Site:
 
     @property
     def best(self) -> float:
-        """Z' of best focus: midway between those of the two edges, which astigmatism moves apart, metres."""
+        """Z' of best focus, metres: the mean of the two edges' best foci, which astigmatism separates."""
         return float(np.mean([self.edge_focus[edge] for edge in DIRECTIONS]))
 
     @property
@@ -83,43 +84,57 @@ class Site:
         """Nyquist frequency of the band, cycles/m."""
         return self.imagers[ALONG].ccd.band.nyquist
 
-    def crossing(self, standing: Pose, height: float) -> np.ndarray:
-        """Where the chief ray meets the chip, in the focal-plane frame, (3,), metres."""
-        normal = standing.rotation[:, 2]
-        chip = standing.translation + height * normal
+    def crossing(self, placement: Pose, height: float) -> np.ndarray:
+        """Return the intersection of the chief ray and the chip in the focal-plane frame, (3,), metres."""
+        normal = placement.rotation[:, 2]
+        chip = placement.translation + height * normal
         return np.asarray(self.point + self.direction * ((chip - self.point) @ normal) / (self.direction @ normal))
 
-    def defocus(self, standing: Pose, height: float) -> float:
-        """How far the chip stands downstream of best focus, metres."""
-        return float(self.crossing(standing, height)[2] - self.best)
+    def defocus(self, placement: Pose, height: float) -> float:
+        """Return the defocus of the chip, positive downstream of best focus, metres."""
+        return float(self.crossing(placement, height)[2] - self.best)
 
-    def column(self, standing: Pose, height: float) -> int:
-        """First column of the line on which the image of the edge lies in the middle."""
+    def column(self, placement: Pose, height: float) -> int:
+        """Return the first column of the recorded region, which has the image of the edge in its middle."""
         imager = self.imagers[ALONG]
-        along = standing.inverse().apply(self.crossing(standing, height))[1]
+        along = placement.inverse().apply(self.crossing(placement, height))[1]
         middle = along / imager.ccd.band.pitch + 0.5 * (imager.ccd.band.pixels - 1)
         return int(np.clip(round(middle - 0.5 * imager.region), 0, imager.ccd.band.pixels - imager.region))
 
-    def image(self, edge: str, standing: Pose, height: float, target_shift: float, offset: float) -> np.ndarray:
-        """Share of the white signal in every pixel, for a target moved by ``target_shift`` and an edge ``offset``."""
-        moved = self.crossing(standing, height)[2] - self.defocus_per_shift[edge] * target_shift
+    def image(self, edge: str, placement: Pose, height: float, target_shift: float, offset: float) -> np.ndarray:
+        """Return the signal of every pixel as a fraction of white.
+
+        Parameters
+        ----------
+        edge : str
+            Direction in which the edge measures the MTF.
+        placement : Placement
+            Placement of the assembly.
+        height : float
+            Height of the chip above the assembly, metres.
+        target_shift : float
+            Shift of the target, metres.
+        offset : float
+            Offset of the edge on the chip, metres.
+        """
+        moved = self.crossing(placement, height)[2] - self.defocus_per_shift[edge] * target_shift
         return self.imagers[edge].image(float(moved), offset)
 
 
 @dataclass(frozen=True, eq=False)
 class BudgetLine:
-    """What makes a band's MTF at its Nyquist frequency, in the middle of the field and at best focus.
+    """MTF budget of one band at its Nyquist frequency, in the middle of the field and at best focus.
 
     Attributes
     ----------
     band : str
-        name.
+        Name of the band.
     edge : str
-        Direction in which it is measured.
-    factors : Mapping[str, float]
-        Effect -> its transfer there.
+        Direction in which the MTF is measured.
+    factors : mapping
+        Effect -> its transfer factor.
     total : float
-        Their product.
+        MTF, the product of the factors.
     """
 
     band: str
@@ -129,23 +144,23 @@ class BudgetLine:
 
 
 class FocusBench:
-    """Everything of the bench that does not change from one alignment to the next.
+    """Bench with all that stays the same from alignment to alignment.
 
     Parameters
     ----------
     setup
-        The test with all it refers to.
+        Test with all files that it refers to.
     backend
-        Where to trace.
+        Array backend of the trace.
     advance
-        Told how many of how many tables are done.
+        Called with the number of tables done and their total.
 
     Raises
     ------
     InputError
-        The camera cannot be built as the file says.
+        The camera cannot be built as the file specifies.
     AimError, BeamMissedError, ValueError
-        Its beam is lost or vignetted.
+        The beam is lost or vignetted.
     """
 
     def __init__(self, setup: FocusSetup, backend: Backend, advance: Advance = silent) -> None:
@@ -161,11 +176,12 @@ class FocusBench:
         self.sites = self._build_sites(advance)
 
     def geometric_zero(self, band: str) -> float:
-        """Defocus at which geometric blur takes all contrast at a band's Nyquist frequency, metres."""
+        """Return the defocus at which geometric blur removes all contrast at a band's Nyquist frequency, metres."""
         f_number = self.focal_length / self.setup.camera.entrance_pupil
         return 1.22 * f_number / self.ccds[band].band.nyquist
 
     def _build_sites(self, advance: Advance) -> tuple[Site, ...]:
+        """Trace all sites and tabulate their images."""
         test, bands = self.setup.test, self.setup.camera.bands
         keys = [(name, field) for name in bands for field in test.fields]
         half = {n: 0.5 * (b.pixels - 2.0 * test.edge.region) * b.pitch for n, b in bands.items()}
@@ -181,6 +197,7 @@ class FocusBench:
         return tuple(sites)
 
     def _site(self, band: str, field: float, direction: np.ndarray, hit: np.ndarray, pupil: PupilFunction) -> Site:
+        """Build the site of one band and field from its traced pupil."""
         test, ccd = self.setup.test, self.ccds[band]
         local = self.path.local_map(self.camera.as_built, direction, ccd.band.pitch * test.edge.region)
         nominal = self.path.local_map({}, direction, ccd.band.pitch * test.edge.region)
@@ -199,7 +216,7 @@ class FocusBench:
         return Site(band, field, point[:2], point, ray, imagers, ratio, nominal_ratio, focus)
 
     def budget(self) -> tuple[BudgetLine, ...]:
-        """What makes each band's MTF at Nyquist in the middle of the field, along the line and along the track."""
+        """Compute the MTF budget of each band at Nyquist in the middle of the field, in both directions."""
         out = []
         for name, ccd in self.ccds.items():
             site = min((s for s in self.sites if s.band == name), key=lambda s: abs(s.field))
@@ -226,11 +243,12 @@ class FocusBench:
 
 
 def _modulus(optics: EdgeOptics, defocus: float, frequency: float) -> float:
+    """Return the modulus of the optical transfer at one frequency."""
     return float(np.abs(optics.at(defocus, np.array([frequency])))[0])
 
 
 def _longitudinal(local: LocalMap, normal: np.ndarray) -> float:
-    """Longitudinal magnification in the direction of an edge's normal.
+    """Return the longitudinal magnification in the direction of an edge's normal.
 
     A target moved by s adds s |p|^2 / 2F^2 to the path at p in the entrance pupil. By Lagrange's invariant p = F J^T u
     for direction cosines u at the image and the map's Jacobian J, so the image's curvature is s J J^T.
@@ -239,7 +257,7 @@ def _longitudinal(local: LocalMap, normal: np.ndarray) -> float:
 
 
 def best_focus(imager: EdgeImager, frequency: float) -> float:
-    """Defocus at which the MTF is largest, metres."""
+    """Return the defocus at which the MTF is largest, metres."""
 
     def loss(defocus: float) -> float:
         return -imager.mtf(defocus, frequency)
@@ -251,31 +269,35 @@ def best_focus(imager: EdgeImager, frequency: float) -> float:
 
 
 NYQUIST = 0.5
-"""Cycles per pixel."""
+"""Nyquist frequency, cycles per pixel."""
 
 VERTEX_ERROR = 0.5e-6
-"""Error that the form of the curve near its peak leaves in all vertices alike, metres, one sigma: wavefronts of 0.2
-waves shift them by so much. Without noise the vertices of the example are up to 0.6 um off."""
+"""Standard deviation of the error common to all vertices, metres, from the difference between the true MTF curve near
+its peak and the fitted form: wavefronts of 0.2 waves shift them by this much. Without noise the vertices of the
+example are up to 0.6 um off.
+"""
 
 VERTEX_TREND = 0.15e-6
-"""By how much this error changes from the middle to the ends of the line and of the bands, metres, one sigma, since the
-wavefront and the wavelength do."""
+"""Standard deviation of the change of this error from the middle to the ends of the line and of the bands, metres, as
+the wavefront and the wavelength change.
+"""
 
 _OFFSET, _FRAMES = range(2)
 _COARSE = 4
-"""Positions of the first scan that lie within the defocus at which all contrast is gone, at least."""
+"""Least number of positions of the first scan within the defocus at which all contrast is lost."""
 _ATTEMPTS = 3
+"""Largest number of scans of one site."""
 
 
 @dataclass(frozen=True, eq=False)
-class Standing:
-    """Where the focal-plane assembly and its chips stand.
+class Placement:
+    """Pose of the focal-plane assembly and heights of its chips.
 
     Attributes
     ----------
     pose : Pose
-        Of the assembly in the nominal focal-plane frame.
-    heights : Mapping[str, float]
+        Pose of the assembly in the nominal focal-plane frame.
+    heights : mapping
         Band -> height of its chip above the assembly, along Z', metres.
     """
 
@@ -285,22 +307,23 @@ class Standing:
 
 @dataclass(frozen=True, eq=False)
 class SiteScan:
-    """One site through focus.
+    """Through-focus measurement of one site.
 
     Attributes
     ----------
-    shift : Mapping[str, np.ndarray]
-        Edge -> moves of the target, as moves of the image in the edge's direction, metres, (Z,).
-    mtf, sigma : Mapping[str, np.ndarray]
-        Edge -> MTF at the Nyquist frequency, (Z,); an infinite sigma where no edge could be measured.
-    vertex : Mapping[str, FocusVertex]
-        Edge -> its peak.
-    frames : Mapping[str, np.ndarray]
-        Edge -> one recorded frame near the peak; empty of a table of MTF values.
-    target : np.ndarray
-        Moves of the target itself, metres, (Z,); empty of measurements.
+    shift : mapping
+        Edge -> shifts of the image in the edge's direction, metres, (Z,), computed from the target's shifts.
+    mtf, sigma : mapping
+        Edge -> MTF at the Nyquist frequency and its standard deviation, (Z,); the latter is infinite where no edge
+        could be measured.
+    vertex : mapping
+        Edge -> fitted peak of the MTF curve.
+    frames : mapping
+        Edge -> one recorded frame near the peak; empty for a table of MTF values.
+    target : (Z,) ndarray
+        Shifts of the target itself, metres; empty for measurements from files.
     take : int
-        Number of the exposure at its first position.
+        Number of the exposure at the first position.
     """
 
     shift: Mapping[str, np.ndarray]
@@ -313,24 +336,24 @@ class SiteScan:
 
     @property
     def defocus(self) -> float:
-        """How far the CCD stands downstream of best focus, midway between the edges' vertices, metres."""
+        """Defocus of the CCD from the mean of the edges' vertices, positive downstream of best focus, metres."""
         return float(np.mean([v.position for v in self.vertex.values()]))
 
     @property
     def defocus_sigma(self) -> float:
-        """Standard deviation of `defocus` from noise, metres; ``VERTEX_ERROR``, the same for all sites, adds to it."""
+        """Standard deviation of `defocus` by noise, metres; ``VERTEX_ERROR``, common to all sites, adds to it."""
         return float(np.sqrt(sum(v.sigma**2 for v in self.vertex.values())) / len(self.vertex))
 
 
 @dataclass(frozen=True, eq=False)
 class NyquistMtf:
-    """Edges of one site with the target at the collimator's focus.
+    """MTF of one site with the target at the collimator's focus.
 
     Attributes
     ----------
-    by_edge : Mapping[str, tuple[float, float]]
-        Edge -> MTF at the Nyquist frequency and its sigma.
-    frames : Mapping[str, np.ndarray]
+    by_edge : mapping
+        Edge -> MTF at the Nyquist frequency and its standard deviation.
+    frames : mapping
         Edge -> recorded frames (frames, region, region).
     """
 
@@ -339,45 +362,61 @@ class NyquistMtf:
 
 
 class Recorder:
-    """Records and measures edges of one standing of the assembly.
+    """Recorder of edge images for one placement of the assembly.
 
     Parameters
     ----------
     bench
-        The bench.
-    standing
-        Of the assembly.
+        Bench with the camera.
+    placement
+        Placement of the assembly.
     seed
-        Of the noise and of where the edge happens to lie.
+        Seed of the noise and of the random sub-pixel position of the edge.
     patterns
-        Band -> columns' gains and offsets.
+        Band -> gains and offsets of its columns.
     """
 
     def __init__(
-        self, bench: FocusBench, standing: Standing, seed: np.random.SeedSequence, patterns: Mapping[str, FixedPattern]
+        self,
+        bench: FocusBench,
+        placement: Placement,
+        seed: np.random.SeedSequence,
+        patterns: Mapping[str, FixedPattern],
     ) -> None:
         self.bench = bench
-        self.standing = standing
+        self.placement = placement
         self.seed = seed
         self.patterns = patterns
 
     def frames(self, number: int, edge: str, shift: float, take: int) -> np.ndarray:
-        """Frames (frames, region, region) of an edge at site ``number``, the target moved by ``shift`` metres; ``take``
-        tells one exposure from another.
+        """Record frames (frames, region, region) of an edge at one site.
+
+        Parameters
+        ----------
+        number : int
+            Number of the site.
+        edge : str
+            Direction in which the edge measures the MTF.
+        shift : float
+            Shift of the target, metres.
+        take : int
+            Number of the exposure, which selects its noise.
         """
         site, bench = self.bench.sites[number], self.bench
-        height = self.standing.heights[site.band]
+        height = self.placement.heights[site.band]
         ccd = bench.ccds[site.band]
-        way = DIRECTIONS.index(edge)
-        offset_seed, frame_seed = (stream(self.seed, which, number, way, take) for which in (_OFFSET, _FRAMES))
+        direction_index = DIRECTIONS.index(edge)
+        offset_seed, frame_seed = (
+            stream(self.seed, which, number, direction_index, take) for which in (_OFFSET, _FRAMES)
+        )
         offset = float(np.random.default_rng(offset_seed).uniform(-0.5, 0.5)) * ccd.band.pitch
-        share = site.image(edge, self.standing.pose, height, shift, offset)
+        share = site.image(edge, self.placement.pose, height, shift, offset)
         photons = ccd.white_photons(bench.setup.test.white) * share
-        column = site.column(self.standing.pose, height)
+        column = site.column(self.placement.pose, height)
         return ccd.expose(photons, column, self.patterns[site.band], bench.setup.test.frames, frame_seed)
 
     def measure(self, number: int, edge: str, shift: float, take: int) -> tuple[float, float, np.ndarray]:
-        """MTF at the Nyquist frequency, its sigma, and the frames.
+        """Record an edge; return its MTF at the Nyquist frequency, the standard deviation, and the frames.
 
         Raises
         ------
@@ -390,9 +429,7 @@ class Recorder:
         return *measure_pages(frames, noise=ccd.noise, step=grey_step(frames), even=True).at(NYQUIST), frames
 
     def attempt(self, number: int, edge: str, shift: float, take: int) -> tuple[float, float, np.ndarray, str]:
-        """Measure like ``measure``, but give MTF 0 with infinite sigma, and the reason, for an image that is too
-        blurred or otherwise unusable.
-        """
+        """Measure like ``measure``; for an image without a usable edge return MTF 0, infinite sigma and the reason."""
         try:
             return *self.measure(number, edge, shift, take), ""
         except EdgeError as error:
@@ -405,17 +442,17 @@ def scan(recorder: Recorder, advance: Advance = silent, search: bool = True) -> 
     Parameters
     ----------
     recorder : Recorder
-        Of one standing.
+        Recorder of one placement.
     advance : Advance
-        Told how many of how many sites are done.
+        Called with the number of sites done and their total.
     search : bool
-        First look for the peak over the whole reach; without it the peak is taken to be near zero, and only where it is
-        not there is it looked for.
+        First search the peak over the whole range of the scan. Otherwise the peak is assumed near zero, and searched
+        for only where it is not.
 
     Raises
     ------
     BenchError
-        a peak lies outside of the scan.
+        A peak lies outside of the scan.
     """
     count = len(recorder.bench.sites)
     done: list[SiteScan] = []
@@ -427,12 +464,12 @@ def scan(recorder: Recorder, advance: Advance = silent, search: bool = True) -> 
 
 
 def in_focus(recorder: Recorder) -> tuple[NyquistMtf, ...]:
-    """MTF of every site with the target at the collimator's focus.
+    """Measure the MTF of every site with the target at the collimator's focus.
 
     Raises
     ------
     BenchError
-        No edge can be measured there.
+        The edge cannot be measured at a site.
     """
 
     def site(number: int) -> NyquistMtf:
@@ -443,7 +480,7 @@ def in_focus(recorder: Recorder) -> tuple[NyquistMtf, ...]:
             raise BenchError(
                 f"the edge cannot be measured after the alignment in {where.band} at field {where.field:g}: {error}",
                 ("misset", "chips"),
-                "chips nearer to one plane, so that all of them come into focus together",
+                "chips closer to one plane, so that all of them can be in focus together",
             ) from error
         return NyquistMtf({e: (t[0], t[1]) for e, t in takes.items()}, {e: t[2] for e, t in takes.items()})
 
@@ -452,6 +489,7 @@ def in_focus(recorder: Recorder) -> tuple[NyquistMtf, ...]:
 
 
 def _scan_site(recorder: Recorder, number: int, search: bool) -> SiteScan:
+    """Measure one site through focus and fit its vertices."""
     bench = recorder.bench
     site, plan = bench.sites[number], bench.setup.test.scan
     zero = bench.geometric_zero(site.band)
@@ -460,51 +498,54 @@ def _scan_site(recorder: Recorder, number: int, search: bool) -> SiteScan:
     steps = plan.depth * zero / ratio[ALONG] * np.linspace(-1.0, 1.0, plan.points)
     for attempt in range(_ATTEMPTS):
         target = centre + steps
-        taken = {
+        measurements = {
             edge: [recorder.attempt(number, edge, float(s), 1000 * (attempt + 1) + k) for k, s in enumerate(target)]
             for edge in DIRECTIONS
         }
         shift = {edge: target * ratio[edge] for edge in DIRECTIONS}
-        mtf = {edge: np.array([one[0] for one in taken[edge]]) for edge in DIRECTIONS}
-        sigma = {edge: np.array([one[1] for one in taken[edge]]) for edge in DIRECTIONS}
+        mtf = {edge: np.array([m[0] for m in measurements[edge]]) for edge in DIRECTIONS}
+        sigma = {edge: np.array([m[1] for m in measurements[edge]]) for edge in DIRECTIONS}
         try:
             vertex = {edge: focus_vertex(shift[edge], mtf[edge], sigma[edge]) for edge in DIRECTIONS}
         except FocusError as problem:
             if attempt == _ATTEMPTS - 1:
                 raise _lost(site, problem) from problem
-            # the first scan may have met a side lobe or a flank: go to the highest point, then look everywhere again
+            # the scan may have hit a side lobe or a flank: move to the highest point, then search the whole range
             best = int(np.argmax(sum(mtf.values())))
-            again = 1000 * (_ATTEMPTS + 1) if attempt == 1 else 0  # images of their own for a second search
+            again = 1000 * (_ATTEMPTS + 1) if attempt == 1 else 0  # new images for a second search
             centre = _search(recorder, number, zero, again) if attempt == 1 or not search else float(target[best])
             continue
-        frames = {edge: taken[edge][int(np.argmax(mtf[edge]))][2][0] for edge in DIRECTIONS}
+        frames = {edge: measurements[edge][int(np.argmax(mtf[edge]))][2][0] for edge in DIRECTIONS}
         return SiteScan(shift, mtf, sigma, vertex, frames, target, 1000 * (attempt + 1))
     raise AssertionError("unreachable")
 
 
 def _search(recorder: Recorder, number: int, zero: float, first: int = 0) -> float:
-    """Rough place of the peak, as a move of the target: where the whole reach shows most contrast along the line.
-    ``first``: number of the first image.
+    """Return the target shift with the highest contrast along the line over the whole range of the scan, metres.
+
+    ``first`` is the number of the first image.
     """
     plan = recorder.bench.setup.test.scan
     site = recorder.bench.sites[number]
-    # wide peaks need no more positions than that some of them meet the peak
+    # a wide peak needs only as many positions as place some of them on the peak
     step = max(plan.step, 2.0 * zero / _COARSE)
     reach = plan.reach / site.nominal_per_shift[ALONG]
     shift = np.linspace(-reach, reach, 2 * int(np.ceil(plan.reach / step)) + 1)
-    taken = [recorder.attempt(number, ALONG, float(s), k) for k, s in enumerate(shift, first)]
-    if all(np.isinf(one[1]) for one in taken):
+    measurements = [recorder.attempt(number, ALONG, float(s), k) for k, s in enumerate(shift, first)]
+    if all(np.isinf(m[1]) for m in measurements):
         raise BenchError(
-            f"the edge cannot be measured anywhere through focus in {site.band} at field {site.field:g}: {taken[0][3]}",
+            f"the edge cannot be measured anywhere through focus in {site.band} at field {site.field:g}: "
+            f"{measurements[0][3]}",
             ("edge",),
             "another edge, region or light",
         )
-    mtf = np.array([one[0] for one in taken])
+    mtf = np.array([m[0] for m in measurements])
     best = int(np.argmax(mtf))
     if best in (0, len(shift) - 1):
         where = "the lower" if best == 0 else "the upper"
         raise BenchError(
-            f"best focus of {site.band} at field {site.field:g} is not inside the scan: most contrast at {where} end",
+            f"best focus of {site.band} at field {site.field:g} is not inside the scan: contrast is highest at {where} "
+            "end",
             ("scan", "reach"),
             "a longer reach",
         )
@@ -512,6 +553,7 @@ def _search(recorder: Recorder, number: int, zero: float, first: int = 0) -> flo
 
 
 def _lost(site: Site, problem: FocusError) -> BenchError:
+    """Return the error for a site without a best focus in the scan."""
     return BenchError(
         f"no best focus of {site.band} at field {site.field:g}: {problem}",
         ("scan",),

@@ -1,7 +1,6 @@
-"""Report of a focal-plane alignment: what was found, how well, and what limits it; of a simulated bench also beside its
-truth.
+"""Report of a focal-plane alignment: results, accuracy and its limits; of a simulated bench also the truth.
 
-Figures of the focal-plane alignment: curves through focus, defocus, MTF curves, edges.
+Its plots show the curves through focus, the defocus of the CCDs, MTF curves and recorded edges.
 """
 
 from __future__ import annotations
@@ -34,11 +33,12 @@ if TYPE_CHECKING:
 FIELD_COLOURS = (svg.BLUE, svg.GREEN, svg.ORANGE, svg.VERMILION, svg.PURPLE)
 EDGE_COLOURS = {ALONG: svg.BLUE, TRACK: svg.VERMILION}
 PER_MM = 1e-3
+"""Factor from cycles/m to cycles/mm."""
 _COLUMNS, _MOST_BANDS = 5, 10
 
 
 def _shown(run: FocusRun) -> list[tuple[int, FocusState, str]]:
-    """Number, standing and title of the first and the last standing."""
+    """Return number, state and title of the first and the last measured state."""
     states = run.states
     return (
         [(0, states[0], "before"), (len(states) - 1, states[-1], "after")] if len(states) > 1 else [(0, states[0], "")]
@@ -46,7 +46,7 @@ def _shown(run: FocusRun) -> list[tuple[int, FocusState, str]]:
 
 
 def through_focus_svg(run: FocusRun) -> str:
-    """Curves through focus of every band, both directions, before the first and after the last shims."""
+    """Draw the curves through focus of every band, in both directions, before the first and after the last shims."""
     bands, shown = list(dict.fromkeys(run.bands))[:_MOST_BANDS], _shown(run)
     with svg.look("through-focus"):
         columns, each = min(len(bands), _COLUMNS), -(-len(bands) // _COLUMNS)
@@ -55,42 +55,41 @@ def through_focus_svg(run: FocusRun) -> str:
         for (_, state, when), panels in zip(shown, np.split(grid, len(shown)), strict=True):
             for axes, band in zip(panels.ravel(), bands, strict=False):
                 _curves(axes, run, state, band)
-                axes.set_title(", ".join(part for part in (band, when) if part) or "all places")
+                axes.set_title(", ".join(part for part in (band, when) if part) or "all sites")
             for axes in panels.ravel()[len(bands) :]:
                 axes.set_visible(False)
             panels[0, 0].set_ylabel("MTF (○ filled: along the line,\nopen: along the track)")
         for axes in grid[-1]:
-            axes.set_xlabel("move of the image [µm]")
+            axes.set_xlabel("shift of the image [µm]")
         return svg.to_svg(figure)
 
 
 def _curves(axes: Axes, run: FocusRun, state: FocusState, band: str) -> None:
-    own = [scan for scan, name in zip(state.scans, run.bands, strict=True) if name == band]
-    for number, scan in enumerate(own):
+    """Draw the curves through focus of one band."""
+    scans = [scan for scan, name in zip(state.scans, run.bands, strict=True) if name == band]
+    for number, scan in enumerate(scans):
         colour = FIELD_COLOURS[number % len(FIELD_COLOURS)]
         for edge, vertex in scan.vertex.items():
             good = np.isfinite(scan.sigma[edge])
-            at, value, sigma = (each[edge][good] for each in (scan.shift, scan.mtf, scan.sigma))
+            shift, value, sigma = (each[edge][good] for each in (scan.shift, scan.mtf, scan.sigma))
             fill = colour if edge == ALONG else "white"
-            axes.errorbar(UM * at, value, sigma, fmt="o", ms=2.6, lw=0.7, color=colour, mfc=fill)
-            place = np.linspace(np.min(at), np.max(at), 101)
-            axes.plot(UM * place, _form(vertex, place), color=colour, lw=0.8)
+            axes.errorbar(UM * shift, value, sigma, fmt="o", ms=2.6, lw=0.7, color=colour, mfc=fill)
+            positions = np.linspace(np.min(shift), np.max(shift), 101)
+            axes.plot(UM * positions, _form(vertex, positions), color=colour, lw=0.8)
     axes.axvline(0.0, color=svg.INK, lw=0.8)
     axes.set_ylim(bottom=0.0)
     svg.plain_axes(axes)
 
 
-def _form(vertex: FocusVertex, place: np.ndarray) -> np.ndarray:
-    """The fitted curve, where it is above a third of its peak."""
-    u = -0.5 * vertex.curvature / vertex.peak * (place - vertex.position) ** 2
+def _form(vertex: FocusVertex, positions: np.ndarray) -> np.ndarray:
+    """Return the fitted curve where it is above a third of its peak, elsewhere NaN."""
+    u = -0.5 * vertex.curvature / vertex.peak * (positions - vertex.position) ** 2
     value = vertex.peak * (1.0 - u + QUARTIC * u**2)
     return np.where((value > vertex.peak / 3.0) & (u < 0.5 / QUARTIC), value, np.nan)
 
 
 def defocus_svg(run: FocusRun) -> str:
-    """Defocus of every place before the first and after the last shims, with the fitted plane; of a simulated bench the
-    truth.
-    """
+    """Draw the defocus at every site before the first and after the last shims, with the fitted plane and any truth."""
     shown = _shown(run)
     with svg.look("defocus"):
         figure = svg.new_figure(3.4)
@@ -105,14 +104,15 @@ def defocus_svg(run: FocusRun) -> str:
 
 
 def _defocus(axes: Axes, run: FocusRun, number: int, state: FocusState) -> None:
+    """Draw the defocus of one state by band."""
     for k, band in enumerate(dict.fromkeys(run.bands)):
-        own = np.array(run.bands) == band
-        colour, places = FIELD_COLOURS[k % len(FIELD_COLOURS)], run.places[own]
-        along, sigma = 1e3 * places[:, 1], UM * state.defocus_sigma[own]
-        style: dict[str, Any] = {"fmt": "o", "ms": 3.5, "lw": 1.0, "color": colour, "label": band or "all places"}
-        axes.errorbar(along, UM * state.defocus[own], sigma, **style)
+        of_band = np.array(run.bands) == band
+        colour, places = FIELD_COLOURS[k % len(FIELD_COLOURS)], run.places[of_band]
+        along, sigma = 1e3 * places[:, 1], UM * state.defocus_sigma[of_band]
+        style: dict[str, Any] = {"fmt": "o", "ms": 3.5, "lw": 1.0, "color": colour, "label": band or "all sites"}
+        axes.errorbar(along, UM * state.defocus[of_band], sigma, **style)
         if isinstance(state, SimulatedState):
-            axes.plot(along, UM * state.true_defocus[own], "_", ms=11, color=colour, alpha=0.8)
+            axes.plot(along, UM * state.true_defocus[of_band], "_", ms=11, color=colour, alpha=0.8)
         if number < len(run.shimmings):
             for x in np.unique(places[:, 0]):
                 line = np.array([[x, y] for y in (np.min(places[:, 1]), np.max(places[:, 1]))])
@@ -125,13 +125,13 @@ def _defocus(axes: Axes, run: FocusRun, number: int, state: FocusState) -> None:
 
 
 def _middle(run: SimulatedFocus, band: str) -> int:
-    """Number of the band's site that is nearest to the middle of the field."""
+    """Return the number of the band's site nearest to the middle of the field."""
     sites = run.bench.sites
     return min((i for i, s in enumerate(sites) if s.band == band), key=lambda i: abs(sites[i].field))
 
 
 def mtf_svg(run: SimulatedFocus) -> str:
-    """MTF curves in the middle of the field after the alignment, measured and true."""
+    """Draw the measured and true MTF curves in the middle of the field after the alignment."""
     with svg.look("mtf-curves"):
         bench, state = run.bench, run.states[-1]
         figure = svg.new_figure(3.0)
@@ -139,10 +139,12 @@ def mtf_svg(run: SimulatedFocus) -> str:
         for axes, band in zip(panels, bench.ccds, strict=True):
             number = _middle(run, band)
             site, ccd = bench.sites[number], bench.ccds[band]
-            defocus = state.true_place(number)
+            defocus = state.true_chip_z(number)
             for edge in DIRECTIONS:
                 frames = state.focus[number].frames[edge]
-                measured = slanted_edge_mtf(frames.mean(axis=0), noise=ccd.noise, frames=len(frames), uniform_light=True)
+                measured = slanted_edge_mtf(
+                    frames.mean(axis=0), noise=ccd.noise, frames=len(frames), uniform_light=True
+                )
                 frequency = measured.frequency / ccd.band.pitch
                 true = np.abs(site.imagers[edge].transfer(defocus, frequency))
                 colour = EDGE_COLOURS[edge]
@@ -168,7 +170,7 @@ def mtf_svg(run: SimulatedFocus) -> str:
 
 
 def edges_svg(run: SimulatedFocus) -> str:
-    """Recorded edges of the first and the last band."""
+    """Draw the recorded edges of the first and the last band."""
     with svg.look("edges"):
         bench, state = run.bench, run.states[-1]
         bands = list(bench.ccds)[:: max(len(bench.ccds) - 1, 1)]
@@ -184,10 +186,11 @@ def edges_svg(run: SimulatedFocus) -> str:
 
 
 MOVED = {"image": "image, along the light", "target": "target, along the light", "focal_plane": "CCD, along the light"}
+"""Moved part -> its description for readers."""
 
 
 def focus_report(run: FocusRun) -> Report:
-    """Report of an alignment."""
+    """Build the report of an alignment."""
     data = focus_run.focus_numbers(run)
     sections = (_shims(run), _plane(run), _curve_section(run))
     if isinstance(run, SimulatedFocus):
@@ -207,21 +210,22 @@ def focus_report(run: FocusRun) -> Report:
 
 
 def _alignment_verdict(run: SimulatedFocus, data: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
+    """Return the verdict on a simulated alignment and the sentences that follow it."""
     end = data["rounds"][-1]
     true, chips = data["truth"]["rounds"][-1]["confocal_um_max"], end["chips_um_rms"]
     rounds = len(run.shimmings)
     return answer(
-        f"{'One round' if rounds == 1 else f'{rounds} rounds'} of shims brought the CCDs from "
+        f"{'One round' if rounds == 1 else f'{rounds} rounds'} of shims moved the CCDs from "
         f"{data['initial']['confocal_um_max']:.0f} µm to {end['confocal_um_max']:.1f} ± "
-        f"{end['confocal_um_sigma']:.1f} µm from best focus (truly {true:.1f} µm), in every "
+        f"{end['confocal_um_sigma']:.1f} µm from best focus (truth: {true:.1f} µm), in every "
         f"field and band, and the line to {abs(end['line_level_arcmin']):.2f} arcmin of level",
-        f"the CCDs depart from one plane by {chips:.1f} µm rms, which no shim corrects" if chips > 0.0 else "",
+        f"the CCDs scatter about one plane by {chips:.1f} µm rms, which no shim corrects" if chips > 0.0 else "",
         "see the rounds of the alignment and the MTF",
     )
 
 
 def _edge_frames(run: SimulatedFocus) -> dict[str, np.ndarray]:
-    """Frames of all edges after the alignment."""
+    """Return the frames of all edges after the alignment, by file name."""
     fields = run.bench.setup.test.fields
     return {
         f"{site.band}_field{fields.index(site.field) + 1}_{edge}": scan.frames[edge]
@@ -231,14 +235,17 @@ def _edge_frames(run: SimulatedFocus) -> dict[str, np.ndarray]:
 
 
 def _facts(run: FocusRun, test: MeasuredFocusSpec) -> tuple[tuple[str, str], ...]:
+    """Return the facts about a measured series, as pairs of label and text."""
     mount, level, file = test.mount, run.states[0].level, run.readings and run.readings.file
     edges = " and ".join(DIRECTION_NAMES[edge] for edge in run.edges)
     return (
-        ("Places", f"{len(run.places)} of {len(set(run.bands))} bands, MTF {edges}"),
-        ("Moved", MOVED[test.measured.moved]),
+        ("Sites", f"{len(run.places)} in {len(set(run.bands))} bands, MTF {edges}"),
+        ("Scanned by moving", MOVED[test.measured.moved]),
         (
             "Level of the line",
-            "not read: the turn about Z′ stays" if level is None else f"{level.angle / ARCMIN:.3f} arcmin",
+            "not read: the rotation about Z′ is not corrected"
+            if level is None
+            else f"{level.angle / ARCMIN:.3f} arcmin",
         ),
         (
             "Mount",
@@ -251,11 +258,12 @@ def _facts(run: FocusRun, test: MeasuredFocusSpec) -> tuple[tuple[str, str], ...
 
 
 def _thousands(value: float) -> str:
-    """A large number with narrow spaces."""
+    """Format a large number with narrow spaces between groups of thousands."""
     return f"{value:,.0f}".replace(",", "\u202f")
 
 
 def _bench_facts(run: SimulatedFocus) -> tuple[tuple[str, str], ...]:
+    """Return the facts about a simulated bench, as pairs of label and text."""
     setup = run.bench.setup
     test, camera = setup.test, setup.camera
     bands = ", ".join(
@@ -288,6 +296,7 @@ def _bench_facts(run: SimulatedFocus) -> tuple[tuple[str, str], ...]:
 
 
 def _rounds(data: Mapping[str, Any]) -> Table:
+    """Return the table of confocal error and line level before the alignment and after each round."""
     stages = [("before", data["initial"], data["truth"]["initial"])]
     for k, (measured, true) in enumerate(zip(data["rounds"], data["truth"]["rounds"], strict=True)):
         stages.append((f"after round {k + 1}", measured, true))
@@ -312,86 +321,98 @@ def _rounds(data: Mapping[str, Any]) -> Table:
 
 
 def _verdict(run: FocusRun, data: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
+    """Return the verdict on a measured series and the sentences that follow it."""
     plane = data["plane"]
     chips, noise = plane["chips_um_rms"], UM_PER_M * float(np.sqrt(np.mean(run.states[0].defocus_sigma ** 2)))
     limit = (
-        f"by the CCDs' departure from one plane, {chips:.1f} µm rms, which no shim corrects"
+        f"by the scatter of the CCDs about one plane, {chips:.1f} µm rms, which no shim corrects"
         if chips > noise
-        else f"by the noise of each place, {noise:.1f} µm rms"
+        else f"by the noise of each site, {noise:.1f} µm rms"
     )
-    gone = len(data["images_without_edge"])
+    without_edge = len(data["images_without_edge"])
     return answer(
         f"The CCDs are up to {data['confocal_um_max']:.1f} ± {data['confocal_um_sigma']:.1f} µm from best focus",
         f"new shims will bring them within {data['expected_confocal_um_max']:.1f} ± "
         f"{data['expected_confocal_um_sigma']:.1f} µm, limited {limit}",
         f"chi-square of the plane is {plane['chi_square']:.1f} for {plane['degrees_of_freedom']} degrees of freedom, "
         f"of the curves through focus {data['curves_chi_square']:.0f} for {data['curves_degrees_of_freedom']}",
-        f"{gone} {'image has' if gone == 1 else 'images have'} no measurable edge" if gone else "",
+        f"{without_edge} {'image has' if without_edge == 1 else 'images have'} no measurable edge"
+        if without_edge
+        else "",
         "see the shims",
     )
 
 
 def _warnings(run: FocusRun, data: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the warnings of the report on a measured series."""
     out = []
     square, freedom = run.chi_square
     if freedom and chi2.sf(square, freedom) < DOUBTFUL:
         out.append(
             f"the curves through focus scatter more than their sigmas allow, chi-square {square:.0f} for {freedom} "
-            "degrees of freedom: sigmas of the MTF are too small, or the curves have another form; sigmas of the "
-            f"places are too small by about {np.sqrt(square / freedom):.1f}; those of plane and shims hold what places "
-            "scatter"
+            "degrees of freedom: the sigmas of the MTF are too small, or the curves have another form. The sigmas of "
+            "the "
+            f"sites are too small by a factor of about {np.sqrt(square / freedom):.1f}; those of plane and shims "
+            "include "
+            "the scatter of the sites"
         )
     move, noise = run.states[0].skew
     if run.readings and chi2.sf((move / noise) ** 2, 1) < DOUBTFUL:
         out.append(
-            f"the curves are wider on one side of their peaks than on the other: all places may stand"
-            f" {UM_PER_M * move:+.1f} ± {UM_PER_M * noise:.1f} µm from where they are given. The common error of"
-            f" {UM_PER_M * run.shimmings[0].vertex_error:.1f} µm in the sigmas of plane and shims holds it"
+            f"the curves are wider on one side of their peaks than on the other: all sites may be shifted by"
+            f" {UM_PER_M * move:+.1f} ± {UM_PER_M * noise:.1f} µm. The common error of"
+            f" {UM_PER_M * run.shimmings[0].vertex_error:.1f} µm in the sigmas of plane and shims covers this"
         )
-    for name, faults in (("rows do not count", "excluded"), ("images have a sigma that does not hold", "uneven")):
+    for name, faults in (("rows are excluded", "excluded"), ("images have a doubtful sigma", "uneven")):
         rows = getattr(run.readings, faults, ())
         if rows:
             where = f"lines {', '.join(str(row.line) for row in rows[:9])}{', ...' if len(rows) > 9 else ''}"
-            out.append(f"{len(rows)} {name} ({where} of {rows[0].file}); of the first: {rows[0].reason}")
+            out.append(f"{len(rows)} {name} ({where} of {rows[0].file}); reason for the first: {rows[0].reason}")
     out += run.readings.file.doubts if run.readings else ()
     if len(run.edges) == 1:
         out.append(
-            f"one direction only, {DIRECTION_NAMES[run.edges[0]]}: with astigmatism best focus is midway between two"
+            f"one direction only, {DIRECTION_NAMES[run.edges[0]]}: with astigmatism best focus lies midway between the "
+            "two"
         )
     if run.states[0].level is None:
-        out.append("the line's level was not read: shims that tilt the assembly can turn the line, see the shims")
+        out.append("the line's level was not read: shims that tilt the assembly can rotate the line, see the shims")
     if not data["plane"]["degrees_of_freedom"]:
-        out.append("three places give a plane and nothing to judge it by: no sigma knows of CCDs off one plane")
+        out.append("three sites determine a plane without redundancy: the sigmas do not include CCDs off one plane")
     return tuple(out)
 
 
 def _summary(data: Mapping[str, Any]) -> Table:
+    """Return the table of the main results."""
     plane = data["plane"]
     rows: list[tuple[Cell, ...]] = [
         ("largest distance from best focus [µm]", data["confocal_um_max"], data["confocal_um_sigma"]),
         *focus_run.PLANE.lines(plane, ("piston_um", "slope_x_arcsec", "slope_y_arcsec", "chips_um_rms")),
     ]
     rows += [
-        (f"change of shim {name.removeprefix('hole_')} [µm]", one["change_um"], one["change_um_sigma"])
-        for name, one in data["shims"].items()
+        (f"change of shim {name.removeprefix('hole_')} [µm]", shim["change_um"], shim["change_um_sigma"])
+        for name, shim in data["shims"].items()
     ]
-    caption = "Plane: best focus minus CCD. Sigmas hold noise, CCDs off one plane, and an error common to all vertices."
+    caption = (
+        "Plane: best focus minus CCD. Sigmas include noise, CCDs off one plane, and an error common to all vertices."
+    )
     return Table("alignment", "Result", caption, ("", "measured", "sigma"), rows, (None, 2, 2))
 
 
 def _shims(run: FocusRun) -> Section:
-    """The shims of every round."""
+    """Return the section on the shims of every round."""
     tables = []
-    for number, done in enumerate(run.shimmings, 1):
+    for number, shimming in enumerate(run.shimmings, 1):
         rows = {
-            f"{hole}": {**one, "slide_mm": float(np.linalg.norm(one["slide_mm"]))}
-            for hole, one in enumerate(focus_run.SHIMS.rows(done), 1)
+            f"{hole}": {**shim, "slide_mm": float(np.linalg.norm(shim["slide_mm"]))}
+            for hole, shim in enumerate(focus_run.SHIMS.rows(shimming), 1)
         }
         title = "Shims" if len(run.shimmings) == 1 else f"Shims of round {number}"
         caption = (
-            "Changes of thickness under each hole. The turn in the mounting surface of "
-            f"{fixed(done.plan.turn / ARCMIN, 2)} arcmin is set by hand; without it the line would be off its wanted "
-            f"level by {fixed(done.plan.level_coupling / ARCMIN, 2)} arcmin, as the mounting surface is not parallel "
+            "Changes of thickness under each hole. The rotation in the mounting surface of "
+            f"{fixed(shimming.plan.turn / ARCMIN, 2)} arcmin is set by hand; without it the line would deviate from "
+            "its nominal "
+            f"level by {fixed(shimming.plan.level_coupling / ARCMIN, 2)} arcmin, as the mounting surface is not "
+            "parallel "
             "to the focal plane."
         )
         tables.append(focus_run.SHIMS.table(f"shims-{number}", title, caption, rows, label="hole"))
@@ -399,60 +420,66 @@ def _shims(run: FocusRun) -> Section:
 
 
 def _last(run: FocusRun) -> tuple[FocusRun, FocusState, Shimming]:
-    """The last standing of which a plane was made, and this plane."""
+    """Return the run with the last state to which a plane was fitted, and that plane with its shims."""
     number = len(run.shimmings) - 1
     return run, run.states[number], run.shimmings[number]
 
 
 def _plane(run: FocusRun) -> Section:
-    """The plane from which the last shims are."""
-    *_, done = last = _last(run)
-    plane = done.plane
+    """Return the section on the plane from which the last shims were computed."""
+    *_, shimming = last = _last(run)
+    plane = shimming.plane
     text = (
         f"Chi-square of the plane is {plane.chi_square:.1f} for {plane.degrees_of_freedom} degrees of freedom "
-        "with the places' own sigmas. What the places scatter beyond them, "
-        f"{UM_PER_M * plane.extra_sigma:.1f} µm rms, is in the weights and in all sigmas of plane and shims.",
-        f"All vertices share an error of {UM_PER_M * done.vertex_error:.2g} µm by the form of the curve; "
-        f"{UM_PER_M * done.vertex_trend:.2g} µm of it change from the middle to the ends; both are in the sigmas.",
+        "with the sites' sigmas by noise. The scatter of the sites beyond them, "
+        f"{UM_PER_M * plane.extra_sigma:.1f} µm rms, is included in the weights and in all sigmas of plane and shims.",
+        f"All vertices have a common error of {UM_PER_M * shimming.vertex_error:.2g} µm by the form of the curve; "
+        f"{UM_PER_M * shimming.vertex_trend:.2g} µm of it change from the middle to the ends. The sigmas include both.",
     )
     keys = ("band", "x_mm", "y_mm", "defocus_um", "defocus_um_sigma", "residual_um")
-    caption = "Measured with one sigma by noise; lines: the plane that the shims take away."
+    caption = "Measured, with one sigma by noise; lines: the plane that the shims correct."
     if isinstance(run, SimulatedFocus):
         caption += " Dashes: truth from the traced pupils."
     artefacts: tuple[Artefact, ...] = (
-        SvgFigure("defocus", "Where the CCDs stand", caption, defocus_svg(run)),
-        focus_run.PLACES.table("places", "Places", "Before the last shims.", focus_run.PLACES.rows(last), keys),
+        SvgFigure("defocus", "Defocus of the CCDs", caption, defocus_svg(run)),
+        focus_run.PLACES.table("places", "Sites", "Before the last shims.", focus_run.PLACES.rows(last), keys),
     )
     return Section("Plane", text, artefacts, folded=1)
 
 
 def _curve_section(run: FocusRun) -> Section:
-    """Curves through focus, of the last standing of which a plane was made as a table."""
+    """Return the section on the curves through focus of the last state to which a plane was fitted."""
     rows = [
-        {**one, "direction": DIRECTION_NAMES[edge], **curve}
-        for one in focus_run.PLACES.rows(_last(run))
-        for edge, curve in one["curves"].items()
+        {**site, "direction": DIRECTION_NAMES[edge], **curve}
+        for site in focus_run.PLACES.rows(_last(run))
+        for edge, curve in site["curves"].items()
     ]
     where = [focus_run.PLACES[key] for key in ("band", "x_mm", "y_mm")]
     record = Record("A curve.", *where, focus_run.BUDGET["direction"], *focus_run.CURVE)
     drawn = "MTF with one sigma and the fitted curve, by band; black: the CCD."
     artefacts: list[Artefact] = [
         SvgFigure("through-focus", "Through focus", drawn, through_focus_svg(run)),
-        record.table("curves", "Curves through focus", "Vertices as moves of the image.", rows),
+        record.table("curves", "Curves through focus", "Vertices as shifts of the image.", rows),
     ]
     if run.readings and run.readings.no_edge:
-        gone = [{**focus_run.ROW_FAULT(one), "file": Path(one.file).name} for one in run.readings.no_edge]
-        note = "They have no weight."
-        artefacts.insert(1, focus_run.ROW_FAULT.table("no-edge", "Images without a measurable edge", note, gone))
+        without_edge = [{**focus_run.ROW_FAULT(row), "file": Path(row.file).name} for row in run.readings.no_edge]
+        note = "These images have no weight."
+        artefacts.insert(
+            1, focus_run.ROW_FAULT.table("no-edge", "Images without a measurable edge", note, without_edge)
+        )
     text: tuple[str, ...] = ()
     if isinstance(run, SimulatedFocus):
         ratio = run.bench.sites[0].nominal_per_shift
-        apart = 100 * abs(ratio[TRACK] / ratio[ALONG] - 1.0)
-        text = (f"Per move of the target the image moves by {apart:.1f}% more in one direction than in the other.",)
+        difference_percent = 100 * abs(ratio[TRACK] / ratio[ALONG] - 1.0)
+        text = (
+            f"Per shift of the target the image moves by {difference_percent:.1f}% more in one direction than in the "
+            "other.",
+        )
     return Section("Through focus", text, tuple(artefacts), folded=1)
 
 
 def _mtf_section(run: SimulatedFocus, data: Mapping[str, Any]) -> Section:
+    """Return the section on the MTF at the Nyquist frequency and its budget."""
     end, true = data["rounds"][-1], data["truth"]["rounds"][-1]
     rows = [
         (
@@ -480,16 +507,16 @@ def _mtf_section(run: SimulatedFocus, data: Mapping[str, Any]) -> Section:
             Table(
                 "mtf",
                 "Measured in focus, mean over the fields",
-                "The noise's sigma; truth from the traced pupils at the places where the CCDs really stand.",
+                "Sigma by noise; truth from the traced pupils at the true positions of the CCDs.",
                 ("band", "along the track", "along the track, true", "along the line"),
                 rows,
             ),
             Table(
                 "mtf-budget",
-                "What makes it, in the middle of the field",
-                "Transfer of each effect at Nyquist, from the trace and the data sheets; diffraction: the pupil "
-                "without aberrations; design: those of the prescription, at best focus of each direction; "
-                "wavefront: the camera's and the collimator's errors, at best focus midway between the directions.",
+                "MTF budget in the middle of the field",
+                "Transfer factor of each effect at Nyquist, from the trace and the data sheets; diffraction: the pupil "
+                "without aberrations; design: aberrations of the prescription, at best focus of each direction; "
+                "wavefront: errors of camera and collimator, at best focus midway between the directions.",
                 ("band", "direction", *(n.replace("_", " ").replace("tdi", "TDI") for n in names), "product"),
                 budget,
             ),

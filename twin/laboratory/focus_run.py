@@ -1,10 +1,12 @@
-"""Focal-plane alignment as paper 004 carries it out (section 2): through-focus MTF of every field and band, a weighted
-plane, shims at the mounting holes, and the same again; on a simulated bench or from a measured through-focus series.
+"""Focal-plane alignment by paper 004 (section 2), on a simulated bench or from a measured through-focus series.
 
-The analysis gets MTF values, readings of a theodolite, the nominal focal length and the drawing of the mount. Where a
-simulated assembly really stands is drawn from the seed and known to the images alone.
+A round measures the through-focus MTF in every field and band, fits a weighted plane through best focus and computes
+the shims at the mounting holes. A simulated bench mounts the shims and measures again.
 
-Numbers of a focal-plane alignment, as focus.json has them.
+The analysis gets MTF values, readings of a theodolite, the nominal focal length and the drawing of the mount. The true
+placement of a simulated assembly is drawn from the seed and enters the images alone.
+
+The records at the end define the contents of focus.json.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.random_streams import stream
 from twin.framework.record import Quantity, Record
 from twin.laboratory import focus_bench
-from twin.laboratory.focus_bench import VERTEX_ERROR, BudgetLine, FocusBench, NyquistMtf, Recorder, SiteScan, Standing
+from twin.laboratory.focus_bench import VERTEX_ERROR, BudgetLine, FocusBench, NyquistMtf, Placement, Recorder, SiteScan
 from twin.laboratory.measured_focus import FocusReadings, RowFault, read_focus
 from twin.laboratory.turntable_run import DATA_FILE, likely
 from twin.sensors.area_detector import FixedPattern
@@ -54,14 +56,14 @@ _GREY, _EDGE_PIXEL = 2.0, 57.0
 
 @dataclass(frozen=True, eq=False)
 class FocusState:
-    """The assembly as it stands, measured at N sites.
+    """Measurement of one placement of the assembly at N sites.
 
     Attributes
     ----------
-    scans : tuple[SiteScan, ...]
-        Through focus, site by site.
-    level : LineLevel | None
-        Of the line by the theodolite; None if nobody read it.
+    scans : tuple of SiteScan
+        Through-focus measurements of the sites.
+    level : LineLevel or None
+        Level of the line by the theodolite; None if it was not read.
     """
 
     scans: tuple[SiteScan, ...]
@@ -69,7 +71,7 @@ class FocusState:
 
     @property
     def defocus(self) -> np.ndarray:
-        """Measured, (N,), metres, positive where the CCD stands downstream of best focus."""
+        """Measured defocus of the CCDs, (N,), metres, positive downstream of best focus."""
         return np.array([scan.defocus for scan in self.scans])
 
     @property
@@ -79,9 +81,9 @@ class FocusState:
 
     @property
     def skew(self) -> tuple[float, float]:
-        """Return by how much the places move together if curves may be skewed, and its sigma by noise, metres.
+        """Common shift of all vertices if the curves may be skewed, and its standard deviation by noise, metres.
 
-        It is the weighted mean over the places of an edge's direction, and the mean of the directions.
+        It is the weighted mean over the sites for each direction, averaged over the directions.
         """
         moves, squares = [], []
         for edge in self.scans[0].vertex:
@@ -93,63 +95,63 @@ class FocusState:
 
     @property
     def confocal(self) -> tuple[float, float]:
-        """Largest distance of any site from best focus and its sigma by noise, metres."""
+        """Largest distance of a CCD from best focus and its standard deviation by noise, metres."""
         return float(np.max(np.abs(self.defocus))), float(np.max(self.defocus_sigma))
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedState(FocusState):
-    """The assembly on the simulated bench, measured and true.
+    """Measurement of one placement on the simulated bench, with its truth.
 
     Attributes
     ----------
     level : LineLevel
-        There is always one.
+        Level of the line, which is always read.
     bench : FocusBench
-        Where it stands.
-    standing : Standing
-        truth.
-    focus : tuple[NyquistMtf, ...]
-        MTF with the target at the collimator's focus, site by site; empty when it was not measured.
-    true_defocus : np.ndarray
-        How far each site's CCD stands downstream of best focus, (N,), metres.
+        Bench that measured it.
+    placement : Placement
+        True placement of the assembly.
+    focus : tuple of NyquistMtf
+        MTF of the sites with the target at the collimator's focus; empty when it was not measured.
+    true_defocus : (N,) ndarray
+        True defocus of the CCDs, metres, positive downstream of best focus.
     true_level : float
-        Turn of the line about Z', radians.
-    shims : Shimming | None
-        What led to it; None for the first standing.
+        True rotation of the line about Z', radians.
+    shims : Shimming or None
+        Shims that led to this placement; None for the first one.
     """
 
     level: LineLevel
     bench: FocusBench
-    standing: Standing
+    placement: Placement
     focus: tuple[NyquistMtf, ...]
     true_defocus: np.ndarray
     true_level: float
     shims: Shimming | None
 
     def of_band(self, band: str) -> list[int]:
-        """Numbers of a band's sites."""
+        """Return the numbers of a band's sites."""
         return [k for k, site in enumerate(self.bench.sites) if site.band == band]
 
     def mtf(self, edge: str) -> dict[str, tuple[float, float]]:
-        """Band -> measured MTF at the Nyquist frequency for edges of a direction, mean of the fields, and its sigma."""
+        """Return band -> measured MTF at the Nyquist frequency in one direction, mean of the fields, and its sigma."""
         out = {}
         for band in self.bench.ccds:
             values, sigmas = np.array([self.focus[k].by_edge[edge] for k in self.of_band(band)]).T
             out[band] = float(np.mean(values)), float(np.sqrt(np.sum(sigmas**2)) / len(sigmas))
         return out
 
-    def true_place(self, number: int) -> float:
-        """Z' at which the chief ray of a site meets its chip, metres."""
+    def true_chip_z(self, number: int) -> float:
+        """Return the true Z' at which the chief ray of a site meets its chip, metres."""
         site = self.bench.sites[number]
-        return float(site.crossing(self.standing.pose, self.standing.heights[site.band])[2])
+        return float(site.crossing(self.placement.pose, self.placement.heights[site.band])[2])
 
     @property
     def true_mtf(self) -> dict[str, float]:
         """Band -> MTF along the track at the Nyquist frequency by the traced pupils, mean of the fields."""
         sites = self.bench.sites
         return {
-            band: float(np.mean([sites[k].imagers[TRACK].mtf(self.true_place(k), sites[k].nyquist) for k in which]))
+            band: float(np.mean([sites[k].imagers[TRACK].mtf(self.true_chip_z(k), sites[k].nyquist) for k in which]))
             for band in self.bench.ccds
             for which in [self.of_band(band)]
         }
@@ -157,16 +159,18 @@ class SimulatedState(FocusState):
 
 @dataclass(frozen=True, eq=False)
 class Shimming:
-    """One round's decision: the fitted plane and the shims.
+    """Fitted plane and shims of one round.
 
     Attributes
     ----------
-    plane, plan : FocalPlaneFit
-        As fitted and as decided.
+    plane : FocalPlaneFit
+        Plane fitted to best focus minus CCD.
+    plan : ShimPlan
+        Shims and motion of the assembly.
     vertex_error : float
-        That all vertices share, one sigma, metres.
+        Standard deviation of the error common to all vertices, metres.
     vertex_trend : float
-        By how much it changes from the middle to the ends of the places, one sigma, metres.
+        Standard deviation of its change from the middle to the ends of the sites, metres.
     """
 
     plane: FocalPlaneFit
@@ -176,38 +180,38 @@ class Shimming:
 
     @property
     def systematic(self) -> np.ndarray:
-        """Sigmas of piston, slope_x and slope_y by the vertices' own error, (3,), metres and radians: the part that is
-        the same in every alignment of a camera.
+        """Sigmas of piston, slope_x and slope_y by the vertices' common error, (3,), metres and radians.
+
+        This part is the same in every alignment of a camera.
         """
         reach = np.max(np.abs(self.plane.position), axis=0)
         return np.array([self.vertex_error, *(self.vertex_trend / reach)])
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance (3, 3) of piston, slope_x, slope_y against the true plane: noise and the vertices' own error."""
+        """Covariance (3, 3) of piston, slope_x, slope_y by noise and the vertices' common error."""
         return self.plane.noise_covariance + np.diag(self.systematic**2)
 
     @property
     def plane_covariance(self) -> np.ndarray:
-        """Covariance (3, 3) of piston, slope_x, slope_y of a plane for all CCDs: as `covariance`, and what the measured
-        CCDs are off one plane.
+        """Covariance (3, 3) of piston, slope_x, slope_y of a plane for all CCDs.
+
+        It is `covariance` plus the scatter of the measured CCDs about one plane.
         """
         return self.plane.covariance + np.diag(self.systematic**2)
 
     @property
     def change_sigma(self) -> np.ndarray:
-        """Standard deviation of the shims' exact changes, (H,), metres, the vertices' own error included."""
+        """Standard deviation of the exact changes of the shims, (H,), metres, with the vertices' common error."""
         holes, up = self.plan.mount.holes, self.plan.mount.normal
         lever = np.cross(holes, up)
-        # a piston moves along Z', a slope along X' turns about -Y' and one along Y' about X'
+        # a piston moves along Z'; a slope along X' is a rotation about -Y', one along Y' about X'
         gain = np.column_stack([np.full(len(holes), up[2]), -lever[:, 1], lever[:, 0]])
         return np.sqrt(np.diag(self.plan.change_covariance) + (gain * self.systematic) ** 2 @ np.ones(3))
 
     @property
     def expected(self) -> tuple[float, float]:
-        """Largest distance of a site from best focus that is expected on the new shims, after rounding, and its sigma,
-        metres.
-        """
+        """Expected largest distance of a CCD from best focus on the new, rounded shims, and its sigma, metres."""
         left, spread = self.plane.predicted_defocus()
         left = left + self.plan.focus_error(self.plane.position)
         worst = int(np.argmax(np.abs(left)))
@@ -216,24 +220,24 @@ class Shimming:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FocusRun:
-    """One alignment, on a simulated bench or from a measured through-focus series.
+    """Alignment on a simulated bench or from a measured through-focus series.
 
     Attributes
     ----------
-    test : FocusTestSpec | MeasuredFocusSpec
-        What its file says.
+    test : FocusTestSpec or MeasuredFocusSpec
+        Specification from the test's file.
     seed : int
-        Of what was drawn.
-    bands : tuple[str, ...]
-        Whose CCD stands at each of the N sites; an empty name where a table does not say.
-    places : np.ndarray
-        (X', Y') of the sites, (N, 2), metres.
-    states : tuple[FocusState, ...]
-        The standings that were measured.
-    shimmings : tuple[Shimming, ...]
-        What was decided after each of them; a simulated bench also measures what the last one leads to.
-    readings : FocusReadings | None
-        As read from files; None for a simulated bench.
+        Seed of all that was drawn.
+    bands : tuple of str
+        Band of the CCD at each of the N sites; empty where a table has no bands.
+    places : (N, 2) ndarray
+        Positions (X', Y') of the sites, metres.
+    states : tuple of FocusState
+        Measured states.
+    shimmings : tuple of Shimming
+        Plane and shims after each of them; a simulated bench also measures the state on the last shims.
+    readings : FocusReadings or None
+        Series that was read from files; None for a simulated bench.
     """
 
     test: FocusTestSpec | MeasuredFocusSpec
@@ -251,21 +255,21 @@ class FocusRun:
 
     @property
     def chi_square(self) -> tuple[float, int]:
-        """Chi-square of all curves through focus of the first standing together, and their degrees of freedom."""
-        every = [vertex for scan in self.states[0].scans for vertex in scan.vertex.values()]
-        return sum(v.chi_square for v in every), sum(v.degrees_of_freedom for v in every)
+        """Chi-square of all curves through focus of the first state together, and their degrees of freedom."""
+        vertices = [vertex for scan in self.states[0].scans for vertex in scan.vertex.values()]
+        return sum(v.chi_square for v in vertices), sum(v.degrees_of_freedom for v in vertices)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulatedFocus(FocusRun):
-    """An alignment on the simulated bench, which also knows the truth.
+    """Alignment on the simulated bench, with its truth.
 
     Attributes
     ----------
     bench : FocusBench
-        With all that was set up.
-    states : tuple[SimulatedState, ...]
-        One more than there are shimmings.
+        Bench of the alignment.
+    states : tuple of SimulatedState
+        Measured states, one more than there are shimmings.
     """
 
     bench: FocusBench
@@ -273,13 +277,11 @@ class SimulatedFocus(FocusRun):
 
     @cached_property
     def budget(self) -> tuple[BudgetLine, ...]:
-        """What makes the MTF, as `FocusBench.budget` traces it."""
+        """MTF budget of the bands by `FocusBench.budget`."""
         return self.bench.budget()
 
     def true_plane(self, number: int) -> np.ndarray:
-        """What ``shimmings[number].plane`` should have been: piston and slopes (3,) of the true defocus with the same
-        weights.
-        """
+        """Return piston and slopes (3,) of the true defocus with the weights of ``shimmings[number].plane``."""
         plane = self.shimmings[number].plane
         weight = 1.0 / np.sqrt(plane.sigma**2 + plane.extra_sigma**2)
         design = np.column_stack([np.ones(len(weight)), plane.position]) * weight[:, None]
@@ -288,14 +290,14 @@ class SimulatedFocus(FocusRun):
 
 
 def run_focus(setup: ExperimentSetup[Any], backend: Backend, seed: int, advance: Advance = silent) -> FocusRun:
-    """``python -m twin.lab focus``.
+    """Run ``python -m twin.lab focus``.
 
     Raises
     ------
     InputError
-        The camera cannot be built as the file says; a table of measurements cannot be used.
+        The camera cannot be built as the file specifies, or a table of measurements cannot be used.
     BenchError
-        What the file asks for cannot be done.
+        The test cannot be carried out as its file specifies.
     """
     if isinstance(setup, MeasuredFocusSetup):
         return align_files(setup.test, seed, advance)
@@ -307,62 +309,62 @@ def run_focus(setup: ExperimentSetup[Any], backend: Backend, seed: int, advance:
     except TooNarrowError as error:
         raise BenchError(str(error), ("collimator", "aperture"), "a wider collimator") from error
     except (AimError, BeamMissedError, ValueError) as error:
-        raise BenchError(str(error), ("as_built",), "a camera whose whole beam gets through") from error
+        raise BenchError(str(error), ("as_built",), "a camera whose beam passes without vignetting") from error
     _check_light(bench)
     return align(bench, seed, advance)
 
 
 def _require_memory(setup: FocusSetup) -> None:
-    """See whether the frames in focus, and those of one edge in each thread, fit into the memory."""
+    """Raise an error unless the frames in focus and those of one edge per thread fit into memory."""
     test = setup.test
     series = 2 * test.rounds * len(setup.camera.bands) * len(test.fields)  # of edges in two directions
-    each = test.edge.region**2 * (series * _GREY + cores() * _EDGE_PIXEL)
-    require_memory(Lowered(test, ("frames",), test.frames, "frames", lambda frames: frames * each))
+    bytes_per_frame = test.edge.region**2 * (series * _GREY + cores() * _EDGE_PIXEL)
+    require_memory(Lowered(test, ("frames",), test.frames, "frames", lambda frames: frames * bytes_per_frame))
 
 
 def align_files(spec: MeasuredFocusSpec, seed: int = 0, advance: Advance = silent) -> FocusRun:
-    """Read the series, find best focus at every place, fit the plane and decide on shims.
+    """Read a measured series, find best focus at every site, fit the plane and compute the shims.
 
     Parameters
     ----------
     spec : MeasuredFocusSpec
-        Of the test.
+        Specification of the test.
     seed : int
-        Of the command; nothing is drawn.
+        Seed of the command; nothing is drawn.
     advance : Advance
-        Told of the progress.
+        Called with the progress.
 
     Raises
     ------
     InputError
-        a table or an image cannot be used, or no best focus can be told from it.
+        A table or an image cannot be used, or best focus cannot be determined from it.
     BenchError
         The mount does not allow the motion.
     """
-    found = read_focus(spec.measured, advance)
+    readings = read_focus(spec.measured, advance)
     level = None if spec.measured.level is None else LineLevel(spec.measured.level.angle, spec.measured.level.sigma)
-    state = FocusState(found.scans, level)
+    state = FocusState(readings.scans, level)
     present = np.array(spec.shims or [spec.mount.thickness] * len(spec.mount.holes))
     try:
-        move, noise = state.skew
-        # what the skew of the curves says beyond its noise all places share
-        shared = float(np.sqrt(spec.vertex_error**2 + max(move**2 - noise**2, 0.0)))
-        shimming = decide(found.places, state, mount_of(spec), present, (shared, spec.vertex_trend))
+        skew, noise = state.skew
+        # skew of the curves beyond its noise is an error common to all sites
+        shared = float(np.sqrt(spec.vertex_error**2 + max(skew**2 - noise**2, 0.0)))
+        shimming = plan_shimming(readings.places, state, mount_of(spec), present, (shared, spec.vertex_trend))
     except ObservabilityError as error:
-        raise found.table.error(0, "x", str(error).removeprefix("focal plane: ")) from error
+        raise readings.table.error(0, "x", str(error).removeprefix("focal plane: ")) from error
     return FocusRun(
         test=spec,
         seed=seed,
-        bands=found.bands,
-        places=found.places,
+        bands=readings.bands,
+        places=readings.places,
         states=(state,),
         shimmings=(shimming,),
-        readings=found,
+        readings=readings,
     )
 
 
 def _check_light(bench: FocusBench) -> None:
-    """BenchError when the bright side of the edge would saturate, which would falsify its MTF."""
+    """Raise BenchError if the bright side of the edge would saturate, which would falsify its MTF."""
     most = {name: ccd.largest_white for name, ccd in bench.ccds.items()}
     name = min(most, key=lambda n: most[n])
     white = bench.setup.test.white
@@ -375,7 +377,7 @@ def _check_light(bench: FocusBench) -> None:
 
 
 def align(bench: FocusBench, seed: int, advance: Advance = silent) -> SimulatedFocus:
-    """Mis-set the focal plane at random and align it.
+    """Misalign the focal plane at random and align it.
 
     Raises
     ------
@@ -383,20 +385,20 @@ def align(bench: FocusBench, seed: int, advance: Advance = silent) -> SimulatedF
         Best focus lies outside of the scan, or the mount does not allow the motion.
     """
     test = bench.setup.test
-    standing = misset(bench, seed)
+    placement = draw_placement(bench, seed)
     patterns = _patterns(bench, seed)
     mount = mount_of(test)
     present = np.full(len(test.mount.holes), test.mount.thickness)
     places = np.array([site.place for site in bench.sites])
-    states = [_look(bench, standing, patterns, seed, None, 0, advance)]
+    states = [_measure_placement(bench, placement, patterns, seed, None, 0, advance)]
     shimmings: list[Shimming] = []
     for number in range(test.rounds):
-        shimming = decide(places, states[-1], mount, present)
+        shimming = plan_shimming(places, states[-1], mount, present)
         present = shimming.plan.thickness
         shimmings.append(shimming)
         setting = np.random.default_rng(stream(seed, _SETTING, number)).normal(0.0, test.level)
-        standing = Standing(_moved(standing.pose, shimming.plan, mount, float(setting)), standing.heights)
-        states.append(_look(bench, standing, patterns, seed, shimming, number + 1, advance))
+        placement = Placement(_on_new_shims(placement.pose, shimming.plan, mount, float(setting)), placement.heights)
+        states.append(_measure_placement(bench, placement, patterns, seed, shimming, number + 1, advance))
     return SimulatedFocus(
         test=test,
         seed=seed,
@@ -408,57 +410,57 @@ def align(bench: FocusBench, seed: int, advance: Advance = silent) -> SimulatedF
     )
 
 
-def decide(
+def plan_shimming(
     places: np.ndarray,
     state: FocusState,
     mount: Mount,
     present: np.ndarray,
     vertex: tuple[float, float] = (focus_bench.VERTEX_ERROR, focus_bench.VERTEX_TREND),
 ) -> Shimming:
-    """The plane through best focus and the shims that bring the assembly there.
+    """Fit the plane through best focus and compute the shims that bring the assembly there.
 
     Parameters
     ----------
-    places : np.ndarray
-        X', Y' of the sites, (N, 2), metres.
+    places : (N, 2) ndarray
+        Positions X', Y' of the sites, metres.
     state : FocusState
-        As measured; without a level of the line its turn stays as it is.
+        Measured state; without a level of the line its rotation about Z' is not corrected.
     mount : Mount
-        Where the shims are.
-    present : np.ndarray
-        Their thickness, (H,), metres.
-    vertex : tuple[float, float]
-        Error that all vertices share and its trend, metres.
+        Mounting surface with its holes.
+    present : (H,) ndarray
+        Present thickness of the shims, metres.
+    vertex : tuple of float
+        Standard deviations of the error common to all vertices and of its trend, metres.
 
     Raises
     ------
     ObservabilityError
-        The places do not tell a slope.
+        The sites do not determine a slope.
     BenchError
         The mount does not allow the motion.
     """
-    # the plane wants how far best focus lies downstream of the CCD
+    # the plane is fitted to the distance of best focus downstream of the CCD
     plane = fit_focal_plane(places, -state.defocus, state.defocus_sigma, estimate_extra=True)
     return Shimming(plane, plan_shims(plane.correction(state.level), mount, present), *vertex)
 
 
-def misset(bench: FocusBench, seed: int) -> Standing:
-    """How the assembly stands at the beginning, drawn from the seed."""
+def draw_placement(bench: FocusBench, seed: int) -> Placement:
+    """Draw the misaligned placement at the beginning from the seed."""
     spec = bench.setup.test.misset
     random = np.random.default_rng(stream(seed, _MISSET))
     rotation = rotation_matrix(np.array(spec.rotate) * random.standard_normal(3))
     shift = np.array(spec.shift) * random.standard_normal(3)
     heights = {name: float(spec.chips * random.standard_normal()) for name in bench.ccds}
-    return Standing(Pose(rotation, shift), heights)
+    return Placement(Pose(rotation, shift), heights)
 
 
 def mount_of(test: FocusTestSpec | MeasuredFocusSpec) -> Mount:
-    """The mounting surface as its drawing has it, in the assembly's frame.
+    """Return the mounting surface of the drawing, in the assembly's frame.
 
     Raises
     ------
     BenchError
-        Holes that cannot carry a tilt.
+        The holes cannot carry a tilt.
     """
     spec = test.mount
     try:
@@ -468,7 +470,7 @@ def mount_of(test: FocusTestSpec | MeasuredFocusSpec) -> Mount:
 
 
 def plan_shims(correction: RigidMotion, mount: Mount, present: np.ndarray) -> ShimPlan:
-    """Shims for a correction.
+    """Compute the shims for a correction.
 
     Raises
     ------
@@ -482,96 +484,101 @@ def plan_shims(correction: RigidMotion, mount: Mount, present: np.ndarray) -> Sh
             slide, far = max(zip(error.slides, error.holes, strict=True))
             raise BenchError(
                 f"the alignment would slide hole_{far + 1} by {1e3 * slide:.3g} mm in the mounting surface, "
-                f"the screws allow {1e3 * mount.clearance:.3g} mm",
+                f"but the screws allow {1e3 * mount.clearance:.3g} mm",
                 ("mount", "clearance"),
                 "more clearance, or a smaller misset",
             ) from error
         raise BenchError(str(error), ("mount", "thickness"), "thicker shims to begin with") from error
 
 
-def line_turn(pose: Pose) -> float:
-    """Turn of the line about Z', radians."""
+def line_rotation(pose: Pose) -> float:
+    """Return the rotation of the line about Z', radians."""
     x, y, _ = pose.rotation[:, 1]
     return float(np.arctan2(-x, y))
 
 
 def recorder_of(
-    bench: FocusBench, standing: Standing, seed: int, number: int, patterns: Mapping[str, FixedPattern] | None = None
+    bench: FocusBench, placement: Placement, seed: int, number: int, patterns: Mapping[str, FixedPattern] | None = None
 ) -> Recorder:
-    """What records the edges of a standing: the same frames whenever it is asked for the same ones.
+    """Return the recorder of a placement, which returns the same frames for the same arguments.
 
     Parameters
     ----------
     bench : FocusBench
-        The bench.
-    standing : Standing
-        Of the assembly.
+        Bench with the camera.
+    placement : Placement
+        Placement of the assembly.
     seed : int
-        Of the alignment.
+        Seed of the alignment.
     number : int
-        Of the round before it, 0 for none.
-    patterns : Mapping[str, FixedPattern] | None
-        Of the columns; None to draw them, always the same.
+        Number of the round before this placement, 0 for none.
+    patterns : mapping, optional
+        Band -> fixed pattern of its columns; by default drawn from the seed.
     """
     drawn = _patterns(bench, seed) if patterns is None else patterns
-    return Recorder(bench, standing, stream(seed, _SCAN, number), drawn)
+    return Recorder(bench, placement, stream(seed, _SCAN, number), drawn)
 
 
 def _patterns(bench: FocusBench, seed: int) -> dict[str, FixedPattern]:
-    """Fixed pattern of the columns of each band."""
+    """Return the fixed pattern of the columns of each band."""
     return {name: ccd.pattern(stream(seed, _PATTERNS, k)) for k, (name, ccd) in enumerate(bench.ccds.items())}
 
 
-def _look(
+def _measure_placement(
     bench: FocusBench,
-    standing: Standing,
+    placement: Placement,
     patterns: Mapping[str, FixedPattern],
     seed: int,
     shims: Shimming | None,
     number: int,
     advance: Advance,
 ) -> SimulatedState:
-    """Measure one standing of the assembly. Only the first one needs to be searched for focus."""
-    recorder = recorder_of(bench, standing, seed, number, patterns)
+    """Measure one placement of the assembly; only for the first one is focus searched over the whole range."""
+    recorder = recorder_of(bench, placement, seed, number, patterns)
     name = "through focus, before" if number == 0 else f"through focus, round {number}"
     scans = focus_bench.scan(recorder, lambda _, done, total: advance(name, done, total), search=number == 0)
     sigma = bench.setup.test.level
-    true = line_turn(standing.pose)
-    read = true + float(np.random.default_rng(stream(seed, _LEVEL, number)).normal(0.0, sigma))
+    true_angle = line_rotation(placement.pose)
+    reading = true_angle + float(np.random.default_rng(stream(seed, _LEVEL, number)).normal(0.0, sigma))
     return SimulatedState(
         scans,
-        LineLevel(read, sigma),
+        LineLevel(reading, sigma),
         bench,
-        standing,
+        placement,
         focus_bench.in_focus(recorder) if number > 0 else (),
-        np.array([site.defocus(standing.pose, standing.heights[site.band]) for site in bench.sites]),
-        true,
+        np.array([site.defocus(placement.pose, placement.heights[site.band]) for site in bench.sites]),
+        true_angle,
         shims,
     )
 
 
-def _moved(pose: Pose, plan: ShimPlan, mount: Mount, setting: float) -> Pose:
-    """The assembly on its new shims, its turn in the mounting surface set with an error of ``setting`` radians."""
+def _on_new_shims(pose: Pose, plan: ShimPlan, mount: Mount, setting: float) -> Pose:
+    """Return the pose of the assembly on its new shims.
+
+    Its rotation in the mounting surface is set with an error of ``setting`` radians.
+    """
     achieved = plan.achieved
     turned = rotation_matrix(setting * mount.normal) @ achieved.matrix
     return pose @ Pose(turned, achieved.shift)
 
 
 def _holes(values: Iterable[Any]) -> dict[str, Any]:
-    """Values of the mounting holes, (H, ...), by the holes' names."""
+    """Return values of the mounting holes, (H, ...), by the holes' names."""
     return {f"hole_{k + 1}": value for k, value in enumerate(values)}
 
 
 def _ground(metres: Any) -> Any:
-    """Whole steps of the workshop in micrometres; beyond picometres there is only rounding."""
+    """Return whole grinding steps in micrometres, rounded to picometres."""
     return np.round(UM * np.asarray(metres), 6)
 
 
 def _mtf(state: SimulatedState, edge: str, which: int) -> dict[str, float]:
+    """Return band -> MTF in one direction, or its sigma."""
     return {band: pair[which] for band, pair in state.mtf(edge).items()}
 
 
 def _shims(state: SimulatedState) -> Shimming:
+    """Return the shims that led to a state."""
     assert state.shims is not None
     return state.shims
 
@@ -579,28 +586,38 @@ def _shims(state: SimulatedState) -> Shimming:
 SITES: Record[SimulatedState] = Record(
     "One band's CCD in one field.",
     Quantity("band", lambda s: [site.band for site in s.bench.sites], "name of the band"),
-    Quantity("field", lambda s: [site.field for site in s.bench.sites], "share of half the line"),
-    Quantity("defocus_um", lambda s: s.defocus, "how far the CCD stands downstream of best focus"),
+    Quantity(
+        "field", lambda s: [site.field for site in s.bench.sites], "position along the line, fraction of half the line"
+    ),
+    Quantity("defocus_um", lambda s: s.defocus, "defocus of the CCD, positive downstream of best focus"),
     Quantity("defocus_um_sigma", lambda s: s.defocus_sigma, "standard deviation by noise"),
 )
 CORRECTION: Record[Shimming] = Record(
-    "Motion that the measurement asks for. Its sigmas hold noise and the error that all vertices share.",
+    "Motion that corrects the measured defocus. Its sigmas include noise and the error common to all vertices.",
     Quantity("rotation_arcmin", lambda s: s.plan.wanted.rotation, "rotation vector about X', Y', Z'"),
     Quantity("shift_um", lambda s: s.plan.wanted.shift, "shift along X', Y', Z'"),
-    Quantity("piston_um_sigma", lambda s: np.sqrt(s.covariance[0, 0]), "of the shift along Z'"),
-    Quantity("slope_x_arcsec_sigma", lambda s: np.sqrt(s.covariance[1, 1]), "of the rise of best focus along X'"),
-    Quantity("slope_y_arcsec_sigma", lambda s: np.sqrt(s.covariance[2, 2]), "of the rise of best focus along Y'"),
+    Quantity("piston_um_sigma", lambda s: np.sqrt(s.covariance[0, 0]), "standard deviation of the shift along Z'"),
+    Quantity(
+        "slope_x_arcsec_sigma",
+        lambda s: np.sqrt(s.covariance[1, 1]),
+        "standard deviation of the slope of best focus along X'",
+    ),
+    Quantity(
+        "slope_y_arcsec_sigma",
+        lambda s: np.sqrt(s.covariance[2, 2]),
+        "standard deviation of the slope of best focus along Y'",
+    ),
 )
 STATE: Record[SimulatedState] = Record(
-    "The assembly as it was measured.",
+    "Measured state of the assembly.",
     Quantity("confocal_um_max", lambda s: s.confocal[0], "largest distance of a CCD from best focus"),
     Quantity("confocal_um_sigma", lambda s: np.hypot(s.confocal[1], VERTEX_ERROR), "noise and error of the vertices"),
-    Quantity("line_level_arcmin", lambda s: s.level.angle, "turn of the line about Z', by the theodolite"),
+    Quantity("line_level_arcmin", lambda s: s.level.angle, "rotation of the line about Z', by the theodolite"),
     Quantity("line_level_arcmin_sigma", lambda s: s.level.sigma, "standard deviation of the theodolite"),
     Quantity("sites", SITES.rows, "all bands in all fields"),
 )
 ROUND: Record[SimulatedState] = Record(
-    "The assembly on new shims, and how they were decided.",
+    "Measured state of the assembly on new shims, and the shims.",
     *STATE,
     Quantity("mtf_nyquist", lambda s: _mtf(s, TRACK, 0), "band -> MTF along the track, mean of the fields"),
     Quantity("mtf_nyquist_sigma", lambda s: _mtf(s, TRACK, 1), "band -> its standard deviation by noise"),
@@ -608,34 +625,45 @@ ROUND: Record[SimulatedState] = Record(
     Quantity("mtf_nyquist_along_line_sigma", lambda s: _mtf(s, ALONG, 1), "band -> its standard deviation by noise"),
     Quantity("shims_um", lambda s: _holes(_ground(_shims(s).plan.thickness)), "thickness by hole", converted=False),
     Quantity(
-        "shim_changes_um", lambda s: _holes(_ground(_shims(s).plan.rounded_change)), "thicker by hole", converted=False
+        "shim_changes_um",
+        lambda s: _holes(_ground(_shims(s).plan.rounded_change)),
+        "change of thickness by hole",
+        converted=False,
     ),
     Quantity("slides_mm", lambda s: _holes(_shims(s).plan.slide), "displacement in the mounting surface, by hole"),
-    Quantity("turn_by_hand_arcmin", lambda s: _shims(s).plan.turn, "rotation about the normal of the mounting surface"),
-    Quantity("line_level_without_turn_arcmin", lambda s: _shims(s).plan.level_coupling, "error of level without it"),
-    Quantity("correction", _shims, "motion that was asked for", record=CORRECTION),
+    Quantity(
+        "rotation_by_hand_arcmin", lambda s: _shims(s).plan.turn, "rotation about the normal of the mounting surface"
+    ),
+    Quantity(
+        "line_level_without_rotation_arcmin",
+        lambda s: _shims(s).plan.level_coupling,
+        "error of level without this rotation",
+    ),
+    Quantity("correction", _shims, "motion that corrects the measured defocus", record=CORRECTION),
     Quantity("chips_um_rms", lambda s: _shims(s).plane.extra_sigma, "scatter of the CCDs about one plane"),
 )
 BUDGET: Record[BudgetLine] = Record(
-    "What makes one band's MTF at the Nyquist frequency in one direction.",
+    "MTF budget of one band at the Nyquist frequency in one direction.",
     Quantity("band", lambda line: line.band, "name of the band"),
     Quantity("direction", lambda line: line.edge, "along the line or the track"),
-    Quantity("factors", lambda line: line.factors, "effect -> its transfer"),
+    Quantity("factors", lambda line: line.factors, "effect -> its transfer factor"),
     Quantity("total", lambda line: line.total, "product of the factors"),
 )
 TRUE_STATE: Record[SimulatedState] = Record(
-    "The assembly as it stands, by the exact trace.",
+    "True state of the assembly, by the exact trace.",
     Quantity("confocal_um_max", lambda s: np.max(np.abs(s.true_defocus)), "largest distance from best focus"),
-    Quantity("line_level_arcmin", lambda s: s.true_level, "turn of the line about Z'"),
+    Quantity("line_level_arcmin", lambda s: s.true_level, "rotation of the line about Z'"),
     Quantity("mtf_nyquist", lambda s: s.true_mtf, "band -> MTF along the track, mean of the fields"),
-    Quantity("rotation_arcmin", lambda s: rotation_vector(s.standing.pose.rotation), "of the assembly"),
-    Quantity("shift_um", lambda s: s.standing.pose.translation, "of the assembly"),
-    Quantity("chip_height_um", lambda s: s.standing.heights, "band -> height of its chip above the assembly"),
-    Quantity("defocus_um", lambda s: s.true_defocus, "of the sites, in the order of `sites`"),
+    Quantity(
+        "rotation_arcmin", lambda s: rotation_vector(s.placement.pose.rotation), "rotation vector of the assembly"
+    ),
+    Quantity("shift_um", lambda s: s.placement.pose.translation, "shift of the assembly"),
+    Quantity("chip_height_um", lambda s: s.placement.heights, "band -> height of its chip above the assembly"),
+    Quantity("defocus_um", lambda s: s.true_defocus, "defocus of the CCDs in the order of `sites`"),
 )
 TRUTH: Record[SimulatedFocus] = Record(
-    "What the analysis does not know.",
-    Quantity("initial", lambda r: r.states[0], "as the assembly was mis-set", record=TRUE_STATE),
+    "Truth, which the analysis does not know.",
+    Quantity("initial", lambda r: r.states[0], "before the first round", record=TRUE_STATE),
     Quantity("rounds", lambda r: r.states[1:], "after each round", record=TRUE_STATE),
 )
 SIMULATED: Record[SimulatedFocus] = Record(
@@ -644,45 +672,57 @@ SIMULATED: Record[SimulatedFocus] = Record(
     Quantity("seed", lambda r: r.seed, "seed of all that was drawn"),
     Quantity("initial", lambda r: r.states[0], "before the first round", record=STATE),
     Quantity("rounds", lambda r: r.states[1:], "after each round", record=ROUND),
-    Quantity("mtf_budget", lambda r: r.budget, "in the middle of the field", record=BUDGET),
-    Quantity("truth", lambda r: r, "by the exact trace", record=TRUTH),
+    Quantity("mtf_budget", lambda r: r.budget, "MTF budget in the middle of the field", record=BUDGET),
+    Quantity("truth", lambda r: r, "truth by the exact trace", record=TRUTH),
 )
 CURVE: Record[FocusVertex] = Record(
     "A curve through focus.",
-    Quantity("vertex_um", lambda v: v.position, "best focus as a move of the image", "vertex", 2),
+    Quantity("vertex_um", lambda v: v.position, "best focus as a shift of the image", "vertex", 2),
     Quantity("vertex_um_sigma", lambda v: v.sigma, "standard deviation by noise", "sigma", 2),
     Quantity("peak_mtf", lambda v: v.peak, "MTF in best focus", "peak", 4),
     Quantity("peak_mtf_sigma", lambda v: v.peak_sigma, "standard deviation by noise", "sigma of it", 4),
-    Quantity("chi_square", lambda v: v.chi_square, "of the fitted curve", "χ²", 2),
+    Quantity("chi_square", lambda v: v.chi_square, "chi-square of the fitted curve", "χ²", 2),
     Quantity("degrees_of_freedom", lambda v: v.degrees_of_freedom, "points used minus three unknowns", "ν"),
     Quantity("positions", lambda v: len(v.used), "points of the curve", "positions"),
     Quantity("positions_used", lambda v: np.sum(v.used), "points near the peak that the fit uses", "used"),
 )
-_Standing: TypeAlias = tuple[FocusRun, FocusState, Shimming]
-PLACES: Record[_Standing] = Record(
-    "One place of the focal plane, before the shims are changed.",
+_PlacePlane: TypeAlias = tuple[FocusRun, FocusState, Shimming]
+PLACES: Record[_PlacePlane] = Record(
+    "One site of the focal plane, before the shims are changed.",
     Quantity("band", lambda s: list(s[0].bands), "name of the band"),
     Quantity("x_mm", lambda s: s[0].places[:, 0], "X', in the flight direction", "x", 3),
     Quantity("y_mm", lambda s: s[0].places[:, 1], "Y', along the line", "y", 3),
-    Quantity("defocus_um", lambda s: s[1].defocus, "from best focus to the CCD", "CCD downstream of focus", 2),
+    Quantity(
+        "defocus_um",
+        lambda s: s[1].defocus,
+        "defocus of the CCD, positive downstream of best focus",
+        "CCD downstream of focus",
+        2,
+    ),
     Quantity("defocus_um_sigma", lambda s: s[1].defocus_sigma, "standard deviation by noise", "sigma", 2),
     Quantity("residual_um", lambda s: s[2].plane.residual, "best focus minus the fitted plane", "from the plane", 2),
     Quantity(
-        "curves", lambda s: [{e: CURVE(v) for e, v in scan.vertex.items()} for scan in s[1].scans], "by direction"
+        "curves",
+        lambda s: [{e: CURVE(v) for e, v in scan.vertex.items()} for scan in s[1].scans],
+        "direction -> curve through focus",
     ),
 )
 PLANE: Record[Shimming] = Record(
-    "The weighted plane of best focus minus CCD. Its sigmas hold the error that all vertices share.",
+    "Weighted plane of best focus minus CCD. Its sigmas include the error common to all vertices.",
     Quantity("piston_um", lambda s: s.plane.piston, "piston of the plane", decimals=2),
     Quantity("piston_um_sigma", lambda s: np.sqrt(s.plane_covariance[0, 0]), "standard deviation"),
     Quantity("slope_x_arcsec", lambda s: s.plane.slope_x, "slope along X′", decimals=2),
     Quantity("slope_x_arcsec_sigma", lambda s: np.sqrt(s.plane_covariance[1, 1]), "standard deviation"),
     Quantity("slope_y_arcsec", lambda s: s.plane.slope_y, "slope along Y′", decimals=2),
     Quantity("slope_y_arcsec_sigma", lambda s: np.sqrt(s.plane_covariance[2, 2]), "standard deviation"),
-    Quantity("covariance", lambda s: s.plane_covariance, "of piston and slopes, metres and radians"),
-    Quantity("chi_square", lambda s: s.plane.chi_square, "of the places about the plane with their own sigmas"),
-    Quantity("degrees_of_freedom", lambda s: s.plane.degrees_of_freedom, "places minus three unknowns"),
-    Quantity("probability", lambda s: s.plane.p_value, "of such a chi-square or a larger one"),
+    Quantity("covariance", lambda s: s.plane_covariance, "covariance of piston and slopes, metres and radians"),
+    Quantity(
+        "chi_square",
+        lambda s: s.plane.chi_square,
+        "chi-square of the sites about the plane, with their sigmas by noise",
+    ),
+    Quantity("degrees_of_freedom", lambda s: s.plane.degrees_of_freedom, "sites minus three unknowns"),
+    Quantity("probability", lambda s: s.plane.p_value, "p-value of this chi-square"),
     Quantity("chips_um_rms", lambda s: s.plane.extra_sigma, "scatter of the CCDs about one plane, RMS", decimals=2),
 )
 SHIMS: Record[Shimming] = Record(
@@ -696,49 +736,70 @@ SHIMS: Record[Shimming] = Record(
     Quantity("slide_mm", lambda s: s.plan.slide, "displacement in the mounting surface, by hand", "slide", 3),
 )
 ROW_FAULT: Record[RowFault] = Record(
-    "A row of the table with what is wrong with it or with its image.",
-    Quantity("file", lambda one: one.file, "the table that names it"),
-    Quantity("line", lambda one: one.line, "line of the table"),
-    Quantity("reason", lambda one: one.reason, "why"),
+    "Row of the table with the reason why it, or its image, is excluded or doubtful.",
+    Quantity("file", lambda fault: fault.file, "path of the table"),
+    Quantity("line", lambda fault: fault.line, "line of the table"),
+    Quantity("reason", lambda fault: fault.reason, "reason"),
 )
 
 
-def _standing(run: FocusRun) -> _Standing:
+def _first_plane(run: FocusRun) -> _PlacePlane:
+    """Return the run with its first state and the plane fitted to it."""
     return run, run.states[0], run.shimmings[0]
 
 
 MEASURED: Record[FocusRun] = Record(
-    "focus.json of a measured series. Expected: on the new shims, after rounding, where places are best predicted.",
+    "focus.json of a measured series. Expected values: on the new shims, after rounding, by the best prediction.",
     Quantity("name", lambda r: r.test.name, "name of the test"),
-    Quantity("seed", lambda r: r.seed, "of the command; nothing is drawn"),
+    Quantity("seed", lambda r: r.seed, "seed of the command; nothing is drawn"),
     Quantity("confocal_um_max", lambda r: r.states[0].confocal[0], "largest distance of a CCD from best focus"),
     Quantity(
         "confocal_um_sigma",
         lambda r: np.hypot(r.states[0].confocal[1], r.shimmings[0].vertex_error),
         "noise and error of the vertices",
     ),
-    Quantity("line_level_arcmin", lambda r: r.states[0].level and r.states[0].level.angle, "turn about Z'"),
+    Quantity("line_level_arcmin", lambda r: r.states[0].level and r.states[0].level.angle, "rotation about Z'"),
     Quantity("line_level_arcmin_sigma", lambda r: r.states[0].level and r.states[0].level.sigma, "standard deviation"),
-    Quantity("plane", lambda r: r.shimmings[0], "that the shims take away", record=PLANE),
-    Quantity("correction", lambda r: r.shimmings[0], "motion that is asked for", record=CORRECTION),
-    Quantity("shims", lambda r: _holes(SHIMS.rows(r.shimmings[0])), "by hole"),
-    Quantity("turn_by_hand_arcmin", lambda r: r.shimmings[0].plan.turn, "rotation in the mounting surface"),
-    Quantity("line_level_without_turn_arcmin", lambda r: r.shimmings[0].plan.level_coupling, "error without it"),
-    Quantity("expected_confocal_um_max", lambda r: r.shimmings[0].expected[0], "largest expected distance"),
+    Quantity("plane", lambda r: r.shimmings[0], "plane that the shims correct", record=PLANE),
+    Quantity("correction", lambda r: r.shimmings[0], "motion that corrects the measured defocus", record=CORRECTION),
+    Quantity("shims", lambda r: _holes(SHIMS.rows(r.shimmings[0])), "hole -> shim"),
+    Quantity(
+        "rotation_by_hand_arcmin",
+        lambda r: r.shimmings[0].plan.turn,
+        "rotation about the normal of the mounting surface",
+    ),
+    Quantity(
+        "line_level_without_rotation_arcmin", lambda r: r.shimmings[0].plan.level_coupling, "error of level without it"
+    ),
+    Quantity(
+        "expected_confocal_um_max",
+        lambda r: r.shimmings[0].expected[0],
+        "expected largest distance of a CCD from best focus",
+    ),
     Quantity("expected_confocal_um_sigma", lambda r: r.shimmings[0].expected[1], "standard deviation"),
-    Quantity("skew_um", lambda r: r.states[0].skew[0], "move of all vertices if curves may be skewed"),
+    Quantity("skew_um", lambda r: r.states[0].skew[0], "common shift of all vertices if curves may be skewed"),
     Quantity("skew_um_sigma", lambda r: r.states[0].skew[1], "standard deviation by noise"),
-    Quantity("curves_chi_square", lambda r: r.chi_square[0], "of all curves through focus together"),
-    Quantity("curves_degrees_of_freedom", lambda r: r.chi_square[1], "of all curves through focus together"),
-    Quantity("curves_agree", lambda r: likely(*r.chi_square), "whether that is likely"),
-    Quantity("sites", lambda r: PLACES.rows(_standing(r)), "all places"),
-    Quantity("images_without_edge", lambda r: r.readings and r.readings.no_edge, "not measured", record=ROW_FAULT),
-    Quantity("images_with_structure", lambda r: r.readings and r.readings.uneven, "doubtful", record=ROW_FAULT),
-    Quantity("rows_excluded", lambda r: r.readings and r.readings.excluded, "off their curves", record=ROW_FAULT),
-    Quantity("files", lambda r: r.readings and [r.readings.file], "that were read", record=DATA_FILE),
+    Quantity("curves_chi_square", lambda r: r.chi_square[0], "chi-square of all curves through focus"),
+    Quantity("curves_degrees_of_freedom", lambda r: r.chi_square[1], "degrees of freedom of all curves"),
+    Quantity("curves_agree", lambda r: likely(*r.chi_square), "true if its p-value is 0.001 or more"),
+    Quantity("sites", lambda r: PLACES.rows(_first_plane(r)), "all sites"),
+    Quantity(
+        "images_without_edge",
+        lambda r: r.readings and r.readings.no_edge,
+        "images without a measurable edge",
+        record=ROW_FAULT,
+    ),
+    Quantity(
+        "images_with_structure",
+        lambda r: r.readings and r.readings.uneven,
+        "images whose sigma is doubtful",
+        record=ROW_FAULT,
+    ),
+    Quantity("rows_excluded", lambda r: r.readings and r.readings.excluded, "rows off their curves", record=ROW_FAULT),
+    Quantity("files", lambda r: r.readings and [r.readings.file], "files that were read", record=DATA_FILE),
 )
 
 
 def focus_numbers(run: FocusRun) -> dict[str, Any]:
-    """Contents of focus.json without its frames."""
+    """Return the contents of focus.json without its frames."""
     return SIMULATED(run) if isinstance(run, SimulatedFocus) else MEASURED(run)

@@ -1,6 +1,4 @@
-"""A measured through-focus series, from a table of MTF values or from images of a slanted knife edge to best focus at
-every place.
-"""
+"""Measured through-focus series, read from a table of MTF values or of images, with best focus at every site."""
 
 from __future__ import annotations
 
@@ -30,9 +28,10 @@ from twin.laboratory.focus_bench import SiteScan
 from twin.laboratory.measured_readings import DataFile
 from twin.targets.target_images import ALONG, DIRECTIONS
 
-MOST_SITES = 3000
+MAX_SITES = 3000
+"""Largest number of sites of a series."""
 NANOMETRE = 1e-9
-"""Places nearer than this are one."""
+"""Distance below which two positions are the same site, metres."""
 _WHERE = (
     Column("band", text=True, needed=False),
     Column("x", LENGTH, least=-10.0, most=10.0),
@@ -49,21 +48,21 @@ IMAGE_COLUMNS = (
     *(Column(name, needed=False, whole=True, least=1.0, most=1e5) for name in ("height", "width")),
 )
 _FALSE_ALARM = 1e-3
-"""Rate at which one of all rows of a sound table is excluded."""
+"""Probability that any row of a sound table is excluded."""
 _REGION = ("row", "column", "height", "width")
 
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """One place of the focal plane with its rows of the table.
+    """Site of the focal plane with its rows of the table.
 
     Attributes
     ----------
     band : str
-        Whose CCD; empty if the table does not say.
-    place : Array
-        (X', Y'), metres.
-    rows : Mapping[str, NDArray[np.intp]]
+        Band of its CCD; empty if the table has no bands.
+    place : (2,) ndarray
+        Position (X', Y'), metres.
+    rows : mapping
         Edge -> its rows of the table, by shift.
     """
 
@@ -78,7 +77,7 @@ class _Place:
 
 @dataclass(frozen=True, eq=False)
 class RowFault:
-    """A row of the table with what is wrong with it or with its image."""
+    """Row of the table with the reason why it, or its image, is excluded or doubtful."""
 
     file: str
     line: int
@@ -87,26 +86,26 @@ class RowFault:
 
 @dataclass(frozen=True, eq=False)
 class FocusReadings:
-    """A measured through-focus series of N sites.
+    """Measured through-focus series of N sites.
 
     Attributes
     ----------
     table : Table
-        As read.
-    bands : tuple[str, ...]
-        Of the sites; empty names if the table does not say.
-    places : Array
-        (X', Y') of the sites, (N, 2), metres.
-    scans : tuple[SiteScan, ...]
+        Table of the series.
+    bands : tuple of str
+        Bands of the sites; empty names if the table has no bands.
+    places : (N, 2) ndarray
+        Positions (X', Y') of the sites, metres.
+    scans : tuple of SiteScan
         Curves through focus of the sites.
-    no_edge : tuple[RowFault, ...]
+    no_edge : tuple of RowFault
         Images that could not be measured.
-    uneven : tuple[RowFault, ...]
+    uneven : tuple of RowFault
         Images with structure that their edge does not explain.
-    excluded : tuple[RowFault, ...]
-        Rows that disagree with the curve of all others and do not count.
+    excluded : tuple of RowFault
+        Rows that disagree with the curve of all others and have no weight.
     file : DataFile
-        The table's.
+        File of the table.
     """
 
     table: Table
@@ -120,27 +119,27 @@ class FocusReadings:
 
 
 def read_focus(files: FocusFiles, advance: Advance = silent) -> FocusReadings:
-    """Read a through-focus series and find best focus at every place.
+    """Read a through-focus series and find best focus at every site.
 
     Parameters
     ----------
     files : FocusFiles
-        The section of the test's file.
+        Section ``measured`` of the test's file.
     advance : Advance
-        Told of the progress.
+        Called with the progress.
 
     Raises
     ------
     InputError
-        a table or an image cannot be used, or no best focus can be told from it.
+        A table or an image cannot be used, or best focus cannot be determined from it.
     """
     advance("read the series", 0, 1)
     images = files.images is not None
     table = read_table(str(files.images or files.mtf), IMAGE_COLUMNS if images else MTF_COLUMNS, 5)
     sites = _sites(table)
     empty: dict[int, str] = {}
-    found = _from_images(table, files, advance) if images else (table["mtf"], table["sigma"].copy(), empty, empty)
-    mtf, sigma, reasons, doubts = found
+    measured = _from_images(table, files, advance) if images else (table["mtf"], table["sigma"].copy(), empty, empty)
+    mtf, sigma, reasons, warnings = measured
     shift = table["shift"] * _per_shift(table, files)
     excluded: dict[int, str] = {}
     limit = float(np.sqrt(limit_of(_FALSE_ALARM / len(table), 1)))
@@ -156,7 +155,7 @@ def read_focus(files: FocusFiles, advance: Advance = silent) -> FocusReadings:
         np.array([site.place for site in sites]),
         tuple(_scan(table, site, shift, mtf, sigma, reasons) for site in sites),
         _faults(table, reasons),
-        _faults(table, doubts),
+        _faults(table, warnings),
         _faults(table, excluded),
         DataFile.of(table, [column.name for column in _WHERE]),
     )
@@ -168,73 +167,74 @@ def _faults(table: Table, reasons: Mapping[int, str]) -> tuple[RowFault, ...]:
 
 
 def _per_shift(table: Table, files: FocusFiles) -> Array | float:
-    """What a shift of the table is multiplied by to be one of the image along the light."""
+    """Return the factor from a shift in the table to a shift of the image along the light."""
     if files.moved != "target":
         if "per shift" in table:
-            raise table.error(
-                0, "per shift", "only a target's move is another than the image's", allowed="moved: target"
-            )
-        # a CCD that moves downstream sees what it would see if the image moved upstream
+            raise table.error(0, "per shift", "only a target's shift differs from the image's", allowed="moved: target")
+        # moving the CCD downstream is equivalent to moving the image upstream
         return 1.0 if files.moved == "image" else -1.0
     if "per shift" in table:
         return table["per shift"]
     if files.per_shift is None:
-        text = "how far the image moves with the target is not told"
+        text = "the ratio of image shift to target shift is not specified"
         allowed = "per_shift: (f of the camera / f of the collimator)^2, or a column 'per shift'"
         raise files.error(text, ("moved",), found="target", allowed=allowed)
     return files.per_shift
 
 
 def _sites(table: Table) -> tuple[_Place, ...]:
-    """Places in the order of bands as they are named and of their places, each with its rows."""
+    """Return the sites, sorted by band and position, each with its rows."""
     band = table["band"] if "band" in table else np.full(len(table), "", dtype=object)
     edge = table["edge"] if "edge" in table else np.full(len(table), ALONG, dtype=object)
     odd = np.flatnonzero(~np.isin(edge, DIRECTIONS))
     if odd.size:
-        row, found = int(odd[0]), str(edge[odd[0]])
-        meant = nearest(found, DIRECTIONS)
-        raise table.error(row, "edge", "no such direction", found, names_text(DIRECTIONS), meant)
+        row, unknown = int(odd[0]), str(edge[odd[0]])
+        meant = nearest(unknown, DIRECTIONS)
+        raise table.error(row, "edge", "no such direction", unknown, names_text(DIRECTIONS), meant)
     bands, of_band = np.unique(band.astype(str), return_inverse=True)
-    spots = np.rint(table.stacked("x", "y") / NANOMETRE)
-    keys, group = np.unique(np.column_stack([of_band, spots]), axis=0, return_inverse=True)
-    if len(keys) > MOST_SITES:
-        allowed = f"at most {MOST_SITES} places; x and y are those of the field, the same in all rows of a place"
-        raise table.error(0, "x", "too many places", str(len(keys)), allowed)
+    keys_nm = np.rint(table.stacked("x", "y") / NANOMETRE)
+    keys, group = np.unique(np.column_stack([of_band, keys_nm]), axis=0, return_inverse=True)
+    if len(keys) > MAX_SITES:
+        allowed = f"at most {MAX_SITES} sites; x and y are those of the field, the same in all rows of a site"
+        raise table.error(0, "x", "too many sites", str(len(keys)), allowed)
     columns = [table[name] for name in ("sigma", "mtf") if name in table]
     names = [np.unique(table["file"].astype(str), return_inverse=True)[1]] if "file" in table else []
     pages = [table["page"]] if "page" in table else []
     order = np.lexsort((*columns, *pages, *names, table["shift"], edge == DIRECTIONS[1], group.ravel()))
-    directions = [one for one in DIRECTIONS if np.any(edge == one)]
+    directions = [direction for direction in DIRECTIONS if np.any(edge == direction)]
     out = []
     starts = np.searchsorted(group.ravel()[order], np.arange(len(keys) + 1))
     for k in range(len(keys)):
         rows = order[starts[k] : starts[k + 1]]
-        own = {one: rows[edge[rows] == one] for one in directions}
-        site = _Place(str(bands[int(keys[k][0])]), table.stacked("x", "y")[rows[0]], FrozenMap(own))
-        empty = next((one for one, some in own.items() if not some.size), None)
+        rows_by_edge = {direction: rows[edge[rows] == direction] for direction in directions}
+        site = _Place(str(bands[int(keys[k][0])]), table.stacked("x", "y")[rows[0]], FrozenMap(rows_by_edge))
+        empty = next((name for name, edge_rows in rows_by_edge.items() if not edge_rows.size), None)
         if empty is not None:
-            text = f"{site} has no row of the edge {empty!r}, which other places have"
-            raise table.error(int(rows[0]), "edge", text, allowed="both directions at every place, or one at all")
+            text = f"{site} has no row of the edge {empty!r}, which other sites have"
+            raise table.error(
+                int(rows[0]), "edge", text, allowed="both directions at every site, or the same one at all"
+            )
         out.append(site)
     return tuple(out)
 
 
 def _scan(table: Table, site: _Place, shift: Array, mtf: Array, sigma: Array, reasons: Mapping[int, str]) -> SiteScan:
-    """The place's curves and their vertices."""
+    """Fit the vertices of a site's curves through focus."""
     vertex = {}
     for edge, rows in site.rows.items():
         good = int(np.sum(np.isfinite(sigma[rows])))
         try:
             if good < LEAST_POINTS:
                 raise FocusError(
-                    f"{good} positions with an edge of {len(rows)}, at least {LEAST_POINTS} are needed", {}
+                    f"only {good} of {len(rows)} positions have a measurable edge, at least {LEAST_POINTS} are needed",
+                    {},
                 )
             vertex[edge] = focus_vertex(shift[rows], mtf[rows], sigma[rows])
         except FocusError as error:
-            text = f"no best focus of {site}, edge {edge}: {error}; positions are moves of the image, metres"
+            text = f"no best focus of {site}, edge {edge}: {error}; positions are shifts of the image, metres"
             bad = next((reasons[int(row)] for row in rows if int(row) in reasons), "")
             if bad:
-                text += f"; of its first image without an edge: {bad}"
+                text += f"; reason for its first image without an edge: {bad}"
             raise table.error(int(rows[0]), "shift", text) from error
     return SiteScan(
         shift={edge: shift[rows] for edge, rows in site.rows.items()},
@@ -249,11 +249,11 @@ def _scan(table: Table, site: _Place, shift: Array, mtf: Array, sigma: Array, re
 def _from_images(
     table: Table, files: FocusFiles, advance: Advance
 ) -> tuple[Array, Array, dict[int, str], dict[int, str]]:
-    """Return MTF and sigma of every row's image, why some have no edge, and why the sigma of some does not hold."""
-    given = [name for name in _REGION if name in table]
-    if given and len(given) < len(_REGION):
+    """Return MTF and sigma of every row's image, why some have no edge, and doubts about the sigma of others."""
+    region_columns = [name for name in _REGION if name in table]
+    if region_columns and len(region_columns) < len(_REGION):
         allowed = "all of row, column, height and width, or none for whole images"
-        raise table.error(0, given[0], "part of a region only", names_text(given), allowed)
+        raise table.error(0, region_columns[0], "part of a region only", names_text(region_columns), allowed)
     band = table["band"] if "band" in table else np.full(len(table), "", dtype=object)
     stranger = next((name for name in files.noise if name not in set(band)), None)
     if stranger is not None:
@@ -263,9 +263,9 @@ def _from_images(
     models = {name: _noise_model(files, name, spec) for name, spec in files.noise.items()}
     folder = Path(table.file).parent
 
-    def one(row: int) -> tuple[float, float, str, str]:
+    def measure_row(row: int) -> tuple[float, float, str, str]:
         page = int(table["page"][row]) if "page" in table else None
-        region = Region(*(int(table[name][row]) for name in _REGION)) if given else None
+        region = Region(*(int(table[name][row]) for name in _REGION)) if region_columns else None
         try:
             frames = ImageFile.open(folder / str(table["file"][row]), page=page, choose="").frames(region)
         except ImageError as error:
@@ -278,7 +278,7 @@ def _from_images(
 
     results: list[tuple[float, float, str, str]] = []
     with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:
-        for result in pool.map(one, range(len(table))):
+        for result in pool.map(measure_row, range(len(table))):
             results.append(result)
             advance("measure the edges", len(results), len(table))
     mtf, sigma = (np.array([result[k] for result in results], np.float64) for k in (0, 1))
@@ -288,6 +288,7 @@ def _from_images(
 
 
 def _noise_model(files: FocusFiles, name: str, spec: NoiseSpec) -> NoiseModel:
+    """Return the noise model of a band from its specification."""
     try:
         return NoiseModel(**{field: getattr(spec, field) for field in NoiseSpec.model_fields})
     except ValueError as error:

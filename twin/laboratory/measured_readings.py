@@ -1,4 +1,4 @@
-"""Measured readings of a turntable, and spots of a camera on it, from tables to what the analysis takes.
+"""Measured readings of a turntable, and spots of a camera on it, read from tables for the analysis.
 
 Rows are sorted before anything is computed, so that their order in a file changes no bit of a result.
 """
@@ -23,17 +23,17 @@ from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.input_file import digest_of
 from scenes.yaml.units import ANGLE, LENGTH
 
-Places = NDArray[np.int64]
-MOST_ANGLES = 3000
-"""Different angles of a series: the fits have matrices of this many rows and columns."""
-MOST_CELLS = 30_000_000
-"""Angles times the largest number of repeats."""
-SAME_READING = 1e-9
-"""Radians, 0.0002 arcsec: readings nearer than this are repeats of one."""
-MOST_ERROR = np.radians(1.0)
-"""By how much the difference from the reference may change over the region: no dividing error is as large."""
+Integers = NDArray[np.int64]
+MAX_ANGLES = 3000
+"""Largest number of different angles of a series: the fits have matrices with this many rows and columns."""
+MAX_CELLS = 30_000_000
+"""Largest number of angles times the largest number of repeats, to limit memory."""
+READING_TOLERANCE = 1e-9
+"""Difference below which two readings are repeats of the same angle, radians (0.0002 arcsec)."""
+MAX_DIFFERENCE_CHANGE = np.radians(1.0)
+"""Largest change of the difference from the reference over the region, radians; no dividing error is that large."""
 CIRCLE = 2.0 * np.pi
-# Columns that number repeats; share of them that rounding makes equal at most; and so many rows.
+# Columns that number repeats; largest fraction of rows that rounding makes equal; least number of such rows.
 _COUNTS, _COPIED, _LEAST_SET = ("set", "repeat"), 0.8, 3
 READING = Column("reading", ANGLE, least=-2.0 * CIRCLE, most=2.0 * CIRCLE)
 COMPARISON_COLUMNS = (
@@ -59,10 +59,19 @@ SPOT_COLUMNS = (
 
 @dataclass(frozen=True)
 class DataFile:
-    """A file that was read: its path, rows and SHA-256, so that a result can be held against its data.
+    """Data file that was read, identified so that a result can be checked against its data.
 
-    copied: number of rows that repeat another one to the last digit, if all rows of a set do, or most of those that
-        repeat a measurement where sets have no number.
+    Attributes
+    ----------
+    file : str
+        Path of the file.
+    rows : int
+        Number of rows below its heads.
+    sha256 : str
+        SHA-256 of its contents.
+    copied : int
+        Number of rows that repeat another one to the last digit, counted if all rows of a set do, or most of those that
+        repeat a measurement where sets have no number; else 0.
     """
 
     file: str
@@ -72,7 +81,7 @@ class DataFile:
 
     @classmethod
     def of(cls, table: Table, where: Sequence[str]) -> DataFile:
-        """Return the file of a table whose rows were measured in the same place if these columns are equal."""
+        """Return the file of a table; rows with equal values in columns ``where`` repeat the same measurement."""
         code = {name: np.unique(each, return_inverse=True)[1].ravel() for name, each in table.columns.items()}
         copy, again = np.ones((2, len(table)), bool)
         for rows, names in ((copy, set(code) - set(_COUNTS)), (again, set(code) & set(where))):
@@ -83,29 +92,31 @@ class DataFile:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Return what speaks against the file."""
-        text = "of a repeated measurement equal another one to the last digit: were they copied? Sigmas count them all"
+        """Warnings about the contents of the file."""
+        text = (
+            "of a repeated measurement equal another one to the last digit: were they copied? All count in the sigmas"
+        )
         return (f"{self.copied} rows of {self.file} {text}",) if self.copied else ()
 
 
 @dataclass(frozen=True, eq=False)
 class Comparisons:
-    """A measured series.
+    """Measured series of comparisons of a turntable with a reference.
 
     Attributes
     ----------
     series : CalibrationSeries
-        For the analysis.
-    lines : Places
-        Of each comparison in the file, (N, repeats); 0 where none was made.
+        Series for the analysis.
+    lines : (N, repeats) ndarray of int
+        Line of each comparison in the file; 0 where none was made.
     file : DataFile
-        They stand in.
+        File that holds the series.
     head : str
-        Of its readings.
+        Head of its column of readings.
     """
 
     series: CalibrationSeries
-    lines: Places
+    lines: Integers
     file: DataFile
     head: str
 
@@ -116,67 +127,69 @@ class SpotReadings:
 
     Attributes
     ----------
-    reading : Array
-        Of the turntable, (N, S), radians.
+    reading : (N, S) ndarray
+        Readings of the turntable, radians.
     spots : Spots
-        On the line.
-    present : NDArray[np.bool_] | None
-        Which were measured, (N, S); None for all.
-    across : Array | None
-        Of the spots across the line, (N, S), metres; None if the table has no such column.
-    lines : Places
-        In the file, (N, S); 0 where nothing was measured.
+        Spots on the line.
+    present : (N, S) ndarray of bool, or None
+        Spots that were measured; None for all.
+    across : (N, S) ndarray, or None
+        Positions of the spots across the line, metres; None if the table has no such column.
+    lines : (N, S) ndarray of int
+        Lines in the file; 0 where nothing was measured.
     file : DataFile
-        They stand in.
+        File that holds the spots.
     head : str
-        Of its readings.
+        Head of its column of readings.
     numbered : bool
-        The sets have numbers in the file.
+        True if the sets have numbers in the file.
     """
 
     reading: Array
     spots: Spots
     present: NDArray[np.bool_] | None
     across: Array | None
-    lines: Places
+    lines: Integers
     file: DataFile
     head: str
     numbered: bool
 
 
 def read_turntable(files: TurntableFiles) -> tuple[Comparisons, ...]:
-    """The calibration of a turntable and, if there is one, the series at held-out readings.
+    """Read the calibration of a turntable and, if there is one, the series at held-out readings.
 
     Raises
     ------
     InputError
-        a table that cannot be used, with file, line and column.
+        A table cannot be used; the message has file, line and column.
     """
     series = read_comparisons(files.comparisons, files.reference)
     if files.held_out is None:
         return (series,)
-    own = series.series.angle
-    held_out = read_comparisons(files.held_out, files.reference, fewest=1, around=0.5 * float(own[0] + own[-1]))
-    beyond = ~covered(own, held_out.series.angle)
+    calibrated = series.series.angle
+    held_out = read_comparisons(
+        files.held_out, files.reference, fewest=1, around=0.5 * float(calibrated[0] + calibrated[-1])
+    )
+    beyond = ~covered(calibrated, held_out.series.angle)
     if np.any(beyond):
         k = int(np.argmax(beyond))
-        found = f"{np.degrees(held_out.series.angle[k]):.9g} deg"
-        allowed = f"{calibrated_text(own)}, as {files.comparisons} has it"
+        reading = f"{np.degrees(held_out.series.angle[k]):.9g} deg"
+        allowed = f"{calibrated_text(calibrated)}, as {files.comparisons} has it"
         line = int(held_out.lines[k].max())
         text = "a held-out reading beyond the calibrated ones"
-        raise InputError(Issue(text, held_out.file.file, line, (held_out.head,), found, allowed))
+        raise InputError(Issue(text, held_out.file.file, line, (held_out.head,), reading, allowed))
     return series, held_out
 
 
 def calibrated_text(angle: Array) -> str:
-    """Return where a turntable is calibrated at angles (N,), in words: the region, and the gaps in it."""
+    """Describe the region in which a turntable is calibrated at angles (N,), and the gaps in it."""
     holes = [f"{a:.9g} to {b:.9g}" for a, b in np.degrees(gaps(angle))]
     first, last = np.degrees(angle[[0, -1]])
     return f"{first:.9g} to {last:.9g} deg" + (f" without the gaps {', '.join(holes)} deg" if holes else "")
 
 
 def unwrapped(reading: Array, around: float | None = None) -> Array:
-    """Return readings of a circle without a jump of a whole turn among them.
+    """Return readings of a circle without a jump of a full turn among them.
 
     Parameters
     ----------
@@ -196,29 +209,29 @@ def unwrapped(reading: Array, around: float | None = None) -> Array:
 
 
 def read_comparisons(path: str, reference_sigma: float, fewest: int = 4, around: float | None = None) -> Comparisons:
-    """A table of comparisons of a turntable with a reference.
+    """Read a table of comparisons of a turntable with a reference.
 
     Parameters
     ----------
     path : str
-        Of the CSV file.
+        Path of the CSV file.
     reference_sigma : float
-        Of the reference's certificate, radians.
+        Standard deviation from the certificate of the reference, radians.
     fewest : int
-        Different angles.
-    around : float | None
-        As of `unwrapped`.
+        Least number of different angles.
+    around : float, optional
+        Reading around which the circle is unwrapped, as in `unwrapped`.
 
     Raises
     ------
     InputError
-        With file, line and column.
+        The table cannot be used; the message has file, line and column.
     """
     table = read_table(path, COMPARISON_COLUMNS, 2)
     if ("difference" in table) is ("reference" in table):
-        found = "neither" if "difference" not in table else "both"
+        columns = "neither" if "difference" not in table else "both"
         allowed = "'difference [arcsec]', reading minus reference, or 'reference [deg]'"
-        raise InputError(Issue("one column has to say what the reference read", path, 1, (), found, allowed))
+        raise InputError(Issue("a column with the reading of the reference is needed", path, 1, (), columns, allowed))
     reading = unwrapped(table["reading"], around)
     table = replace(table, columns=FrozenMap({**table.columns, "reading": reading}))
     if "difference" in table:
@@ -228,7 +241,7 @@ def read_comparisons(path: str, reference_sigma: float, fewest: int = 4, around:
         # whole turns only, so that the order of rows changes no bit
         value = value - CIRCLE * (np.rint((value - value[0]) / CIRCLE) + np.rint(value[0] / CIRCLE))
     group = _groups(table)
-    # repeats by their number; else by their value, so that the order of rows does not matter
+    # sort repeats by their number, else by their value, so that the order of rows does not matter
     order = np.lexsort((value, table["repeat"] if "repeat" in table else value, group))
     cells = _Cells(table, group[order], order)
     if "repeat" in table:
@@ -239,44 +252,44 @@ def read_comparisons(path: str, reference_sigma: float, fewest: int = 4, around:
     few = cells.count < 2
     if np.any(few):
         remedy = (
-            "2 or more of each, 5 for Chauvenet's criterion to reject any; where the table does not come back to the "
+            "2 or more of each, 5 for Chauvenet's criterion to reject any; where the table does not return to the "
             "same reading, a column 'position' that numbers the stops"
         )
-        text = "one repeat only of this reading, which does not tell its noise"
+        text = "a single repeat of this reading, from which its noise cannot be estimated"
         raise table.error(int(cells.first[int(np.argmax(few))]), "reading", text, allowed=remedy)
     matrix = cells.matrix(value)
     present = cells.present
     mean = np.sum(matrix, axis=1) / cells.count
-    if np.ptp(mean) > MOST_ERROR:
+    if np.ptp(mean) > MAX_DIFFERENCE_CHANGE:
         worst = int(np.argmax(np.abs(mean - np.median(mean))))
         name = "difference" if "difference" in table else "reference"
         text = f"the difference from the reference changes by {np.degrees(np.ptp(mean)):.3g} deg over the region"
-        remedy = "less than 1 deg: reading minus reference, both counted in the same sense and in the unit of the head"
+        remedy = (
+            "less than 1 deg: reading minus reference, both with the same sense of rotation and in the unit of the head"
+        )
         raise table.error(int(cells.first[worst]), name, text, allowed=remedy)
     series = CalibrationSeries(angle, matrix, reference_sigma, present=None if np.all(present) else present)
     return Comparisons(series, cells.matrix(table.lines, 0), DataFile.of(table, ["reading"]), table.heads[READING.name])
 
 
 def read_spots(files: DistortionFiles) -> SpotReadings:
-    """A table of readings and spots.
+    """Read a table of turntable readings and spots.
 
     Parameters
     ----------
     files : DistortionFiles
-        The section of the test's file.
+        Section ``measured`` of the test's file.
 
     Raises
     ------
     InputError
-        With file, line and column.
+        The table cannot be used; the message has file, line and column.
     """
     table = read_table(files.spots, SPOT_COLUMNS, len(CALIBRATED))
-    where, sigma, fixed = _places(table, files)
+    positions, sigma, fixed = _places(table, files)
     numbered = "point" in table
     if "set" in table and not numbered:
-        raise InputError(
-            Issue("sets of points that have no number", files.spots, 1, allowed="a column 'point' as well")
-        )
+        raise InputError(Issue("sets of points without numbers", files.spots, 1, allowed="a column 'point' as well"))
     reading = unwrapped(table["reading"], files.zero)
     group = (
         np.unique(table["point"], return_inverse=True)[1]
@@ -284,7 +297,7 @@ def read_spots(files: DistortionFiles) -> SpotReadings:
         else np.argsort(np.argsort(reading, kind="stable"))
     )
     sets = table["set"] if "set" in table else np.zeros(len(table))
-    order = np.lexsort((where, reading, sets, group))
+    order = np.lexsort((positions, reading, sets, group))
     cells = _Cells(table, group[order], order)
     if "set" in table:
         cells.refuse_twice(sets, "set")
@@ -294,18 +307,18 @@ def read_spots(files: DistortionFiles) -> SpotReadings:
     cells = cells.at(slot)
     _few_points(table, cells, sets if "set" in table else None)
     present = cells.present
-    alone = cells.count < 2
-    if present.shape[1] > 1 and np.any(alone):
-        row = int(cells.first[int(np.argmax(alone))])
-        text = "one spot only of this point in a test of several sets"
+    single = cells.count < 2
+    if present.shape[1] > 1 and np.any(single):
+        row = int(cells.first[int(np.argmax(single))])
+        text = "a single spot of this point in a test of several sets"
         raise table.error(row, "point", text, allowed="2 or more of each, 5 for Chauvenet's criterion to reject any")
-    # what was not measured gets a value of its own point, which no mean takes
-    filled = {name: cells.matrix(value, None) for name, value in (("reading", reading), ("where", where))}
+    # a missing spot gets a value of its point, which no mean uses
+    filled = {name: cells.matrix(value, None) for name, value in (("reading", reading), ("where", positions))}
     spots = Spots(filled["where"], cells.matrix(sigma), cells.matrix(fixed), np.zeros(present.shape))
     if present.shape[1] == 1 and sigma is not None and not np.all(sigma > 0.0) and files.turntable is None:
         row = int(np.argmin(sigma))
         name = "sigma" if "along" in table else "column sigma"
-        text = "one set of points without sigmas, which does not tell their noise"
+        text = "a single set of points without sigmas, from which their noise cannot be estimated"
         shown = name if name in table else ""
         raise table.error(row, shown, text, allowed=f"a column '{name}' above zero, or two sets or more")
     # points in the order of their readings
@@ -313,104 +326,111 @@ def read_spots(files: DistortionFiles) -> SpotReadings:
     spots = Spots(spots.position[rank], spots.temporal[rank], spots.fixed[rank], spots.row[rank])
     across = cells.matrix(table["across"], None)[rank] if "across" in table else None
     lines = cells.matrix(table.lines, 0)[rank]
-    whole = None if np.all(present) else present[rank]
+    mask = None if np.all(present) else present[rank]
     file = DataFile.of(table, ["point" if numbered else "reading"])
     head, named = table.heads[READING.name], "set" in table
-    return SpotReadings(filled["reading"][rank], spots, whole, across, lines, file, head, named)
+    return SpotReadings(filled["reading"][rank], spots, mask, across, lines, file, head, named)
 
 
 def _places(table: Table, files: DistortionFiles) -> tuple[Array, Array, Array]:
-    """Places on the line and their sigmas, new in each exposure and fixed, (rows,), metres."""
+    """Return positions on the line and their sigmas, independent per exposure and fixed, (rows,), metres."""
     if ("along" in table) is ("column" in table):
         found = "neither" if "along" not in table else "both"
         allowed = "'along [mm]' from the line's middle, or 'column' with `line:` in the test's file"
-        raise InputError(Issue("one column has to say where the spots are", files.spots, 1, (), found, allowed))
+        raise InputError(
+            Issue("a column with the positions of the spots is needed", files.spots, 1, (), found, allowed)
+        )
     none = np.zeros(len(table))
     if "along" in table:
-        odd = next((n for n in ("column sigma", "column fixed sigma") if n in table), None)
-        if odd is not None:
-            raise table.error(0, odd, "a sigma in pixels of places in lengths", allowed=f"'{odd[7:]} [um]'")
+        wrong = next((n for n in ("column sigma", "column fixed sigma") if n in table), None)
+        if wrong is not None:
+            raise table.error(0, wrong, "a sigma in pixels for positions in lengths", allowed=f"'{wrong[7:]} [um]'")
         return table["along"], table.columns.get("sigma", none), table.columns.get("fixed sigma", none)
-    odd = next((n for n in ("sigma", "fixed sigma") if n in table), None)
-    if odd is not None:
-        raise table.error(0, odd, "a sigma in lengths of places in pixels", allowed=f"'column {odd}'")
+    wrong = next((n for n in ("sigma", "fixed sigma") if n in table), None)
+    if wrong is not None:
+        raise table.error(0, wrong, "a sigma in lengths for positions in pixels", allowed=f"'column {wrong}'")
     if files.line is None:
         allowed = "line: {pitch: 7 um, middle: 6143.5}"
-        raise files.error("places in pixels need the line's pixels", ("spots",), found="column", allowed=allowed)
+        raise files.error(
+            "positions in pixels need the pixel pitch of the line", ("spots",), found="column", allowed=allowed
+        )
     pitch = files.line.pitch
-    own, fixed = (table.columns.get(n, none) for n in ("column sigma", "column fixed sigma"))
-    return (table["column"] - files.line.middle) * pitch, own * pitch, fixed * pitch
+    temporal, fixed = (table.columns.get(n, none) for n in ("column sigma", "column fixed sigma"))
+    return (table["column"] - files.line.middle) * pitch, temporal * pitch, fixed * pitch
 
 
 def _few_points(table: Table, cells: _Cells, sets: Array | None) -> None:
-    """InputError unless there are points enough, in all and in each set, and not more than fit into memory."""
+    """Raise InputError for too few points, in all or in a set, or more than fit into memory."""
     count, need = len(cells.count), len(CALIBRATED) + 2
-    if count < need or count > MOST_ANGLES:
+    if count < need or count > MAX_ANGLES:
         few = "too few points" if count < need else "too many points"
         remedy = (
-            f"{need} or more, over the whole field" if count < need else f"at most {MOST_ANGLES}; 'point' numbers them"
+            f"{need} or more, over the whole field" if count < need else f"at most {MAX_ANGLES}; 'point' numbers them"
         )
         raise table.error(0, "", few, str(count), remedy)
-    own = cells.present.sum(axis=0)
-    if np.min(own) < need:
-        k = int(np.argmin(own))
+    points_per_set = cells.present.sum(axis=0)
+    if np.min(points_per_set) < need:
+        k = int(np.argmin(points_per_set))
         row = int(np.flatnonzero(cells.slot == k)[0])
         row = int(cells.order[row])
         name = "point" if sets is None else "set"
-        text = f"a set of {own[k]} points"
+        text = f"a set of {points_per_set[k]} points"
         raise table.error(row, name if name in table else "", text, allowed=f"{need} or more in every set")
 
 
-def _groups(table: Table) -> Places:
-    """Number of the angle that each row belongs to, (rows,), rising with the readings."""
+def _groups(table: Table) -> Integers:
+    """Return the number of the angle to which each row belongs, (rows,), increasing with the readings."""
     reading = table["reading"]
     if "position" in table:
         _, group = np.unique(table["position"], return_inverse=True)
-        # the smallest reading of a stop, whose order is that of the means where no two stops overlap, and which no
-        # order of rows rounds differently
+        # the smallest reading of a stop has the order of the means where no two stops overlap, and
+        # does not depend on the order of rows by rounding
         least = np.full(int(group.max()) + 1, np.inf)
         np.minimum.at(least, group, reading)
         return np.asarray(np.argsort(np.argsort(least, kind="stable"))[group], np.int64)
     order = np.argsort(reading, kind="stable")
-    new = np.concatenate([[0], np.cumsum(np.diff(reading[order]) > SAME_READING)])
+    new = np.concatenate([[0], np.cumsum(np.diff(reading[order]) > READING_TOLERANCE)])
     group = np.empty(len(reading), np.int64)
     group[order] = new
     return group
 
 
 class _Cells:
-    """Rows of a table, sorted, as a matrix of groups and their members.
+    """Sorted rows of a table as a matrix of groups and their members.
 
     Parameters
     ----------
     table
-        With the rows.
+        Table with the rows.
     group
-        Of the sorted rows, (rows,), not falling.
+        Group of each sorted row, (rows,), non-decreasing.
     order
         Row of the table of each sorted row, (rows,).
     slot
-        Place of each sorted row among the columns; by default members of a group one after the other.
+        Column of each sorted row in the matrix; by default members of a group one after the other.
     """
 
-    def __init__(self, table: Table, group: Places, order: Places, slot: Places | None = None) -> None:
+    def __init__(self, table: Table, group: Integers, order: Integers, slot: Integers | None = None) -> None:
         self.table, self.order = table, order
         _, start, self.group, self.count = np.unique(group, return_index=True, return_inverse=True, return_counts=True)
         self.first = order[start]
         self.slot = np.arange(len(order)) - start[self.group] if slot is None else slot
         width = int(self.slot.max()) + 1
-        if len(self.count) * width > MOST_CELLS:
+        if len(self.count) * width > MAX_CELLS:
             text = f"{len(self.count)} angles with up to {width} repeats each"
-            raise table.error(0, "", "too many to hold", text, "fewer repeats")
+            raise table.error(0, "", "too many for the memory", text, "fewer repeats")
         self.present = np.zeros((len(self.count), width), bool)
         self.present[self.group, self.slot] = True
 
-    def at(self, slot: Places) -> _Cells:
-        """The cells of this matrix in other columns."""
+    def at(self, slot: Integers) -> _Cells:
+        """Return the rows of this matrix in other columns."""
         return _Cells(self.table, self.group, self.order, slot)
 
-    def matrix(self, value: Array | Places, empty: float | None = 0.0) -> np.ndarray:
-        """Values of the table's rows as a matrix; what is empty gets that value, None for the first of its group."""
+    def matrix(self, value: Array | Integers, empty: float | None = 0.0) -> np.ndarray:
+        """Return values of the table's rows as a matrix.
+
+        Empty cells get ``empty``, or with None the first value of their group.
+        """
         start = (
             np.asarray(value)[self.first] if empty is None else np.full(len(self.count), empty, np.asarray(value).dtype)
         )
@@ -419,7 +439,7 @@ class _Cells:
         return out
 
     def centre(self, value: Array) -> Array:
-        """Mean of every group, (N,); exactly the value where all are the same."""
+        """Return the mean of every group, (N,); exactly the value where all are equal."""
         least, most = (np.full(len(self.count), side) for side in (np.inf, -np.inf))
         np.minimum.at(least, self.group, value[self.order])
         np.maximum.at(most, self.group, value[self.order])
@@ -427,45 +447,45 @@ class _Cells:
         return np.where(least == most, least, mean)
 
     def refuse_twice(self, number: Array, name: str) -> None:
-        """InputError where two rows of a group have the same number."""
-        own = number[self.order]
-        same = (np.diff(self.group) == 0) & (np.diff(own) == 0)
+        """Raise InputError if two rows of a group have the same number."""
+        numbers = number[self.order]
+        same = (np.diff(self.group) == 0) & (np.diff(numbers) == 0)
         if np.any(same):
             k = int(np.argmax(same))
             first, again = sorted((int(self.order[k]), int(self.order[k + 1])))
             text = f"the same {name} twice, first in line {self.table.lines[first]}"
-            raise self.table.error(again, name, text, f"{own[k]:g}", "every number once for each angle")
+            raise self.table.error(again, name, text, f"{numbers[k]:g}", "every number once for each angle")
 
 
 def _check_angles(cells: _Cells, angle: Array, fewest: int) -> None:
-    """InputError unless there are as many different readings as are needed, and not more than fit into memory."""
+    """Raise InputError for too few different readings, or more than fit into memory."""
     count = len(angle)
-    if fewest <= count <= MOST_ANGLES:
+    if fewest <= count <= MAX_ANGLES:
         return
     text, remedy = (
-        ("few", f"{fewest} or more; where the table does not come back to the same reading, a column 'position'")
+        ("few", f"{fewest} or more; where the table does not return to the same reading, a column 'position'")
         if count < fewest
-        else ("many", f"at most {MOST_ANGLES}; a column 'position' numbers the stops of the table")
+        else ("many", f"at most {MAX_ANGLES}; a column 'position' numbers the stops of the table")
     )
     raise cells.table.error(0, READING.name, f"too {text} different readings", str(count), remedy)
 
 
 def _check_positions(cells: _Cells, reading: Array, angle: Array) -> None:
-    """InputError unless readings of one position lie nearer to it than half way to the next, which stands elsewhere."""
+    """Raise InputError unless readings of a position are nearer to its mean than half the distance to the next one."""
     if "position" not in cells.table or len(angle) < 2:
         return
     same = np.diff(angle) == 0.0
     if np.any(same):
         rows = sorted(int(row) for row in cells.first[int(np.argmax(same)) :][:2])
         text = f"two positions with the same readings, the other in line {cells.table.lines[rows[0]]}"
-        allowed = "one number for all comparisons of a stop, however often the table came back to it"
+        allowed = "the same number for all comparisons of a stop, however often the table returned to it"
         raise cells.table.error(rows[1], "position", text, f"{cells.table['position'][rows[1]]:g}", allowed)
     rank = np.sort(angle)
     at = np.searchsorted(rank, angle)
     gap = np.diff(rank)
     room = 0.5 * np.minimum(np.concatenate([[np.inf], gap])[at], np.concatenate([gap, [np.inf]])[at])
-    off = np.abs(reading[cells.order] - angle[cells.group]) > room[cells.group]
-    if np.any(off):
-        row = int(cells.order[int(np.argmax(off))])
+    beyond = np.abs(reading[cells.order] - angle[cells.group]) > room[cells.group]
+    if np.any(beyond):
+        row = int(cells.order[int(np.argmax(beyond))])
         text = "a reading that is nearer to those of another position"
         raise cells.table.error(row, "reading", text, allowed="the position's own number in this row")

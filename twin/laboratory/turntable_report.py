@@ -1,6 +1,4 @@
-"""Report of a turntable test: what was found, how well, and what limits it; of a simulated table also beside its
-truth.
-"""
+"""Report of a turntable test: results, accuracy and its limits; of a simulated table also the truth."""
 
 from __future__ import annotations
 
@@ -32,7 +30,7 @@ FIT_NAMES = {
     "fourier": "Fourier series",
     "network": "network",
 }
-"""Names of the fits for readers."""
+"""Fit -> its name for readers."""
 COLOURS = {
     "piecewise_linear": svg.ORANGE,
     "polynomial": svg.PURPLE,
@@ -44,7 +42,7 @@ _CURVE_POINTS = 801
 
 
 def comparison_figure(run: TurntableRun) -> Figure:
-    """All comparisons about the mean of those that are kept, and the RMS at each angle before and after rejection."""
+    """Draw all comparisons about their accepted mean, and the RMS at each angle before and after rejection."""
     series = run.series
     angle = np.degrees(series.angle)
     off = series.from_mean / ARCSEC
@@ -53,10 +51,10 @@ def comparison_figure(run: TurntableRun) -> Figure:
     keep = series.keep
     figure = svg.new_figure(5.2)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
-    top.plot(places[keep], off[keep], ".", color=svg.BLUE, ms=3.5, label=f"kept, {np.sum(keep)}")
+    top.plot(places[keep], off[keep], ".", color=svg.BLUE, ms=3.5, label=f"accepted, {np.sum(keep)}")
     rejected = series.excluded_comparisons
     top.plot(places[rejected], off[rejected], "x", color=svg.VERMILION, ms=5.5, label=f"rejected, {series.rejected}")
-    top.set(title="Comparisons, minus the mean of those kept at their angle", ylabel="arcsec")
+    top.set(title="Comparisons minus the mean of those accepted at their angle", ylabel="arcsec")
     top.margins(y=0.18)
     top.legend(loc="upper right", ncols=2)
     bottom.plot(angle, series.rms_before / ARCSEC, "o-", color=svg.GREY, ms=3.5, lw=0.9, label="all repeats")
@@ -73,7 +71,7 @@ def comparison_figure(run: TurntableRun) -> Figure:
 
 
 def curve_figure(run: TurntableRun) -> Figure:
-    """The measured dividing error with the chosen fit and, of a simulated table, the true curve."""
+    """Draw the measured dividing error with the chosen fit and, for a simulated table, the true curve."""
     series, held = run.series, run.held_out
     chosen = run.choice.chosen
     at = np.linspace(*run.compensation.region, _CURVE_POINTS)
@@ -106,7 +104,7 @@ def curve_figure(run: TurntableRun) -> Figure:
 
 
 def residual_figure(run: TurntableRun) -> Figure:
-    """For each fit, ranked: the held-out points and, of a simulated table, the true curve, both minus the fit."""
+    """Draw held-out points minus each fit, best first, and for a simulated table the true curve minus the fit."""
     at = np.linspace(*run.compensation.region, _CURVE_POINTS)
     held = run.held_out
     assert held is not None
@@ -142,13 +140,13 @@ def residual_figure(run: TurntableRun) -> Figure:
 
 
 def _slow_truth(model: TurntableModel, at: np.ndarray) -> np.ndarray:
-    """True dividing error without the subdivision error, whose period is far below what a figure can show."""
+    """Return the true dividing error without the subdivision error, whose period is too short for a plot."""
     error = model.error
     return error(at) - error.parts["subdivision"](at)
 
 
 def _readings(run: TurntableRun) -> str:
-    """Which readings were compared."""
+    """Describe the readings that were compared."""
     series = run.series
     first, last = np.degrees(run.compensation.region)
     least, most = int(np.min(series.counts)), int(np.max(series.counts))
@@ -160,44 +158,49 @@ def _readings(run: TurntableRun) -> str:
 
 
 def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
+    """Return the section on the comparisons with the reference."""
     series = run.series
     text = [
-        f"Chauvenet's criterion rejects {series.rejected} of {np.sum(series.taken)} comparisons. It would reject "
+        f"Chauvenet's criterion rejects {series.rejected} of {np.sum(series.taken)} comparisons. By chance it would "
+        "reject "
         f"{result['rejected_expected_by_chance']:.0f} on average if all were good: it trims normal noise, and the RMS "
         "that remains is that of trimmed readings, for which the σ of one comparison is corrected."
     ]
     if result["suspect_angles"]:
         text.append(
-            f"At {result['suspect_angles']} of the angles the kept repeats scatter more than their number allows: "
-            "gross errors that hide each other. Those angles are given the sigma of their own repeats; "
+            f"At {result['suspect_angles']} of the angles the accepted repeats scatter more than their number allows: "
+            "gross errors that mask each other. Those angles get the sigma of their own repeats; "
             "measure them again."
         )
     figure = SvgFigure(
         "turntable-comparisons",
         "Comparisons with the reference",
-        "Above, all repeats; below, their RMS at each angle, and what the mean of all repeats would have at worst.",
+        "Above, all repeats; below, their RMS at each angle, and the largest RMS of the mean of all repeats.",
         svg.drawn("turntable-comparisons", comparison_figure, run),
     )
     return Section("Regional comparison of the turntable", tuple(text), (figure,))
 
 
 def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
+    """Return the section on the fits of the dividing error."""
     fits, chosen, held, model = result["fits"], result["chosen"], run.held_out, run.model
     best = result["ranking"][0]
     ranking_text = (
         "ranked by cross-validation: there are no held-out readings, so that an error with a period below the step "
-        "stays unseen"
+        "is not detected"
         if held is None
-        else f"ranked at {len(held.angle)} held-out readings, measured in a series of their own with "
+        else f"ranked at {len(held.angle)} held-out readings, measured in a separate series with "
         f"σ = {result['heldout_arcsec_sigma']:.4f} arcsec each"
     )
     held_out_text = (
-        "" if held is None else f"; it has {fits[chosen]['heldout_rms_arcsec']:.4f} arcsec at the held-out readings"
+        ""
+        if held is None
+        else f"; its RMS residual at the held-out readings is {fits[chosen]['heldout_rms_arcsec']:.4f} arcsec"
     )
     text = [
         f"Fits of the means, {ranking_text}. Cross-validation on the calibration points alone chooses the "
         f"{FIT_NAMES[chosen]}{held_out_text}."
-        + ("" if held is None or best == chosen else f" There the {FIT_NAMES[best]} is the best.")
+        + ("" if held is None or best == chosen else f" The {FIT_NAMES[best]} has the smallest residual there.")
     ]
     if model is not None:
         subdivision = model.spec.dividing_error.subdivision
@@ -206,8 +209,9 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
             text.append(
                 f"A step of the calibration is {round(periods)} whole periods of the grating's signal "
                 f"({subdivision.period / ARCSEC:.4g} arcsec), so that all calibration points lie at one phase and "
-                "cannot see the subdivision error. The held-out readings lie at all phases, as the readings in use do: "
-                "what no fit can follow is in their residuals."
+                "do not show the subdivision error. The held-out readings lie at all phases, as the readings in use "
+                "do: "
+                "their residuals include what no fit can represent."
             )
     text += [f"The {FIT_NAMES[name]} failed: {failure}." for name, failure in result["failed"].items()]
     drawn = "the chosen fit" if model is None else "the chosen fit and the true curve without its subdivision error"
@@ -225,7 +229,7 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
         artefacts.append(
             SvgFigure(
                 "turntable-residuals",
-                "What the fits miss",
+                "Residuals of the fits",
                 note,
                 svg.drawn("turntable-residuals", residual_figure, run),
             )
@@ -238,23 +242,23 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
 
 
 def rejected_table(record: Record[Any], name: str, what: str, rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return what Chauvenet's criterion takes out, by the lines of its files."""
-    note, shown = "Difference from the mean of those that stay.", [{**r, "file": Path(r["file"]).name} for r in rows]
-    return record.table(name, f"{what} that Chauvenet's criterion takes out", note, shown)
+    """Return the table of rows that Chauvenet's criterion rejects, with the lines of their files."""
+    note, shown = "Difference from the mean of the accepted ones.", [{**r, "file": Path(r["file"]).name} for r in rows]
+    return record.table(name, f"{what} that Chauvenet's criterion rejects", note, shown)
 
 
 def _ranking(result: Mapping[str, Any]) -> Table:
-    """All fits, the best first; of a simulated table also against the truth."""
+    """Return the table of all fits, the best first; for a simulated table also against the truth."""
     fits, truth = result["fits"], result.get("truth")
     keys = ["heldout_rms_arcsec", "train_rms_arcsec", "cross_validation_rms_arcsec", "effective_parameters"]
     note = "RMS, the best fit first."
     if truth is not None:
         note += (
             " The last two columns use the true curve, which no test in a laboratory has: over the whole region and "
-            "all phases of the signal, and the same without a constant, which differences of angles do not see."
+            "all phases of the signal, and without a constant, which differences of angles do not show."
         )
         fits = {name: {**fit, **truth["fits"][name]} for name, fit in fits.items()}
-        keys += [one.key for one in turntable_run.TRUE_FIT]
+        keys += [quantity.key for quantity in turntable_run.TRUE_FIT]
     rows = {FIT_NAMES[name]: fits[name] for name in result["ranking"]}
     return Record("A fit.", *turntable_run.FIT, *turntable_run.TRUE_FIT).table(
         "turntable-fits", "The fits", note, rows, keys, "fit"
@@ -262,47 +266,52 @@ def _ranking(result: Mapping[str, Any]) -> Table:
 
 
 def _noise(run: TurntableRun) -> float:
-    """Sigma that noise of the calibration leaves in a compensated angle, mean over its readings, arcsec."""
+    """Return the sigma of a compensated angle by noise of the calibration, RMS over its readings, arcsec."""
     return float(np.sqrt(np.mean(np.diag(run.compensation.fit.covariance(run.series.angle))))) / ARCSEC
 
 
 def _left(run: TurntableRun, result: Mapping[str, Any]) -> Table:
+    """Return the table of the remaining error of a compensated angle."""
     noise = "noise of the calibration, mean over its readings [arcsec]", DecimalNumber(_noise(run), 4)
     lines = [noise, *turntable_run.COMPENSATION.lines(result["compensation"])]
-    title = "What is left of a compensated angle"
+    title = "Remaining error of a compensated angle"
     return Table("turntable-sigma", title, "Without the repeatability of one comparison.", ("part", "σ"), lines)
 
 
 def _chi_square(result: Mapping[str, Any]) -> Table:
+    """Return the table of chi-square of the chosen fit."""
     keys = ["fit_chi_square", "fit_degrees_of_freedom", "heldout_chi_square", "heldout_degrees_of_freedom"]
     lines = TURNTABLE.lines(result, keys if result["heldout_degrees_of_freedom"] else keys[:2])
     note = (
-        "Of the means against their sigmas, and of held-out readings against all that the compensation states. Far "
-        "above the degrees of freedom, the fit misses more than noise; the misfits stand for it."
+        "Chi-square of the means against their sigmas, and of held-out readings against the compensation's covariance. "
+        "Far "
+        "above the degrees of freedom, the fit has errors beyond noise, which the misfits cover."
     )
     return Table("turntable-chi-square", "Chi-square of the chosen fit", note, ("", ""), lines)
 
 
 def turntable_report(run: TurntableRun) -> Report:
-    """Report of a turntable test."""
+    """Build the report of a turntable test."""
     data, spec = TURNTABLE(run), run.spec
     chosen, parts, truth = data["chosen"], data["compensation"], data.get("truth")
     sigma = float(np.sqrt(np.mean(run.compensation.sigma(run.series.angle) ** 2))) / ARCSEC
-    names = {"common": "an offset common to all readings", "smooth": "what the fit misses between its points"}
-    names["white"] = "what changes from reading to reading"
+    names = {"common": "an offset common to all readings", "smooth": "the misfit between the calibrated points"}
+    names["white"] = "errors independent from reading to reading"
     size = {name: parts[f"{part}_arcsec"] for part, name in names.items()}
     size["the noise of the calibration"] = _noise(run)
     limit = max(size, key=lambda name: size[name])
     span = float(np.ptp(run.series.mean)) / ARCSEC
     missed = data["fits"][chosen]["heldout_rms_arcsec"]
-    missed_text = "" if missed is None else f" and misses held-out angles by {missed:.3f} arcsec RMS"
-    missed_text += "" if truth is None else f" and the truth by {truth['fits'][chosen]['true_rms_arcsec']:.3f} arcsec"
+    missed_text = "" if missed is None else f", with errors of {missed:.3f} arcsec RMS at held-out angles"
+    missed_text += (
+        "" if truth is None else f" and true errors of {truth['fits'][chosen]['true_rms_arcsec']:.3f} arcsec RMS"
+    )
     verdict, more = answer(
         f"The dividing error spans {span:.2f} arcsec",
         f"the {FIT_NAMES[chosen]} compensates it to σ = {sigma:.3f} arcsec{missed_text}, limited by {limit}",
         f"repeats scatter by {data['repeatability_arcsec']:.3f} arcsec",
-        f"of {int(np.sum(run.series.taken))} comparisons {data['rejected']} were rejected, where "
-        f"{data['rejected_expected_by_chance']:.0f} are expected without gross errors: see what is left of a compensated "
+        f"{data['rejected']} of {int(np.sum(run.series.taken))} comparisons were rejected, "
+        f"{data['rejected_expected_by_chance']:.0f} expected by chance: see the remaining error of a compensated "
         "angle",
     )
     judged_key = "cross_validation_rms_arcsec" if run.held_out is None else "heldout_rms_arcsec"
@@ -322,8 +331,8 @@ def turntable_report(run: TurntableRun) -> Report:
         more,
         (
             ("Calibration", _readings(run)),
-            ("Reference", f"its certificate: {format_quantity(certified, ANGLE)} at each position"),
-            *(("File", f"{one['file']}, {one['rows']} rows") for one in data.get("files", ())),
+            ("Reference", f"σ = {format_quantity(certified, ANGLE)} at each position, by its certificate"),
+            *(("File", f"{file['file']}, {file['rows']} rows") for file in data.get("files", ())),
             ("Description", spec.description),
         ),
         Table("dividing-error", "Result", f"Fits in the order of their RMS {by}.", ("", "RMS"), rows),
@@ -333,22 +342,27 @@ def turntable_report(run: TurntableRun) -> Report:
 
 
 def _warnings(run: TurntableRun, data: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the warnings of the report."""
     warnings = []
     if run.too_few:
         warnings.append(f"too few angles for: {', '.join(FIT_NAMES[name] for name in run.too_few)}")
     if run.held_out is None:
         warnings.append(
-            "no held-out readings: an error with a period below the step, as the subdivision error, is in no sigma here"
+            "no held-out readings: the sigmas do not include errors with a period below the step, as the subdivision "
+            "error"
         )
     elif (tail := float(chi2.sf(data["heldout_chi_square"], data["heldout_degrees_of_freedom"]))) < DOUBTFUL:
         warnings.append(
-            f"held-out readings scatter more than the compensation states: chi-square {data['heldout_chi_square']:.0f} "
-            f"for {data['heldout_degrees_of_freedom']} degrees of freedom, by chance once in {1.0 / tail:.0f}"
+            "held-out readings scatter more than the compensation's covariance: chi-square "
+            f"{data['heldout_chi_square']:.0f} "
+            f"for {data['heldout_degrees_of_freedom']} degrees of freedom, p = {tail:.2g}"
         )
     if len(holes := np.degrees(gaps(run.series.angle))):
         arcs = ", ".join(f"{first:.9g} to {last:.9g} deg" for first, last in holes)
         warnings.append(f"the calibration has gaps in which no reading is compensated: {arcs}")
     warnings += [doubt for table in run.tables for doubt in table.file.doubts]
     if data["suspect_angles"]:
-        warnings.append(f"angles whose kept repeats scatter more than their number allows: {data['suspect_angles']}")
+        warnings.append(
+            f"angles whose accepted repeats scatter more than their number allows: {data['suspect_angles']}"
+        )
     return tuple(warnings)

@@ -1,18 +1,15 @@
-"""The turntable test of paper 004 (section 3.3): a table whose dividing error nobody knows is compared with a
-reference, five fits are made of the comparisons and judged on angles that no fit has seen.
+"""Turntable test of paper 004 (section 3.3): the dividing error of a table from comparisons with a reference.
 
-The analysis gets the comparisons and the certificate of the reference, of a simulated bench or from files of
-measurements. The true dividing error of a simulated table is only compared with.
+Five fits are made of the comparisons and ranked on angles that no fit has used. The analysis gets the comparisons and
+the certificate of the reference, of a simulated bench or from files of measurements. The true dividing error of a
+simulated table serves for comparison only.
 
-A turntable with a dividing error, and its comparison with a reference, simulated.
+Dividing error = reading - true angle: the table that reads R is at the true angle phi = R - e(R). e is a sum of
+harmonics of the full turn; the subdivision error is a few harmonics of the grating's signal. All coefficients are drawn
+from the seed, so that the turntable test and the distortion test of one seed use the same table. All angles are in
+radians.
 
-Dividing error = reading - true angle: the table that reads R stands at phi = R - e(R). e is a sum of harmonics of the
-turn; the subdivision error is a few harmonics of the grating's signal. All coefficients are drawn from the seed, so
-that the turntable test and the distortion test of one seed use the same table.
-
-Radians.
-
-Numbers of a turntable test, as turntable.json has them.
+The records at the end define the contents of turntable.json.
 """
 
 from __future__ import annotations
@@ -49,20 +46,21 @@ from twin.framework.record import Quantity, Record
 from twin.laboratory.measured_readings import Comparisons, DataFile, read_turntable
 
 _TABLE, _CALIBRATION, _HELD_OUT, _SPREAD = range(4)
-"""Numbers of the seed's random streams."""
+"""Numbers of the random streams of the seed."""
 _FIXED_POINT_STEPS = 8
+"""Fixed-point iterations from a true angle to a reading; they leave less than rounding errors."""
 
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """sum_k cosine_k cos(k R) + sine_k sin(k R).
+    """Periodic function sum_k cosine_k cos(k R) + sine_k sin(k R) of the reading R.
 
     Attributes
     ----------
-    order : NDArray[np.int64]
-        k, periods in a full turn, (K,).
-    cosine, sine : Array
-        (K,), radians.
+    order : (K,) ndarray of int
+        Periods in a full turn, k.
+    cosine, sine : (K,) ndarray
+        Coefficients, radians.
     """
 
     order: NDArray[np.int64]
@@ -71,38 +69,38 @@ class Harmonics:
 
     @classmethod
     def draw(cls, order: ArrayLike, rms: Array, rng: np.random.Generator) -> Harmonics:
-        """Normal coefficients, such that each harmonic's mean square over the circle is expected to be rms^2, (K,)."""
+        """Draw normal coefficients, with which the mean square of harmonic k over the circle is rms_k^2 on average."""
         k = np.asarray(order, np.int64)
         cosine, sine = rng.standard_normal((2, len(k))) * rms
         return cls(k, cosine, sine)
 
     def __call__(self, reading: ArrayLike) -> Array:
-        """The sum at readings, in their shape."""
+        """Return the sum at readings, in their shape."""
         at = np.asarray(reading, np.float64)
         phase = at.ravel()[:, None] * self.order
         return (np.cos(phase) @ self.cosine + np.sin(phase) @ self.sine).reshape(at.shape)
 
     @property
     def rms(self) -> float:
-        """Over the full circle, radians."""
+        """RMS over the full circle, radians."""
         return float(np.sqrt(0.5 * np.sum(self.cosine**2 + self.sine**2)))
 
 
 @dataclass(frozen=True, eq=False)
 class DividingError:
-    """The true dividing error of one table, reading - true angle, as a function of the reading.
+    """True dividing error of one table, reading - true angle, as a function of the reading.
 
     Attributes
     ----------
-    parts : Mapping[str, Harmonics]
-        Axis, eccentricity, graduation, subdivision.
+    parts : mapping
+        Cause -> harmonics: axis, eccentricity, graduation, subdivision.
     """
 
     parts: Mapping[str, Harmonics]
 
     @classmethod
     def draw(cls, spec: DividingErrorSpec, seed: int) -> DividingError:
-        """A table; spec and seed determine it."""
+        """Draw a table, which is determined by specification and seed."""
         rng = np.random.default_rng(stream(seed, _TABLE))
         g, sub = spec.graduation, spec.subdivision
         lines = np.arange(g.first, g.last + 1)
@@ -120,20 +118,20 @@ class DividingError:
         )
 
     def __call__(self, reading: ArrayLike) -> Array:
-        """Exact dividing error at readings, in their shape, radians."""
+        """Return the exact dividing error at readings, in their shape, radians."""
         return np.asarray(sum(part(reading) for part in self.parts.values()), np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class TurntableModel:
-    """A table and the reference it is compared with.
+    """Simulated turntable and the reference with which it is compared.
 
     Attributes
     ----------
     spec : TurntableTestSpec
-        Of the test.
+        Specification of the test.
     seed : int
-        Of everything that is random.
+        Seed of everything that is drawn.
     """
 
     spec: TurntableTestSpec
@@ -144,24 +142,24 @@ class TurntableModel:
         """True dividing error of this table; the analysis does not get it."""
         return DividingError.draw(self.spec.dividing_error, self.seed)
 
-    def stand(self, reading: ArrayLike, rng: np.random.Generator | None = None) -> Array:
-        """True angles at which the table stands when it reads this, in the shape of the readings, radians.
+    def true_angle(self, reading: ArrayLike, rng: np.random.Generator | None = None) -> Array:
+        """Return the true angles of the table at these readings, in the shape of the readings, radians.
 
         Parameters
         ----------
-        reading : ArrayLike
-            radians.
-        rng : np.random.Generator | None
-            Of the repeatability; None for a table that repeats perfectly.
+        reading : array_like
+            Readings, radians.
+        rng : Generator, optional
+            Random generator of the repeatability; None for a table that repeats perfectly.
         """
-        at = np.asarray(reading, np.float64)
-        return at - self.error(at) - self._scatter(at.shape, rng)
+        readings = np.asarray(reading, np.float64)
+        return readings - self.error(readings) - self._scatter(readings.shape, rng)
 
-    def read(self, true_angle: ArrayLike, rng: np.random.Generator | None = None) -> Array:
-        """Readings of a table that stands at these true angles; the inverse of `stand`.
+    def reading(self, true_angle: ArrayLike, rng: np.random.Generator | None = None) -> Array:
+        """Return the readings of the table at these true angles, the inverse of `true_angle`, radians.
 
-        R = phi + e(R) by fixed-point steps: |de/dR| is a few times 1e-2 (subdivision), so that eight of them leave less
-        than rounding.
+        R = phi + e(R) is solved by fixed-point steps: |de/dR| is a few times 1e-2 (subdivision), so that eight steps
+        leave less than rounding errors.
         """
         phi = np.asarray(true_angle, np.float64)
         scatter = self._scatter(phi.shape, rng)
@@ -171,67 +169,70 @@ class TurntableModel:
         return reading
 
     def _scatter(self, shape: tuple[int, ...], rng: np.random.Generator | None) -> Array:
+        """Draw the repeatability error; zeros without a generator."""
         if rng is None:
             return np.zeros(shape)
         return rng.normal(0.0, self.spec.dividing_error.repeatability, shape)
 
     def calibrate(self) -> CalibrationSeries:
-        """The regional comparison."""
+        """Simulate the regional comparison."""
         plan = self.spec.calibration
         return self._compare(self._steps(0.0, plan.count), plan.repeats, _CALIBRATION)
 
     def held_out(self) -> CalibrationSeries:
-        """The separate series at angles in the middle of the steps, set off by the spread."""
+        """Simulate the separate series at angles in the middle of the steps, displaced at random up to the spread."""
         plan = self.spec.calibration
         rng = np.random.default_rng(stream(self.seed, _SPREAD))
         off = rng.uniform(-plan.held_out.spread, plan.held_out.spread, plan.count - 1)
         return self._compare(self._steps(0.5, plan.count - 1) + off, plan.held_out.repeats, _HELD_OUT)
 
     def _steps(self, start: float, count: int) -> Array:
-        """So many readings a step apart, from this many steps after the first, radians."""
+        """Return ``count`` readings a step apart, radians, the first ``start`` steps after the first calibrated one."""
         plan = self.spec.calibration
         return np.asarray(plan.first + plan.step * (np.arange(count) + start), np.float64)
 
     def _compare(self, angle: Array, repeats: int, number: int) -> CalibrationSeries:
+        """Simulate comparisons of the table with the reference."""
         rng = np.random.default_rng(stream(self.seed, number))
         reference = self.spec.reference
         shape = len(angle), repeats
-        known = rng.normal(0.0, reference.calibration, len(angle))
+        reference_error = rng.normal(0.0, reference.calibration, len(angle))
         readings = np.broadcast_to(angle[:, None], shape)
-        seen = self.stand(readings, rng) + known[:, None] + rng.normal(0.0, reference.noise, shape)
+        measured = self.true_angle(readings, rng) + reference_error[:, None] + rng.normal(0.0, reference.noise, shape)
         gross = rng.random(shape) < reference.gross_probability
-        seen = seen + gross * rng.choice([-1.0, 1.0], shape) * reference.gross_error
-        return CalibrationSeries(angle, readings - seen, reference.calibration)
+        measured = measured + gross * rng.choice([-1.0, 1.0], shape) * reference.gross_error
+        return CalibrationSeries(angle, readings - measured, reference.calibration)
 
 
 TRUTH_READINGS = 4000
-"""Readings at which fits are compared with the true curve."""
+"""Number of readings at which fits are compared with the true curve."""
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+"""Golden ratio minus one, which spreads the readings evenly."""
 
 
 @dataclass(frozen=True, eq=False)
 class TurntableRun:
-    """One turntable test, on a simulated bench or on measured readings.
+    """Turntable test on a simulated bench or on measured readings.
 
     Attributes
     ----------
-    spec : TurntableTestSpec | MeasuredTurntableSpec
-        Of the test.
+    spec : TurntableTestSpec or MeasuredTurntableSpec
+        Specification of the test.
     seed : int
-        Of all that is drawn: the simulated bench, and the network's starts.
+        Seed of all that is drawn: the simulated bench, and the starting values of the network.
     series : CalibrationSeries
         Comparisons at the calibrated readings.
-    held_out : CalibrationSeries | None
-        Comparisons at readings that no fit has seen; None if there are none.
+    held_out : CalibrationSeries or None
+        Comparisons at readings that no fit has used; None if there are none.
     choice : Choice
         Fits and their cross-validation.
     compensation : DividingCompensation
-        Of the chosen fit.
-    model : TurntableModel | None
-        The simulated table and reference, which hold the truth; None for measurements.
-    tables : tuple[Comparisons, ...]
-        The series as read from files; empty for a simulated bench.
-    too_few : tuple[str, ...]
+        Compensation by the chosen fit.
+    model : TurntableModel or None
+        Simulated table and reference, which hold the truth; None for measurements.
+    tables : tuple of Comparisons
+        Series that were read from files; empty for a simulated bench.
+    too_few : tuple of str
         Fits that need more angles than there are.
     """
 
@@ -247,35 +248,34 @@ class TurntableRun:
 
     @property
     def fits(self) -> dict[str, AngleFit]:
-        """The fits that succeeded, in the order in which they were made."""
+        """Fits that succeeded, in the order in which they were made."""
         return {name: trial.fit for name, trial in self.choice.trials.items()}
 
     def residual(self, name: str) -> Array:
-        """Measured - fitted dividing error at the calibrated readings, (N,), radians."""
+        """Return measured - fitted dividing error at the calibrated readings, (N,), radians."""
         return self.series.mean - self.fits[name](self.series.angle)
 
     def true_residual(self, name: str) -> Array:
-        """Fitted - true dividing error of a simulated table at `truth_readings`, radians."""
+        """Return fitted - true dividing error of a simulated table at `truth_readings`, radians."""
         return self.fits[name](self.truth_readings) - self.true_error
 
     def held_out_residual(self, name: str) -> Array:
-        """Measured - fitted dividing error at the held-out readings, radians."""
+        """Return measured - fitted dividing error at the held-out readings, radians."""
         assert self.held_out is not None
         return self.held_out.mean - self.fits[name](self.held_out.angle)
 
     def held_out_rms(self, name: str) -> float | None:
-        """RMS of `held_out_residual`, radians; None without held-out readings."""
+        """Return the RMS of `held_out_residual`, radians; None without held-out readings."""
         return None if self.held_out is None else rms(self.held_out_residual(name))
 
     def _judged(self, name: str) -> float:
+        """Return the RMS by which a fit is ranked, radians."""
         held_out = self.held_out_rms(name)
         return self.choice[name].validation.rms if held_out is None else held_out
 
     @cached_property
     def ranking(self) -> tuple[str, ...]:
-        """Names of the fits by their RMS at the held-out readings, the best first; without such readings by
-        cross-validation.
-        """
+        """Names of the fits, the best first, by RMS at the held-out readings or, without these, by cross-validation."""
         return tuple(sorted(self.fits, key=self._judged))
 
     @cached_property
@@ -286,8 +286,9 @@ class TurntableRun:
 
     @cached_property
     def held_out_chi_square(self) -> tuple[float, int] | tuple[None, None]:
-        """Chi-square at the held-out readings, against all that the compensation states, and its degrees of freedom;
-        None without such readings.
+        """Chi-square at the held-out readings and its degrees of freedom; None without such readings.
+
+        Its covariance is that of the readings plus the full covariance of the compensation.
         """
         if self.held_out is None:
             return None, None
@@ -300,7 +301,7 @@ class TurntableRun:
     def truth_readings(self) -> Array:
         """Readings spread evenly over the region and over the phases of the grating's signal, increasing, radians."""
         first, last = self.compensation.region
-        # multiples of the golden ratio: no common measure with the signal's period, unlike an even grid
+        # multiples of the golden ratio have no common measure with the signal's period, unlike an even grid
         return np.sort(first + (last - first) * np.mod(_GOLDEN * np.arange(1, TRUTH_READINGS + 1), 1.0))
 
     @cached_property
@@ -316,23 +317,23 @@ def run_turntable(
     progress: Callable[[str], None] | None = None,
     names: Sequence[str] = tuple(FITS),
 ) -> TurntableRun:
-    """Simulate or read the comparisons, clean them, fit them, choose a fit and make the compensation of it.
+    """Simulate or read the comparisons, reject outliers, fit them, choose a fit and build its compensation.
 
     Parameters
     ----------
-    spec : TurntableTestSpec | MeasuredTurntableSpec
-        Of the test.
+    spec : TurntableTestSpec or MeasuredTurntableSpec
+        Specification of the test.
     seed : int
-        Of all that is drawn; with the spec it determines everything.
-    progress : Callable[[str], None] | None
-        Told what is being done.
-    names : Sequence[str]
-        Of the fits; the network takes nearly all of the time.
+        Seed of all that is drawn; with the specification it determines everything.
+    progress : callable, optional
+        Called with a text that says what is being done.
+    names : sequence of str
+        Names of the fits to make; the network takes nearly all of the time.
 
     Raises
     ------
     InputError
-        a table cannot be used, or there are fewer angles than a fit and its cross-validation need.
+        A table cannot be used, or there are fewer angles than a fit and its cross-validation need.
     """
     say = progress or (lambda text: None)
     model: TurntableModel | None = None
@@ -358,7 +359,7 @@ def run_turntable(
 
 
 def _check_count(spec: TurntableTestSpec, names: Sequence[str]) -> None:
-    """InputError unless the simulated calibration has angles enough for every fit."""
+    """Raise InputError if the simulated calibration has too few angles for a fit."""
     plan = spec.calibration
     left = angles_left(plan.count, plan.folds)
     short = [name for name in names if left < fewest(name)]
@@ -372,16 +373,16 @@ def _check_count(spec: TurntableTestSpec, names: Sequence[str]) -> None:
 
 
 def usable_fits(
-    files: TurntableFiles, found: Comparisons, names: Sequence[str]
+    files: TurntableFiles, comparisons: Comparisons, names: Sequence[str]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The fits of which there are angles enough, and the others.
+    """Return the fits for which there are enough angles, and the others.
 
     Raises
     ------
     InputError
-        There are enough for none.
+        There are too few angles for any fit.
     """
-    count = len(found.series.angle)
+    count = len(comparisons.series.angle)
     left = angles_left(count, files.folds)
     enough = tuple(name for name in names if left >= fewest(name))
     if not enough:
@@ -392,30 +393,36 @@ def usable_fits(
 
 
 def rms(value: Array) -> float:
-    """Root of the mean square."""
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(value**2)))
 
 
 def run_turntable_test(
     setup: ExperimentSetup[Any], backend: Backend, seed: int, advance: Advance = silent
 ) -> TurntableRun:
-    """``python -m twin.lab turntable``; nothing is traced, so that the backend is not used. Raises InputError."""
+    """Run ``python -m twin.lab turntable``; nothing is traced, so that the backend is not used.
+
+    Raises
+    ------
+    InputError
+        A table cannot be used, or there are too few angles.
+    """
     return run_turntable(setup.test, seed, lambda part: advance(part, 0, 1))
 
 
 DOUBTFUL = 1e-3
-"""Chance below which a chi-square is told as a warning."""
+"""p-value of a chi-square below which a warning is given."""
 
 
 def likely(chi_square: float, degrees: int) -> bool | None:
-    """Return whether a chi-square as large has a chance of DOUBTFUL at least; None without degrees of freedom.
+    """Return True if the p-value of a chi-square is at least DOUBTFUL; None without degrees of freedom.
 
     Parameters
     ----------
     chi_square : float
-        Of residuals against their sigmas.
+        Chi-square of residuals against their sigmas.
     degrees : int
-        Of freedom.
+        Degrees of freedom.
     """
     return bool(chance_beyond(chi_square, degrees) >= DOUBTFUL) if degrees else None
 
@@ -428,11 +435,19 @@ DATA_FILE: Record[DataFile] = Record(
     Quantity("copied", lambda f: f.copied, "rows that repeat another one to the last digit"),
 )
 REJECTED: Record[Comparisons] = Record(
-    "A comparison that Chauvenet's criterion takes out, and where it stands.",
+    "Comparison that Chauvenet's criterion rejects, and its line in the file.",
     Quantity("file", lambda c: [c.file.file] * c.series.rejected, "path of its table"),
     Quantity("line", lambda c: c.lines[c.series.excluded_comparisons], "line in this file"),
-    Quantity("reading_deg", lambda c: c.series.angle[np.nonzero(c.series.excluded_comparisons)[0]], "reading", decimals=6),
-    Quantity("from_mean_arcsec", lambda c: c.series.from_mean[c.series.excluded_comparisons], "minus the mean", "from the mean", 3),
+    Quantity(
+        "reading_deg", lambda c: c.series.angle[np.nonzero(c.series.excluded_comparisons)[0]], "reading", decimals=6
+    ),
+    Quantity(
+        "from_mean_arcsec",
+        lambda c: c.series.from_mean[c.series.excluded_comparisons],
+        "difference from the mean",
+        "from the mean",
+        3,
+    ),
 )
 FIT: Record[tuple[TurntableRun, str]] = Record(
     "One fit of the dividing error; the source is the run and the fit's name.",
@@ -440,10 +455,10 @@ FIT: Record[tuple[TurntableRun, str]] = Record(
     Quantity("train_rms_arcsec", lambda s: rms(s[0].residual(s[1])), "RMS residual", "training points", 4),
     Quantity("cross_validation_rms_arcsec", lambda s: s[0].choice[s[1]].validation.rms, "RMS", "cross-validation", 4),
     Quantity("effective_parameters", lambda s: s[0].fits[s[1]].effective_parameters, "trace of smoothing", decimals=1),
-    Quantity("settings", lambda s: s[0].fits[s[1]].settings, "what was selected: order, period, smoothing, trainings"),
+    Quantity("settings", lambda s: s[0].fits[s[1]].settings, "selected settings: order, period, smoothing, trainings"),
 )
 COMPENSATION: Record[DividingCompensation] = Record(
-    "What a compensated angle is wrong by beside the calibration's noise: one sigma of each part.",
+    "Standard deviations of the errors of a compensated angle beyond the calibration's noise.",
     Quantity("common_arcsec", lambda c: c.common, "a constant, the same at all readings", decimals=4),
     Quantity("smooth_arcsec", lambda c: c.smooth, "misfit along the curve, correlated over one step", decimals=4),
     Quantity("white_arcsec", lambda c: c.white, "misfit of each reading by itself", decimals=4),
@@ -451,10 +466,16 @@ COMPENSATION: Record[DividingCompensation] = Record(
 TRUE_FIT: Record[Any] = Record(
     "A fit minus the true curve.",
     Quantity("true_rms_arcsec", rms, "RMS difference", "truth", 4),
-    Quantity("true_spread_arcsec", np.std, "the same without a constant, which no angle sees", "truth, no constant", 4),
+    Quantity(
+        "true_spread_arcsec",
+        np.std,
+        "RMS difference without a constant, which angle differences do not show",
+        "truth, no constant",
+        4,
+    ),
 )
 TRUTH: Record[TurntableRun] = Record(
-    "What no test in a laboratory has.",
+    "Truth, which no test in a laboratory has.",
     Quantity("fits", lambda r: {n: r.true_residual(n) for n in r.fits}, "name -> fit minus truth", record=TRUE_FIT),
     Quantity("dividing_error_spread_arcsec", lambda r: np.std(r.true_error), "RMS of the true curve about its mean"),
     Quantity("part_rms_full_circle_arcsec", lambda r: _parts(r), "cause -> RMS of its error over the full circle"),
@@ -463,33 +484,34 @@ _Points: TypeAlias = tuple[TurntableRun, CalibrationSeries]
 POINTS: Record[_Points] = Record(
     "One reading and its comparisons with the reference, reading minus reference.",
     Quantity("reading_deg", lambda s: s[1].angle, "reading of the table"),
-    Quantity("mean_arcsec", lambda s: s[1].mean, "mean of the comparisons that are kept"),
+    Quantity("mean_arcsec", lambda s: s[1].mean, "mean of the accepted comparisons"),
     Quantity("mean_arcsec_sigma", lambda s: s[1].sigma, "standard deviation of this mean"),
     Quantity("rms_before_arcsec", lambda s: s[1].rms_before, "RMS scatter of all comparisons"),
-    Quantity("rms_after_arcsec", lambda s: s[1].rms_after, "RMS scatter of the comparisons that are kept"),
+    Quantity("rms_after_arcsec", lambda s: s[1].rms_after, "RMS scatter of the accepted comparisons"),
     Quantity("comparisons_arcsec", lambda s: _each(s[1], s[1].comparisons), "all comparisons"),
-    Quantity("kept", lambda s: _each(s[1], s[1].keep), "whether Chauvenet's criterion keeps each comparison"),
-    Quantity("fitted_arcsec", lambda s: _fitted(*s), "fit -> dividing error by it"),
+    Quantity("kept", lambda s: _each(s[1], s[1].keep), "true for each comparison that Chauvenet's criterion accepts"),
+    Quantity("fitted_arcsec", lambda s: _fitted(*s), "fit -> fitted dividing error"),
 )
 
 
 def _each(series: CalibrationSeries, values: Any) -> list[Any]:
-    """Values (N, repeats) of a series, reading by reading, without those of comparisons that were not made."""
+    """Return values (N, repeats) of a series, reading by reading, without those of comparisons that were not made."""
     return [row[taken] for row, taken in zip(values, series.taken, strict=True)]
 
 
 def _fitted(run: TurntableRun, series: CalibrationSeries) -> list[dict[str, float]]:
-    """Fit -> dividing error, at every reading of a series, radians."""
+    """Return fit -> dividing error, radians, at every reading of a series."""
     values = {name: fit(series.angle) for name, fit in run.fits.items()}
     return [dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True)]
 
 
 def _parts(run: TurntableRun) -> dict[str, float]:
+    """Return cause -> RMS of its dividing error over the full circle, radians; empty for measurements."""
     return {} if run.model is None else {name: part.rms for name, part in run.model.error.parts.items()}
 
 
 def rejected_rows(tables: tuple[Comparisons, ...]) -> list[dict[str, Any]]:
-    """Rows of `REJECTED` of all tables that were read."""
+    """Return the rows of `REJECTED` of all tables that were read."""
     return [row for table in tables for row in REJECTED.rows(table)]
 
 
@@ -504,22 +526,32 @@ TURNTABLE: Record[TurntableRun] = Record(
         decimals=3,
     ),
     Quantity(
-        "chauvenet_rms_arcsec", lambda r: np.max(r.series.rms_after), "the largest of those that are kept", decimals=3
+        "chauvenet_rms_arcsec",
+        lambda r: np.max(r.series.rms_after),
+        "largest RMS of the accepted repeats at a reading",
+        decimals=3,
     ),
     Quantity(
-        "averaging_alone_rms_arcsec", lambda r: r.series.averaging_alone, "largest RMS of a mean of all", decimals=3
+        "averaging_alone_rms_arcsec",
+        lambda r: r.series.averaging_alone,
+        "largest RMS of the mean of all repeats",
+        decimals=3,
     ),
-    Quantity("mean_rms_arcsec", lambda r: r.series.mean_rms, "largest RMS of a mean of what is kept", decimals=3),
-    Quantity("repeatability_arcsec", lambda r: r.series.repeatability, "one comparison, σ of all together", decimals=3),
-    Quantity("rejected", lambda r: r.series.rejected, "comparisons that Chauvenet's criterion takes out"),
-    Quantity("rejected_expected_of_good", lambda r: expected_rejections(r.series.counts), "average if all were good"),
+    Quantity(
+        "mean_rms_arcsec", lambda r: r.series.mean_rms, "largest RMS of the mean of the accepted repeats", decimals=3
+    ),
+    Quantity("repeatability_arcsec", lambda r: r.series.repeatability, "one comparison, pooled σ", decimals=3),
+    Quantity("rejected", lambda r: r.series.rejected, "comparisons that Chauvenet's criterion rejects"),
+    Quantity(
+        "rejected_expected_by_chance", lambda r: expected_rejections(r.series.counts), "rejections expected by chance"
+    ),
     Quantity("suspect_angles", lambda r: np.sum(r.series.suspect), "readings that still scatter after the criterion"),
     Quantity("heldout_arcsec_sigma", lambda r: r.held_out and rms(r.held_out.sigma), "RMS sigma of the held-out means"),
     Quantity("fits", lambda r: {n: (r, n) for n in r.fits}, "name -> fit", record=FIT),
-    Quantity("failed", lambda r: r.choice.failed, "name of a fit -> why it failed"),
+    Quantity("failed", lambda r: r.choice.failed, "name of a fit -> reason of its failure"),
     Quantity("chosen", lambda r: r.choice.chosen, "fit that cross-validation chooses"),
     Quantity("ranking", lambda r: r.ranking, "fits by their RMS at held-out readings or cross-validation, best first"),
-    Quantity("compensation", lambda r: r.compensation, "of the chosen fit", record=COMPENSATION),
+    Quantity("compensation", lambda r: r.compensation, "compensation by the chosen fit", record=COMPENSATION),
     Quantity("points", lambda r: POINTS.rows((r, r.series)), "calibrated readings"),
     Quantity("heldout_points", lambda r: POINTS.rows((r, r.held_out)) if r.held_out else [], "held-out readings"),
     Quantity("fit_chi_square", lambda r: r.chi_square[0], "chi-square against the sigmas of the means", decimals=1),
@@ -527,19 +559,30 @@ TURNTABLE: Record[TurntableRun] = Record(
     Quantity(
         "heldout_chi_square",
         lambda r: r.held_out_chi_square[0],
-        "of held-out readings against the compensation",
+        "chi-square of held-out readings against the compensation",
         decimals=1,
     ),
     Quantity("heldout_degrees_of_freedom", lambda r: r.held_out_chi_square[1], "number of held-out readings"),
-    Quantity("heldout_agrees", lambda r: r.held_out and likely(*r.held_out_chi_square), "whether that is likely"),
     Quantity(
-        "rejected_readings", lambda r: rejected_rows(r.tables) if r.tables else None, "in files", where_known=True
+        "heldout_agrees",
+        lambda r: r.held_out and likely(*r.held_out_chi_square),
+        "true if its p-value is 0.001 or more",
     ),
     Quantity(
-        "too_few_angles_for", lambda r: r.too_few if r.tables else None, "fits that were left out", where_known=True
+        "rejected_readings",
+        lambda r: rejected_rows(r.tables) if r.tables else None,
+        "rejected comparisons in the files",
+        where_known=True,
     ),
     Quantity(
-        "files", lambda r: [t.file for t in r.tables] or None, "that were read", record=DATA_FILE, where_known=True
+        "too_few_angles_for", lambda r: r.too_few if r.tables else None, "fits that were omitted", where_known=True
     ),
-    Quantity("truth", lambda r: r.model and r, "of a simulated table", record=TRUTH, where_known=True),
+    Quantity(
+        "files",
+        lambda r: [t.file for t in r.tables] or None,
+        "files that were read",
+        record=DATA_FILE,
+        where_known=True,
+    ),
+    Quantity("truth", lambda r: r.model and r, "truth of a simulated table", record=TRUTH, where_known=True),
 )

@@ -124,12 +124,12 @@ class SpotTest:
     @cached_property
     def true_place(self) -> Array:
         """L of the chief rays, (N,), metres."""
-        return self.run.means.mean(self.run.truth.place[..., 0])
+        return self.run.means.mean(self.run.truth.position[..., 0])
 
     @cached_property
     def true_turn(self) -> Array:
         """W, (N,), radians."""
-        return self.run.means.mean(self.run.truth.turn)
+        return self.run.means.mean(self.run.truth.field_angle)
 
     @cached_property
     def camera(self) -> Perspective:
@@ -327,7 +327,7 @@ def _sensitivity(context: Context, tests: Sequence[SpotTest], facts: Facts) -> I
     """The rows of the sources of error."""
     if not context.wants("004.sensitivity"):
         return
-    half = np.flatnonzero(np.abs(tests[0].run.bench.turn) <= 0.5 * tests[0].run.bench.turn[-1])
+    half = np.flatnonzero(np.abs(tests[0].run.bench.field_angle) <= 0.5 * tests[0].run.bench.field_angle[-1])
     whole = slice(None)
     raw = [np.asarray(t.run.raw.fit.angle) for t in tests]
     all_raw, inner = (np.array([t.errors(w, k) for t, w in zip(tests, raw, strict=True)]) for k in (whole, half))

@@ -22,7 +22,7 @@ from scenes.specs.resolved import FocusSetup
 from twin.framework.artefact import Cell
 from twin.framework.svg import AFTER, BEFORE, INK, LIGHT
 from twin.laboratory.focus_bench import NYQUIST, FocusBench
-from twin.laboratory.focus_run import FocusState, SimulatedFocus, align, line_turn, mount_of
+from twin.laboratory.focus_run import FocusState, SimulatedFocus, align, line_rotation, mount_of
 from twin.targets.target_images import TRACK
 from twin.validation.check import CheckResult, Chosen, mean_of, rms
 from twin.validation.group import Context, drawing, group_of, load_printed
@@ -80,7 +80,7 @@ def _parameters(bench: FocusBench, pose: Pose) -> Array:
     places = np.array([site.place for site in bench.sites])
     piston, slope_x, slope_y = np.linalg.lstsq(np.column_stack([np.ones(len(places)), places]), defocus)[0]
     # a rotation (a, b, c) lifts a point by a Y' - b X'
-    return np.array([slope_y, -slope_x, line_turn(pose), *pose.translation[:2], piston])
+    return np.array([slope_y, -slope_x, line_rotation(pose), *pose.translation[:2], piston])
 
 
 def _coupling(context: Context, bench: FocusBench) -> CheckResult:
@@ -132,12 +132,12 @@ class Plan:
     @cached_property
     def moved(self) -> Pose:
         """Where the assembly would truly stand after exactly the motion wanted."""
-        return self.alignment.states[0].standing.pose @ Pose(self.motion.matrix, self.motion.shift)
+        return self.alignment.states[0].placement.pose @ Pose(self.motion.matrix, self.motion.shift)
 
     @property
     def left(self) -> Array:
         """True defocus of every site there, (N,), metres."""
-        heights = self.alignment.states[0].standing.heights
+        heights = self.alignment.states[0].placement.heights
         return np.array([site.defocus(self.moved, heights[site.band]) for site in self.alignment.bench.sites])
 
     @property
@@ -202,7 +202,9 @@ def _edges(alignment: SimulatedFocus, band: str) -> list[EdgeMtf]:
     """Edges along the track at the fields of a band, measured after the alignment."""
     noise, focus = alignment.bench.ccds[band].noise, alignment.states[-1].focus
     stacks = [f.frames[TRACK] for f, site in zip(focus, alignment.bench.sites, strict=True) if site.band == band]
-    return [slanted_edge_mtf(frames.mean(axis=0), noise=noise, frames=len(frames), uniform_light=True) for frames in stacks]
+    return [
+        slanted_edge_mtf(frames.mean(axis=0), noise=noise, frames=len(frames), uniform_light=True) for frames in stacks
+    ]
 
 
 def _losses(factors: Mapping[str, float], value: float) -> list[Chosen]:
@@ -268,10 +270,10 @@ def _measured(
     yield context.row("004.alignment.defocus", UM_PER_M * rms(error), None, 0.0, **facts, **more)
     plans = [Plan(a) for a in alignments]
     left = np.array([MM_PER_M * np.max(np.abs(p.left)) for p in plans])
-    moved = [(a, p.moved, a.states[0].standing.heights) for a, p in zip(alignments, plans, strict=True)]
+    moved = [(a, p.moved, a.states[0].placement.heights) for a, p in zip(alignments, plans, strict=True)]
     more = {"left": _list(left, 4)}
     yield context.row("004.alignment.plane", float(np.max(left)), inputs=[_chips(moved)], **facts, **more)
-    turns = np.array([abs(line_turn(p.moved)) / ARCMIN for p in plans])
+    turns = np.array([abs(line_rotation(p.moved)) / ARCMIN for p in plans])
     begin = np.array([abs(a.states[0].true_level) / ARCMIN for a in alignments])
     value = float(np.max(turns))
     more = {"begin": _list(begin, 2), "turns": _list(turns, 2)}
@@ -307,7 +309,7 @@ def _reached(context: Context, alignments: Sequence[SimulatedFocus], facts: Mapp
     plan = alignments[0].bench.setup.test
     far = np.array([[MM_PER_M * np.max(np.abs(s.true_defocus)) for s in a.states] for a in alignments])
     turns = np.array([[abs(s.true_level) / ARCMIN for s in a.states] for a in alignments])
-    ends = [(a, a.states[-1].standing.pose, a.states[-1].standing.heights) for a in alignments]
+    ends = [(a, a.states[-1].placement.pose, a.states[-1].placement.heights) for a in alignments]
     more: dict[str, Any] = {"before": _list(far[:, 0], 2), "after": _list(far[:, -1], 4)}
     value = float(np.max(far[:, -1]))
     yield context.row("004.alignment.confocal", value, inputs=[_chips(ends)], **facts, **more)
