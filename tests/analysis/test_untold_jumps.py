@@ -52,7 +52,7 @@ def test_what_is_known_now_is_the_mixture_of_all_jumps_there_may_be(amounts: tup
         belief, found = how.update(belief, one)
         assert found.jump is None
     # the mixture is of the filter that knows of no walk
-    now = how.mixture(replace(belief, state=belief.looking, search=None))
+    now = how.mixture(replace(belief, state=belief.jump_track, search=None))
     value, spread = how.parameters(now, times[-1])
 
     still = toy(every=None)

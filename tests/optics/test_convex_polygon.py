@@ -164,7 +164,7 @@ def test_random_shadows_in_a_pupil_take_what_a_dense_raster_of_it_says(count) ->
             outlines[-1] = outlines[0] + (outlines[0][:, 1] - outlines[0][:, 0])[:, None]
         shadows = Shadows.of([(str(k), outline) for k, outline in enumerate(outlines)], 1)
         shares = shadows.shares()
-        taken = polygons.covered(np.stack([polygons.widened(o, 9) for o in outlines], axis=1), raster)[0]
+        taken = polygons.covered(np.stack([polygons.padded(o, 9) for o in outlines], axis=1), raster)[0]
         # a raster is right to the square root of the length of edges that it counts, some 1e-3 here
         assert sum(float(share[0]) for share in shares.values()) == pytest.approx(np.mean(taken), abs=4e-3)
         assert all(-1e-6 < float(share[0]) < 1.0 + 1e-6 for share in shares.values())

@@ -115,11 +115,11 @@ def test_ground_without_points_is_refused(flown: Simulation) -> None:
     photo, nadir = maps.orthophoto, flown.patch.images["nadir"]
     grey = FrozenMap({**patch.images, "nadir": replace(nadir, frame=np.zeros_like(nadir.frame))})
     for points, wrong, words in (
-        (map_points, replace(patch, control=replace(maps, orthophoto=replace(photo, west=1e5))), "no place of the"),
+        (map_points, replace(patch, control=replace(maps, orthophoto=replace(photo, west=1e5))), "no point of the"),
         (
             map_points,
             replace(patch, control=replace(maps, orthophoto=replace(photo, values=np.zeros_like(photo.values)))),
-            "the orthophoto has no distinct places",
+            "the orthophoto has no distinct points",
         ),
         (tie_points, replace(patch, images=grey), "nadir: no distinct point is seen"),
     ):
@@ -133,7 +133,7 @@ def test_matches_that_agree_on_nothing_are_refused(flown: Simulation, monkeypatc
 
     def wrong(*what: Any, **how: Any) -> Any:
         found = right(*what, **how)
-        return replace(found, place=found.place + random.uniform(-20.0, 20.0, found.place.shape))
+        return replace(found, position=found.position + random.uniform(-20.0, 20.0, found.position.shape))
 
     monkeypatch.setattr(image_points, "match_windows", wrong)
     with pytest.raises(image_points.PointsError, match=r"forward: .*no consensus.*; .* accepted"):
