@@ -17,7 +17,7 @@ from scenes.specs.resolved import resolve_job
 from tests.benchmarks.monitor_speed import random_states
 from tests.benchmarks.workbench import Number, Speed, Work, Workbench, timed
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.observation import Observing, observe, one_detector
+from twin.monitor.observation import ObservationOptions, observe, shared_detector
 
 SIDE = 48
 """Of the CCDs of many states, pixels."""
@@ -37,7 +37,7 @@ def with_ccd(bench: Workbench, side: int) -> MonitorExperiment:
 def of_states(bench: Workbench, count: int) -> Callable[[], object]:
     """States observed, with one frame of small CCDs, that nobody keeps."""
     experiment = with_ccd(bench, SIDE)
-    how = Observing(one_detector(experiment, 1, 1), stated=False)
+    how = ObservationOptions(shared_detector(experiment, 1, 1), stated=False)
     every = random_states(count, 2)
 
     def observed() -> int:

@@ -10,7 +10,7 @@ from analysis.arrays import ARCSEC
 from optics.geometry.tree import Motion, State
 from scenes.specs.instrument import BASE
 from tests.benchmarks.workbench import Number, Speed, Work, Workbench, in_turns
-from twin.monitor.observation import Observing, StateReader, observe, one_detector
+from twin.monitor.observation import ObservationOptions, StateReader, observe, shared_detector
 from twin.sensors.poisson_numbers import poisson_numbers
 
 STATES, QUICK_STATES = 200, 25
@@ -32,12 +32,18 @@ def random_states(count: int, seed: int) -> list[State]:
 def measure(bench: Workbench, quick: bool) -> Speed:
     """Milliseconds per state, amortised over a batch; calibration and kernels are not what is timed."""
     setup = bench.experiment("gf7_pair")
-    list(observe(setup, random_states(QUICK_STATES, 1), Observing(one_detector(setup, FRAMES, 1), stated=False)))
+    list(
+        observe(
+            setup,
+            random_states(QUICK_STATES, 1),
+            ObservationOptions(shared_detector(setup, FRAMES, 1), use_prior=False),
+        )
+    )
     count = QUICK_STATES if quick else STATES
     states = random_states(count, 2)
 
     def batch(_: Any) -> list[Any]:
-        return list(observe(setup, states, Observing(one_detector(setup, FRAMES, 1), stated=False)))
+        return list(observe(setup, states, ObservationOptions(shared_detector(setup, FRAMES, 1), use_prior=False)))
 
     rounds = 1 if quick else ROUNDS
     spent = in_turns({"batch": Work(batch)}, rounds)["batch"]

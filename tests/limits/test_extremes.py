@@ -114,7 +114,7 @@ def test_surfaces_that_make_no_image_are_named_first(name: str, tmp_path: Path, 
     assert Path(first.file).name == "camera.yaml"
     assert first.key == ("mirrors",)
     assert first.line is not None
-    assert "make no image" in first.problem
+    assert "form no image" in first.problem
     assert first.allowed is not None
     assert all(Path(one.file).name == "instrument.yaml" for one in others)
     assert others

@@ -110,7 +110,7 @@ def test_named_edits(file, key, change, tmp_path, backend) -> None:
     job = job_of(tmp_path, camera, instrument)
     run_until(job, backend, STAGES[3])
     experiment = MonitorExperiment(resolve(job), backend)
-    places = experiment.path.coarse_trace([{}]).place
+    places = experiment.path.coarse_trace([{}]).centre
     assert np.abs(places).max() < 0.1  # pixels; coma of the beam's edge against its middle
     block = experiment.instrument.solids[-1]
     mesh = solid_mesh(block, experiment.instrument.assembly.place()).mesh

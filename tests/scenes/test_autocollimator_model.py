@@ -23,7 +23,7 @@ def test_ccds_that_cannot_follow_the_spots(part: str, key: str, value: float, ba
     collimator = SPEC.autocollimator
     changed = getattr(collimator, part).model_copy(update={key: value})
     spec = SPEC.model_copy(update={"autocollimator": collimator.model_copy(update={part: changed})})
-    with pytest.raises(InputError, match="cannot follow the spots") as caught:
+    with pytest.raises(InputError, match="do not sample the spots") as caught:
         AutocollimatorPath(model.build_bench(spec, ANGLES[0]), backend)
     assert caught.value.key == ("autocollimator", part, key)
     assert caught.value.allowed is not None

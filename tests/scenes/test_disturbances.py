@@ -256,7 +256,7 @@ def test_derivatives_by_radii_and_conic_constants(backend, pair) -> None:
     for k, component in enumerate(found.components):
         step = 0.3 * STEPS[component.kind]
         key = {component.kind: step}, {component.kind: -step}
-        up, down = np.moveaxis(path.coarse_trace([{component.body: Motion(**one)} for one in key]).place, 1, 0)
+        up, down = np.moveaxis(path.coarse_trace([{component.body: Motion(**one)} for one in key]).centre, 1, 0)
         expected = ((up - down) / (2.0 * step)).ravel() * component.sigma
         np.testing.assert_allclose(known.spots[:, k], expected, rtol=1e-5, atol=1e-6 * np.max(np.abs(expected)))
         assert np.max(np.abs(expected)) > 1e-4
@@ -315,15 +315,15 @@ def test_what_is_no_covariance(pair) -> None:
     own = [Component("a", "base/forward/M2", "shift", axis, "centre", 1e-6) for axis in range(3)]
     sound = 1e-12 * np.array([[1.0, 0.5, 0.2], [0.5, 1.0, -0.1], [0.2, -0.1, 1.0]])
     for matrix, message in (
-        (sound[:2, :2], "has not the shape"),
-        (sound * np.nan, "has not the shape"),
+        (sound[:2, :2], "cannot have the shape"),
+        (sound * np.nan, "cannot have the shape"),
         (sound - 2e-12 * np.eye(3), "a variance is negative"),
-        (sound + np.triu(0.1 * sound, 1), "a covariance is symmetric"),
-        (sound + 0.8e-12 * (np.eye(3)[::-1] - np.diag([0.0, 1.0, 0.0])), "no negative eigenvalue"),
+        (sound + np.triu(0.1 * sound, 1), "the covariance is not symmetric"),
+        (sound + 0.8e-12 * (np.eye(3)[::-1] - np.diag([0.0, 1.0, 0.0])), "has a negative eigenvalue"),
     ):
         with pytest.raises(ValueError, match=message):
             disturbances.joint_disturbances("posterior", own, matrix, pair.nodes, "r")
-    with pytest.raises(ValueError, match="a component is there twice"):
+    with pytest.raises(ValueError, match="a component is named twice"):
         disturbances.joint_disturbances("posterior", [*own[:2], own[0]], sound, pair.nodes, "r")
 
 

@@ -61,12 +61,12 @@ def test_lines_of_sight(backend, pair) -> None:
 def test_spots_through_all_prisms(backend, pair) -> None:
     drawn, built, states = pair
     there, here = ([state[k] for state in states] for k in (0, 1))
-    places = MonitorPath(built, backend).coarse_trace(here).place
+    places = MonitorPath(built, backend).coarse_trace(here).centre
     # pixels of 12 um
     np.testing.assert_allclose(
-        places, MonitorPath(drawn, backend).coarse_trace(there).place, rtol=0.0, atol=ROUNDING / 12e-6
+        places, MonitorPath(drawn, backend).coarse_trace(there).centre, rtol=0.0, atol=ROUNDING / 12e-6
     )
-    at_rest = MonitorPath(drawn, backend).coarse_trace([{}]).place
+    at_rest = MonitorPath(drawn, backend).coarse_trace([{}]).centre
     assert np.all(np.max(np.abs(places[:, :1] - at_rest), axis=-1) > 0.5)
 
 
@@ -143,8 +143,8 @@ def test_facets_are_squared_to_cameras_as_built(backend, pair, tmp_path) -> None
     bodies = {body.path: body for body in built.assembly.tree.bodies}
     whole = read(tmp_path, as_built_file("own", "gf7_pair", compose(built.as_built, turns, bodies)))
     square = build_instrument(whole, load_cameras(whole), backend)
-    middle = MonitorPath(square, backend).coarse_trace([{}]).place
-    drawn = MonitorPath(pair[0], backend).coarse_trace([{}]).place
+    middle = MonitorPath(square, backend).coarse_trace([{}]).centre
+    drawn = MonitorPath(pair[0], backend).coarse_trace([{}]).centre
     # the chief ray meets the middle of the CCD; the mean of the beam is as far off it as in the drawing
     np.testing.assert_allclose(middle, drawn, rtol=0.0, atol=0.02)
 

@@ -118,7 +118,7 @@ def test_heat_of_a_channels_prisms_moves_its_spot_alone(two) -> None:
     channel = next(c for c in two.instrument.channels if c.key == "forward/left_2")
     field = Temperature(0.0, (0.0, 0.02, 0.05))
     states = [{}, *(two.thermal.state({channel.prism_body(p): field}) for p in ("prism_180", "prism_0"))]
-    place = two.path.coarse_trace(states).place
+    place = two.path.coarse_trace(states).centre
     moved = np.linalg.norm(place[:, 1:] - place[:, :1], axis=-1)
     own = two.instrument.channels.index(channel)
     assert np.all(moved[own] > 1e-3)
@@ -136,7 +136,7 @@ def turned_by_heat(own: MonitorExperiment, prism: str) -> tuple[float, float]:
     channels = own.instrument.channels
     fields = [Temperature(0.0, tuple(GRADIENT * e)) for e in np.eye(3)] + [Temperature(1.0)]
     states = [own.thermal.state(dict.fromkeys([c.prism_body(prism) for c in channels], field)) for field in fields]
-    place = own.path.coarse_trace([{}, *states]).place
+    place = own.path.coarse_trace([{}, *states]).centre
     focal = np.array([own.instrument.cameras[c.camera].line_principal_distance for c in channels])[:, None, None]
     moved = (place[:, 1:] - place[:, :1]) * own.path.pitch / focal / ARCSEC
     return float(np.sqrt(np.mean(np.sum(moved[:, :3] ** 2, axis=(1, 2))) / 2.0)), float(np.abs(moved[:, 3]).max())

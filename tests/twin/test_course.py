@@ -167,8 +167,8 @@ def test_what_is_wrong_with_a_course_is_told_at_its_first_time(prepared) -> None
     parts = {"smoothed": None, "times": np.array(course.times), "curvature": {"model": bent}, "evidence": evidence}
     first, lost, again = TimeSeries.doubts(SimpleNamespace(**parts), ["a"])
     assert first == "course a at 1 min"
-    assert "σ does not hold at 1 times, first at 2 min: the motions that the model reads" in lost
-    assert "at 1 times, first at 1 min, the motions that the model reads are not small" in again
+    assert "σ does not hold at 1 times, first at 2 min: the motions estimated by the model" in lost
+    assert "at 1 times, first at 1 min, the motions estimated by the model are too large for linear theory" in again
 
 
 # --- motions of a course, also from a CSV file ------------------------------------------------------------------------

@@ -39,8 +39,8 @@ from twin.sensors.area_detector import (
     FixedOffsets,
     FixedPattern,
     ReadNoise,
+    coarse_step_warnings,
     coarse_warnings,
-    told_of_steps,
 )
 from twin.sensors.exposure_kernel import FEWEST
 from twin.sensors.line_ccd import Collection, LineCcd, Motion
@@ -258,9 +258,9 @@ def test_impossible_exposures_are_explained() -> None:
         (lambda: sensor.fixed_pattern((4,), 1), "shape must be"),
         (lambda: FixedPattern(np.ones((2, 2)), np.zeros((2, 3))), "must have one shape"),
         (lambda: FixedPattern(-np.ones((2, 2)), np.zeros((2, 2))), "gain must be finite and >= 0"),
-        (lambda: Collection(0, 1e-3), "a collection has a step or more"),
+        (lambda: Collection(0, 1e-3), "a collection needs one step or more"),
         (lambda: Motion.of([(0.0, 1.0)]), "oscillations have frequencies above zero"),
-        (lambda: Motion.of(bands=[(2.0, 1.0, 1.0)]), "bands reach from a frequency to a higher one"),
+        (lambda: Motion.of(bands=[(2.0, 1.0, 1.0)]), "bands extend from a frequency to a higher one"),
     ):
         with pytest.raises(ValueError, match=words):
             call()
@@ -299,7 +299,7 @@ def test_a_line_ccd_knows_its_exposure():
     sheet = DetectorSpec.model_validate({"name": "any", **SHEET, "dark_current_e_per_s": 0.99 * room / 11.2e-3})
     ccd, seed = LineCcd.from_specs(spec, sheet), np.random.SeedSequence(1)
     assert ccd.noise.dark_signal_e == pytest.approx(0.99 * room)
-    with pytest.raises(ValueError, match="columns 60 to 67 are not all on a line of 64 pixels"):
+    with pytest.raises(ValueError, match="columns 60 to 67 reach beyond a line of 64 pixels"):
         ccd.expose(np.zeros((1, 8)), 60, ccd.pattern(seed), 1, seed)
     full = DetectorSpec.model_validate({"name": "any", **SHEET, "dark_current_e_per_s": 1.01 * room / 11.2e-3})
     with pytest.raises(InputError, match="dark current alone saturates"):
@@ -310,13 +310,15 @@ def test_a_line_ccd_knows_its_exposure():
 def test_coarse_grey_values_are_warned_of(backend):
     """By the data sheet alone: every one of the library is fine, 8 bits of the monitor's CCD are not."""
     for path in sorted((LIBRARY / "detectors").glob("*.yaml")):
-        assert told_of_steps(EmvaDetector.from_sheet(load_detector(path.stem), 0.01).noise_model(0.01), "it") == ()
+        assert (
+            coarse_step_warnings(EmvaDetector.from_sheet(load_detector(path.stem), 0.01).noise_model(0.01), "it") == ()
+        )
     fine = resolve_job(JobSpec(instrument="gf7_pair"))
     assert coarse_warnings(fine) == ()
     few_bits = {"system_gain_dn_per_e": 0.0025, "bit_depth": 8, "offset_dn": 3.0}
     coarse = fine.model_copy(update={"detector": fine.detector.model_copy(update=few_bits)})
     (text,) = coarse_warnings(coarse)
-    assert "area CCD monitor_ccd has coarse grey values: noise of 0.092 DN" in text
+    assert "area CCD monitor_ccd has coarse grey values: its noise is 0.092 DN" in text
     assert text in render_job(coarse, backend).warnings
     assert coarse_warnings(fine.detector) == ()
 

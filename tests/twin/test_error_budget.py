@@ -63,7 +63,7 @@ def test_causes_draw_for_every_prism_by_itself(budget):
 @pytest.mark.second
 def test_the_growth_of_a_focal_plane_is_a_true_change_and_no_error(backend, budget):
     """A line CCD that grows with its focal plane sees larger angles in its pixels, by as much as the spots move."""
-    true, read = budget.grown_focal_planes(0.55)
+    true, read = budget.warmed_focal_planes(0.55)
     size = 2.2e-6 * 0.55  # silicon carbide
     # 0.34 %: distortion of the field, over the line and at the area CCDs
     assert true == pytest.approx(-7.7256 * size, rel=5e-3)

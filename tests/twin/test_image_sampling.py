@@ -12,7 +12,7 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.specs.load import load_camera, load_instrument
 from tests.hunt.dense_images import DenseImages
 from twin.monitor import image_sampling, monitor_beams, monitor_path
-from twin.monitor.image_sampling import NodeClasses, UncertainImageError, lost_or_gained
+from twin.monitor.image_sampling import NodeClasses, UncertainImageError, energy_excess
 from twin.monitor.monitor_path import MonitorPath
 
 ACCURACY = 3e-6  # of the peak: what classes of blurred spots are chosen for, in double precision
@@ -82,7 +82,7 @@ def test_what_no_nodes_can_do_is_refused(blurred, monkeypatch) -> None:
 
 
 def test_spots_blurred_beyond_the_last_class_are_refused(blurred) -> None:
-    with pytest.raises(UncertainImageError, match=r"blurred so much .* spread over \S+ px or .* mm; refocus"):
+    with pytest.raises(UncertainImageError, match=r"too blurred for its image .* spread over \S+ px or .* mm; refocus"):
         blurred(2.0).expected_photons([{}])
 
 
@@ -91,7 +91,7 @@ def test_light_is_that_of_the_rays(blurred, monkeypatch) -> None:
     path = blurred(0.0)
     path.expected_photons([{}])
     true = monitor_path.image
-    monkeypatch.setattr(monitor_path, "disagreement", lambda images, *_: np.zeros(len(images)))
+    monkeypatch.setattr(monitor_path, "quadrature_difference", lambda images, *_: np.zeros(len(images)))
     monkeypatch.setattr(monitor_path, "image", lambda *arguments: 1.2 * true(*arguments))
     with pytest.raises(UncertainImageError, match="of its light too much"):
         path.expected_photons([{}])
@@ -106,7 +106,7 @@ def test_energy_leaves_room_for_diffraction_alone() -> None:
     share = np.full((1, 4), 0.25)
     # one quarter is surely on the image, one surely not
     for light, expected in ((0.1, -0.07), (0.2, 0.0), (0.8, 0.0), (0.9, 0.07)):
-        assert lost_or_gained(np.array([light]), place, share, half, wings)[0] == pytest.approx(expected)
+        assert energy_excess(np.array([light]), place, share, half, wings)[0] == pytest.approx(expected)
 
 
 def test_classes_grow_to_the_most_phase() -> None:
@@ -141,5 +141,5 @@ def test_figures_with_fine_structure_move_rays_about(blurred) -> None:
 def test_figures_that_are_too_rough_are_refused(blurred, monkeypatch) -> None:
     """Spots that are not blurred beyond all nodes do not come so far; the limit is lowered."""
     monkeypatch.setattr(monitor_beams, "TOO_ROUGH", 1e-9)
-    with pytest.raises(UncertainImageError, match=r"too rough for an image: .* smaller figures"):
+    with pytest.raises(UncertainImageError, match=r"too rough for an image: .* use smaller figures"):
         blurred(0.0).photons_of({"base/central_prism/forward_right": Motion(figure={9: 19e-9, 22: 15e-9})})

@@ -83,10 +83,10 @@ def test_shares_of_bodies_beyond_the_stop_are_none(backend, gf7_pair, monkeypatc
     """What a sliver of a shadow once made of image quality: 2.4e24 of the stop."""
     true = shadow.Shadows.shares
     monkeypatch.setattr(shadow.Shadows, "shares", lambda self: {k: v + 2.4e24 for k, v in true(self).items()})
-    with pytest.raises(UnphysicalError, match=r"that a body takes: 2\.4e\+24"):
+    with pytest.raises(UnphysicalError, match=r"that a body blocks: 2\.4e\+24"):
         image_quality(gf7_pair, backend, [{}], (1.0,))
     monkeypatch.setattr(shadow.Shadows, "shares", lambda self: {k: 0.5 * v for k, v in true(self).items()})
-    with pytest.raises(UnphysicalError, match=r"that bodies take: .* differs from that of points in it"):
+    with pytest.raises(UnphysicalError, match=r"that bodies block: .* differs from that of points in it"):
         image_quality(gf7_pair, backend, [{}], (1.0,))
 
 
@@ -103,7 +103,7 @@ def test_image_quality_that_cannot_be_is_none(backend, gf7_pair, monkeypatch) ->
         (1, 7.9e11, "a wavefront error of camera forward in waves: 7.9e"),
         (2, 0.06, "at best focus: 0.06"),
         (4, -0.5, "an MTF of camera forward: -0.5"),
-        (0, -0.1, "that bodies take: -0.1"),
+        (0, -0.1, "that bodies block: -0.1"),
     ):
         wrong = good.copy()
         wrong[row] = value

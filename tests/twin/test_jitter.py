@@ -11,7 +11,7 @@ from tests.tiers import quick
 from tests.twin.pushbroom_bench import LINE_TIME, PLACE, Ground, lines
 from twin.orbit.flight.trajectory import Jitter, Trajectory
 from twin.orbit.ground.grid import GroundFrame, Terrain
-from twin.orbit.images.line_optics import with_mean_jitter, exposures
+from twin.orbit.images.line_optics import exposures, with_mean_jitter
 from twin.orbit.images.patch import window_of
 from twin.orbit.images.pushbroom import PushbroomScene, render_patch
 from twin.sensors.line_ccd import Collection, Motion
@@ -91,7 +91,7 @@ def test_bands_and_lines_together_against_drawn_motions() -> None:
 
 def test_gauss_rules_of_a_collection_mean_polynomials() -> None:
     for light in (Collection(1, STEP), Collection(24, STEP, 0.6), Collection(3, STEP, 0.2)):
-        at, (place, weight) = moments(light, 20000), light.moments(4)
+        at, (place, weight) = moments(light, 20000), light.gauss_rule(4)
         for power in range(8):
             scale = light.length**power
             assert np.isclose(weight @ place**power / scale, np.mean(at**power) / scale, rtol=0, atol=1e-8), power

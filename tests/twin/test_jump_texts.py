@@ -37,8 +37,9 @@ def course(jumps: tuple[Jump, ...] | None) -> SmoothedCourse:
 
 def test_a_jump_in_words() -> None:
     assert jump_text(JUMP) == (
-        "base/M2 jumped between 1 h and 2 h: shift x +3.21 ± 0.42 um, shift y -0.5 ± 0.4 um, log ratio 31.4; sigmas "
-        "are wide there, and smoothed changes take it for an event; base/M1 would explain it nearly as well"
+        "base/M2 jumped between 1 h and 2 h: shift x +3.21 ± 0.42 um, shift y -0.5 ± 0.4 um, log likelihood "
+        "ratio 31.4; sigmas are larger there, and the smoothed changes treat it as an event; base/M1 would explain it "
+        "nearly as well"
     )
     assert "nearly" not in jump_text(replace(JUMP, rivals={"base/M3": 12.0}))
 

@@ -35,7 +35,7 @@ def off_middle(path: MonitorPath, wanted: float) -> State:
     half = 0.5 * np.array(path.shape)
 
     def excess(by: float) -> float:
-        place = path.coarse_trace([shifted(path, by)]).place
+        place = path.coarse_trace([shifted(path, by)]).centre
         return float(np.max(np.linalg.norm(np.abs(place) + half, axis=-1)) / np.linalg.norm(half) - wanted)
 
     return shifted(path, brentq(excess, 0.0, 0.5 * path.pitch * half[0] * wanted, xtol=1e-11))
@@ -72,7 +72,7 @@ def test_both_classes_are_right_at_their_border(setup, number: int) -> None:
 
 def test_beams_that_are_too_wide_for_the_pixels_are_refused(setup) -> None:
     wide = SimpleNamespace(aperture=np.array([10.0 * setup.path.numerical_aperture]))
-    with pytest.raises(UncertainImageError, match="beams have 10 times the aperture as designed: "):
+    with pytest.raises(UncertainImageError, match="beams have 10 times the designed aperture: "):
         setup.path._response_of(wide)
 
 
@@ -99,7 +99,7 @@ def test_predicted_rays_meet_the_aimed_ones(setup, monkeypatch) -> None:
     monkeypatch.setattr(monitor_beams, "aim", counted)
     predicted = path.rays(states, known)
     assert not calls
-    aimed = path.rays(states, replace(known, turn=np.zeros_like(known.turn)))
+    aimed = path.rays(states, replace(known, turn=np.zeros_like(known.aim_change)))
     assert len(calls) == 1
     # a nanometre off its node on the face, a ray is off by that part of the aperture in direction
     limit = 2.0 * monitor_beams.AIM_TOLERANCE / path.face_radius.min() * path.numerical_aperture
@@ -115,12 +115,12 @@ from optics.geometry.tree import Motion
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.observation import Observing, observe, one_detector
+from twin.monitor.observation import ObservationOptions, observe, shared_detector
 setup = MonitorExperiment(resolve_job(JobSpec(instrument="gf7_pair")), load_backend("llvm"))
 rng = np.random.default_rng(5)
 states = [{"base/forward/focal_plane": Motion(shift=tuple(3e-5 * rng.normal(size=3)))} for _ in range(7)]
 digest = hashlib.sha256()
-for seen in observe(setup, states, Observing(one_detector(setup, 3, 1), chunk=4, stated=False)):
+for seen in observe(setup, states, ObservationOptions(shared_detector(setup, 3, 1), chunk=4, use_prior=False)):
     found = seen.recovery
     for array in (found.after, found.shift_covariance, found.parameters["forward"]["model"].vector):
         digest.update(np.ascontiguousarray(array).tobytes())
@@ -159,7 +159,7 @@ def one_by_one(setup) -> list[State]:
 def test_cameras_whose_light_a_body_changes(setup) -> None:
     """To the bit: of the others not even the last digit of a spot's place moves, and of these some spot does."""
     path, states = setup.path, one_by_one(setup)
-    places = path.coarse_trace([{}, *states]).place
+    places = path.coarse_trace([{}, *states]).centre
     moved = [path.moved_cameras(state) for state in states]
     for s, (state, cameras) in enumerate(zip(states, moved, strict=True), 1):
         for channel, place in zip(path.channels, places, strict=True):

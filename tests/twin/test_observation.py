@@ -12,7 +12,7 @@ from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve
 from tests.benchmarks.monitor_speed import random_states
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.observation import LOST, Observing, StateReader, observe, one_detector
+from twin.monitor.observation import LOST, ObservationOptions, StateReader, observe, shared_detector
 
 FRAMES, SEED = 2, 7
 BEYOND = {"base/forward/focal_plane": Motion(shift=(5e-3, 0.0, 0.0))}
@@ -29,20 +29,20 @@ def test_states_that_are_lost_are_left_out_and_told(pair: MonitorExperiment) -> 
     """Those that are not keep their numbers, and with them their noise."""
     told: dict[int, str] = {}
     states = random_states(3, 1)
-    record = one_detector(pair, FRAMES, SEED)
-    how = Observing(record, leave=told.__setitem__, stated=False)
+    record = shared_detector(pair, FRAMES, SEED)
+    how = ObservationOptions(record, omit=told.__setitem__, use_prior=False)
     (found,) = observe(pair, [states[0], BEYOND, *states[1:]], how, [10, 11, 12, 13])
     assert list(told) == [11]
     assert "forward/" in told[11]
     assert found.numbers.tolist() == [10, 12, 13]
     assert [len(found.truth.angle_change), len(found.light.photons), len(found.recovery.after)] == [3, 3, 3]
     for k, number in enumerate((10, 12, 13)):
-        (alone,) = observe(pair, [states[k]], Observing(record, stated=False), [number])
+        (alone,) = observe(pair, [states[k]], ObservationOptions(record, use_prior=False), [number])
         np.testing.assert_array_equal(alone.after[0], found.after[k])
         np.testing.assert_array_equal(alone.recovery.after[0], found.recovery.after[k])
         assert alone.truth.angle_change == pytest.approx(found.truth.angle_change[k : k + 1], rel=1e-9)
     with pytest.raises(LOST):
-        next(observe(pair, [states[0], BEYOND], Observing(record, stated=False)))
+        next(observe(pair, [states[0], BEYOND], ObservationOptions(record, use_prior=False)))
     assert list(observe(pair, [BEYOND], how, [3])) == []
     assert list(told) == [11, 3]
 
@@ -51,7 +51,9 @@ def test_states_that_are_lost_are_left_out_and_told(pair: MonitorExperiment) -> 
 def test_pieces_are_the_whole(pair: MonitorExperiment) -> None:
     states = random_states(5, 2)
     whole, parts = (
-        list(observe(pair, states, Observing(one_detector(pair, FRAMES, SEED), chunk=chunk, stated=False)))
+        list(
+            observe(pair, states, ObservationOptions(shared_detector(pair, FRAMES, SEED), chunk=chunk, use_prior=False))
+        )
         for chunk in (5, 2)
     )
     assert [found.numbers.tolist() for found in parts] == [[0, 1], [2, 3], [4]]
@@ -61,7 +63,7 @@ def test_pieces_are_the_whole(pair: MonitorExperiment) -> None:
 def test_a_spot_that_cannot_be_measured_leaves_its_state_out(pair: MonitorExperiment) -> None:
     """Whatever is recorded: here one detector has seen no light."""
     told: dict[int, str] = {}
-    exposed = one_detector(pair, FRAMES, SEED)
+    exposed = shared_detector(pair, FRAMES, SEED)
 
     def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         before, after = exposed(photons, numbers)
@@ -70,7 +72,7 @@ def test_a_spot_that_cannot_be_measured_leaves_its_state_out(pair: MonitorExperi
         return before, after
 
     states = random_states(3, 1)
-    (found,) = observe(pair, states, Observing(record, leave=told.__setitem__, stated=False))
+    (found,) = observe(pair, states, ObservationOptions(record, omit=told.__setitem__, use_prior=False))
     assert found.numbers.tolist() == [0, 2]
     assert found.measured.tolist() == [0, 2]
     assert list(told) == [1]

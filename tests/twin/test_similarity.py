@@ -109,7 +109,7 @@ def test_no_angle_changes_and_no_spot_moves_on_its_pixels(camera: str, motions: 
             assert np.ptp(turn) < ROUNDING
         assert np.ptp(change.d_f) < ROUNDING * truth.principal_distance[name]
     path = MonitorPath(instrument, backend).coarse
-    found, coarse = spots(path, path.rays(states)), path.coarse_trace(states).place
+    found, coarse = spots(path, path.rays(states)), path.coarse_trace(states).centre
     assert not motions or np.abs(found).max() > 15.0
     for place in (found, coarse):
         np.testing.assert_allclose(place[:, 1:] - place[:, :1], 0.0, rtol=0, atol=PIXELS)

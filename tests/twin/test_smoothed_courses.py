@@ -127,7 +127,7 @@ def traced(experiment: MonitorExperiment, times: np.ndarray, at: np.ndarray, cou
     states = states_of(experiment, times, count, seed)
     truth, height = truths(experiment, states, count)
     seen = [states[n * len(times) + k] for n in range(count) for k in at]
-    place = np.moveaxis(experiment.path.coarse_trace([{}, *seen]).place, 1, 0)
+    place = np.moveaxis(experiment.path.coarse_trace([{}, *seen]).centre, 1, 0)
     shifts = (place[1:] - place[0]).reshape(count, len(at), -1)
     rng = np.random.default_rng(seed + 1)
     shifts = shifts + NOISE * (rng.standard_normal(shifts.shape) + rng.standard_normal((count, 1, shifts.shape[2])))

@@ -30,12 +30,12 @@ from tests.own_trace import OwnCamera, Traced
 from tests.scenes.lens.colour_cameras import colour_camera
 from tests.twin.study_bench import TEXTS, budget
 from twin.camera.camera_optics import CameraOptics
-from twin.camera.varied_beams import CutError, RoughError
+from twin.camera.varied_beams import RoughWavefrontError, VignettedBeamError
 from twin.monitor.image_quality import image_quality
-from twin.monitor.information import built_noise, quantity_rows
+from twin.monitor.information import noise_as_built, quantity_rows
 from twin.monitor.monitor_derivative import SMALL, STEPS
 from twin.monitor.monitor_experiment import TEMPLATE_MARGIN
-from twin.monitor.observation import Observing, observe, one_detector
+from twin.monitor.observation import ObservationOptions, observe, shared_detector
 from twin.tolerance import monitor_merit, tolerance_bench
 from twin.tolerance.monitor_merit import ROTATIONS, obstructed_shares, readings_of
 from twin.tolerance.tolerance_bench import ToleranceBench
@@ -206,21 +206,26 @@ def test_light_of_a_band_takes_as_many_wavelengths_as_it_needs(backend: Backend,
     ("changes", "why"), [({"spectrum": "[400 nm, 1000 nm]"}, ""), ({"image": "300 mm"}, ": a transfer function needs")]
 )
 def test_a_blurred_camera_has_no_mtf_for_tolerances(backend: Backend, tmp_path: Path, changes: dict, why: str) -> None:
-    with pytest.raises(InputError, match=rf"merits\.mtf: the MTF of the designed camera is not settled{why}"):
+    with pytest.raises(InputError, match=rf"merits\.mtf: the MTF of the designed camera has not converged{why}"):
         ToleranceBench(lens_budget(tmp_path, colour_camera("achromat", **changes)), backend)
 
 
 def test_colours_too_far_apart_for_a_sum_are_told_at_the_light(backend: Backend, tmp_path: Path) -> None:
     camera = colour_camera("achromat", "[350 nm, 2000 nm]")
-    with pytest.raises(InputError, match=r"light: merits over .* colours stand too far apart.*light: design"):
+    with pytest.raises(InputError, match=r"light: merits over .* the lateral colour is too large.*light: design"):
         ToleranceBench(lens_budget(tmp_path, camera, merits=WAVEFRONT), backend)
 
 
 @pytest.mark.parametrize(
     ("place", "name", "error", "words"),
     [
-        (tolerance_bench, "VariedBeams", CutError("cut"), "merits: cut.*fields whose light comes through whole"),
-        (tolerance_bench, "VariedBeams", RoughError("rough"), "merits: rough.*a sharper camera"),
+        (
+            tolerance_bench,
+            "VariedBeams",
+            VignettedBeamError("cut"),
+            "merits: cut.*fields whose light comes through whole",
+        ),
+        (tolerance_bench, "VariedBeams", RoughWavefrontError("rough"), "merits: rough.*a sharper camera"),
         (CameraOptics, "colour_pupils", UnphysicalError("more light"), r"merits\.mtf: .* has no MTF: more light"),
     ],
 )
@@ -291,8 +296,8 @@ def test_a_built_instrument_is_that_of_the_main_job(pair_bench: ToleranceBench) 
     )
     states = states_of((*pair_bench.numbers, *pair_bench.compensators), x)
     found = monitor.variances(x, states)
-    record = one_detector(experiment, experiment.resolved.frames, 1)
-    (seen,) = observe(experiment, states, Observing(record))
+    record = shared_detector(experiment, experiment.resolved.frames, 1)
+    (seen,) = observe(experiment, states, ObservationOptions(record))
     assert list(seen.numbers) == [0, 1, 2]
     fitted = seen.recovery.sigma_after.reshape(3, -1)
     bound = np.sqrt(0.5 * np.diagonal(monitor._noise(states), axis1=1, axis2=2))
@@ -337,13 +342,13 @@ def test_derivatives_are_those_of_central_differences(pair_bench: ToleranceBench
         state_of(row, motions.components, experiment.thermal, about[0])
         for row in np.concatenate([np.diag(steps), -np.diag(steps)])
     ]
-    spots = np.moveaxis(experiment.path.coarse_trace(states).place, 1, 2).reshape(-1, len(states))
+    spots = np.moveaxis(experiment.path.coarse_trace(states).centre, 1, 2).reshape(-1, len(states))
     truth = experiment.sight.truth(states)
     parameters = np.concatenate([truth.vector(name).T for name in truth.cameras])
     count = len(steps)
     slopes = [(one[:, :count] - one[:, count:]) / (2.0 * steps) * motions.sigma for one in (spots, parameters)]
     stated = replace(designed, spots=slopes[0], parameters=slopes[1])
-    noise = built_noise(monitor.path, experiment.detector, about)[0]
+    noise = noise_as_built(monitor.path, experiment.detector, about)[0]
     row = quantity_rows(experiment.instrument, None)
     found, plain = monitor.exact(about), np.zeros((1, x.shape[1]))
     designed_values = monitor.variances(plain, states_of((*pair_bench.numbers, *pair_bench.compensators), plain))
@@ -361,7 +366,7 @@ def test_area_ccds_are_set_to_their_spots(pair_bench: ToleranceBench) -> None:
     assert monitor is not None
     x = amounts(pair_bench, {"tilt": 1.0}, {})
     states = states_of((*pair_bench.numbers, *pair_bench.compensators), x)
-    place = pair_bench.experiment.path.coarse_trace(states[:1]).place
+    place = pair_bench.experiment.path.coarse_trace(states[:1]).centre
     assert np.max(np.abs(place)) > 0.5 * pair_bench.experiment.path.shape[0]
     assert np.all(np.isfinite(monitor.variances(x, states)["angle"]))
     chip = {"base/forward/focal_plane/left/area_ccd": Motion(shift=(24e-6, -36e-6, 0.0))}

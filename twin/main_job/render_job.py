@@ -24,7 +24,7 @@ from scenes.specs.job import checked_nodes
 from scenes.specs.perturbation import perturbation_text
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
-from twin.camera.first_order_data import obscuration, unstated_shadows
+from twin.camera.first_order_data import obscuration, unmodelled_obscuration
 from twin.framework.frame_store import mean_of
 from twin.framework.procedure import Advance, silent
 from twin.main_job.render_files import deformation_warnings
@@ -34,7 +34,7 @@ from twin.monitor.image_quality import ImageQuality, image_quality
 from twin.monitor.monitor_beams import SpotFocus
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import require_memory
-from twin.monitor.observation import LOST, Observing, light_of, read
+from twin.monitor.observation import LOST, ObservationOptions, light_of, read
 from twin.monitor.time_series import run_series, series_states, too_large
 from twin.path_tracing.stray_light import NominalPathLost, StrayLight, ghost_warnings, stray_light
 from twin.sensors.area_detector import coarse_warnings
@@ -114,10 +114,10 @@ def render_job(
         A node is unknown, memory does not suffice, or the perturbation is so large that light misses the mirrors or a
         spot its CCD.
     """
-    count = resolved.frames if frames is None else frames
-    number = resolved.job.render.seed if seed is None else seed
+    frame_count = resolved.frames if frames is None else frames
+    run_seed = resolved.job.render.seed if seed is None else seed
     # the run's config.yaml has to repeat the run, overrides included
-    resolved = resolved.with_render(count, number)
+    resolved = resolved.with_render(frame_count, run_seed)
     check_targets(resolved)
     if resolved.instrument.monitor is None:
         return _without_monitor(resolved, backend, advance, experiment)
@@ -125,7 +125,7 @@ def render_job(
     stage.begin(0)
     experiment = MonitorExperiment(resolved, backend) if experiment is None else experiment
     times = 0 if resolved.job.course is None else len(resolved.job.course.times)
-    require_memory(resolved, experiment.size(count, times, target_pixels(resolved)), experiment.detector)
+    require_memory(resolved, experiment.size(frame_count, times, target_pixels(resolved)), experiment.detector)
     resolved = resolved.with_job(checked_nodes(resolved.job, experiment.instrument.nodes))
     experiment.stated  # noqa: B018 - what is wrong with it is said before the long parts
     stage.begin(1)
@@ -141,53 +141,53 @@ def render_job(
         focus = experiment.nominal_focus
     except LOST as error:
         raise _no_spots(experiment, str(error)) from error
-    which, series = np.array([shown]), None
+    numbers_shown, series = np.array([shown]), None
     with _lost_by_motions(resolved, *LOST):
         stage.begin(3)
         experiment.calibration  # noqa: B018 - before the long parts
         stage.begin(4)
         nominal = experiment.nominal_photons
-        light = light_of(experiment, [state], which, single=False) if course is None else None
+        light = light_of(experiment, [state], numbers_shown, single=False) if course is None else None
     if light is None:
         series = run_series(experiment, resolved, states, lambda done: advance(COURSE, done, len(states)))
         # a course is rendered in single precision; the run shows the frames that it measured
-        light = light_of(experiment, [state], which, photons=series.shown_photons[None])
+        light = light_of(experiment, [state], numbers_shown, photons=series.shown_photons[None])
     stray = None
     if resolved.job.render.stray is not None:
-        stray = _stray(experiment, resolved, state, number, advance)
+        stray = _stray(experiment, resolved, state, run_seed, advance)
         nominal, light = nominal + stray.before.photons, replace(light, photons=light.photons + stray.after.photons)
     stage.begin(5)
-    before = experiment.frames_before(count, number, 0.0 if stray is None else stray.before.photons)
+    before = experiment.frames_before(frame_count, run_seed, 0.0 if stray is None else stray.before.photons)
 
     def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        after = experiment.frames_after(photons, count, number, numbers)
+        after = experiment.frames_after(photons, frame_count, run_seed, numbers)
         stage.begin(6)
         return before, after
 
     try:
-        found = read(experiment, light, Observing(record, resolved.job.analysis.centroid))
+        observation = read(experiment, light, ObservationOptions(record, resolved.job.analysis.centroid))
     except SpotError as error:
         raise _unmeasured(experiment, before, error, focus) from error
-    assert found is not None
-    photons, after = light.photons[0], found.after[0]
+    assert observation is not None
+    photons, after = light.photons[0], observation.after[0]
     stage.begin(7)
-    tables = crosstalk(experiment, found.recovery.shift_covariance[0])
+    tables = crosstalk(experiment, observation.recovery.shift_covariance[0])
     stage.end()
-    targets, quality = _images(experiment, resolved, state, number, advance)
+    targets, quality = _images(experiment, resolved, state, run_seed, advance)
     deformed = experiment.deformed(resolved.job)
     of_glass = {e.body for e in experiment.instrument.assembly.elements.values() if e.solid is not None}
     return RenderRun(
         resolved=resolved,
         experiment=experiment,
         state=state,
-        frames=count,
-        seed=number,
+        frames=frame_count,
+        seed=run_seed,
         truth=light.truth,
         photons_before=nominal,
         photons_after=photons,
         before=before,
         after=after,
-        recovery=found.recovery,
+        recovery=observation.recovery,
         crosstalk=tables,
         warnings=(
             *blur_warnings(resolved, backend),
@@ -310,7 +310,9 @@ def _image_warnings(
     if targets is None and quality is None:
         return ()
     models = {model.spec.name: model for model in experiment.instrument.cameras.values()}
-    shadows = {name: unstated_shadows(model, obscuration(model, experiment.backend)) for name, model in models.items()}
+    shadows = {
+        name: unmodelled_obscuration(model, obscuration(model, experiment.backend)) for name, model in models.items()
+    }
     return (
         *(f"camera {name}: {text}" for name, text in shadows.items() if text),
         *(targets.warnings if targets is not None else ()),
@@ -358,14 +360,14 @@ def _stray(
             )
 
         before = traced({}, 0)
-        taken = find_obstructions(experiment.instrument, experiment.backend)
-        return StrayPair(before, traced(state, sources) if state else before, taken, measured)
+        obstructions = find_obstructions(experiment.instrument, experiment.backend)
+        return StrayPair(before, traced(state, sources) if state else before, obstructions, measured)
 
 
 def _stray_warnings(experiment: MonitorExperiment, stray: StrayPair) -> Iterator[str]:
     for o in stray.obstructions:
-        own = prism_of(o.body) == PRISM_180 and o.beam == f"{o.body.split('/')[1]}/imaging"
-        if o.used == 0.0 and not own:
+        intended = prism_of(o.body) == PRISM_180 and o.beam == f"{o.body.split('/')[1]}/imaging"
+        if o.used == 0.0 and not intended:
             yield f"{o.body} blocks {100.0 * o.share:.1f} % of the beam {o.beam}"
     if stray.measured is not None:
         yield from stray.measured.warnings()
@@ -411,14 +413,16 @@ def _no_spots(experiment: MonitorExperiment, reason: str) -> InputError:
 
 def _mounted_facets(experiment: MonitorExperiment) -> str:
     """Return the facet orientations with which the monitor of an instrument as built would work, as text."""
-    instrument, smaller = experiment.instrument, "bodies closer to their design positions"
+    instrument, advice = experiment.instrument, "bodies closer to their design positions"
     try:
-        turns = squared_facets(instrument, experiment.backend)
+        rotations = squared_facets(instrument, experiment.backend)
     except (MisplacedError, *LOST):
-        return smaller
+        return advice
     bodies = {body.path: body for body in instrument.assembly.tree.bodies}
-    stand = as_built_of(compose(instrument.as_built, turns, bodies))
-    return f"{smaller}; or facets aligned when mounted: {perturbation_text({path: stand[path] for path in turns})}"
+    positions = as_built_of(compose(instrument.as_built, rotations, bodies))
+    return (
+        f"{advice}; or facets aligned when mounted: {perturbation_text({path: positions[path] for path in rotations})}"
+    )
 
 
 def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotError, focus: SpotFocus) -> InputError:
@@ -439,38 +443,38 @@ def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotEr
 
 def _blurred(experiment: MonitorExperiment, focus: SpotFocus) -> tuple[str, ...]:
     """Return a warning for each camera whose spots are out of focus as designed, which is probably a mistake."""
-    out = []
+    warnings = []
     for name in experiment.instrument.cameras:
-        own = [i for i, channel in enumerate(experiment.path.channels) if channel.camera == name]
-        worst = max(own, key=lambda i: focus.error[i])
+        indices = [i for i, channel in enumerate(experiment.path.channels) if channel.camera == name]
+        worst = max(indices, key=lambda i: focus.error[i])
         if focus.error[worst] > SHARP:
             channel = experiment.path.channels[worst].name
             model = experiment.instrument.cameras[name]
             # image.z counts along the parent axis, +-Z of the focal plane
             shift = model.focal_plane.rotation[2, 2] * focus.defocus[worst]
-            out.append(
+            warnings.append(
                 f"{name}: the spots of camera {model.spec.name} are out of focus as designed, "
                 f"{focus.error[worst]:.2g} waves rms in channel {channel}; they are sharpest with image.z "
                 f"changed by {1e3 * shift:+.3g} mm"
             )
-    return tuple(out)
+    return tuple(warnings)
 
 
 def _warnings(
     experiment: MonitorExperiment, nominal: np.ndarray, photons: np.ndarray, before: np.ndarray, after: np.ndarray
 ) -> tuple[str, ...]:
     """Return warnings about saturation and lost light."""
-    out = []
+    warnings = []
     channels = experiment.path.channels
     for name, recorded in (("before", before), ("after", after)):
         saturated = experiment.detector.saturated(recorded)
-        bad = [c.key for c, pixels in zip(channels, np.ravel(saturated.pixels), strict=True) if pixels]
-        if bad:
-            out.append(
-                f"saturated pixels in the spots {', '.join(bad)} ({name}): centroids are biased; reduce the light"
+        full = [c.key for c, pixels in zip(channels, np.ravel(saturated.pixels), strict=True) if pixels]
+        if full:
+            warnings.append(
+                f"saturated pixels in the spots {', '.join(full)} ({name}): centroids are biased; reduce the light"
             )
     for i, channel in enumerate(channels):
         share = float(photons[i].sum() / nominal[i].sum())
         if share < MIN_LIGHT:
-            out.append(f"{channel.key}: only {100 * share:.0f} % of the nominal light reaches the CCD")
-    return tuple(out)
+            warnings.append(f"{channel.key}: only {100 * share:.0f} % of the nominal light reaches the CCD")
+    return tuple(warnings)

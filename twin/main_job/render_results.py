@@ -22,7 +22,7 @@ from scenes.models.obstruction import Obstruction
 from scenes.models.scenery import MeasuredFinishes
 from scenes.specs.resolved import ResolvedJob
 from twin.framework.provenance import SelfCheck
-from twin.main_job.monitor_reading import MonitorReading, stated_check
+from twin.main_job.monitor_reading import MonitorReading, prior_check
 from twin.monitor.crosstalk import CameraCrosstalk
 from twin.monitor.image_quality import ImageQuality
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -88,24 +88,24 @@ class JobRun:
     def truth_dict(self) -> dict[str, Any]:
         """Return the contents of truth.json."""
         out: dict[str, Any] = {"cameras": {}}
-        for group, one, value in self.true_changes():
-            held = out if group in (ANGLE_GROUP, GROUND_GROUP) else out["cameras"]
-            held.setdefault(group, {})[one.key] = value
+        for group, parameter, value in self.true_changes():
+            target = out if group in (ANGLE_GROUP, GROUND_GROUP) else out["cameras"]
+            target.setdefault(group, {})[parameter.key] = value
         return self._with_nominal(out)
 
     def true_changes(self) -> list[tuple[str, Parameter, float]]:
         """Return (camera or group of two cameras, parameter, true change in the parameter's unit) of each parameter."""
         truth = self.truth
         out = [
-            (name, one, one.per_si * float(value) + 0.0)
+            (name, parameter, parameter.per_si * float(value) + 0.0)
             for name in truth.cameras
-            for one, value in zip(parameters.ESTIMATED, truth.vector(name)[0], strict=True)
+            for parameter, value in zip(parameters.ESTIMATED, truth.vector(name)[0], strict=True)
         ]
         if len(truth.cameras) == 2:
             out.append((ANGLE_GROUP, parameters.ANGLE, float(truth.angle_change[0]) / ARCSEC + 0.0))
         if (ground := self.experiment.ground) is not None:
             errors = zip(parameters.GROUND, truth.ground_error(ground)[0], strict=True)
-            out += [(GROUND_GROUP, one, float(value) + 0.0) for one, value in errors]
+            out += [(GROUND_GROUP, parameter, float(value) + 0.0) for parameter, value in errors]
         return out
 
     def _with_nominal(self, out: dict[str, Any]) -> dict[str, Any]:
@@ -170,7 +170,7 @@ class RenderRun(JobRun):
     def reading(self) -> MonitorReading:
         """Reading of the monitor, beside the truth."""
         experiment = self.experiment
-        together = None if self.series is None else self.series.smoothed
+        smoothed = None if self.series is None else self.series.smoothed
         return MonitorReading(
             channels=tuple((channel.camera, channel.name) for channel in experiment.path.channels),
             cameras=experiment.cameras,
@@ -180,7 +180,7 @@ class RenderRun(JobRun):
             crosstalk=self.crosstalk,
             frames=self.frames,
             centroid=self.resolved.job.analysis.centroid,
-            found_wrong=together.contradiction if together is not None else (),
+            earlier_doubts=smoothed.contradiction if smoothed is not None else (),
             truth=self.truth,
             together=1 if self.series is None else len(self.series.times),
         )
@@ -227,16 +227,16 @@ class RenderRun(JobRun):
     @property
     def checks(self) -> tuple[SelfCheck, ...]:
         """Checks of images and readings, and of the energy balance of stray light."""
-        out = [*self.experiment.path.checked.told(), *self.reading.checks]
+        out = [*self.experiment.path.checked.self_checks(), *self.reading.checks]
         if self.worst_of_course is not None:
             out.append(
-                stated_check("worst time of the course against the prior on disturbances", self.worst_of_course[1])
+                prior_check("worst time of the course against the prior on disturbances", self.worst_of_course[1])
             )
         if self.stray is not None:
             for when, light in (("before", self.stray.before), ("after", self.stray.after)):
                 error = max((abs(path.balance.error) for path in light.traced.runs.values()), default=0.0)
-                says = "emitted light minus absorbed, detected, escaped and truncated light"
-                out.append(SelfCheck(f"balance of stray light {when}", error, None, "of the light", says))
+                meaning = "emitted light minus absorbed, detected, escaped and truncated light"
+                out.append(SelfCheck(f"balance of stray light {when}", error, None, "of the light", meaning))
         return tuple(out)
 
     def recovered_dict(self) -> dict[str, Any]:

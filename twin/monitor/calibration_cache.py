@@ -72,7 +72,7 @@ def cache_folder() -> Path | None:
     if named:
         return None if named == OFF else Path(named)
     shared = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    if not shared.is_absolute():  # so the XDG Base Directory Specification demands
+    if not shared.is_absolute():  # required by the XDG Base Directory Specification
         try:
             shared = Path.home() / ".cache"
         except RuntimeError:
@@ -140,11 +140,11 @@ class CacheEntry:
 
     def get(self, compute: Callable[[], Value]) -> Value:
         """Return the content; compute and cache it if there is none."""
-        found: Value | None = self.read()
-        if found is None:
-            found = compute()
-            self.write(found)
-        return found
+        content: Value | None = self.read()
+        if content is None:
+            content = compute()
+            self.write(content)
+        return content
 
     def read(self) -> Any:
         """Return the content, or None if there is none that can be trusted."""
@@ -155,7 +155,7 @@ class CacheEntry:
         with suppress(OSError):
             content = _checked(file, self._head())
             os.utime(file)
-            # whatever is wrong with a pickle, the content is computed
+            # a pickle that cannot be read is recomputed
             with suppress(Exception):
                 return _Reader(io.BytesIO(content), self).load()
         return None
@@ -176,7 +176,7 @@ class CacheEntry:
             if _private(folder) is None:
                 return
             _written += 1
-            # never a part of an entry under its name, whatever two processes write at once
+            # renamed when complete, so that no partial entry has its name even if two processes write it
             number, partial = tempfile.mkstemp(ENDING, ".partial-", folder)
             try:
                 with open(number, "wb") as file:
@@ -202,11 +202,11 @@ class _Writer(pickle.Pickler):
     def persistent_id(self, thing: Any) -> int | None:
         if not isinstance(thing, Backend | Spec):
             return None
-        for number, known in enumerate(self._known):
-            # instruments that are equal share their parts in one process, those of the first job's specification
-            if thing is known or (thing == known and repr(thing) == repr(known)):
+        for number, reference in enumerate(self._known):
+            # equal instruments share their parts in one process, those of the first job's specification
+            if thing is reference or (thing == reference and repr(thing) == repr(reference)):
                 return number
-        raise pickle.PicklingError(f"{type(thing).__name__} is none of the specifications that were given")
+        raise pickle.PicklingError(f"{type(thing).__name__} is not one of the entry's specifications")
 
     def reducer_override(self, thing: Any) -> Any:
         """Write members of an enumeration by value: Python before 3.11.4 would write a call of `getattr`."""
@@ -224,10 +224,10 @@ class _Reader(pickle.Unpickler):
         return self._known[number]
 
     def find_class(self, module: str, name: str) -> Any:
-        found = super().find_class(module, name) if _of_program(module) or (module, name) in _ARRAYS else None
-        if found is None or (_of_program(module) and not isinstance(found, type)):
+        member = super().find_class(module, name) if _of_program(module) or (module, name) in _ARRAYS else None
+        if member is None or (_of_program(module) and not isinstance(member, type)):
             raise pickle.UnpicklingError(f"{module}.{name} is no part of a calibration")
-        return found
+        return member
 
 
 _ARRAYS = {
@@ -247,16 +247,16 @@ def _of_program(module: str) -> bool:
 def _private(folder: Path | None) -> Path | None:
     """Return the folder if it belongs to this user and nobody else can access it, otherwise None."""
     try:
-        found = os.stat(folder) if folder is not None else None
+        status = os.stat(folder) if folder is not None else None
     except OSError:
         return None
-    mine = found is not None and stat.S_ISDIR(found.st_mode) and _mine(found)
-    return folder if mine else None
+    private = status is not None and stat.S_ISDIR(status.st_mode) and _mine(status)
+    return folder if private else None
 
 
-def _mine(found: os.stat_result) -> bool:
+def _mine(status: os.stat_result) -> bool:
     """Return True if a file or folder belongs to this user alone."""
-    return hasattr(os, "geteuid") and found.st_uid == os.geteuid() and not found.st_mode & 0o077
+    return hasattr(os, "geteuid") and status.st_uid == os.geteuid() and not status.st_mode & 0o077
 
 
 def _checked(file: Path, head: bytes) -> bytes:
@@ -266,9 +266,9 @@ def _checked(file: Path, head: bytes) -> bytes:
     """
     number = os.open(file, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     with open(number, "rb") as opened:
-        found = os.fstat(number)
-        if not stat.S_ISREG(found.st_mode) or not _mine(found):
-            raise OSError(f"{file} is not this user's own")
+        status = os.fstat(number)
+        if not stat.S_ISREG(status.st_mode) or not _mine(status):
+            raise OSError(f"{file} does not belong to this user alone")
         text = opened.read()
     content = text[len(head) + 32 :]
     if text[: len(head) + 32] != head + hashlib.sha256(content).digest():
@@ -279,23 +279,28 @@ def _checked(file: Path, head: bytes) -> bytes:
 def _remove_oldest(folder: Path) -> None:
     """Remove the least recently used entries beyond MOST_BYTES."""
     with os.scandir(folder) as listed:
-        found = [(one.stat(follow_symlinks=False), one.path) for one in listed if one.name.endswith(ENDING)]
-    left = sum(one.st_size for one, _ in found)
-    for one, path in sorted(found, key=lambda pair: pair[0].st_mtime_ns):
-        if left <= MOST_BYTES:
+        entries = [
+            (status.stat(follow_symlinks=False), status.path) for status in listed if status.name.endswith(ENDING)
+        ]
+    total = sum(status.st_size for status, _ in entries)
+    for status, path in sorted(entries, key=lambda pair: pair[0].st_mtime_ns):
+        if total <= MOST_BYTES:
             break
         with suppress(FileNotFoundError):
             os.unlink(path)
-        left -= one.st_size
+        total -= status.st_size
 
 
 @cache
 def _machine() -> str:
     """Return program, packages and processor as text; the last bits of every number depend on them."""
     here = provenance.Provenance.here().model_dump(mode="json", exclude={"blas", "system"})
-    # of the libraries that happen to be loaded, the one that calibrations are computed with
-    loaded = [one for one in threadpool_info() if "numpy" in one["filepath"]]
-    blas = [(one["internal_api"], one["version"], one.get("architecture")) for one in loaded]
+    # the library that computes calibrations, of those that happen to be loaded
+    loaded = [loaded_library for loaded_library in threadpool_info() if "numpy" in loaded_library["filepath"]]
+    blas = [
+        (loaded_library["internal_api"], loaded_library["version"], loaded_library.get("architecture"))
+        for loaded_library in loaded
+    ]
     library = os.environ.get(LLVM_VARIABLE, "")
     with suppress(OSError):
         library += f" {os.stat(library).st_size} {os.stat(library).st_mtime_ns}"
@@ -308,8 +313,8 @@ def _digest(*inputs: Any) -> str | None:
         words = list(_words(inputs))
     except _UnnamedError:
         return None
-    found = provenance.inputs_in([word[2:-1] for word in words if word.startswith("s'")])
-    return hashlib.sha256(json.dumps([words, sorted(found.items())]).encode()).hexdigest()
+    checksums = provenance.inputs_in([word[2:-1] for word in words if word.startswith("s'")])
+    return hashlib.sha256(json.dumps([words, sorted(checksums.items())]).encode()).hexdigest()
 
 
 def _words(value: Any) -> Iterator[str]:
@@ -324,24 +329,24 @@ def _words(value: Any) -> Iterator[str]:
         yield f"class or function {_name(value)}"
     elif isinstance(value, Mapping | Sequence):
         yield f"{type(value).__name__} {len(value)}"
-        for one in value.items() if isinstance(value, Mapping) else value:
-            yield from _words(one)
+        for item in value.items() if isinstance(value, Mapping) else value:
+            yield from _words(item)
     elif isinstance(value, Enum):
         yield f"{_name(type(value))} {value.name}"
     else:
         if isinstance(value, Spec):
             names = [*type(value).model_fields, "model_fields_set"]
         elif is_dataclass(value):
-            names = [one.name for one in fields(value)]
+            names = [item.name for item in fields(value)]
         elif hasattr(value, "__dict__"):
             names = sorted(vars(value))
         else:
             raise _UnnamedError(f"a {type(value).__name__} has no name")
         yield f"{_name(type(value))} {len(names)}"
         for name in names:
-            own = getattr(value, name)
+            attribute = getattr(value, name)
             yield f"s'{name}'"
-            yield from _words(sorted(own) if isinstance(own, set | frozenset) else own)
+            yield from _words(sorted(attribute) if isinstance(attribute, set | frozenset) else attribute)
 
 
 def _name(thing: Any) -> str:

@@ -90,7 +90,7 @@ class CameraCrosstalk:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for crosstalk.json."""
-        rows, keys = [], [one.key for one in parameters.CAMERA_PARAMETERS.values()]
+        rows, keys = [], [parameter.key for parameter in parameters.CAMERA_PARAMETERS.values()]
         for k, motion in enumerate(self.motions):
             rows.append(
                 {
@@ -116,25 +116,25 @@ class CameraCrosstalk:
             along_axis = motion.kind == "shift" and motion.axis == 2 and motion.body.count("/") == 2
             if not (along_axis or motion.kind == "scale"):
                 continue
-            true, seen = self.true[3, k], self.readings["derived"][3, k]
-            false = self.readings["derived"][:3, k] - self.true[:3, k]
-            worst = int(np.argmax(np.abs(false)))
-            if abs(seen - true) < _SEEN_WITHIN * abs(true):
-                verdict = "the spots see it"
-            elif abs(seen) < _SEEN_WITHIN * abs(true):
-                verdict = "the spots do not see it"
+            true, reading = self.true[3, k], self.readings["derived"][3, k]
+            false_readings = self.readings["derived"][:3, k] - self.true[:3, k]
+            worst = int(np.argmax(np.abs(false_readings)))
+            if abs(reading - true) < _SEEN_WITHIN * abs(true):
+                verdict = "the spots show this change"
+            elif abs(reading) < _SEEN_WITHIN * abs(true):
+                verdict = "the spots do not show this change"
             else:
-                verdict = "the spots see it wrongly"
+                verdict = "the spots show a wrong change"
             out.append(
                 f"{motion.label}: the principal distance changes by {true:+.3g} um per {motion.unit}, the spots read "
-                f"{seen:+.3g} um: {verdict}. Beside it they show {false[worst]:+.2g} arcsec of "
-                f"{[*parameters.CAMERA_PARAMETERS.values()][worst].key.removesuffix('_arcsec')} that is not there."
+                f"{reading:+.3g} um: {verdict}. They also show a false {false_readings[worst]:+.2g} arcsec in "
+                f"{[*parameters.CAMERA_PARAMETERS.values()][worst].key.removesuffix('_arcsec')}."
             )
         return tuple(out)
 
 
 def estimator_gains(
-    cameras: Mapping[str, CameraCalibration], stated: Disturbances | None, covariance: np.ndarray | None = None
+    cameras: Mapping[str, CameraCalibration], prior: Disturbances | None, covariance: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
     """Return the first-order gain of each estimator.
 
@@ -142,7 +142,7 @@ def estimator_gains(
     ----------
     cameras : mapping of str to CameraCalibration
         Calibration of each camera.
-    stated : Disturbances | None
+    prior : Disturbances | None
         Prior of the disturbances; None for none.
     covariance : (2 x spots, 2 x spots) ndarray | None
         Covariance of the spots' shifts, in px^2, which weights them; None for no noise.
@@ -153,10 +153,10 @@ def estimator_gains(
         Estimator -> parameters (rad, m) per pixel of shift.
     """
     spots = sum(len(camera.channels) for camera in cameras.values())
-    still = np.zeros((1, spots, 2))
+    zeros = np.zeros((1, spots, 2))
     spread = np.zeros((2 * spots, 2 * spots)) if covariance is None else covariance
-    shifts = Shifts(still, still, spread[None], cameras, stated)
-    return {name: one.gain(shifts)[0] for name, one in applicable(cameras, stated).items()}
+    shifts = Shifts(zeros, zeros, spread[None], cameras, prior)
+    return {name: estimator.gain(shifts)[0] for name, estimator in applicable(cameras, prior).items()}
 
 
 def crosstalk(experiment: MonitorExperiment, covariance: np.ndarray) -> dict[str, CameraCrosstalk]:
@@ -176,38 +176,38 @@ def crosstalk(experiment: MonitorExperiment, covariance: np.ndarray) -> dict[str
     """
     instrument = experiment.instrument
     sets = {name: (*line_family(name), *other_motions(instrument, name)) for name in instrument.cameras}
-    every = [motion for motions in sets.values() for motion in motions]
-    all_spots = spot_jacobian(experiment.path, every)
-    all_truth = truth_jacobian(instrument, experiment.backend, every)
+    all_motions = [motion for motions in sets.values() for motion in motions]
+    all_spots = spot_jacobian(experiment.path, all_motions)
+    all_truth = truth_jacobian(instrument, experiment.backend, all_motions)
     gains = estimator_gains(experiment.cameras, experiment.disturbances)
     out = {}
     for k, (name, motions) in enumerate(sets.items()):
-        own = slice(len(motions) * k, len(motions) * (k + 1))
-        spots = all_spots[list(instrument.channels_of(name))][:, :, own].reshape(-1, len(motions))
-        truth = all_truth[name][:, own]
+        columns = slice(len(motions) * k, len(motions) * (k + 1))
+        spots = all_spots[list(instrument.channels_of(name))][:, :, columns].reshape(-1, len(motions))
+        truth = all_truth[name][:, columns]
         geometry = experiment.geometry(name)
         size = np.array([motion.unit_size for motion in motions])
-        moved = all_spots[:, :, own].reshape(-1, len(motions))
+        moved = all_spots[:, :, columns].reshape(-1, len(motions))
         rows, unit = slice(4 * k, 4 * k + 4), parameters.rows_of(experiment.cameras[name])
-        readings = {e: (unit @ (gain[rows] @ moved)) * size for e, gain in gains.items()}
+        readings = {estimator: (unit @ (gain[rows] @ moved)) * size for estimator, gain in gains.items()}
         true = unit @ truth * size
         f = geometry.principal_distance_m
         ideal = PER_SI * np.array([-1.0 / f, 1.0 / f, 1.0, f]) * size[:4]
         factors = tuple(
             FormulaFactor(
                 where,
-                e,
+                estimator,
                 [*parameters.CAMERA_PARAMETERS.values()][p].key,
                 motions[p].label,
-                readings[e][p, p] / ideal[p],
-                readings[e][p, p] / true[p, p],
+                readings[estimator][p, p] / ideal[p],
+                readings[estimator][p, p] / true[p, p],
             )
-            for (e, p), where in PRINTED.items()
-            if e in readings
+            for (estimator, p), where in PRINTED.items()
+            if estimator in readings
         )
         labels = [f"{m.label} [{m.unit}]" for m in motions]
-        seen = instrument.coordinates_of(name)
-        spread = covariance[np.ix_(seen, seen)]
+        coordinates = instrument.coordinates_of(name)
+        spread = covariance[np.ix_(coordinates, coordinates)]
         report = model_fit.observability(labels, spots, truth, size, spread, family=(0, 1, 2, 3))
         channels = experiment.cameras[name].channels
         out[name] = CameraCrosstalk(motions, spots * size, true, readings, factors, report, channels)

@@ -83,8 +83,8 @@ class PupilMean:
         count = len(points)
         all_weights = np.concatenate([np.broadcast_to(nodes.weight, (count, nodes.count)), -weight], axis=1)
         self._share = all_weights / np.maximum(np.sum(all_weights, axis=1, keepdims=True), _SOME)
-        own = zernike.basis(3, points.real.ravel(), points.imag.ravel()).reshape(*points.shape, 3)
-        self._tilts = np.concatenate([np.broadcast_to(tilts, (count, *tilts.shape)), own], axis=1)
+        shadow_tilts = zernike.basis(3, points.real.ravel(), points.imag.ravel()).reshape(*points.shape, 3)
+        self._tilts = np.concatenate([np.broadcast_to(tilts, (count, *tilts.shape)), shadow_tilts], axis=1)
         degree = DEGREE if free is None else CUT_MEAN_DEGREE
         self._to_terms = to_terms(nodes, degree)
         self._on_stop = products(nodes.x, nodes.y, degree)
@@ -242,8 +242,8 @@ class ImageQuality:
 
     def state(self, number: int) -> dict[str, CameraState]:
         """Return every camera in one state, for files."""
-        where = {place: self.fields.index(field) for place, field in PLACES.items() if field in self.fields}
-        return {name: CameraState(camera, number, where) for name, camera in self.cameras.items()}
+        positions = {position: self.fields.index(field) for position, field in PLACES.items() if field in self.fields}
+        return {name: CameraState(camera, number, positions) for name, camera in self.cameras.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,7 +256,7 @@ class CameraState:
 
     def named(self, values: np.ndarray) -> dict[str, float | None]:
         """Return position -> value, from values (S, F)."""
-        return {place: _known(values[self.number, k]) for place, k in self.places.items()}
+        return {position: _known(values[self.number, k]) for position, k in self.places.items()}
 
 
 def _known(value: float | np.floating[Any]) -> float | None:
@@ -264,50 +264,69 @@ def _known(value: float | np.floating[Any]) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-_REFOCUSED, _TAKEN = "wavefront error at each field's own best focus", "share of the light that bodies in the beam take"
+_REFOCUSED, _TAKEN = (
+    "wavefront error at each field's own best focus",
+    "fraction of the light that bodies in the beam block",
+)
 AT_FIELDS: Record[CameraQuality] = Record(
     "Image quality of a camera in every state at every field, (S, F).",
     Quantity("wfe_rms_waves", lambda c: c.wfe, "wavefront error without piston and tilt", "wavefront error, rms", 4),
-    Quantity("wfe_rms_waves_focus_removed", lambda c: c.wfe_refocused, _REFOCUSED, "the same at best focus [waves]", 4),
+    Quantity(
+        "wfe_rms_waves_focus_removed", lambda c: c.wfe_refocused, _REFOCUSED, "wavefront error at best focus [waves]", 4
+    ),
     Quantity("defocus_um", lambda c: c.defocus, "best focus less line CCD, + downstream", "best focus − line CCD", 1),
     Quantity("mtf_along_line", lambda c: c.mtf_along_line, "at Nyquist", "MTF at Nyquist along the line", 4),
     Quantity("mtf_along_track", lambda c: c.mtf_along_track, "at Nyquist", "MTF at Nyquist along the track", 4),
-    Quantity("light_lost", lambda c: c.light_lost, _TAKEN, "light taken by bodies in the beam", 2, shown="percent"),
+    Quantity("light_lost", lambda c: c.light_lost, _TAKEN, "light blocked by bodies in the beam", 2, shown="percent"),
 )
 """Quantities given at every field: the list that files, reports and scripts follow."""
 
 
-def _at_places(one: Quantity[CameraQuality]) -> Quantity[CameraState]:
+def _at_places(quantity: Quantity[CameraQuality]) -> Quantity[CameraState]:
     """Return the quantity at the named positions of the line, in one state."""
-    return Quantity(one.key, lambda of: of.named(one.of(of.camera)), f"{one.meaning}, at places of the line")
+    return Quantity(
+        quantity.key,
+        lambda camera_state: camera_state.named(quantity.of(camera_state.camera)),
+        f"{quantity.meaning}, at places of the line",
+    )
 
 
 _CAMERA: Record[CameraState] = Record(
     "Image quality of a camera in one state; null where it is not known.",
     Quantity("wfe_rms_waves", lambda of: _known(np.mean(of.camera.wfe[of.number])), "wavefront error, mean of RMS"),
     Quantity("wfe_rms_waves_focus_removed", lambda of: _known(np.mean(of.camera.wfe_refocused[of.number])), _REFOCUSED),
-    Quantity("wfe_worst_waves", lambda of: _known(np.max(of.camera.wfe[of.number])), "the same of the worst field"),
+    Quantity(
+        "wfe_worst_waves", lambda of: _known(np.max(of.camera.wfe[of.number])), "wavefront error of the worst field"
+    ),
     *map(_at_places, list(AT_FIELDS)[2:]),
-    Quantity("obstructed_by", lambda of: {k: of.named(v) for k, v in of.camera.bodies.items()}, "body -> share"),
+    Quantity(
+        "obstructed_by",
+        lambda of: {k: of.named(v) for k, v in of.camera.bodies.items()},
+        "body -> fraction of the stop that it blocks",
+    ),
     Quantity("reason", lambda of: of.camera.reasons[of.number] or None, "why numbers are missing", where_known=True),
 )
 _LIGHT: Record[CameraQuality] = Record(
-    "What the MTF is of.",
+    "Light and limit of the MTF.",
     Quantity("nyquist_per_mm", lambda camera: camera.nyquist, "Nyquist frequency of the line CCD"),
     Quantity("spectrum_nm", lambda camera: camera.wavelengths, "first and last wavelength of the light"),
 )
 QUALITY: Record[ImageQuality] = Record(
     "quality.json: image quality of the perturbed state, and before of the nominal one.",
     Quantity("cameras", lambda quality: quality.state(1), "perturbed, by camera", record=_CAMERA),
-    Quantity("before", lambda quality: {"cameras": quality.state(0)}, "the same of the nominal state", record=_CAMERA),
+    Quantity(
+        "before", lambda quality: {"cameras": quality.state(0)}, "by camera, in the nominal state", record=_CAMERA
+    ),
     Quantity("obstruction", lambda q: "traced" if q.obstruction else "ignore", "whether bodies in the beams count"),
     Quantity("wavelength_nm", lambda quality: quality.wavelength, "unit of wavefront errors"),
-    Quantity("fields", lambda quality: quality.fields, "shares of half the line, +1 at its left end"),
+    Quantity(
+        "fields", lambda quality: quality.fields, "field points as fractions of half the line, +1 at its left end"
+    ),
     Quantity("mtf", lambda quality: quality.cameras, "light and limit of the MTF by camera", record=_LIGHT),
 )
 
 
-@one_blas_thread()  # of small matrices: threads would only wait for each other
+@one_blas_thread()  # for small matrices, threads would only wait for each other
 def image_quality(
     instrument: Instrument,
     backend: Backend,
@@ -371,8 +390,11 @@ def quality_dicts(
     instrument: Instrument, backend: Backend, states: Sequence[State], obstruction: bool = True
 ) -> list[dict[str, Any]]:
     """Return the contents of quality.json for each of many states, traced together."""
-    found = image_quality(instrument, backend, states, obstruction=obstruction)
-    return [{"cameras": {k: _CAMERA(of) for k, of in found.state(s).items()}} for s in range(len(states))]
+    quality = image_quality(instrument, backend, states, obstruction=obstruction)
+    return [
+        {"cameras": {k: _CAMERA(camera_state) for k, camera_state in quality.state(s).items()}}
+        for s in range(len(states))
+    ]
 
 
 _COLUMNS = ("light_lost", "wfe", "wfe_refocused", "defocus", "mtf_along_line", "mtf_along_track")
@@ -436,8 +458,8 @@ class _CameraBench:
         self.points = np.stack([across, along, np.zeros_like(along)], axis=-1)
         self.nyquist = 0.5 / line.pitch
         self.frequency = self.nyquist * np.eye(2)
-        own = spec.spectrum or SpectrumSpec.evenly(spec.wavelength, spec.wavelength)
-        light = own if band is None else band.spectrum
+        spectrum = spec.spectrum or SpectrumSpec.evenly(spec.wavelength, spec.wavelength)
+        light = spectrum if band is None else band.spectrum
         self.ends = light.ends
         self.colours, self.weights = light.rule(COLOURS)
         x, y = self.frequency.T
@@ -468,18 +490,18 @@ class _CameraBench:
         count = len(self.points)
         out[:, which] = values.reshape(len(values), len(which), count)
         for k, s in enumerate(which):
-            own = slice(k * count, (k + 1) * count)
-            if np.any(dark[own]):
+            columns = slice(k * count, (k + 1) * count)
+            if np.any(dark[columns]):
                 out[:, s] = np.nan
-                reasons[s] = f"an aperture beside the stop cuts {np.max(dark[own]):.1%} of the beam"
-            elif np.any(values[0, own] > _DARKEST):
+                reasons[s] = f"an aperture other than the stop vignettes {np.max(dark[columns]):.1%} of the beam"
+            elif np.any(values[0, columns] > _DARKEST):
                 out[1:, s] = np.nan
-                reasons[s] = f"bodies in the beam take {np.max(values[0, own]):.1%} of it"
-            elif np.any(rough[own]):
-                reasons[s] = "no MTF: the wavefront or the pupil's edge is too rough for its polynomials"
-                if self.model.edges and np.max(values[1, own]) > MOST_BLUR:
+                reasons[s] = f"bodies in the beam block {np.max(values[0, columns]):.1%} of it"
+            elif np.any(rough[columns]):
+                reasons[s] = "no MTF: the wavefront or the pupil's edge is too rough for a polynomial fit"
+                if self.model.edges and np.max(values[1, columns]) > MOST_BLUR:
                     reasons[s] = (
-                        f"no MTF: {np.max(values[1, own]):.3g} waves of wavefront error are more than {MOST_BLUR:g}"
+                        f"no MTF: {np.max(values[1, columns]):.3g} waves of wavefront error are more than {MOST_BLUR:g}"
                     )
 
     def bodies(self, count: int) -> dict[str, np.ndarray]:
@@ -504,38 +526,40 @@ class _CameraBench:
         assembly, name = self.assembly, self.name
         placed = assembly.place(states)
         to_stop, to_object = (
-            assemble(assembly, [f"{name}/{way}"], states, placed=placed) for way in ("image_to_stop", "image_to_object")
+            assemble(assembly, [f"{name}/{sequence}"], states, placed=placed)
+            for sequence in ("image_to_stop", "image_to_object")
         )
         axis = self.instrument.camera_axes(name)[:, 1]
         guess = self.instrument.toward_optics(placed, name)[:, None]
         points = points_to_world(placed, self.body, self.points).real
         places, sight = chief_rays(self.backend, to_stop, to_object, points, guess, axis)
-        every = np.repeat(np.arange(len(states)), len(self.points))
+        owner = np.repeat(np.arange(len(states)), len(self.points))
         launch = (places + LAUNCH_DISTANCE * sight).reshape(-1, 3)
         heading = -sight.reshape(-1, 3)
 
-        def sent(colour: float) -> tuple[SystemBatch, ImagingRays]:
-            own = [coloured(self.model.spec, f"{BASE}/{name}", state, colour) for state in states]
+        def launch_beams(colour: float) -> tuple[SystemBatch, ImagingRays]:
+            coloured_states = [coloured(self.model.spec, f"{BASE}/{name}", state, colour) for state in states]
             imaging, forward = (
-                assemble(assembly, [f"{name}/{way}"], own, placed=placed).take(every) for way in ("imaging", "to_stop")
+                assemble(assembly, [f"{name}/{sequence}"], coloured_states, placed=placed).take(owner)
+                for sequence in ("imaging", "to_stop")
             )
             return imaging, imaging_rays(
                 self.backend, imaging, forward, heading, launch, self.stop, self.nodes, first=axis
             )
 
-        imaging, rays = sent(self.model.spec.wavelength)
-        beams = shadow.TracedBeams(assembly, placed, every, imaging, rays, heading, self.nodes)
+        imaging, rays = launch_beams(self.model.spec.wavelength)
+        beams = shadow.TracedBeams(assembly, placed, owner, imaging, rays, heading, self.nodes)
         shadows = None if self.shadows is None else self.shadows.cast(beams)
         outlines: StopOutlines | None = None
         covers: np.ndarray | None = None
         if self.model.edges:
-            free = shadow.no_shadows(len(every)) if shadows is None else shadows
-            seen = shadow.SeenEdges.of(beams, self.model, self.name, self.backend)
-            outlines = seen.outlines(LINE_SIDES) + StopOutlines((), tuple(np.moveaxis(free.pieces, 1, 0)))
-            shadows = free.and_edges(seen.outlines, f"edges of {name}")
+            free = shadow.no_shadows(len(owner)) if shadows is None else shadows
+            edges = shadow.SeenEdges.of(beams, self.model, self.name, self.backend)
+            outlines = edges.outlines(LINE_SIDES) + StopOutlines((), tuple(np.moveaxis(free.pieces, 1, 0)))
+            shadows = free.and_edges(edges.outlines, f"edges of {name}")
             covers = ~covered(shadows.pieces, np.stack([self.nodes.x, self.nodes.y], axis=-1), SMALLEST)
         origin = (imaging.size[:, None] * np.tile(self.points, (len(states), 1)))[:, None]
-        return _Traced(rays, imaging.size, origin, shadows, outlines, covers, lambda colour: sent(colour)[1])
+        return _Traced(rays, imaging.size, origin, shadows, outlines, covers, lambda colour: launch_beams(colour)[1])
 
     def _numbers(self, traced: _Traced, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return values (V, B) of _COLUMNS, the vignetted fraction of each beam, and whether its MTF is unknown."""
@@ -550,34 +574,36 @@ class _CameraBench:
         wfe, refocused = (np.sqrt(np.maximum(mean(e**2), 0.0)) / self.wavelength for e in (error, rest))
         dark = np.mean((rays.amplitude == 0.0) & (True if free is None else free), axis=-1)
         mtf = np.full((2, len(dark)), np.nan)
-        lost = np.zeros(len(dark))
-        lit = np.flatnonzero(dark == 0.0)
-        if len(lit):
-            pupils, smooth, cosines = self._pupils(traced, rays, lit, float(np.min(self.colours)))
-            lost[lit] = 1.0 - pupils.light
+        light_lost = np.zeros(len(dark))
+        illuminated = np.flatnonzero(dark == 0.0)
+        if len(illuminated):
+            pupils, smooth, cosines = self._pupils(traced, rays, illuminated, float(np.min(self.colours)))
+            light_lost[illuminated] = 1.0 - pupils.light
             if self.model.edges:
-                # as many nodes as such a phase takes would be minutes, for a contrast that is next to nothing
-                smooth &= wfe[lit] * self.wavelength <= MOST_BLUR * float(np.min(self.colours))
+                # the nodes for such a phase would take minutes, for almost no contrast
+                smooth &= wfe[illuminated] * self.wavelength <= MOST_BLUR * float(np.min(self.colours))
             good = np.flatnonzero(smooth & (pupils.bend <= WORST_BEND) & (pupils.light >= 1.0 - _DARKEST))
             if len(good):
                 if self.refracts:
-                    otf, known = self._in_colours(traced, lit[good])
+                    otf, known = self._in_colours(traced, illuminated[good])
                 else:
-                    own = pupils if len(good) == len(lit) else pupils.take(good)
-                    seen = tuple(part[good] for part in cosines)
-                    otf, known = self._transfer(traced, lit[good], own, seen, self.colours, self.weights)
+                    good_pupils = pupils if len(good) == len(illuminated) else pupils.take(good)
+                    good_cosines = tuple(part[good] for part in cosines)
+                    otf, known = self._transfer(
+                        traced, illuminated[good], good_pupils, good_cosines, self.colours, self.weights
+                    )
                 good, otf = good[known], otf[known]
                 check_range(f"an MTF of the optics of camera {self.name}", np.abs(otf), 0.0, 1.0, _MTF_ROUNDING)
-                mtf[:, lit[good]] = (np.abs(otf) * self.detector).T
-            self._note(pupils, lit, which)
+                mtf[:, illuminated[good]] = (np.abs(otf) * self.detector).T
+            self._note(pupils, illuminated, which)
         if shadows is not None:
             self._taken.append((which, shadows.shares()))
-        values = np.stack([lost, wfe, refocused, defocus, *mtf])
+        values = np.stack([light_lost, wfe, refocused, defocus, *mtf])
         self._hold(values, dark, shadows)
         return values, dark, np.isnan(mtf[0])
 
     def _pupils(
-        self, traced: _Traced, rays: ImagingRays, lit: np.ndarray, colour: float
+        self, traced: _Traced, rays: ImagingRays, illuminated: np.ndarray, colour: float
     ) -> tuple[PupilStack, np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Return pupils of illuminated beams, whether each is smooth at a wavelength, and the rays' direction cosines.
 
@@ -595,33 +621,35 @@ class _CameraBench:
         """
         # the image's first axis runs along the line, Y', the second along the track, X'
         # per length of the nominal CCD, in which the pixels keep their pitch
-        v, u = np.moveaxis(traced.size[lit, None, None] * rays.direction[lit, :, :2], -1, 0)
-        path = eikonal(rays.position[lit], rays.direction[lit], rays.path[lit], traced.origin[lit])
-        beams = u, v, path - path[:, :1], rays.amplitude[lit], self.nodes
-        taken = None if traced.shadows is None else traced.shadows.pieces[lit]
+        v, u = np.moveaxis(traced.size[illuminated, None, None] * rays.direction[illuminated, :, :2], -1, 0)
+        path = eikonal(
+            rays.position[illuminated], rays.direction[illuminated], rays.path[illuminated], traced.origin[illuminated]
+        )
+        beams = u, v, path - path[:, :1], rays.amplitude[illuminated], self.nodes
+        shadows = None if traced.shadows is None else traced.shadows.pieces[illuminated]
         if traced.free is None:
-            pupils = PupilStack.fit(*beams, DEGREE, taken, FEW_SIDES)
+            pupils = PupilStack.fit(*beams, DEGREE, shadows, FEW_SIDES)
         else:
-            pupils = PupilStack.fit_vignetted(*beams, colour, taken, traced.free[lit])
+            pupils = PupilStack.fit_vignetted(*beams, colour, shadows, traced.free[illuminated])
         return pupils, pupils.residual <= WORST_RESIDUAL * colour, (u, v)
 
-    def _in_colours(self, traced: _Traced, lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _in_colours(self, traced: _Traced, illuminated: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return ``_transfer`` of beams through lenses, with the rays of each wavelength.
 
         All wavelengths refer to one image point, so that lateral colour blurs.
         """
-        total, known = np.zeros((len(lit), len(self.frequency)), complex), np.ones(len(lit), bool)
+        total, known = np.zeros((len(illuminated), len(self.frequency)), complex), np.ones(len(illuminated), bool)
         for colour, weight in zip(self.colours, self.weights / np.sum(self.weights), strict=True):
-            pupils, good, cosines = self._pupils(traced, traced.again(float(colour)), lit, float(colour))
-            otf, told = self._transfer(traced, lit, pupils, cosines, np.array([colour]), np.ones(1))
-            known &= good & told & (pupils.bend <= WORST_BEND)
+            pupils, good, cosines = self._pupils(traced, traced.again(float(colour)), illuminated, float(colour))
+            otf, computed = self._transfer(traced, illuminated, pupils, cosines, np.array([colour]), np.ones(1))
+            known &= good & computed & (pupils.bend <= WORST_BEND)
             total += weight * otf
         return total, known
 
     def _transfer(
         self,
         traced: _Traced,
-        lit: np.ndarray,
+        illuminated: np.ndarray,
         pupils: PupilStack,
         cosines: tuple[np.ndarray, ...],
         colours: np.ndarray,
@@ -635,14 +663,16 @@ class _CameraBench:
         if traced.outlines is None or traced.free is None:
             return pupils.transfer(self.frequency, colours, weights), known
         total, shares = np.zeros((len(known), len(self.frequency)), complex), weights / np.sum(weights)
-        for k, (beam, pupil) in enumerate(zip(lit, pupils.functions(), strict=True)):
+        for k, (beam, pupil) in enumerate(zip(illuminated, pupils.functions(), strict=True)):
             u, v = (part[k : k + 1] for part in cosines)
-            own = slice(beam, beam + 1)
+            beam_slice = slice(beam, beam + 1)
             try:
-                cut = vignetted_pupils([pupil], u, v, self.nodes, traced.outlines.take(own), traced.free[own])
+                vignetted = vignetted_pupils(
+                    [pupil], u, v, self.nodes, traced.outlines.take(beam_slice), traced.free[beam_slice]
+                )
                 for colour, share in zip(colours, shares, strict=True):
-                    (ways,) = line_transfers(cut, [float(colour)], np.eye(2), self.nyquist, 2)
-                    total[k] += share * np.array([way.values[1] for way in ways])
+                    (directions,) = line_transfers(vignetted, [float(colour)], np.eye(2), self.nyquist, 2)
+                    total[k] += share * np.array([way.values[1] for way in directions])
             except UnphysicalError:
                 known[k] = False
         return total, known
@@ -655,11 +685,11 @@ class _CameraBench:
         UnphysicalError
             A value is impossible; the message names the camera and the quantity.
         """
-        # a beam that something cuts or all but stops is told by its reason, and not by numbers
-        told = (dark == 0.0) & (values[0] <= _DARKEST)
-        lost, wfe, refocused, _, along, track, *_ = values[:, told]
+        # a vignetted or almost blocked beam has a reason instead of numbers
+        judged = (dark == 0.0) & (values[0] <= _DARKEST)
+        lost, wfe, refocused, _, along, track, *_ = values[:, judged]
         of = f"of camera {self.name}"
-        check_range(f"the share of the light {of} that bodies take", lost, 0.0, 1.0, _ROUNDING)
+        check_range(f"the fraction of the light {of} that bodies block", lost, 0.0, 1.0, _ROUNDING)
         check_range(f"a wavefront error {of} in waves", wfe, 0.0, _MOST_WAVES, 0.0)
         most = wfe * (1.0 + _ROUNDING)
         check_at_most(f"a wavefront error {of} at best focus", refocused, most, "that on the line CCD", _ROUNDING)
@@ -667,22 +697,26 @@ class _CameraBench:
         if shadows is None or not shadows.owners:
             return
         shares = np.array(list(shadows.shares().values()))
-        check_range(f"the share of the stop {of} that a body takes", shares, 0.0, 1.0, _ROUNDING)
+        check_range(f"the fraction of the stop {of} that a body blocks", shares, 0.0, 1.0, _ROUNDING)
         together = np.sum(shares, axis=0)
-        check_range(f"the share of the stop {of} that bodies take together", together, 0.0, 1.0, _ROUNDING)
+        check_range(f"the fraction of the stop {of} that bodies block together", together, 0.0, 1.0, _ROUNDING)
         points = np.stack([_FEW.x, _FEW.y], axis=-1)
         counted = np.mean(covered(shadows.pieces, points, SMALLEST), axis=-1)
-        check_close(f"the share of the stop {of} that bodies take", together, counted, "that of points in it", _APART)
-        check_close(f"the share of the stop {of} that bodies take", together[told], lost, "that of the light", _APART)
+        check_close(
+            f"the fraction of the stop {of} that bodies block", together, counted, "that of points in it", _APART
+        )
+        check_close(
+            f"the fraction of the stop {of} that bodies block", together[judged], lost, "that of the light", _APART
+        )
 
-    def _note(self, pupils: PupilStack, lit: np.ndarray, which: np.ndarray) -> None:
+    def _note(self, pupils: PupilStack, illuminated: np.ndarray, which: np.ndarray) -> None:
         """Store the outlines of the pupils of states with all fields illuminated."""
         count = len(self.points)
         size = np.sqrt(np.abs(np.linalg.det(pupils.axes)))[:, None, None]
         axes = pupils.axes / size
         pieces = np.zeros((len(axes), 0, 3, 2)) if pupils.shadow is None else pupils.shadow.pieces
         pieces = np.einsum("bij,bkvj->bkvi", axes, pieces)
-        where = {int(b): k for k, b in enumerate(lit)}
+        where = {int(b): k for k, b in enumerate(illuminated)}
         for k, s in enumerate(which):
-            own = [where.get(b) for b in range(k * count, (k + 1) * count)]
-            self.pupils[int(s)] = tuple(PupilOutline(axes[b], pieces[b]) for b in own if b is not None)
+            beams = [where.get(b) for b in range(k * count, (k + 1) * count)]
+            self.pupils[int(s)] = tuple(PupilOutline(axes[b], pieces[b]) for b in beams if b is not None)

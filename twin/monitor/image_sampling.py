@@ -96,12 +96,12 @@ class ImageChecks:
         self.difference = max(self.difference, float(np.max(difference, initial=0.0)))
         self.light = max(self.light, float(np.max(np.abs(light), initial=0.0)))
 
-    def told(self) -> tuple[SelfCheck, ...]:
+    def self_checks(self) -> tuple[SelfCheck, ...]:
         """Return the checks for a manifest; none if no image was made."""
         if not self.images:
             return ()
-        refused = f"{self.images} images; one beyond the limit is refused"
-        wings = f"{self.images} images; beyond the wings that diffraction allows; one that has any is refused"
+        refused = f"{self.images} images; images beyond the limit are refused"
+        wings = f"{self.images} images; light beyond the wings of diffraction; images with any are refused"
         return (
             SelfCheck("images by a second quadrature at 16 pixels", self.difference, WRONG, "of the peak", refused),
             SelfCheck("light on the CCDs against that of the rays", self.light, 0.0, "of a channel's light", wings),
@@ -157,13 +157,13 @@ class NodeClasses:
         return quadrature.second_disk_for(self.phase(number))
 
     def class_of(
-        self, place: np.ndarray, margin: int = 0, blur: np.ndarray | float = 0.0, widening: np.ndarray | float = 1.0
+        self, position: np.ndarray, margin: int = 0, blur: np.ndarray | float = 0.0, widening: np.ndarray | float = 1.0
     ) -> np.ndarray:
         """Return the first class that suffices for all spots of each state; the number of classes if none does.
 
         Parameters
         ----------
-        place : (C, S, 2) ndarray
+        position : (C, S, 2) ndarray
             Centres of the spots, in pixels from the CCD's centre.
         margin : int
             Extra pixels rendered on every side of the CCD.
@@ -180,11 +180,11 @@ class NodeClasses:
         half = np.array(self.half)
         wide = np.where(np.asarray(widening) > _WIDER_BEAM, widening, 1.0)
         more = np.maximum(BLUR_PHASE * (wide * blur - _SHARP_PHASE / self.phase_per_pixel), 0.0)
-        farthest = np.max(wide * np.linalg.norm(np.abs(place) + half + margin, axis=-1) + more, axis=0)
+        farthest = np.max(wide * np.linalg.norm(np.abs(position) + half + margin, axis=-1) + more, axis=0)
         return np.searchsorted(self.reached, farthest / np.linalg.norm(half))
 
 
-def disagreement(images: np.ndarray, second: PupilField, x: Grid, y: Grid) -> np.ndarray:
+def quadrature_difference(images: np.ndarray, second: PupilField, x: Grid, y: Grid) -> np.ndarray:
     """Return the largest difference of each image from a second quadrature, relative to its peak, (B,).
 
     The images are compared at their corners, at their peak and beside it.
@@ -203,19 +203,19 @@ def disagreement(images: np.ndarray, second: PupilField, x: Grid, y: Grid) -> np
     count, rows, columns = images.shape
     top = np.argmax(images.reshape(count, -1), axis=-1)
     row, column = top // columns, top % columns
-    # halfway from the peak to the nearer edge: some place on its flank or in its rings
+    # halfway from the peak to the nearer edge: on its flank or in its rings
     along = [
         np.stack([np.zeros_like(at), at, (at + np.where(2 * at < n, n - 1, 0)) // 2, np.full_like(at, n - 1)], axis=-1)
         for at, n in ((row, rows), (column, columns))
     ]
-    seen = images[np.arange(count)[:, None, None], along[0][:, :, None], along[1][:, None, :]]
-    want = at_intersections(second, x.start + x.step * along[1], y.start + y.step * along[0])
-    peak = np.maximum(images.reshape(count, -1).max(axis=-1), want.reshape(count, -1).max(axis=-1))
-    return np.asarray(np.max(np.abs(seen - want), axis=(-2, -1)) / peak)
+    values = images[np.arange(count)[:, None, None], along[0][:, :, None], along[1][:, None, :]]
+    expected = at_intersections(second, x.start + x.step * along[1], y.start + y.step * along[0])
+    peak = np.maximum(images.reshape(count, -1).max(axis=-1), expected.reshape(count, -1).max(axis=-1))
+    return np.asarray(np.max(np.abs(values - expected), axis=(-2, -1)) / peak)
 
 
-def lost_or_gained(
-    light: np.ndarray, place: np.ndarray, share: np.ndarray, half: np.ndarray, wings: np.ndarray
+def energy_excess(
+    light: np.ndarray, position: np.ndarray, share: np.ndarray, half: np.ndarray, wings: np.ndarray
 ) -> np.ndarray:
     """Return the fraction of each image's light outside the range that the traced rays allow, (B,).
 
@@ -225,7 +225,7 @@ def lost_or_gained(
     ----------
     light : (B,) ndarray
         Light on the image, as a fraction of the channel's.
-    place : (B, N, 2) ndarray
+    position : (B, N, 2) ndarray
         Positions of the rays from the centre of the image, (row, column) in pixels.
     share : (B, N) ndarray
         Light of each ray, 0 for a lost one.
@@ -234,7 +234,7 @@ def lost_or_gained(
     wings : (B,) ndarray
         Distance that diffraction reaches, in pixels.
     """
-    outside = np.max(np.abs(place) - half, axis=-1)
+    outside = np.max(np.abs(position) - half, axis=-1)
     most = np.sum(share * (outside < wings[:, None]), axis=-1) + LOST
     least = np.sum(share * (outside < -wings[:, None]), axis=-1) - LOST
     return np.asarray(np.maximum(light - most, 0.0) - np.maximum(least - light, 0.0))

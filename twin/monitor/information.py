@@ -80,11 +80,11 @@ class Information:
         The gain has the least variance, so its own change does not contribute: with w = gain' row, the variance
         changes by 2 w' dA C (A' w - B' row) + w' dR w.
         """
-        stated, rows = self.disturbances, self.quantities[name]
+        prior, rows = self.disturbances, self.quantities[name]
         weights = rows @ self.gain
-        left = (weights @ stated.spots - rows @ stated.parameters) @ stated.correlation
+        residual = (weights @ prior.spots - rows @ prior.parameters) @ prior.correlation
         scale = 2.0 * self.sigma(name) * len(rows)
-        return 2.0 * weights.T @ left / scale, weights.T @ weights / scale
+        return 2.0 * weights.T @ residual / scale, weights.T @ weights / scale
 
     def shares(self, name: str, measured: bool = True) -> dict[str, float]:
         """Return the variance of a quantity by cause, in SI units; causes are independent, so the variances add up.
@@ -96,10 +96,10 @@ class Information:
         measured : bool
             True for the posterior variance, including noise; False for the prior variance.
         """
-        found = self.splits[name]
-        shares = Split.by(found.after if measured else found.before, self.disturbances.causes)
+        variances = self.splits[name]
+        shares = Split.by(variances.after if measured else variances.before, self.disturbances.causes)
         out = {cause: float(np.mean(share)) for cause, share in shares.items()}
-        return {**out, NOISE: float(np.mean(found.noise))} if measured else out
+        return {**out, NOISE: float(np.mean(variances.noise))} if measured else out
 
     @property
     def spot_sigma(self) -> np.ndarray:
@@ -109,11 +109,11 @@ class Information:
 
 def information_of(
     instrument: Instrument,
-    stated: Sequence[DisturbancesSpec],
+    prior: Sequence[DisturbancesSpec],
     detector: EmvaDetector,
     backend: Backend,
     ground: GroundGeometry | None = None,
-    alike: bool = False,
+    same_shape: bool = False,
     single: bool = True,
 ) -> list[Information]:
     """Return the information of an instrument's spots, for each prior.
@@ -122,7 +122,7 @@ def information_of(
     ----------
     instrument : Instrument
         Instrument.
-    stated : sequence of DisturbancesSpec
+    prior : sequence of DisturbancesSpec
         Disturbances files.
     detector : EmvaDetector
         Model of the area CCDs.
@@ -130,7 +130,7 @@ def information_of(
         Backend of the ray trace.
     ground : GroundGeometry | None
         Ground geometry of a pair, which adds the height to the quantities.
-    alike : bool
+    same_shape : bool
         True to assume the same noise for spots of one camera and one beam width.
     single : bool
         True for images in single precision, as elsewhere; False (double) if they are differentiated.
@@ -143,7 +143,7 @@ def information_of(
         Light does not reach the area CCDs.
     """
     path, thermal = MonitorPath(instrument, backend), ThermalModel(instrument)
-    noise, brightest = spot_noise(path, detector, alike, single)
+    noise, brightest = spot_noise(path, detector, same_shape, single)
     rows = quantity_rows(instrument, ground)
     return [
         Information(
@@ -152,7 +152,7 @@ def information_of(
             rows,
             brightest,
         )
-        for spec in stated
+        for spec in prior
     ]
 
 
@@ -191,7 +191,7 @@ def ground_of(instrument: Instrument) -> GroundGeometry | None:
 
 
 def spot_noise(
-    path: MonitorPath, detector: EmvaDetector, alike: bool = False, single: bool = True
+    path: MonitorPath, detector: EmvaDetector, same_shape: bool = False, single: bool = True
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the noise covariance of all shifts, and how full each spot's brightest pixel is.
 
@@ -204,7 +204,7 @@ def spot_noise(
         Optical path of the monitor.
     detector : EmvaDetector
         Model of the area CCDs.
-    alike : bool
+    same_shape : bool
         True to assume the same shape, but not the same light, for spots of one camera and one beam width.
     single : bool
         True for images in single precision.
@@ -220,19 +220,21 @@ def spot_noise(
         Light does not reach the area CCDs.
     """
     channels = path.channels
-    groups = {(c.camera, c.aperture) if alike else c.key: c for c in reversed(channels)}
+    groups = {(c.camera, c.aperture) if same_shape else c.key: c for c in reversed(channels)}
     shown = tuple(c for c in channels if c in groups.values())
-    own = path if len(shown) == len(channels) else MonitorPath(replace(path.instrument, channels=shown), path.backend)
-    photons = own.expected_photons([{}], margin=_SLOPE, single=single)[0]
+    shown_path = (
+        path if len(shown) == len(channels) else MonitorPath(replace(path.instrument, channels=shown), path.backend)
+    )
+    photons = shown_path.expected_photons([{}], margin=_SLOPE, single=single)[0]
     images = []
     for channel in channels:
-        like = groups[(channel.camera, channel.aperture) if alike else channel.key]
-        images.append(photons[shown.index(like)] * (channel.photons / like.photons))
+        representative = groups[(channel.camera, channel.aperture) if same_shape else channel.key]
+        images.append(photons[shown.index(representative)] * (channel.photons / representative.photons))
     bounds, brightest = _image_bounds(np.stack(images)[None], path, detector)
     return joint(2.0 * bounds)[0], brightest[0]
 
 
-def built_noise(path: MonitorPath, detector: EmvaDetector, states: Sequence[State]) -> np.ndarray:
+def noise_as_built(path: MonitorPath, detector: EmvaDetector, states: Sequence[State]) -> np.ndarray:
     """Return the noise covariance of all shifts for instruments as built, (S, D, D), in px^2, as ``spot_noise`` does.
 
     Both images, before and after, are those of the instrument as built.
@@ -251,8 +253,8 @@ def built_noise(path: MonitorPath, detector: EmvaDetector, states: Sequence[Stat
     BeamMissedError, AimError
         Light does not reach the area CCDs, or no image can be computed.
     """
-    found = [_image_bounds(photons, path, detector)[0] for _, photons in path.iterate_photons(states, margin=_SLOPE)]
-    return joint(2.0 * np.concatenate(found))
+    bounds = [_image_bounds(photons, path, detector)[0] for _, photons in path.iterate_photons(states, margin=_SLOPE)]
+    return joint(2.0 * np.concatenate(bounds))
 
 
 def _image_bounds(photons: np.ndarray, path: MonitorPath, detector: EmvaDetector) -> tuple[np.ndarray, np.ndarray]:

@@ -29,7 +29,7 @@ from twin.monitor.image_sampling import UncertainImageError
 
 
 @dataclass(frozen=True, eq=False)
-class Aimed:
+class AimedRays:
     """Rays from the pinholes, aimed at the nodes, for C channels x S states (channel-major).
 
     Attributes
@@ -63,9 +63,9 @@ class CoarseTrace:
         Systems from the pinholes to the return face, and on to the CCDs.
     uploaded : UploadedSystems
         Systems ``back`` on the device.
-    turn : (2, C*S, T) ndarray
+    aim_change : (2, C*S, T) ndarray
         Change of the aim parameters relative to the nominal instrument, as Zernike terms on the face.
-    place : (C, S, 2) ndarray
+    centre : (C, S, 2) ndarray
         Centres of the spots, (row, column) in pixels from the CCD's centre.
     blur : (C, S) ndarray
         Distance of the farthest rays from there, extrapolated to the aperture's edge, in pixels.
@@ -77,21 +77,21 @@ class CoarseTrace:
     outgoing: SystemBatch
     back: SystemBatch
     uploaded: UploadedSystems
-    turn: np.ndarray
-    place: np.ndarray
+    aim_change: np.ndarray
+    centre: np.ndarray
     blur: np.ndarray
     aperture: np.ndarray
 
     def take(self, states: np.ndarray, backend: Backend) -> CoarseTrace:
         """Return the states of the given indices."""
-        channels, count = self.place.shape[:2]
+        channels, count = self.centre.shape[:2]
         if np.array_equal(states, np.arange(count)):
             return self
-        own = (np.arange(channels)[:, None] * count + states).ravel()
-        fan = RayFan(self.fan.position[own], self.fan.direction[own], self.fan.axes[own])
-        outgoing, back = self.outgoing.take(own), self.back.take(own)
-        spots = (spot[:, states] for spot in (self.place, self.blur, self.aperture))
-        return CoarseTrace(fan, outgoing, back, back.upload(backend), self.turn[:, own], *spots)
+        rows = (np.arange(channels)[:, None] * count + states).ravel()
+        fan = RayFan(self.fan.position[rows], self.fan.direction[rows], self.fan.axes[rows])
+        outgoing, back = self.outgoing.take(rows), self.back.take(rows)
+        spots = (spot[:, states] for spot in (self.centre, self.blur, self.aperture))
+        return CoarseTrace(fan, outgoing, back, back.upload(backend), self.aim_change[:, rows], *spots)
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,15 +247,15 @@ class MonitorBeams:
         UncertainImageError
             A map is too rough for the Zernike terms.
         """
-        out, rest = _area_ratio(u, v, self._smooth)
-        rough = rest > SMOOTH
+        out, residual = _area_ratio(u, v, self._smooth)
+        rough = residual > SMOOTH
         if np.any(rough):
-            out[rough], rest = _area_ratio(u[rough], v[rough], self._rough)
-            left = float(np.max(rest))
-            if left > TOO_ROUGH:
+            out[rough], residual = _area_ratio(u[rough], v[rough], self._rough)
+            largest = float(np.max(residual))
+            if largest > TOO_ROUGH:
                 raise UncertainImageError(
-                    f"figures of mirrors or prisms are too rough for an image: directions of rays leave {left:.2g} of "
-                    f"the aperture beside {ROUGH_TERMS} Zernike terms; smaller figures, or of lower order, would do"
+                    f"figures of mirrors or prisms are too rough for an image: {ROUGH_TERMS} Zernike terms leave "
+                    f"{largest:.2g} of the aperture in the ray directions; use smaller figures, or lower orders"
                 )
         return out
 
@@ -281,17 +281,17 @@ class MonitorBeams:
         return np.repeat(self.target, states, axis=0)
 
     @cached_property
-    def nominal(self) -> Aimed:
+    def nominal(self) -> AimedRays:
         """Aimed rays of the unperturbed instrument, from which all other states start.
 
         They are aimed first at the centre of the face, then at the nodes around it.
         """
         fan, outgoing = self._outgoing(self.instrument.assembly.place(), [{}])
         middle, slope = aim(self.backend, outgoing, fan, np.zeros((1, 2)), tolerance=_CLOSE_TOLERANCE)
-        near = middle + np.einsum("bnij,bpj->bpi", inverse(slope), self.target)
-        q, slope = aim(self.backend, outgoing, fan, self.target, near, slope, _CLOSE_TOLERANCE)
-        place, heading = fan.at(q)
-        return Aimed(place, heading, fan.axes, q, slope)
+        start = middle + np.einsum("bnij,bpj->bpi", inverse(slope), self.target)
+        q, slope = aim(self.backend, outgoing, fan, self.target, start, slope, _CLOSE_TOLERANCE)
+        launch, heading = fan.at(q)
+        return AimedRays(launch, heading, fan.axes, q, slope)
 
     def coarse_trace(self, states: Sequence[State], placed: PlacedBodies | None = None) -> CoarseTrace:
         """Trace a few rays to find the spots of S states, and the launch directions that hit the nodes of the face.
@@ -316,27 +316,27 @@ class MonitorBeams:
         nominal = scout.nominal
         start, slope = (np.repeat(a, count, axis=0) for a in (nominal.parameters, nominal.jacobian))
         q, _ = aim(self.backend, outgoing, fan, scout.targets(count), start, slope, _CLOSE_TOLERANCE)
-        turn = product(np.moveaxis(q - start, -1, 0), scout._smooth[0].T)
+        aim_change = product(np.moveaxis(q - start, -1, 0), scout._smooth[0].T)
         uploaded = back.upload(self.backend)
         traced = trace(self.backend, uploaded, make_rays(self.backend, *fan.at(q)))
         pitch = self.pitch * back.size[:, None]
         position, direction, _, valid = traced.numpy()
-        place = np.einsum("n,bnk->bk", scout.nodes.share, position[..., :2])[:, ::-1] / pitch
+        centre = np.einsum("n,bnk->bk", scout.nodes.share, position[..., :2])[:, ::-1] / pitch
         # an aberration of some order grows at least like its third power toward the edge
         rim = np.max(np.hypot(scout.nodes.x, scout.nodes.y)) ** 3
-        off = np.linalg.norm(position[..., 1::-1] / pitch[..., None] - place[:, None], axis=-1)
-        blur = np.max(np.where(valid, off, 0.0), axis=-1) / rim
-        middle = np.einsum("n,bnk->bk", scout.nodes.share, direction[..., :2])
-        lean = np.linalg.norm(direction[..., :2] - middle[:, None], axis=-1)
-        aperture = np.max(np.where(valid, lean, 0.0) / np.hypot(scout.nodes.x, scout.nodes.y), axis=-1)
+        distance = np.linalg.norm(position[..., 1::-1] / pitch[..., None] - centre[:, None], axis=-1)
+        blur = np.max(np.where(valid, distance, 0.0), axis=-1) / rim
+        mean_direction = np.einsum("n,bnk->bk", scout.nodes.share, direction[..., :2])
+        slope_from_mean = np.linalg.norm(direction[..., :2] - mean_direction[:, None], axis=-1)
+        aperture = np.max(np.where(valid, slope_from_mean, 0.0) / np.hypot(scout.nodes.x, scout.nodes.y), axis=-1)
         by_state = (len(self.channels), count)
-        spots = place.reshape(*by_state, 2), blur.reshape(by_state), aperture.reshape(by_state)
-        return CoarseTrace(fan, outgoing, back, uploaded, turn, *spots)
+        spots = centre.reshape(*by_state, 2), blur.reshape(by_state), aperture.reshape(by_state)
+        return CoarseTrace(fan, outgoing, back, uploaded, aim_change, *spots)
 
     @cached_property
-    def place_at_rest(self) -> np.ndarray:
+    def centre_at_rest(self) -> np.ndarray:
         """Spot centres of the unperturbed instrument from ``coarse_trace``, (C, 1, 2), in pixels."""
-        return self.coarse_trace([{}]).place
+        return self.coarse_trace([{}]).centre
 
     def mean_spots(self, states: Sequence[State]) -> np.ndarray:
         """Return the means of the rays, (S, C, 2), row and column in pixels from the first pixel's centre.
@@ -362,28 +362,30 @@ class MonitorBeams:
         BeamMissedError, AimError
             A perturbation moves a beam off the mirrors or a spot off its CCD; the message names it.
         """
-        known = self.coarse_trace(states) if coarse is None else coarse
+        coarse_result = self.coarse_trace(states) if coarse is None else coarse
         start, slope = (np.repeat(a, len(states), axis=0) for a in (self.nominal.parameters, self.nominal.jacobian))
-        q = start + np.moveaxis(product(known.turn, self._smooth[1].T), 0, -1)
-        launch = known.fan.at(q)
-        face = len(known.outgoing.structure) - 1
-        traced = trace(self.backend, known.uploaded, make_rays(self.backend, *launch), keep=(face,))
+        q = start + np.moveaxis(product(coarse_result.aim_change, self._smooth[1].T), 0, -1)
+        launch = coarse_result.fan.at(q)
+        face = len(coarse_result.outgoing.structure) - 1
+        traced = trace(self.backend, coarse_result.uploaded, make_rays(self.backend, *launch), keep=(face,))
         goal = self.targets(len(states))
-        if not np.max(np.abs(traced.xy(face) - known.outgoing.size[:, None, None] * goal)) <= AIM_TOLERANCE:
-            # a change that is not smooth enough for its few terms
-            q, _ = aim(self.backend, known.outgoing, known.fan, goal, q, slope, AIM_TOLERANCE)
-            launch = known.fan.at(q)
-            traced = trace(self.backend, known.uploaded, make_rays(self.backend, *launch), keep=(face,))
+        if not np.max(np.abs(traced.xy(face) - coarse_result.outgoing.size[:, None, None] * goal)) <= AIM_TOLERANCE:
+            # the change is not smooth enough for its few terms
+            q, _ = aim(self.backend, coarse_result.outgoing, coarse_result.fan, goal, q, slope, AIM_TOLERANCE)
+            launch = coarse_result.fan.at(q)
+            traced = trace(self.backend, coarse_result.uploaded, make_rays(self.backend, *launch), keep=(face,))
         position, direction, length, valid = traced.numpy()
-        rays = CcdRays(position / known.back.size[:, None, None], direction, length, valid, known.back.size)
+        rays = CcdRays(
+            position / coarse_result.back.size[:, None, None], direction, length, valid, coarse_result.back.size
+        )
         for i, channel in enumerate(self.channels):
-            own = slice(i * len(states), (i + 1) * len(states))
-            if not np.all(np.any(rays.valid[own], axis=1)):
-                lost = int(np.argmin(np.any(rays.valid[own], axis=1)))
-                first = own.start + lost
-                where = self._where_lost(channel, states[lost], launch[0][first], launch[1][first])
+            rows = slice(i * len(states), (i + 1) * len(states))
+            if not np.all(np.any(rays.valid[rows], axis=1)):
+                first_lost = int(np.argmin(np.any(rays.valid[rows], axis=1)))
+                first = rows.start + first_lost
+                where = self._where_lost(channel, states[first_lost], launch[0][first], launch[1][first])
                 raise BeamMissedError(f"the whole beam of the monitor channel {channel.key} misses {where}")
-            middle = np.einsum("n,snk->sk", self.nodes.share, rays.position[own, :, 1::-1])
+            middle = np.einsum("n,snk->sk", self.nodes.share, rays.position[rows, :, 1::-1])
             self._require_on_ccd(channel, middle / self.pitch)
         return rays
 
@@ -392,7 +394,7 @@ class MonitorBeams:
         names = self.instrument.assembly.sequences[f"{channel.key}/monitor"]
         steps = surviving_rays(self.backend, self.instrument.assembly, names, position, direction, state)
         count, element = next((i, element) for i, (element, alive) in enumerate(steps, 1) if not alive.any())
-        return f"{element.name} on {element.body}, at surface {count} of {len(names)} of its way"
+        return f"{element.name} on {element.body}, at surface {count} of {len(names)} of its path"
 
     def fields(self, states: Sequence[State]) -> PupilField:
         """Return the plane waves at the CCDs for C channels x S states. Raises the errors of ``rays``."""
@@ -408,13 +410,13 @@ class MonitorBeams:
         phase = phase - phase[:, :1]
         return PupilField(u, v, phase, amplitude, self.wavelength).scaled_by(rays.size)
 
-    def _require_on_ccd(self, channel: Channel, place: np.ndarray) -> None:
+    def _require_on_ccd(self, channel: Channel, position: np.ndarray) -> None:
         """Raise BeamMissedError if the centre of a spot (S, 2), in pixels from the CCD's centre, is outside its CCD."""
         half = 0.5 * (np.array(self.shape) - 1)
-        beyond = np.linalg.norm(np.maximum(np.abs(place) - half, 0.0), axis=-1)
+        beyond = np.linalg.norm(np.maximum(np.abs(position) - half, 0.0), axis=-1)
         if np.any(beyond > 0.0):
             worst = int(np.argmax(beyond))
-            row, column = place[worst] + half
+            row, column = position[worst] + half
             raise BeamMissedError(
                 f"the spot {channel.key} falls on row {row:.0f}, column {column:.0f}, outside its area CCD of "
                 f"{self.shape[0]} x {self.shape[1]} pixels: {beyond[worst]:.3g} px or "
@@ -435,14 +437,14 @@ class MonitorBeams:
         error, defocus = np.empty(len(paths)), np.empty(len(paths))
         for i, (direction, path) in enumerate(zip(rays.direction, paths, strict=True)):
             root = np.sqrt(weight * rays.valid[i])
-            # light to a point (x, y, z) of the CCD's frame has there an eikonal of -(u x + v y + w z) and a constant
+            # light to a point (x, y, z) of the CCD's frame has an eikonal of -(u x + v y + w z) plus a constant
             basis = np.column_stack([np.ones_like(path), direction - direction[0]]) * root[:, None]
             scale = np.linalg.norm(basis, axis=0)
             flat, point = (
                 np.linalg.lstsq(basis[:, :n] / scale[:n], path * root, rcond=None)[0] / scale[:n] for n in (3, 4)
             )
             error[i] = np.linalg.norm(path * root - basis[:, :3] @ flat) / np.linalg.norm(root)
-            # the CCD's z is the plane's -Z; the pinhole moves with the CCD, its image the other way
+            # the CCD's z is the plane's -Z; the pinhole moves with the CCD, its image in the opposite direction
             defocus[i] = 0.5 * point[3]
         return SpotFocus(error / self.wavelength, defocus)
 
@@ -463,5 +465,5 @@ def _area_ratio(
     solve, basis, dx, dy = series
     a, b = product(u, solve.T), product(v, solve.T)
     ratio = product(a, dx.T) * product(b, dy.T) - product(a, dy.T) * product(b, dx.T)
-    rest = np.maximum(np.abs(u - product(a, basis.T)), np.abs(v - product(b, basis.T))).max(axis=-1)
-    return ratio, rest / np.hypot(u - a[..., :1], v - b[..., :1]).max(axis=-1)
+    residual = np.maximum(np.abs(u - product(a, basis.T)), np.abs(v - product(b, basis.T))).max(axis=-1)
+    return ratio, residual / np.hypot(u - a[..., :1], v - b[..., :1]).max(axis=-1)

@@ -69,19 +69,19 @@ def ray_tangents(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> tup
     position = np.broadcast_to(np.repeat(nominal.position, m, axis=0), direction.shape)
     position_step = source[:, None] / COMPLEX_STEP
 
-    def push(sequence: str, direction_step: np.ndarray | float) -> RayTangents:
+    def propagate(sequence: str, direction_step: np.ndarray | float) -> RayTangents:
         names = [f"{channel.key}/{sequence}" for channel in path.channels]
         systems = assemble(path.instrument.assembly, names, states, steps, placed)
         return jvp(path.backend, systems, position, direction, position_step, direction_step)
 
-    drift = push("outgoing", 0.0).position[..., :2]
+    drift = propagate("outgoing", 0.0).position[..., :2]
     outgoing = assemble(path.instrument.assembly, [f"{channel.key}/outgoing" for channel in path.channels])
     start = np.broadcast_to(nominal.position, nominal.direction.shape)
     axes, slopes = hit_slopes(path.backend, outgoing, start, nominal.direction)
     faces = _size_steps(placed, [channel.face_body for channel in path.channels]).reshape(-1, 1, 1)
     q_step = matvec(np.repeat(inverse(slopes), m, axis=0), faces * path.targets(m) - drift)
     sizes = _size_steps(placed, [channel.ccd_body for channel in path.channels]).ravel()
-    return push("monitor", np.einsum("bnk,bnkx->bnx", q_step, np.repeat(axes, m, axis=0))), sizes
+    return propagate("monitor", np.einsum("bnk,bnkx->bnx", q_step, np.repeat(axes, m, axis=0))), sizes
 
 
 def _of_one_structure(path: MonitorBeams, states: list[State]) -> list[State]:
@@ -122,9 +122,9 @@ def hit_slopes(
         2, 2), in metres per radian.
     """
     axes = transverse_axes(direction, np.broadcast_to([0.0, 1.0, 0.0], direction.shape))
-    place, heading = np.repeat(position, 2, axis=1), np.repeat(direction, 2, axis=1)
-    pushed = jvp(backend, systems, place, heading, 0.0, axes.reshape(len(direction), -1, 3))
-    return axes, np.swapaxes(pushed.position[..., :2].reshape(*direction.shape[:2], 2, 2), -1, -2)
+    launch, unit = np.repeat(position, 2, axis=1), np.repeat(direction, 2, axis=1)
+    tangents = jvp(backend, systems, launch, unit, 0.0, axes.reshape(len(direction), -1, 3))
+    return axes, np.swapaxes(tangents.position[..., :2].reshape(*direction.shape[:2], 2, 2), -1, -2)
 
 
 def spot_jacobian(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> np.ndarray:
@@ -145,9 +145,9 @@ def spot_jacobian(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> np
         Row and column, in pixels per radian, metre or unit.
     """
     tangents, sizes = ray_tangents(path.coarse, motions)
-    place = tangents.traced.numpy()[0]
-    # a place is counted in pixels, which grow with the chip
-    moved = tangents.position - sizes[:, None, None] * place
+    position = tangents.traced.numpy()[0]
+    # positions are in pixels, which expand with the chip
+    moved = tangents.position - sizes[:, None, None] * position
     mean = np.einsum("n,bnk->bk", path.coarse.nodes.share, moved[..., 1::-1])
     return np.asarray(mean.reshape(len(path.channels), len(motions), 2).swapaxes(1, 2)) / path.pitch
 
@@ -196,34 +196,47 @@ def spot_gradient(
     outgoing, outgoing_steps = _numbers(path, "outgoing", middle, states, placed, steps)
 
     out = np.zeros((len(path.channels), 2, len(motions)))
-    once = np.arange(0, outgoing.count, 2)
+    single_systems = np.arange(0, outgoing.count, 2)
     rays = max(chunk // len(path.channels), 1)
-    size = monitor.size[once]
+    size = monitor.size[single_systems]
     pitch = path.pitch * monitor.size
     face_steps = _size_steps(placed, [channel.face_body for channel in path.channels])
     chip_steps = _size_steps(placed, [channel.ccd_body for channel in path.channels])
     for start in range(0, path.nodes.count, rays):
         piece = slice(start, start + rays)
-        place, heading = launch[:, piece], launched[:, piece]
-        across, slope = hit_slopes(path.backend, outgoing.take(once), place, heading)
-        place, heading, across = (np.repeat(array, 2, axis=0) for array in (place, heading, across))
+        start_point, start_direction = launch[:, piece], launched[:, piece]
+        across, slope = hit_slopes(path.backend, outgoing.take(single_systems), start_point, start_direction)
+        start_point, start_direction, across = (
+            np.repeat(array, 2, axis=0) for array in (start_point, start_direction, across)
+        )
         # system 2c is the row of channel c's spot (y of the CCD), 2c + 1 its column (x)
         share = path.nodes.share[piece, None] * np.array([[[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]]])
         weight = np.tile(share, (len(path.channels), 1, 1)) / pitch[:, None, None]
-        there = vjp(path.backend, monitor, place, heading, weight, [tuple(own) for own in monitor_steps])
-        turn = np.einsum("bnkx,bnx->bnk", across, there.direction)
-        back = -np.linalg.solve(np.repeat(np.swapaxes(slope, -1, -2), 2, axis=0), turn[..., None])[..., 0]
-        aside = np.concatenate([back, np.zeros_like(back[..., :1])], axis=-1)
-        node = vjp(path.backend, outgoing, place, heading, aside, [tuple(own) for own in outgoing_steps])
-        pinhole = (there.position + node.position).sum(axis=1).reshape(len(path.channels), 2, 3)
-        out += _dot(monitor_steps, there.values) + _dot(outgoing_steps, node.values)
+        back_monitor = vjp(
+            path.backend, monitor, start_point, start_direction, weight, [tuple(tangent) for tangent in monitor_steps]
+        )
+        slope_direction = np.einsum("bnkx,bnx->bnk", across, back_monitor.direction)
+        weights_direction = -np.linalg.solve(
+            np.repeat(np.swapaxes(slope, -1, -2), 2, axis=0), slope_direction[..., None]
+        )[..., 0]
+        hit_weights = np.concatenate([weights_direction, np.zeros_like(weights_direction[..., :1])], axis=-1)
+        back_outgoing = vjp(
+            path.backend,
+            outgoing,
+            start_point,
+            start_direction,
+            hit_weights,
+            [tuple(tangent) for tangent in outgoing_steps],
+        )
+        pinhole = (back_monitor.position + back_outgoing.position).sum(axis=1).reshape(len(path.channels), 2, 3)
+        out += _dot(monitor_steps, back_monitor.values) + _dot(outgoing_steps, back_outgoing.values)
         out += np.einsum("ckx,cmx->ckm", pinhole, source)
-        # nodes ride on the return face as it grows, and places are counted in pixels, which grow with the chip
-        goal = np.repeat(path.target[:, piece], 2, axis=0)
-        ridden = np.einsum("bnx,bnx->b", back, goal).reshape(-1, 2)
-        out -= ridden[:, :, None] * face_steps[:, None]
+        # nodes move with the return face as it expands, and positions are in pixels, which expand with the chip
+        target_nodes = np.repeat(path.target[:, piece], 2, axis=0)
+        node_motion = np.einsum("bnx,bnx->b", weights_direction, target_nodes).reshape(-1, 2)
+        out -= node_motion[:, :, None] * face_steps[:, None]
         start_rays = make_rays(path.backend, launch[:, piece], launched[:, piece])
-        hit = trace(path.backend, monitor.take(once), start_rays).xy()[..., ::-1]
+        hit = trace(path.backend, monitor.take(single_systems), start_rays).xy()[..., ::-1]
         spot = np.einsum("n,bnk->bk", path.nodes.share[piece], hit) / (path.pitch * size[:, None] ** 2)
         out -= spot[:, :, None] * chip_steps[:, None]
     return out
@@ -237,8 +250,8 @@ def _dot(tangents: _Tangents, slopes: Sequence[Mapping[Path, np.ndarray]]) -> np
     """Return the sum over numbers of slope (C, 2) times derivative by the motions, (C, 2, M)."""
     parts = [
         slope[name].reshape(len(table), 2)[:, :, None] * table[:, None]
-        for own, slope in zip(tangents, slopes, strict=True)
-        for name, table in own.items()
+        for tangent, slope in zip(tangents, slopes, strict=True)
+        for name, table in tangent.items()
     ]
     return np.asarray(sum(parts))
 
@@ -255,11 +268,13 @@ def _numbers(
     assembly = path.instrument.assembly
     names = [f"{channel.key}/{sequence}" for channel in path.channels]
     systems = assemble(assembly, names, [middle])
-    # the union of the states decides the kernel, so that no state of its own adds a figure to another one's mirror
+    # the union of the states determines the kernel, so that no state adds a figure to another mirror
     tangents = assemble(assembly, names, states, steps, placed).tangents
     assert tangents is not None
-    each = [{path: v.reshape(len(names), -1) for path, v in leaves(own).items() if np.any(v)} for own in tangents]
-    return systems.take(np.repeat(np.arange(systems.count), 2)), each
+    nonzero = [
+        {path: v.reshape(len(names), -1) for path, v in leaves(tangent).items() if np.any(v)} for tangent in tangents
+    ]
+    return systems.take(np.repeat(np.arange(systems.count), 2)), nonzero
 
 
 def _named(motion: ElementaryMotion, about: State) -> State:
@@ -295,9 +310,9 @@ def _aimed(path: MonitorBeams, about: State) -> tuple[np.ndarray, np.ndarray]:
     placed = path.instrument.assembly.place([about])
     systems = assemble(path.instrument.assembly, [f"{c.key}/outgoing" for c in path.channels], [about], placed=placed)
     origin = np.concatenate([placed.translation[:, placed.index[c.reticle_body]] for c in path.channels])
-    place = np.broadcast_to(origin[:, None], start.shape)
-    axes, slopes = hit_slopes(path.backend, systems, place, nominal.direction)
-    fan = RayFan(place, nominal.direction, axes)
+    launch = np.broadcast_to(origin[:, None], start.shape)
+    axes, slopes = hit_slopes(path.backend, systems, launch, nominal.direction)
+    fan = RayFan(launch, nominal.direction, axes)
     q, _ = aim(path.backend, systems, fan, path.target, jacobian=slopes, tolerance=AIM_TOLERANCE)
     return fan.at(q)
 
@@ -309,7 +324,7 @@ STEPS = {"temperature": 0.1, "gradient": 0.1, "index_gradient": 1e-6, "radius": 
 
 
 def disturbances_of(
-    stated: StatedMotions, path: MonitorPath, thermal: ThermalModel, instrument: Instrument, backend: Backend
+    prior: StatedMotions, path: MonitorPath, thermal: ThermalModel, instrument: Instrument, backend: Backend
 ) -> Disturbances:
     """Return the motions of a prior with their derivatives, for the analysis.
 
@@ -319,7 +334,7 @@ def disturbances_of(
 
     Parameters
     ----------
-    stated : StatedMotions
+    prior : StatedMotions
         Motions of the prior.
     path : MonitorPath
         Optical path of the monitor.
@@ -335,30 +350,32 @@ def disturbances_of(
     AimError, BeamMissedError
         A step of a temperature loses the light.
     """
-    spots = np.empty((2 * len(path.channels), len(stated.components)))
-    parameters = np.empty((4 * len(instrument.cameras), len(stated.components)))
-    moved = [k for k, c in enumerate(stated.components) if c.kind not in STEPS]
+    spots = np.empty((2 * len(path.channels), len(prior.components)))
+    parameters = np.empty((4 * len(instrument.cameras), len(prior.components)))
+    moved = [k for k, c in enumerate(prior.components) if c.kind not in STEPS]
     if moved:
-        motions = [_elementary(stated.components[k]) for k in moved]
+        motions = [_elementary(prior.components[k]) for k in moved]
         spots[:, moved] = spot_jacobian(path, motions).reshape(-1, len(moved))
         parameters[:, moved] = np.concatenate(list(truth_jacobian(instrument, backend, motions).values()))
-    stepped = [k for k, c in enumerate(stated.components) if c.kind in STEPS]
+    stepped = [k for k, c in enumerate(prior.components) if c.kind in STEPS]
     if stepped:
-        own = [stated.components[k] for k in stepped]
-        spots[:, stepped], parameters[:, stepped] = _by_differences(own, path, thermal, instrument, backend)
-    sigma = stated.sigma
+        stepped_components = [prior.components[k] for k in stepped]
+        spots[:, stepped], parameters[:, stepped] = _by_differences(
+            stepped_components, path, thermal, instrument, backend
+        )
+    sigma = prior.sigma
     return Disturbances(
-        name=stated.name,
-        labels=tuple(c.name for c in stated.components),
-        bodies=tuple(c.body for c in stated.components),
-        causes=tuple(c.cause for c in stated.components),
-        sigmas=np.array([c.sigma / c.unit_size for c in stated.components]),
-        units=tuple(c.unit for c in stated.components),
+        name=prior.name,
+        labels=tuple(c.name for c in prior.components),
+        bodies=tuple(c.body for c in prior.components),
+        causes=tuple(c.cause for c in prior.components),
+        sigmas=np.array([c.sigma / c.unit_size for c in prior.components]),
+        units=tuple(c.unit for c in prior.components),
         spots=spots * sigma,
         parameters=parameters * sigma,
-        correlation=stated.correlation,
-        laws=tuple(_law(law) for law in stated.laws),
-        jump_false_alarm=stated.jump_false_alarm or FALSE_ALARM,
+        correlation=prior.correlation,
+        laws=tuple(_law(law) for law in prior.laws),
+        jump_false_alarm=prior.jump_false_alarm or FALSE_ALARM,
     )
 
 
@@ -379,13 +396,13 @@ def single_states(components: Sequence[Component], amounts: np.ndarray, thermal:
     thermal : ThermalModel
         Thermal model of the instrument.
     """
-    warm = np.array([c.kind in STEPS for c in components], bool)
-    heat = [c for c in components if c.kind in STEPS]
-    # all bodies have a temperature of their own in every state, as in states that are drawn, so that none inherits one
-    warmed = iter(states_of(np.diag(amounts[warm]), heat, thermal))
+    thermal_kind = np.array([c.kind in STEPS for c in components], bool)
+    thermal_components = [c for c in components if c.kind in STEPS]
+    # all bodies have their own temperature in every state, as in drawn states, so that none inherits one
+    thermal_states = iter(states_of(np.diag(amounts[thermal_kind]), thermal_components, thermal))
     return [
-        next(warmed) if own else _elementary(c).state(amount)
-        for c, own, amount in zip(components, warm.tolist(), amounts.tolist(), strict=True)
+        next(thermal_states) if is_thermal else _elementary(c).state(amount)
+        for c, is_thermal, amount in zip(components, thermal_kind.tolist(), amounts.tolist(), strict=True)
     ]
 
 
@@ -394,11 +411,11 @@ def _by_differences(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return derivatives of spots (2 C, M), px, and parameters (4 K, M), per SI unit, by central differences."""
     steps = np.array([STEPS[c.kind] for c in components])
-    # all bodies have a temperature of their own in every state, as in states that are drawn, so that none inherits one
+    # all bodies have their own temperature in every state, as in drawn states, so that none inherits one
     states = states_of(np.concatenate([np.diag(steps), np.diag(-steps)]), components, thermal)
-    place = path.coarse_trace(states).place
+    position = path.coarse_trace(states).centre
     count = len(components)
-    rows = np.moveaxis(place, 1, 2).reshape(-1, 2 * count)
+    rows = np.moveaxis(position, 1, 2).reshape(-1, 2 * count)
     truth = trace_truth(instrument, backend, states)
     both = np.concatenate([truth.vector(name).T for name in truth.cameras])
     return (rows[:, :count] - rows[:, count:]) / (2.0 * steps), (both[:, :count] - both[:, count:]) / (2.0 * steps)
@@ -409,7 +426,7 @@ SMALL: Mapping[str, float] = {"rotate": 1e-6, "shift": 1e-6, "scale": 1e-6, "fig
 
 
 def derivative_changes(
-    stated: StatedMotions, path: MonitorPath, sight: LineSight, thermal: ThermalModel, built: Sequence[State]
+    prior: StatedMotions, path: MonitorPath, sight: LineSight, thermal: ThermalModel, built: Sequence[State]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the differences of the derivatives of ``disturbances_of`` between instruments as built and as designed.
 
@@ -417,7 +434,7 @@ def derivative_changes(
 
     Parameters
     ----------
-    stated : StatedMotions
+    prior : StatedMotions
         M motions of the prior, about an instrument as built.
     path : MonitorPath
         Optical path of the monitor, D spot coordinates.
@@ -439,33 +456,33 @@ def derivative_changes(
     AimError, BeamMissedError
         The light of a state is lost.
     """
-    components = stated.components
+    components = prior.components
     steps = np.array([{**STEPS, **SMALL}[c.kind] for c in components])
     singles = single_states(components, steps, thermal)
     bodies = {body.path: body for body in path.instrument.assembly.tree.bodies}
     roots = {name: f"{BASE}/{name}" for name in path.instrument.cameras}
 
-    def reached(state: State) -> set[str]:
+    def affected_cameras(state: State) -> set[str]:
         """Return the cameras whose spots' or lines' light a state affects."""
         inside = {name for name, root in roots.items() if any(f"{body}/".startswith(f"{root}/") for body in state)}
         return inside | set(path.moved_cameras(state))
 
-    reach = [reached(single) for single in singles]
+    cameras_of_singles = [affected_cameras(single) for single in singles]
 
     def slopes(about: State, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         states = [about, *(compose(singles[m], about, bodies) for m in which.tolist())]
-        spots = np.moveaxis(path.coarse_trace(states).place, 1, 2).reshape(-1, len(states))
+        spots = np.moveaxis(path.coarse_trace(states).centre, 1, 2).reshape(-1, len(states))
         truth = sight.truth(states)
-        found = spots, np.concatenate([truth.vector(name).T for name in truth.cameras])
-        size = stated.sigma[which] / steps[which]
-        return tuple((values[:, 1:] - values[:, :1]) * size for values in found)
+        effects = spots, np.concatenate([truth.vector(name).T for name in truth.cameras])
+        size = prior.sigma[which] / steps[which]
+        return tuple((values[:, 1:] - values[:, :1]) * size for values in effects)
 
     designed = slopes({}, np.arange(len(components)))
-    out = tuple(np.zeros((len(built), *one.shape)) for one in designed)
+    out = tuple(np.zeros((len(built), *derivative.shape)) for derivative in designed)
     for z, about in enumerate(built):
-        # a motion changes nothing of what another one does to light that it does not meet
-        own = reached(about)
-        which = np.array([m for m, cameras in enumerate(reach) if own & cameras], dtype=int)
+        # a motion does not change the effect of another motion on light that it does not affect
+        affected = affected_cameras(about)
+        which = np.array([m for m, cameras in enumerate(cameras_of_singles) if affected & cameras], dtype=int)
         if which.size:
             for change, now, before in zip(out, slopes(about, which), designed, strict=True):
                 change[z][:, which] = now - before[:, which]
@@ -502,7 +519,7 @@ def motion_models(
     sight: LineSight,
     cameras: Mapping[str, CameraCalibration],
     thermal: ThermalModel,
-    stated: StatedMotions | None,
+    prior: StatedMotions | None,
     disturbances: Disturbances | None,
 ) -> dict[str, MotionModel]:
     """Return the motion model of each estimator that retraces.
@@ -519,7 +536,7 @@ def motion_models(
         Calibration of the cameras, in the order of the spots.
     thermal : ThermalModel
         Thermal model of the instrument.
-    stated : StatedMotions | None
+    prior : StatedMotions | None
         Motions of the prior; None for none.
     disturbances : Disturbances | None
         The same motions with their derivatives.
@@ -531,32 +548,32 @@ def motion_models(
     """
     trace = partial(_traced, path, sight)
     out = {"model": _of_families(cameras, trace)}
-    if stated is not None and disturbances is not None:
-        states = partial(_stated_states, stated, thermal)
+    if prior is not None and disturbances is not None:
+        states = partial(_prior_states, prior, thermal)
         out["posterior"] = MotionModel(
             disturbances.spots, disturbances.parameters, disturbances.best_amounts, states, trace, NEAR
         )
     return out
 
 
-# What a model calls are functions of the module: a run is sent to the process that draws it, with all that it holds.
+# Models call functions of this module, since a run is pickled for the process that draws it.
 
 
-def _stated_states(stated: StatedMotions, thermal: ThermalModel, amounts: np.ndarray) -> list[State]:
+def _prior_states(prior: StatedMotions, thermal: ThermalModel, amounts: np.ndarray) -> list[State]:
     """Return the states of the prior's amounts (S, P), in standard deviations."""
-    return states_of(amounts * stated.sigma, stated.components, thermal)
+    return states_of(amounts * prior.sigma, prior.components, thermal)
 
 
 def _of_families(cameras: Mapping[str, CameraCalibration], trace: Callable[[Sequence[State]], Retraced]) -> MotionModel:
     """Return the motion model of each camera's four motions of paper 001."""
     families = {name: line_family(name) for name in cameras}
-    own, count = _spots_of(cameras), sum(map(len, families.values()))
-    spots, parameters = np.zeros((own[-1].stop, count)), np.zeros((4 * len(cameras), count))
-    for k, (camera, at) in enumerate(zip(cameras.values(), own, strict=True)):
+    spot_slices, count = _spots_of(cameras), sum(map(len, families.values()))
+    spots, parameters = np.zeros((spot_slices[-1].stop, count)), np.zeros((4 * len(cameras), count))
+    for k, (camera, spot_rows) in enumerate(zip(cameras.values(), spot_slices, strict=True)):
         block = slice(4 * k, 4 * k + 4)
-        spots[at, block], parameters[block, block] = camera.spot_jacobian, camera.parameter_jacobian
-    every = [motion for family in families.values() for motion in family]
-    return MotionModel(spots, parameters, partial(_family_amounts, cameras), partial(_together, every), trace)
+        spots[spot_rows, block], parameters[block, block] = camera.spot_jacobian, camera.parameter_jacobian
+    motions = [motion for family in families.values() for motion in family]
+    return MotionModel(spots, parameters, partial(_family_amounts, cameras), partial(_together, motions), trace)
 
 
 def _spots_of(cameras: Mapping[str, CameraCalibration]) -> list[slice]:
@@ -567,11 +584,13 @@ def _spots_of(cameras: Mapping[str, CameraCalibration]) -> list[slice]:
 
 def _family_amounts(cameras: Mapping[str, CameraCalibration], noise: np.ndarray) -> np.ndarray:
     """Return the gain of the cameras' own motions, (S, P, D), for covariances of the shifts (S, D, D), in px^2."""
-    own = _spots_of(cameras)
-    out = np.zeros((len(noise), 4 * len(cameras), own[-1].stop))
-    for k, (camera, at) in enumerate(zip(cameras.values(), own, strict=True)):
+    spot_slices = _spots_of(cameras)
+    out = np.zeros((len(noise), 4 * len(cameras), spot_slices[-1].stop))
+    for k, (camera, spot_rows) in enumerate(zip(cameras.values(), spot_slices, strict=True)):
         block = slice(4 * k, 4 * k + 4)
-        out[:, block, at] = model_fit.gain(noise[:, at, at], camera.spot_jacobian, np.eye(4), camera.motions)
+        out[:, block, spot_rows] = model_fit.gain(
+            noise[:, spot_rows, spot_rows], camera.spot_jacobian, np.eye(4), camera.motions
+        )
     return out
 
 
@@ -617,6 +636,6 @@ def traced_states(path: MonitorPath, sight: LineSight, states: Sequence[State]) 
         The light of a state is lost.
     """
     placed = path.instrument.assembly.place(states)
-    shifts = np.moveaxis(path.coarse_trace(states, placed).place - path.place_at_rest, 1, 0).reshape(len(states), -1)
+    shifts = np.moveaxis(path.coarse_trace(states, placed).centre - path.centre_at_rest, 1, 0).reshape(len(states), -1)
     truth = sight.truth(states, placed)
     return Retraced(shifts, np.concatenate([truth.vector(name) for name in truth.cameras], axis=1))

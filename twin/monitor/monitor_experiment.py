@@ -132,7 +132,7 @@ class MonitorExperiment:
     @cached_property
     def path(self) -> MonitorPath:
         """Optical path of the monitor."""
-        self.resolved.instrument.autocollimator  # noqa: B018 - says so where there is none
+        self.resolved.instrument.autocollimator  # noqa: B018 - raises an error if there is none
         return MonitorPath(self.instrument, self.backend)
 
     def _require_sampled(self) -> None:
@@ -141,7 +141,7 @@ class MonitorExperiment:
             self.path.response  # noqa: B018 - fitted before anything is traced
         except UnsampledImageError as error:
             key = ("monitor", "reticle", "pinhole") if error.of_source else ("monitor", "area_ccd", "pitch")
-            problem = f"the area CCDs cannot follow the spots: {error}"
+            problem = f"the area CCDs do not sample the spots: {error}"
             raise self.resolved.instrument.error(problem, key, allowed=error.remedy) from error
 
     def size(self, frames: int = 1, times: int = 0, pictures: int = 0) -> MonitorSize:
@@ -241,10 +241,10 @@ class MonitorExperiment:
             A table does not describe its body.
         """
         out = {}
-        for path, what in job.perturb.items():
-            spec = what.heat
+        for path, perturbation in job.perturb.items():
+            spec = perturbation.heat
             if spec.table is not None:
-                # change and gradient beside the table are not its own
+                # change and gradient are added to the table, and are not part of it
                 key = path, spec.model_copy(update={"change": 0.0, "gradient": NO_MOTION})
                 if key not in self._heated:
                     self._heated[key] = heated_body(self.thermal, job, path, spec)
@@ -260,12 +260,12 @@ class MonitorExperiment:
             A table does not describe its body.
         """
         out = {}
-        for path, what in job.perturb.items():
-            if what.deformation is not None:
-                if (path, what.deformation) not in self._deformed:
-                    face = deformed_face(self.instrument, job, path, what.deformation)
-                    self._deformed[path, what.deformation] = face
-                out[path] = self._deformed[path, what.deformation]
+        for path, perturbation in job.perturb.items():
+            if perturbation.deformation is not None:
+                if (path, perturbation.deformation) not in self._deformed:
+                    face = deformed_face(self.instrument, job, path, perturbation.deformation)
+                    self._deformed[path, perturbation.deformation] = face
+                out[path] = self._deformed[path, perturbation.deformation]
         return out
 
     @property
@@ -284,8 +284,8 @@ class MonitorExperiment:
             The light does not reach the CCDs, or the spots cannot be computed.
         """
         focus = self.path.focus
-        self.nominal_truth  # noqa: B018 - the line's light, too, has to arrive
-        self.wide_photons  # noqa: B018 - and the spots have to be right
+        self.nominal_truth  # noqa: B018 - the line's light has to arrive, too
+        self.wide_photons  # noqa: B018 - and the spots have to be accurate
         return focus
 
     @cached_property
@@ -303,8 +303,8 @@ class MonitorExperiment:
         """Camera -> (4, 4) true parameters per unit of the four motions of its line family."""
         names = list(self.instrument.cameras)
         motions = [motion for name in names for motion in line_family(name)]
-        every = truth_jacobian(self.instrument, self.backend, motions)
-        return {name: every[name][:, 4 * k : 4 * k + 4] for k, name in enumerate(names)}
+        jacobians = truth_jacobian(self.instrument, self.backend, motions)
+        return {name: jacobians[name][:, 4 * k : 4 * k + 4] for k, name in enumerate(names)}
 
     @cached_property
     def cameras(self) -> dict[str, CameraCalibration]:
@@ -313,14 +313,14 @@ class MonitorExperiment:
         spots = spot_jacobian(self.path, [motion for family in families.values() for motion in family])
         cameras = {}
         for k, (name, family) in enumerate(families.items()):
-            own = list(self.instrument.channels_of(name))
+            channels = list(self.instrument.channels_of(name))
             cameras[name] = CameraCalibration(
                 geometry=self.geometry(name),
                 look_rad=self.instrument.spec.cameras[name].look,
-                spot_jacobian=spots[own, :, 4 * k : 4 * k + 4].reshape(2 * len(own), 4),
+                spot_jacobian=spots[channels, :, 4 * k : 4 * k + 4].reshape(2 * len(channels), 4),
                 parameter_jacobian=self._truth_by_family[name],
                 motions=tuple(motion.label for motion in family),
-                channels=tuple(self.path.channels[i].name for i in own),
+                channels=tuple(self.path.channels[i].name for i in channels),
             )
         return cameras
 
@@ -328,17 +328,17 @@ class MonitorExperiment:
     def calibration(self) -> MonitorCalibration:
         """Calibration available to the analysis: geometry, Jacobians and spot shapes of the nominal instrument."""
         photons = self.wide_photons
-        with one_blas_thread():  # several threads of a small decomposition wait for each other
+        with one_blas_thread():  # in a small decomposition, threads would only wait for each other
             template = SpotTemplate.stack([self._template(image) for image in photons])
         noise = self.detector.noise_model(self.exposure)
-        found = MonitorCalibration(self.cameras, template, noise, self.ground)
-        # the path counts its images for the manifest: with those of other states it is not kept
+        calibration = MonitorCalibration(self.cameras, template, noise, self.ground)
+        # the path counts its images for the manifest, so it is not cached with those of other states
         if self.path.checked.images == len(self.path.channels):
-            with suppress(PhysicalError, ArithmeticError):  # said where it is asked for
+            with suppress(PhysicalError, ArithmeticError):  # reported where the focus is used
                 self.path.focus  # noqa: B018
-            vars(self)["calibration"] = found
+            vars(self)["calibration"] = calibration
             self._keep()
-        return found
+        return calibration
 
     @cached_property
     def ground(self) -> GroundGeometry | None:
@@ -360,10 +360,10 @@ class MonitorExperiment:
         InputError
             The prior names a body that the instrument does not have, or that cannot move or be heated in this way.
         """
-        stated = stated_motions(self.resolved, self.instrument)
-        if stated is not None:
-            check_heat(self.resolved, stated, self.thermal)
-        return stated
+        prior = stated_motions(self.resolved, self.instrument)
+        if prior is not None:
+            check_heat(self.resolved, prior, self.thermal)
+        return prior
 
     @cached_property
     def disturbances(self) -> Disturbances | None:
@@ -371,18 +371,18 @@ class MonitorExperiment:
 
         Raises the InputError of `stated`.
         """
-        stated = self.stated
-        if stated is None:
+        prior = self.stated
+        if prior is None:
             return None
-        return self._entry.part("disturbances", stated).get(
-            lambda: disturbances_of(stated, self.path, self.thermal, self.instrument, self.backend)
+        return self._entry.part("disturbances", prior).get(
+            lambda: disturbances_of(prior, self.path, self.thermal, self.instrument, self.backend)
         )
 
     @cached_property
     def motion_models(self) -> Mapping[str, MotionModel]:
         """Estimator -> motion model for retracing. Raises the InputError of `stated`."""
-        stated, known = self.stated, self.disturbances
-        return motion_models(self.path, self.sight, self.cameras, self.thermal, stated, known)
+        prior, known = self.stated, self.disturbances
+        return motion_models(self.path, self.sight, self.cameras, self.thermal, prior, known)
 
     def geometry(self, camera: str) -> MonitorGeometry:
         """Return the calibrated numbers of the formulas: principal distance, plate scale, distortion, L, pixel pitch.
@@ -390,14 +390,14 @@ class MonitorExperiment:
         The papers leave alpha and beta of their cos^2 undefined; they are taken as the field angles of the area CCDs.
         """
         by_x, by_y, *_ = self._truth_by_family[camera].T
-        given = self.instrument.spec.channels_of(camera)
-        one = given[SIDES[0]] if SIDES[0] in given else next(iter(given.values()))
+        channels = self.instrument.spec.channels_of(camera)
+        channel = channels[SIDES[0]] if SIDES[0] in channels else next(iter(channels.values()))
         return MonitorGeometry(
             principal_distance_m=self.nominal_truth.principal_distance[camera],
             separation_m=self.instrument.separation[camera],
             pitch_m=self.path.pitch,
             field_alpha_rad=0.0,
-            field_beta_rad=abs(one.field),
+            field_beta_rad=abs(channel.field),
             principal_distance_across_m=float(1.0 / abs(by_x[0])),
             d_f_per_alpha_m=float(by_x[3] / by_x[0]),
             d_gamma_per_beta=float(by_y[2] / by_y[1]),
@@ -414,18 +414,20 @@ class MonitorExperiment:
         Several seeds give (seeds, C, rows, columns).
         """
         key = tuple(seed) if isinstance(seed, Sequence) else seed
-        found = self._patterns.get(key)
-        if found is None:
-            found = self._drawn_pattern(key)
-            # kept for one seed at a time: states that are exposed one by one would each draw it anew
-            self._patterns = {key: found}
-        return found
+        pattern = self._patterns.get(key)
+        if pattern is None:
+            pattern = self._drawn_pattern(key)
+            # stored for one seed at a time, so that states exposed one by one do not draw it again
+            self._patterns = {key: pattern}
+        return pattern
 
     def _drawn_pattern(self, seed: int | tuple[int, ...]) -> FixedPattern:
         """Draw PRNU and DSNU of all area CCDs."""
         if isinstance(seed, tuple):
-            every = [self._drawn_pattern(one) for one in seed]
-            return FixedPattern(np.stack([one.gain for one in every]), np.stack([one.offset_e for one in every]))
+            patterns = [self._drawn_pattern(pattern) for pattern in seed]
+            return FixedPattern(
+                np.stack([pattern.gain for pattern in patterns]), np.stack([pattern.offset_e for pattern in patterns])
+            )
         return self.detector.fixed_pattern((len(self.path.channels), *self.path.shape), stream(seed, 0))
 
     def frames_before(self, frames: int, seed: int | Sequence[int], stray: np.ndarray | float = 0.0) -> np.ndarray:
@@ -443,8 +445,11 @@ class MonitorExperiment:
         photons = self.nominal_photons + stray
         if not isinstance(seed, Sequence):
             return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, stream(seed, 1))
-        every, own = np.broadcast_to(photons, (len(seed), *photons.shape)), [stream(one, 1) for one in seed]
-        return self.detector.expose(every, self.pattern(seed), frames, self.exposure, own)
+        repeated, streams = (
+            np.broadcast_to(photons, (len(seed), *photons.shape)),
+            [stream(single_seed, 1) for single_seed in seed],
+        )
+        return self.detector.expose(repeated, self.pattern(seed), frames, self.exposure, streams)
 
     def frames_after(
         self, photons: np.ndarray, frames: int, seed: int | Sequence[int], first: int | np.ndarray = 0
@@ -465,8 +470,8 @@ class MonitorExperiment:
         """
         numbers = first if isinstance(first, np.ndarray) else first + np.arange(len(photons))
         seeds = seed if isinstance(seed, Sequence) else [seed] * len(photons)
-        own = [stream(one, 2, int(number)) for one, number in zip(seeds, numbers, strict=True)]
-        return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, own)
+        streams = [stream(state_seed, 2, int(number)) for state_seed, number in zip(seeds, numbers, strict=True)]
+        return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, streams)
 
     def expected_frames(self, photons: np.ndarray) -> np.ndarray:
         """Return noise-free, unrounded grey values of a uniform detector, with the shape of ``photons``."""

@@ -143,15 +143,15 @@ class MonitorSize:
             Model of the area CCDs.
         """
         image = self.rows * self.columns
-        every, frames = self.spots * image, self.frames
-        states = min(self.times, largest_piece(every * frames)) if self.times else 1
+        pixels, frames = self.spots * image, self.frames
+        states = min(self.times, largest_piece(pixels * frames)) if self.times else 1
         threads = min(cores(), 8, self.spots * states)  # that expose images
         return {
-            "ccd": every * (_PIXEL + (states - 1) * _OF_STATE) + self.rays * _RAY,
-            "frames": resident_bytes(every * frames * GREY)
-            + resident_bytes(states * every * frames * GREY)
+            "ccd": pixels * (_PIXEL + (states - 1) * _OF_STATE) + self.rays * _RAY,
+            "frames": resident_bytes(pixels * frames * GREY)
+            + resident_bytes(states * pixels * frames * GREY)
             + detector.exposing_bytes(frames, image, threads),
-            "times": self.times * every * _OF_COURSE,
+            "times": self.times * pixels * _OF_COURSE,
             "pictures": self.pictures * GREY,
         }
 
@@ -164,9 +164,9 @@ class MonitorSize:
             Model of the area CCDs.
         """
         parts = self.parts(detector)
-        every = self.spots * self.rows * self.columns
-        stack = every * self.frames * GREY
-        written = every * WRITTEN + 2.0 * resident_bytes(stack)
+        pixels = self.spots * self.rows * self.columns
+        stack = pixels * self.frames * GREY
+        written = pixels * WRITTEN + 2.0 * resident_bytes(stack)
         written += stack / self.spots if stack <= IN_MEMORY else resident_bytes(stack)
         return max(STARTED + sum(parts.values()), DRAWN + written + parts["times"] + parts["pictures"])
 
@@ -213,11 +213,11 @@ def _lowered(resolved: ResolvedJob, size: MonitorSize, part: str, detector: Emva
         each, what = {"pictures": size.pictures // number}, f"for {number} frames of test targets"
     else:
         what, unit, number = f"for {frames} frames of area CCDs of {rows} x {columns} pixels", "frames", frames
-        own, each = job.render.frames is not None, {"frames": 1}
-        owner, key = (job if own else resolved.instrument), ("render" if own else "monitor", "frames")
+        in_job, each = job.render.frames is not None, {"frames": 1}
+        owner, key = (job if in_job else resolved.instrument), ("render" if in_job else "monitor", "frames")
 
     def needed(n: int) -> float:
-        fewer = {name: min(getattr(size, name), n * one) for name, one in each.items()}
+        fewer = {name: min(getattr(size, name), n * count_per_unit) for name, count_per_unit in each.items()}
         return replace(size, **fewer).bytes(detector)
 
     return what, Lowered(owner, key, number, unit, needed, least)

@@ -28,8 +28,8 @@ from twin.monitor.image_sampling import (
     ImageChecks,
     NodeClasses,
     UncertainImageError,
-    disagreement,
-    lost_or_gained,
+    energy_excess,
+    quadrature_difference,
 )
 from twin.monitor.monitor_beams import CcdRays, CoarseTrace, MonitorBeams
 
@@ -104,10 +104,10 @@ class MonitorPath(MonitorBeams):
     @cached_property
     def _own_class(self) -> int:
         """Class of nodes of the unperturbed instrument."""
-        known = self.coarse_trace([{}])
-        far = np.broadcast_to((1.0 - 1e-9) * SPOT_RANGES[-1] * 0.5 * np.array(self.shape), known.place.shape)
-        number = int(self.node_classes.class_of(far, 0, known.blur, known.aperture / self.numerical_aperture)[0])
-        return self._require_class(number, known, 0)
+        coarse = self.coarse_trace([{}])
+        far = np.broadcast_to((1.0 - 1e-9) * SPOT_RANGES[-1] * 0.5 * np.array(self.shape), coarse.centre.shape)
+        number = int(self.node_classes.class_of(far, 0, coarse.blur, coarse.aperture / self.numerical_aperture)[0])
+        return self._require_class(number, coarse, 0)
 
     def class_beams(self, number: int) -> MonitorBeams:
         """Return beams with the number of nodes of a class."""
@@ -117,31 +117,31 @@ class MonitorPath(MonitorBeams):
             self._class_beams[number] = self._with(self.node_classes.nodes(number))
         return self._class_beams[number]
 
-    def class_of(self, known: CoarseTrace, margin: int = 0) -> np.ndarray:
+    def class_of(self, coarse: CoarseTrace, margin: int = 0) -> np.ndarray:
         """Return the class of nodes that suffices for all spots of each state, (S,), as estimated from a few rays.
 
         Parameters
         ----------
-        known : CoarseTrace
+        coarse : CoarseTrace
             Coarse trace of the states.
         margin : int
             Extra pixels rendered on every side of the CCD.
         """
         if not self._sized:
-            return np.zeros(known.place.shape[1], np.intp)
-        widening = known.aperture / self.numerical_aperture
-        # a beam that is lost stands nowhere; its full trace says where it is lost
-        place = np.where(known.aperture[..., None] > 0.0, known.place, 0.0)
-        return self.node_classes.class_of(place, margin, known.blur, widening)
+            return np.zeros(coarse.centre.shape[1], np.intp)
+        widening = coarse.aperture / self.numerical_aperture
+        # a lost beam has no position; its full trace reports where it is lost
+        position = np.where(coarse.aperture[..., None] > 0.0, coarse.centre, 0.0)
+        return self.node_classes.class_of(position, margin, coarse.blur, widening)
 
-    def _require_class(self, number: int, known: CoarseTrace, state: int) -> int:
+    def _require_class(self, number: int, coarse: CoarseTrace, state: int) -> int:
         """Return the number of a class if it exists. Raises UncertainImageError for a spot that is blurred too much."""
         if number >= len(self.node_classes.reached):
-            worst = int(np.argmax(known.blur[:, state]))
+            worst = int(np.argmax(coarse.blur[:, state]))
             raise UncertainImageError(
-                f"the spot {self.channels[worst].key} is blurred so much that its image is not worked out: its rays "
-                f"spread over {2.0 * known.blur[worst, state]:.3g} px or "
-                f"{2e3 * self.pitch * known.blur[worst, state]:.3g} mm; refocus the camera, or make its aberrations "
+                f"the spot {self.channels[worst].key} is too blurred for its image to be computed: its rays "
+                f"spread over {2.0 * coarse.blur[worst, state]:.3g} px or "
+                f"{2e3 * self.pitch * coarse.blur[worst, state]:.3g} mm; refocus the camera, or make its aberrations "
                 "smaller"
             )
         return number
@@ -167,7 +167,7 @@ class MonitorPath(MonitorBeams):
             self._responses[wider] = PixelResponse.fit(self.pitch, pinhole, cutoff)
         return self._responses[wider]
 
-    def _response_of(self, known: CoarseTrace) -> PixelResponse:
+    def _response_of(self, coarse: CoarseTrace) -> PixelResponse:
         """Return the response of pixel and pinhole for the images of some states.
 
         Raises
@@ -175,12 +175,12 @@ class MonitorPath(MonitorBeams):
         UncertainImageError
             The images are too fine for the pixels.
         """
-        widening = max(float(np.max(known.aperture)) / self.numerical_aperture, 1.0)
+        widening = max(float(np.max(coarse.aperture)) / self.numerical_aperture, 1.0)
         try:
             return self._response(max(0, int(np.ceil(np.log(widening) / np.log(WIDEST))) - 1))
         except UnsampledImageError as error:
-            problem = f"beams have {widening:.3g} times the aperture as designed: {error}"
-            raise UncertainImageError(f"{problem}; {error.remedy} would do") from error
+            problem = f"beams have {widening:.3g} times the designed aperture: {error}"
+            raise UncertainImageError(f"{problem}; allowed: {error.remedy}") from error
 
     def expected_photons(
         self, states: Sequence[State], margin: int = 0, chunk: int = 32, single: bool = True
@@ -213,10 +213,10 @@ class MonitorPath(MonitorBeams):
     ) -> Iterator[tuple[slice, np.ndarray]]:
         """Yield ``expected_photons`` piece by piece: (slice of the states, photons)."""
         for start in range(0, len(states), chunk):
-            some = states[start : start + chunk]
+            chunk_states = states[start : start + chunk]
             with one_blas_thread():
-                photons, _ = self._render(some, margin, single)
-            yield slice(start, start + len(some)), photons
+                photons, _ = self._render(chunk_states, margin, single)
+            yield slice(start, start + len(chunk_states)), photons
 
     def photons_of(self, state: State, placed: PlacedBodies | None = None, single: bool = False) -> np.ndarray:
         """Return the expected photons per pixel and frame of one state, (C, rows, columns).
@@ -246,13 +246,13 @@ class MonitorPath(MonitorBeams):
             if len(moved) < len(self.cameras):
                 part = self._of_cameras(moved)
                 coarse = part.coarse_trace([state], placed)
-                photons, usual = self._at_rest(single)
-                # spots far off or blurred need more nodes, and then all channels get them
-                if part.class_of(coarse)[0] <= usual:
-                    own, number = part._render([state], 0, single, coarse)
-                    if number[0] == usual:
+                photons, rest_class = self._at_rest(single)
+                # spots that are far off or blurred need more nodes, which all channels then use
+                if part.class_of(coarse)[0] <= rest_class:
+                    part_photons, number = part._render([state], 0, single, coarse)
+                    if number[0] == rest_class:
                         out = photons.copy()
-                        out[[c.camera in moved for c in self.channels]] = own[0]
+                        out[[c.camera in moved for c in self.channels]] = part_photons[0]
                         return out
             return self._render([state], 0, single, self.coarse_trace([state], placed))[0][0]
 
@@ -276,13 +276,13 @@ class MonitorPath(MonitorBeams):
         assembly = self.instrument.assembly
         out: dict[str, set[str]] = {name: set() for name in self.cameras}
         for channel in self.channels:
-            own = out[channel.camera]
-            own |= {channel.reticle_body, f"{BASE}/{channel.camera}/focal_plane"}
-            for way in ("outgoing", "monitor"):
-                for element in assembly.sequence(f"{channel.key}/{way}"):
-                    own.add(element.body)
+            bodies = out[channel.camera]
+            bodies |= {channel.reticle_body, f"{BASE}/{channel.camera}/focal_plane"}
+            for sequence in ("outgoing", "monitor"):
+                for element in assembly.sequence(f"{channel.key}/{sequence}"):
+                    bodies.add(element.body)
                     if element.solid is not None:
-                        own.add(element.solid)
+                        bodies.add(element.solid)
         return out
 
     def _of_cameras(self, names: tuple[str, ...]) -> MonitorPath:
@@ -315,26 +315,26 @@ class MonitorPath(MonitorBeams):
             An image cannot be computed accurately with any nodes.
         """
         coarse = self.coarse_trace(states) if coarse is None else coarse
-        for channel, place, aperture in zip(self.channels, coarse.place, coarse.aperture, strict=True):
-            self._require_on_ccd(channel, place[aperture > 0.0])
+        for channel, centre, aperture in zip(self.channels, coarse.centre, coarse.aperture, strict=True):
+            self._require_on_ccd(channel, centre[aperture > 0.0])
         chosen = self.class_of(coarse, margin)
         out = np.empty((len(states), len(self.channels), *(n + 2 * margin for n in self.shape)))
         number, last = 0, len(self.node_classes.reached) - 1
         while number <= np.max(chosen):
-            own = np.flatnonzero(chosen == number)
+            indices = np.flatnonzero(chosen == number)
             rays = self.class_beams(min(number, last)).nodes.count * len(self.channels)
-            for piece in np.array_split(own, -(-len(own) * rays // _MOST_RAYS) or 1):
+            for piece in np.array_split(indices, -(-len(indices) * rays // _MOST_RAYS) or 1):
                 if len(piece):
                     self._require_class(number, coarse, int(piece[0]))
-                    known = coarse.take(piece, self.backend)
-                    some = [states[s] for s in piece.tolist()]
-                    # some are made again with more nodes
-                    out[piece], chosen[piece] = self._images(some, known, number, margin, single)
+                    part = coarse.take(piece, self.backend)
+                    part_states = [states[s] for s in piece.tolist()]
+                    # some states are repeated with more nodes
+                    out[piece], chosen[piece] = self._images(part_states, part, number, margin, single)
             number += 1
         return out, chosen
 
     def _images(
-        self, states: Sequence[State], known: CoarseTrace, number: int, margin: int, single: bool
+        self, states: Sequence[State], coarse: CoarseTrace, number: int, margin: int, single: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return photons of states with the nodes of a class, (S, C, ...), and the class that each needs, (S,).
 
@@ -346,9 +346,9 @@ class MonitorPath(MonitorBeams):
         UncertainImageError
             An image is inaccurate even with the most nodes, or its light does not equal that of its rays.
         """
-        beams, response = self.class_beams(number), self._response_of(known)
+        beams, response = self.class_beams(number), self._response_of(coarse)
         y, x = (self.grid(axis, margin + response.reach) for axis in (0, 1))
-        rays = beams.rays(states, known)
+        rays = beams.rays(states, coarse)
         waves = image(beams.field_of(rays), x, y, single)
         wanted, last = np.full(len(states), number), len(self.node_classes.reached) - 1
         difference = np.zeros((len(self.channels), len(states)))
@@ -356,7 +356,7 @@ class MonitorPath(MonitorBeams):
             if number not in self._second:
                 self._second[number] = self._with(self.node_classes.second_nodes(number))
             second = self._second[number]
-            difference = disagreement(waves, second.field_of(second.rays(states, known)), x, y)
+            difference = quadrature_difference(waves, second.field_of(second.rays(states, coarse)), x, y)
             difference = difference.reshape(-1, len(states))
             if number + 2 <= last:
                 wanted[np.any(difference > GOOD, axis=0)] += 2
@@ -376,9 +376,9 @@ class MonitorPath(MonitorBeams):
         if difference[channel, state] > WRONG:
             lost = 1.0 - float(np.mean(rays.valid[channel * difference.shape[1] + state]))
             why = (
-                f"an aperture stops {100.0 * lost:.2g} % of its rays; widen it, or move the beam to its middle"
+                f"an aperture stops {100.0 * lost:.2g} % of its rays; widen it, or move the beam to its centre"
                 if lost
-                else "its wavefront is too rough for smooth nodes; make figures and deformations smoother, or motions "
+                else "its wavefront is too rough for the nodes; make figures and deformations smoother, or motions "
                 "smaller"
             )
             raise UncertainImageError(
@@ -399,17 +399,17 @@ class MonitorPath(MonitorBeams):
         half = 0.5 * np.array(self.shape) + margin
         wings = np.full(len(images), WINGS * self.wavelength / (2.0 * np.pi * self.numerical_aperture * self.pitch))
         light = np.sum(images, axis=(-2, -1)) * self.pitch**2
-        off = lost_or_gained(light, rays.position[..., 1::-1] / self.pitch, share * rays.valid, half, wings)
-        off = np.where(np.tile(known_bad, len(self.channels)), 0.0, off)
-        worst = int(np.argmax(np.abs(off)))
-        if off[worst]:
+        excess = energy_excess(light, rays.position[..., 1::-1] / self.pitch, share * rays.valid, half, wings)
+        excess = np.where(np.tile(known_bad, len(self.channels)), 0.0, excess)
+        worst = int(np.argmax(np.abs(excess)))
+        if excess[worst]:
             channel = self.channels[worst // len(known_bad)]
             raise UncertainImageError(
-                f"the image of the spot {channel.key} has {100.0 * abs(off[worst]):.2g} % of its light too "
-                f"{'much' if off[worst] > 0.0 else 'little'} against its rays, beyond what diffraction can do; its "
+                f"the image of the spot {channel.key} has {100.0 * abs(excess[worst]):.2g} % of its light too "
+                f"{'much' if excess[worst] > 0.0 else 'little'} for its rays, beyond the limit of diffraction; its "
                 "beam is folded or distorted: refocus the camera, or make its aberrations smaller"
             )
-        return off
+        return excess
 
     @property
     def light_per_pixel(self) -> np.ndarray:
@@ -426,7 +426,7 @@ class _OnSpots(MonitorBeams):
     def _with(self, nodes: PupilNodes) -> MonitorBeams:
         return _OnSpots(self.instrument, self.backend, nodes, self.cameras)
 
-    def _require_on_ccd(self, channel: Channel, place: np.ndarray) -> None:
+    def _require_on_ccd(self, channel: Channel, position: np.ndarray) -> None:
         """Accept every spot, since its CCD is centred on it."""
 
     def rays(self, states: Sequence[State], coarse: CoarseTrace | None = None) -> CcdRays:
@@ -442,6 +442,6 @@ class SpotPath(_OnSpots, MonitorPath):
     It serves spots of instruments that are not built as designed.
     """
 
-    def class_of(self, known: CoarseTrace, margin: int = 0) -> np.ndarray:
+    def class_of(self, coarse: CoarseTrace, margin: int = 0) -> np.ndarray:
         """Return the class of nodes that suffices for all spots of each state at the centres of their CCDs, (S,)."""
-        return super().class_of(replace(known, place=np.zeros_like(known.place)), margin)
+        return super().class_of(replace(coarse, centre=np.zeros_like(coarse.centre)), margin)

@@ -1,7 +1,7 @@
 """Observation of states of an instrument: trace, render, expose and recover them.
 
 The main job, courses, studies, the live twin, error budgets and random states all use it; their differences are in
-`Observing`.
+`ObservationOptions`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ columns), or already measured spots before; and the frames after, (S, C, frames,
 
 
 @dataclass(frozen=True)
-class Observing:
+class ObservationOptions:
     """Options of an observation.
 
     Attributes
@@ -49,10 +49,10 @@ class Observing:
         Number of states processed at once; the last digits of a state depend on the others in its chunk.
     single : bool
         True to render in single precision.
-    leave : callable | None
+    omit : callable | None
         Called with number and reason of each state that is omitted because its light does not arrive or a spot cannot
         be measured; None to raise the error instead.
-    stated : bool
+    use_prior : bool
         True to use the experiment's prior and retrace its motions; False for noise alone.
     keep_parts : bool
         True to return the parts of the noise, which are large.
@@ -64,8 +64,8 @@ class Observing:
     centroid: str = "ml"
     chunk: int = 40
     single: bool = True
-    leave: Callable[[int, str], None] | None = None
-    stated: bool = True
+    omit: Callable[[int, str], None] | None = None
+    use_prior: bool = True
     keep_parts: bool = False
     frames: int | None = None
 
@@ -129,7 +129,7 @@ class Observation:
 def observe(
     experiment: MonitorExperiment,
     states: Sequence[State],
-    how: Observing,
+    how: ObservationOptions,
     numbers: Sequence[int] | np.ndarray | None = None,
 ) -> Iterator[Observation]:
     """Trace, render, expose and recover states, piece by piece.
@@ -157,25 +157,25 @@ def observe(
     SpotError
         A spot cannot be measured.
     """
-    every = np.arange(len(states)) if numbers is None else np.asarray(numbers)
+    state_numbers = np.arange(len(states)) if numbers is None else np.asarray(numbers)
     for first in range(0, len(states), how.chunk):
-        some, own = states[first : first + how.chunk], every[first : first + how.chunk]
+        chunk_states, chunk_numbers = states[first : first + how.chunk], state_numbers[first : first + how.chunk]
         try:
-            light = light_of(experiment, some, own, how.single)
+            light = light_of(experiment, chunk_states, chunk_numbers, how.single)
         except LOST:
-            if how.leave is None:
+            if how.omit is None:
                 raise
-            reasons = [why_lost(experiment, state) for state in some]
-            for number, why in zip(own.tolist(), reasons, strict=True):
+            reasons = [why_lost(experiment, state) for state in chunk_states]
+            for number, why in zip(chunk_numbers.tolist(), reasons, strict=True):
                 if why:
-                    how.leave(number, why)
+                    how.omit(number, why)
             good = [k for k, why in enumerate(reasons) if not why]
             if not good:
                 continue
-            light = light_of(experiment, [some[k] for k in good], own[good], how.single)
-        found = read(experiment, light, how)
-        if found is not None:
-            yield found
+            light = light_of(experiment, [chunk_states[k] for k in good], chunk_numbers[good], how.single)
+        observation = read(experiment, light, how)
+        if observation is not None:
+            yield observation
 
 
 def light_of(
@@ -224,7 +224,7 @@ def why_lost(experiment: MonitorExperiment, state: State) -> str:
     return ""
 
 
-def read(experiment: MonitorExperiment, light: Light, how: Observing) -> Observation | None:
+def read(experiment: MonitorExperiment, light: Light, how: ObservationOptions) -> Observation | None:
     """Expose and recover states; None if no state can be measured.
 
     Parameters
@@ -244,7 +244,7 @@ def read(experiment: MonitorExperiment, light: Light, how: Observing) -> Observa
     before, after = how.record(light.photons, light.numbers)
     images, count = after, how.frames
     if in_file(after):
-        # what recover would do with the frames, a part of them at a time
+        # the mean that the recovery would take, computed in parts
         images, count = mean_of(after), after.shape[-3]
         before = mean_of(before) if isinstance(before, np.ndarray) else before
     channels = experiment.path.channels
@@ -262,26 +262,26 @@ def read(experiment: MonitorExperiment, light: Light, how: Observing) -> Observa
                     experiment.calibration,
                     how.centroid,
                     cores() if len(good) > 1 else 1,
-                    experiment.disturbances if how.stated else None,
+                    experiment.disturbances if how.use_prior else None,
                     how.keep_parts,
-                    experiment.motion_models if how.stated else None,
+                    experiment.motion_models if how.use_prior else None,
                     count,
                 )
             return Observation(light, good, after, recovery)
         except SpotError as error:
-            if how.leave is None:
+            if how.omit is None:
                 raise
             lost: dict[int, str] = {}
             for index in error.indices:
                 state, spot = divmod(index, len(channels))
                 lost.setdefault(state, f"{channels[spot].key}: {error.reasons[index]}")
             for state, why in lost.items():
-                how.leave(int(light.numbers[good[state]]), f"a spot cannot be measured ({why})")
+                how.omit(int(light.numbers[good[state]]), f"a spot cannot be measured ({why})")
             good = np.delete(good, list(lost))
     return None
 
 
-def one_detector(experiment: MonitorExperiment, frames: int, seed: int, stray: np.ndarray | float = 0.0) -> Record:
+def shared_detector(experiment: MonitorExperiment, frames: int, seed: int, stray: np.ndarray | float = 0.0) -> Record:
     """Return a `Record` that exposes every state with the same detectors, against one nominal measurement.
 
     Parameters
@@ -360,5 +360,5 @@ class StateReader:
                 return self._clean_before, experiment.expected_frames(photons)
             return self._before, experiment.frames_after(photons, self.frames, self.seed, numbers)
 
-        how = Observing(record, self.centroid, single=single, frames=None if noise else self.frames)
+        how = ObservationOptions(record, self.centroid, single=single, frames=None if noise else self.frames)
         return next(observe(experiment, [state], how, [number]))

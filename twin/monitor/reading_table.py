@@ -161,7 +161,7 @@ class ReadingTable:
         state : int
             Number of the state.
         """
-        left = {e: {key: float(value[state]) for key, value in own.items()} for e, own in self.left.items()}
+        left = {e: {key: float(value[state]) for key, value in errors.items()} for e, errors in self.left.items()}
         return ReadingTable(tuple(row.each(lambda number: float(number[state])) for row in self.rows), left)
 
     @property
@@ -248,8 +248,8 @@ class ReadingTable:
             for same in zip(*(part.rows for part in parts), strict=True)
         )
         left = {
-            estimator: {key: np.concatenate([part.left[estimator][key] for part in parts]) for key in own}
-            for estimator, own in parts[0].left.items()
+            estimator: {key: np.concatenate([part.left[estimator][key] for part in parts]) for key in errors}
+            for estimator, errors in parts[0].left.items()
         }
         return ReadingTable(rows, left)
 
@@ -258,11 +258,11 @@ def plain(number: Any) -> Any:
     """Return a float or nested lists, as JSON holds them; negative zero becomes zero, NaN becomes None."""
     if isinstance(number, float):
         return None if math.isnan(number) else number + 0.0
-    return [plain(one) for one in np.asarray(number).tolist()]
+    return [plain(item) for item in np.asarray(number).tolist()]
 
 
 def reading_table(
-    found: Estimates | Recovery,
+    estimates: Estimates | Recovery,
     cameras: Mapping[str, CameraCalibration],
     truth: Truth | None = None,
     ground: GroundGeometry | None = None,
@@ -272,7 +272,7 @@ def reading_table(
 
     Parameters
     ----------
-    found : Estimates | Recovery
+    estimates : Estimates | Recovery
         Estimates of all estimators.
     cameras : mapping of str to CameraCalibration
         Calibration of each camera.
@@ -301,36 +301,38 @@ def reading_table(
                     value = sigma = noise = np.full_like(value, np.nan)
                 rows.append(Reading(group, parameter, estimator, own, value, value - own, sigma, noise))
 
-    units = np.array([one.per_si for one in parameters.CAMERA_PARAMETERS.values()])
-    for name, estimators in found.parameters.items():
-        made_of = parameters.rows_of(cameras[name]) / units[:, None]
-        told: dict[str, Sequence[np.ndarray]] = {
+    units = np.array([estimate.per_si for estimate in parameters.CAMERA_PARAMETERS.values()])
+    for name, estimators in estimates.parameters.items():
+        rows_in_si = parameters.rows_of(cameras[name]) / units[:, None]
+        readings: dict[str, Sequence[np.ndarray]] = {
             estimator: [
                 units * number
                 for number in (
-                    one.vector @ made_of.T,
-                    _sigma(made_of, one.error_covariance),
-                    _sigma(made_of, one.covariance),
+                    estimate.vector @ rows_in_si.T,
+                    _sigma(rows_in_si, estimate.error_covariance),
+                    _sigma(rows_in_si, estimate.covariance),
                 )
             ]
-            for estimator, one in estimators.items()
+            for estimator, estimate in estimators.items()
         }
-        true = None if truth is None else units * (truth.vector(name) @ made_of.T)
-        add(name, parameters.CAMERA_PARAMETERS.values(), true, told)
-    if found.angle:
-        told = {
+        true = None if truth is None else units * (truth.vector(name) @ rows_in_si.T)
+        add(name, parameters.CAMERA_PARAMETERS.values(), true, readings)
+    if estimates.angle:
+        readings = {
             e: tuple(v[:, None] / ARCSEC for v in (a.change_rad, a.sigma_rad, a.noise_rad))
-            for e, a in found.angle.items()
+            for e, a in estimates.angle.items()
         }
-        add(ANGLE_GROUP, (parameters.ANGLE,), None if truth is None else truth.angle_change[:, None] / ARCSEC, told)
-    if found.ground:
-        told = {e: (g.error_m, g.sigma_m, g.sigma_noise_m) for e, g in found.ground.items()}
+        add(ANGLE_GROUP, (parameters.ANGLE,), None if truth is None else truth.angle_change[:, None] / ARCSEC, readings)
+    if estimates.ground:
+        readings = {e: (g.error_m, g.sigma_m, g.sigma_noise_m) for e, g in estimates.ground.items()}
         error = None if truth is None or ground is None else truth.ground_error(ground)
-        add(GROUND_GROUP, parameters.GROUND, error, told)
-    left = {e: {"left_plan_rms_m": g.plan_rms_m, "left_height_rms_m": g.height_rms_m} for e, g in found.ground.items()}
+        add(GROUND_GROUP, parameters.GROUND, error, readings)
+    left = {
+        e: {"left_plan_rms_m": g.plan_rms_m, "left_height_rms_m": g.height_rms_m} for e, g in estimates.ground.items()
+    }
     return ReadingTable(tuple(rows), left)
 
 
-def _sigma(made_of: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+def _sigma(combination: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return (S, P) standard deviations of combinations (P, 4) of parameters with covariances (S, 4, 4)."""
-    return np.asarray(np.sqrt(np.einsum("pi,sij,pj->sp", made_of, covariance, made_of)))
+    return np.asarray(np.sqrt(np.einsum("pi,sij,pj->sp", combination, covariance, combination)))

@@ -24,7 +24,7 @@ from scenes.specs.disturbances import ErrorBudgetSpec
 from scenes.specs.instrument import BASE
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.observation import Observing, observe, one_detector
+from twin.monitor.observation import ObservationOptions, observe, shared_detector
 from twin.monitor.truth import Truth
 
 _CENTROID = "centroid"
@@ -71,7 +71,7 @@ class BudgetLine:
 
 
 @dataclass(frozen=True, eq=False)
-class Together:
+class CombinedErrors:
     """Errors of all causes together, from T trials.
 
     Attributes
@@ -113,19 +113,19 @@ class ErrorBudget:
         self.spec = spec
         self.resolved = resolved.model_copy(update={"instrument": spec.applied_to(resolved.instrument)})
         self.experiment = MonitorExperiment(self.resolved, backend)
-        stated = self.experiment.stated
-        assert stated is not None  # resolve_budget refuses a budget without them
+        prior = self.experiment.stated
+        assert prior is not None  # resolve_budget refuses a budget without them
         assert self.resolved.disturbances is not None
-        self.stated = stated
+        self.prior = prior
         if _CENTROID in self.causes:
             text = f"{_CENTROID} is the line of the centroid's own noise"
-            raise self.resolved.disturbances.error(text, ("causes", _CENTROID), allowed="another name of the cause")
+            raise self.resolved.disturbances.error(text, ("causes", _CENTROID), allowed="another name for the cause")
         self.seed = seed
 
     @property
     def causes(self) -> tuple[str, ...]:
         """Causes in the order of the file, without those that are zero."""
-        return tuple(dict.fromkeys(c.cause for c in self.stated.components))
+        return tuple(dict.fromkeys(c.cause for c in self.prior.components))
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -156,7 +156,7 @@ class ErrorBudget:
 
     def input_of(self, cause: str) -> tuple[float, str]:
         """Return a cause's input, 3 sigma, and its unit. Raises ValueError if there is no such cause."""
-        components = self.stated.of_causes((cause,)).components
+        components = self.prior.of_causes((cause,)).components
         if not components:
             raise ValueError(f"error budget: no cause {cause!r}; there are {', '.join(self.causes)}")
         first = components[0]
@@ -177,11 +177,11 @@ class ErrorBudget:
             Number of the random stream.
         """
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(7, stream)))
-        stated = self.stated.of_causes(causes)
-        amounts = stated.draw(rng, trials)
-        return states_of(amounts, stated.components, self.experiment.thermal)
+        prior = self.prior.of_causes(causes)
+        amounts = prior.draw(rng, trials)
+        return states_of(amounts, prior.components, self.experiment.thermal)
 
-    def grown_focal_planes(self, warmer: float) -> tuple[float, float]:
+    def warmed_focal_planes(self, warmer: float) -> tuple[float, float]:
         """Return the true d_f of warmer focal planes and its reading by paper 001, eq. (7), in metres.
 
         Parameters
@@ -221,7 +221,7 @@ class ErrorBudget:
         longer = monitor.model_copy(update={"prism_0": monitor.prism_0.model_copy(update={"shift": shift})})
         instrument = whole.instrument.spec.model_copy(update={"monitor": longer})
         resolved = self.resolved.model_copy(update={"instrument": instrument})
-        # the longer rhomboids stand in the way of the other beams: glass is compared, not a layout
+        # the longer rhomboids block other beams; only the glass is compared here, not a layout
         half = MonitorExperiment(resolved, whole.backend, free_beams=False)
         rms, glass = [], []
         for experiment in (whole, half):
@@ -267,7 +267,7 @@ class ErrorBudget:
         pattern = setup.pattern(self.seed)
         frames = setup.detector.expose(light * setup.nominal_photons, pattern, count, setup.exposure, stream)
         spots = len(frames)
-        # frame by frame, all spots of one after the other, as the estimators take them
+        # frame by frame, with all spots of a frame in sequence, as the estimators need them
         flat = np.swapaxes(frames, 0, 1).reshape(-1, *frames.shape[2:]).astype(np.float64)
         with one_blas_thread():
             position = measure_spots(flat, 1, setup.calibration, "energy", cores()).position.reshape(count, spots, 2)
@@ -281,23 +281,23 @@ class ErrorBudget:
         allowed = value * ALLOWED / three_sigma if allowed is None else allowed
         return BudgetLine(name, three_sigma, sigma, (float(axes[0]), float(axes[1])), value, unit, float(allowed))
 
-    def together(self, progress: Progress = lambda fraction, text: None) -> Together:
+    def together(self, progress: Progress = lambda fraction, text: None) -> CombinedErrors:
         """Simulate all causes together through noisy images and every estimator, with the mean of ``frames``."""
         progress(0.0, "all causes: states")
         states = self.states(self.causes, self.spec.all_together, len(self.lines))
-        record = one_detector(self.experiment, self.spec.frames, self.seed)
+        record = shared_detector(self.experiment, self.spec.frames, self.seed)
         pieces: list[tuple[Truth, Recovery]] = []
-        for found in observe(self.experiment, states, Observing(record, "energy", 25, stated=False)):
-            pieces.append((found.truth, found.recovery))
-            progress(0.1 + 0.9 * (found.numbers[-1] + 1) / len(states), "all causes: render and measure")
+        for observation in observe(self.experiment, states, ObservationOptions(record, "energy", 25, use_prior=False)):
+            pieces.append((observation.truth, observation.recovery))
+            progress(0.1 + 0.9 * (observation.numbers[-1] + 1) / len(states), "all causes: render and measure")
         angle = self.radians_per_pixel * np.concatenate([p.after - p.before for _, p in pieces])
         parameters: dict[str, dict[str, tuple[float, float]]] = {}
         cameras = self.experiment.instrument.cameras
         for estimator in next(iter(pieces[0][1].parameters.values())):
             errors = [[p.parameters[c][estimator].vector - true.vector(c) for true, p in pieces] for c in cameras]
-            off = np.stack([np.concatenate(own) for own in errors], axis=-1)
-            parameters[estimator] = {name: _three_sigma(off[:, k]) for k, name in enumerate(_PARAMETER_FIELDS)}
-        return Together(_three_sigma(angle), parameters)
+            differences = np.stack([np.concatenate(parts) for parts in errors], axis=-1)
+            parameters[estimator] = {name: _three_sigma(differences[:, k]) for k, name in enumerate(_PARAMETER_FIELDS)}
+        return CombinedErrors(_three_sigma(angle), parameters)
 
 
 def _shifts(experiment: MonitorExperiment, states: Sequence[State]) -> np.ndarray:
@@ -307,8 +307,8 @@ def _shifts(experiment: MonitorExperiment, states: Sequence[State]) -> np.ndarra
     def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return before, experiment.expected_frames(photons)
 
-    seen = observe(experiment, states, Observing(record, chunk=32, stated=False, frames=1))
-    return np.concatenate([found.recovery.after - found.recovery.before for found in seen])
+    observations = observe(experiment, states, ObservationOptions(record, chunk=32, use_prior=False, frames=1))
+    return np.concatenate([observation.recovery.after - observation.recovery.before for observation in observations])
 
 
 def _three_sigma(values: np.ndarray) -> tuple[float, float]:

@@ -29,7 +29,7 @@ from twin.framework.artefact import significant
 from twin.framework.record import Quantity, Record
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import largest_piece
-from twin.monitor.observation import LOST, Observing, observe, one_detector, why_lost
+from twin.monitor.observation import LOST, ObservationOptions, observe, shared_detector, why_lost
 from twin.monitor.reading_table import ReadingTable, reading_table
 
 LARGEST_SERIES = 200_000_000
@@ -121,13 +121,15 @@ class TimeSeries:
             recomputed = np.flatnonzero(curvature.beyond & curvature.holds)
             if len(untraceable):
                 out.append(
-                    f"course: σ does not hold at {len(untraceable)} times, first at {moment(float(self.times[untraceable[0]]))}: the "
-                    f"motions that the {name} reads are not small, and the states that it stands for cannot be traced"
+                    f"course: σ does not hold at {len(untraceable)} times, first at "
+                    f"{moment(float(self.times[untraceable[0]]))}: the motions estimated by the {name} are too large "
+                    "for linear theory, and their states cannot be traced"
                 )
             if len(recomputed):
                 out.append(
-                    f"course: at {len(recomputed)} times, first at {moment(float(self.times[recomputed[0]]))}, the motions that "
-                    f"the {name} reads are not small, and its readings are those of Gauss and Newton's steps"
+                    f"course: at {len(recomputed)} times, first at {moment(float(self.times[recomputed[0]]))}, the "
+                    f"motions estimated by the {name} are too large for linear theory; its readings are from "
+                    "Gauss-Newton iteration"
                 )
         return tuple(out)
 
@@ -162,16 +164,16 @@ def _angle(course: TimeSeries) -> dict[str, Any] | None:
 
 
 _TEMPERATURES: Record[Sequence[Temperature]] = Record(
-    "The temperature of a body that was given, at each time, its perturbation included.",
-    Quantity("change_K", lambda fields: [one.change for one in fields], "change at the body's origin"),
-    Quantity("gradient_K_per_m", lambda fields: [one.gradient for one in fields], "gradient along the body's axes"),
+    "Temperature of a body in the course at each time, its perturbation included.",
+    Quantity("change_K", lambda fields: [field.change for field in fields], "change at the body's origin"),
+    Quantity("gradient_K_per_m", lambda fields: [field.gradient for field in fields], "gradient along the body's axes"),
 )
 _MOTIONS: Record[Sequence[Motion]] = Record(
-    "The motion of a body that was given, at each time, its perturbation included.",
-    Quantity("pivot", lambda moves: moves[0].pivot, "point that a rotation or a growth leaves in place"),
-    Quantity("rotate_arcsec", lambda moves: [one.rotate for one in moves], "rotation about X, Y and Z"),
-    Quantity("shift_um", lambda moves: [one.shift for one in moves], "shift along X, Y and Z"),
-    Quantity("scale_ppm", lambda moves: [one.scale for one in moves], "relative growth"),
+    "Motion of a body in the course at each time, its perturbation included.",
+    Quantity("pivot", lambda moves: moves[0].pivot, "fixed point of a rotation or a scale change"),
+    Quantity("rotate_arcsec", lambda moves: [motion.rotate for motion in moves], "rotation about X, Y and Z"),
+    Quantity("shift_um", lambda moves: [motion.shift for motion in moves], "shift along X, Y and Z"),
+    Quantity("scale_ppm", lambda moves: [motion.scale for motion in moves], "relative scale change"),
 )
 
 
@@ -188,14 +190,14 @@ def _between(course: TimeSeries) -> dict[str, Any] | None:
 COURSE: Record[TimeSeries] = Record(
     "course.json: as truth.json and recovered.json, with a list over the times for each number.",
     Quantity("times_s", lambda course: course.times, "times of the measurements"),
-    Quantity("detail", lambda course: course.shown, "number of the time that the run shows in full"),
+    Quantity("detail", lambda course: course.shown, "index of the time that the run shows in full"),
     Quantity("temperatures", lambda course: course.temperatures, "temperatures by body", record=_TEMPERATURES),
-    Quantity("cameras", lambda course: course.group("cameras"), "true changes of each camera and what is read of them"),
+    Quantity("cameras", lambda course: course.group("cameras"), "true changes and readings of each camera"),
     Quantity("motions", lambda course: course.motions or None, "motions by body", record=_MOTIONS, where_known=True),
     Quantity("intersection_angle", _angle, "the angle between two cameras", where_known=True),
     Quantity("ground", lambda course: course.group("ground"), "errors of points on the ground", where_known=True),
     Quantity("sigma_holds", lambda course: course.sigma_holds, "whether sigmas hold at each time"),
-    Quantity("disturbances", _agreement, "whether all measurements agree with what is stated", where_known=True),
+    Quantity("disturbances", _agreement, "whether all measurements agree with the prior", where_known=True),
     Quantity("between", _between, "filtered and smoothed changes between the times", where_known=True),
 )
 
@@ -274,8 +276,8 @@ def run_series(
     tables: list[ReadingTable] = []
     recoveries: list[Recovery] = []
     together = CourseSmoother(experiment.disturbances, experiment.cameras, experiment.ground, course.times)
-    record, size, done = one_detector(experiment, frames, seed), largest_piece(each * frames), 0
-    how = Observing(record, job.analysis.centroid, size, keep_parts=experiment.disturbances is not None)
+    record, size, done = shared_detector(experiment, frames, seed), largest_piece(each * frames), 0
+    how = ObservationOptions(record, job.analysis.centroid, size, keep_parts=experiment.disturbances is not None)
     try:
         for observation in observe(experiment, states, how):
             piece, expected = slice(done, done + len(observation.numbers)), observation.light.photons
@@ -316,7 +318,7 @@ def run_series(
     return TimeSeries(
         times=np.array(course.times),
         temperatures={path: tuple(job.fields(k)[path] for k in range(len(states))) for path in job.fields(0)},
-        motions={path: tuple(every[path] for every in state_motions) for path in course.motion},
+        motions={path: tuple(motions[path] for motions in state_motions) for path in course.motion},
         shown=course.shown,
         angle=angle,
         readings=ReadingTable.joined(tables),
@@ -480,8 +482,8 @@ def jump_text(jump: Jump) -> str:
     rivals = [other for other, ratio in jump.rivals.items() if ratio > jump.log_ratio - _AS_GOOD]
     others = f"; {names_text(rivals[:3])} would explain it nearly as well" if rivals else ""
     return (
-        f"{body} jumped between {moment(jump.after)} and {moment(jump.until)}: {sizes}, log ratio {jump.log_ratio:.1f}; "
-        f"sigmas are wide there, and smoothed changes take it for an event{others}"
+        f"{body} jumped between {moment(jump.after)} and {moment(jump.until)}: {sizes}, log likelihood ratio "
+        f"{jump.log_ratio:.1f}; sigmas are larger there, and the smoothed changes treat it as an event{others}"
     )
 
 
@@ -490,7 +492,7 @@ class CourseSmoother:
 
     Parameters
     ----------
-    stated
+    prior
         Prior with its time laws; without it (None) nothing is smoothed.
     cameras
         Calibration of each camera.
@@ -502,12 +504,12 @@ class CourseSmoother:
 
     def __init__(
         self,
-        stated: Disturbances | None,
+        prior: Disturbances | None,
         cameras: Mapping[str, CameraCalibration],
         ground: GroundGeometry | None,
         times: Sequence[float],
     ) -> None:
-        self._stated, self._cameras, self._ground = stated, cameras, ground
+        self._prior, self._cameras, self._ground = prior, cameras, ground
         self._times = np.array(times)
         self._shifts: list[np.ndarray] = []
         self._noise: SeriesNoise | None = None
@@ -544,7 +546,7 @@ class CourseSmoother:
 
     def smoothed(self) -> SmoothedCourse | None:
         """Return the smoothed course of all stored states; None without a prior, and for a single time."""
-        prior, noise, times = self._stated, self._noise, self._times
+        prior, noise, times = self._prior, self._noise, self._times
         if prior is None or noise is None or len(times) < 2:
             return None
         steps = min(MOST_BETWEEN, LARGEST_BETWEEN // (len(times) - 1)) + 1

@@ -201,9 +201,9 @@ class LineSight:
         AimError, BeamMissedError
             Light is lost, see `trace`.
         """
-        return self.told_by(self.trace(states, placed) if states else self.nominal[:, :0])
+        return self.truth_of(self.trace(states, placed) if states else self.nominal[:, :0])
 
-    def told_by(self, sight: np.ndarray) -> Truth:
+    def truth_of(self, sight: np.ndarray) -> Truth:
         """Return the true changes of S states from directions of sight (cameras, S, LINE_POINTS, 3)."""
         sight = np.concatenate([self.nominal, sight], axis=1)
         cameras: dict[str, LineChange] = {}
@@ -240,11 +240,11 @@ class LineSight:
         The line of sight of an instrument as built differs from the design; Y is then perpendicular to it, as near
         as possible to the camera's Y.
         """
-        own = {name: self.instrument.camera_axes(name) for name in self.instrument.cameras}
+        axes = {name: self.instrument.camera_axes(name) for name in self.instrument.cameras}
         if not self.instrument.as_built:
-            return own
+            return axes
         sights = self.nominal[:, 0, LINE_POINTS // 2]
-        return {name: _about(sight, own[name][:, 1]) for name, sight in zip(own, sights, strict=True)}
+        return {name: _about(sight, axes[name][:, 1]) for name, sight in zip(axes, sights, strict=True)}
 
     def _from_the_image(
         self, states: Sequence[State], placed: PlacedBodies

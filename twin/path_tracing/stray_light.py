@@ -25,7 +25,7 @@ from scenes.models.scenery import Finishes, Scenery, build_scenery
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import Channel, prism_of
 from twin.framework.record import Quantity, Record
-from twin.monitor.monitor_beams import Aimed
+from twin.monitor.monitor_beams import AimedRays
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath
 from twin.path_tracing.path_families import Event, SurfaceEvent, family_name, nominal_codes
@@ -109,7 +109,7 @@ def pinhole(
     state: State,
     channel: Channel,
     cone: float | None = None,
-    aimed: Aimed | None = None,
+    aimed: AimedRays | None = None,
 ) -> DiskSource:
     """Return the light source of a channel: its pinhole, which emits evenly into a cone that covers the camera's pupil.
 
@@ -127,7 +127,7 @@ def pinhole(
         Channel of the pinhole.
     cone : float or None
         Sine of the cone's half-angle; by default that of the pupil times ``CONE_MARGIN``.
-    aimed : Aimed or None
+    aimed : AimedRays or None
         All channels' nominal rays to the return faces, computed here by default.
     """
     placed = instrument.assembly.place([state])
@@ -142,7 +142,7 @@ def pinhole(
     return DiskSource.along(position, axis, radius, cone).aimed_at(aimed.direction[number], NARROW_MARGIN)
 
 
-def _nominal_rays(instrument: Instrument, backend: Backend) -> Aimed:
+def _nominal_rays(instrument: Instrument, backend: Backend) -> AimedRays:
     """Return the rays from every pinhole to its return face in the unperturbed instrument."""
     return MonitorPath(instrument, backend, quadrature.disk(AIM_RINGS)).nominal
 
@@ -223,8 +223,8 @@ def trace_stray(
         nominal = run.of(f"{channel.key}/area_ccd", "nominal")
         if not nominal:
             raise NominalPathLost(
-                f"none of {paths} paths of {channel.key} returned to its area CCD along the nominal surfaces; trace more, "
-                "or the perturbation moves the beam off"
+                f"none of {paths} paths of {channel.key} returned to its area CCD along the nominal surfaces; trace "
+                "more, or the perturbation moves the beam off"
             )
         runs[channel.key] = run
         scale[channel.key] = channel.photons / nominal[0].energy
@@ -419,8 +419,8 @@ def ghosts(experiment: MonitorExperiment, light: StrayLight) -> tuple[Ghost, ...
             text = (
                 f"ghosts on the area CCD of {channel.key} have {100.0 * total:.2g} % of its spot's light and bias the "
                 f"spot by that share of its motion relative to them; the strongest, {100.0 * share:.2g} %, comes "
-                f"from {source} by {family_name(family.surface_events, nominal_events)}, {off:.3g} px from the spot: tilt "
-                "that prism or change the field to move it away"
+                f"from {source} by {family_name(family.surface_events, nominal_events)}, {off:.3g} px from the spot: "
+                "tilt that prism or change the field to move it away"
             )
             out.append(Ghost(channel, source, _reflecting_prism(family, nominal_events), text))
     return tuple(out)

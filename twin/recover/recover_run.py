@@ -40,7 +40,7 @@ from twin.recover.measured_frames import (
     read_measurement,
     repeated_frames,
 )
-from twin.sensors.area_detector import EmvaDetector, told_of_steps
+from twin.sensors.area_detector import EmvaDetector, coarse_step_warnings
 
 CALIBRATE, READ, MEASURE = "calibrate", "read the frames", "search and measure the spots"
 
@@ -86,11 +86,12 @@ class RecoverRun:
     @cached_property
     def worst(self) -> tuple[int, Consistency] | None:
         """Index of the state whose shifts agree least with the prior, and its consistency; None without a prior."""
-        found = [reading.recovery for reading in self.readings]
-        if len(found) == 1:
+        recoveries = [reading.recovery for reading in self.readings]
+        if len(recoveries) == 1:
             return None if self.last.consistency is None else (0, self.last.consistency)
         return self.last.worst_of(
-            np.concatenate([one.shift for one in found]), np.concatenate([one.shift_covariance for one in found])
+            np.concatenate([recovery.shift for recovery in recoveries]),
+            np.concatenate([recovery.shift_covariance for recovery in recoveries]),
         )
 
     @property
@@ -102,14 +103,14 @@ class RecoverRun:
         if self.times is not None and len(self.times) > 1:
             when = f" at {moment(self.times[worst[0]])}, the worst of {len(self.times)} times"
             rate += " for the series"
-        found = (*self.warnings, *contradicted(self.last.disturbances, worst[1], when, rate))
+        warnings = (*self.warnings, *contradicted(self.last.disturbances, worst[1], when, rate))
         if self.smoothed is not None:
-            found += self.smoothed.jump_texts()
-        return (*found, *(() if self.smoothed is None else self.smoothed.contradiction))
+            warnings += self.smoothed.jump_texts()
+        return (*warnings, *(() if self.smoothed is None else self.smoothed.contradiction))
 
 
 @dataclass(frozen=True, eq=False)
-class _Bench:
+class _Calibrated:
     """Calibration of the instrument: cameras, spot shapes where they are modelled, and the prior on disturbances."""
 
     cameras: Mapping[str, CameraCalibration]
@@ -174,30 +175,33 @@ def run_recover(
     times = setup.test.times
     source = f"the data sheet {setup.detector.name} gives"
     if setup.test.photon_transfer == "measured":
-        source = "the frames in the dark and in even light give"
+        source = "the dark and flat frames give"
     tables: Mapping[str, CameraCrosstalk] | None = None
     readings: list[MonitorReading] = []
-    for k, one in enumerate(recoveries):
-        tables = bench.crosstalk(one) if tables is None else tables
+    for k, recovery in enumerate(recoveries):
+        tables = bench.crosstalk(recovery) if tables is None else tables
         frames = min(len(result.channel.after[k].frames) for result in results)
-        own = tuple(replace(result, after=result.after[k : k + 1]) for result in results)
-        wrong = (*_unlike(own, times, k), *_noisy(own, times, source, k))
-        if smoothed is not None and one is recoveries[-1]:
-            wrong += smoothed.contradiction  # recovered.json is about the last state, and its filtered changes
-        told = bench.cameras, ground, bench.disturbances, one, tables, frames, centroid, wrong
-        readings.append(MonitorReading(names, *told, together=len(recoveries)))
-    of_frames = (*_unlike(results, times), *_noisy(results, times, source))
-    given = (*bench.warnings, *order_warnings(channels, times), *_coarse(channels, setup))
-    warnings = (*given, *of_frames, *_of_readings(readings, times), *readings[-1].unseen)
+        results_of_state = tuple(replace(result, after=result.after[k : k + 1]) for result in results)
+        state_doubts = (
+            *_shape_warnings(results_of_state, times, k),
+            *_noise_warnings(results_of_state, times, source, k),
+        )
+        if smoothed is not None and recovery is recoveries[-1]:
+            state_doubts += smoothed.contradiction  # recovered.json has the last state and its filtered changes
+        arguments = bench.cameras, ground, bench.disturbances, recovery, tables, frames, centroid, state_doubts
+        readings.append(MonitorReading(names, *arguments, together=len(recoveries)))
+    frame_warnings = (*_shape_warnings(results, times), *_noise_warnings(results, times, source))
+    input_warnings = (*bench.warnings, *order_warnings(channels, times), *_coarse_warnings(channels, setup))
+    warnings = (*input_warnings, *frame_warnings, *_reading_warnings(readings, times), *readings[-1].unseen)
     return RecoverRun(setup, tuple(readings), results, bench.pitch, smoothed, warnings)
 
 
-def _modelled(setup: MeasurementSetup, backend: Backend, experiment: MonitorExperiment | None) -> _Bench:
+def _modelled(setup: MeasurementSetup, backend: Backend, experiment: MonitorExperiment | None) -> _Calibrated:
     assert setup.model is not None
     experiment = MonitorExperiment(setup.model, backend) if experiment is None else experiment
     ccd = setup.model.instrument.autocollimator.area_ccd
-    experiment.nominal_focus  # noqa: B018 - an instrument without spots is told first
-    return _Bench(
+    experiment.nominal_focus  # noqa: B018 - an instrument without spots raises its error first
+    return _Calibrated(
         cameras=experiment.cameras,
         noise=experiment.detector.noise_model(experiment.exposure),
         ccd=(ccd.rows, ccd.columns),
@@ -209,34 +213,34 @@ def _modelled(setup: MeasurementSetup, backend: Backend, experiment: MonitorExpe
     )
 
 
-def _formulas(setup: MeasurementSetup) -> _Bench:
+def _formulas(setup: MeasurementSetup) -> _Calibrated:
     """Return the calibration by the geometry alone, with the Jacobians of the corrected formulas."""
     cameras = {}
-    for name, given in (setup.test.geometry or {}).items():
+    for name, spec in (setup.test.geometry or {}).items():
         geometry = MonitorGeometry(
-            principal_distance_m=given.principal_distance,
-            separation_m=given.separation,
-            pitch_m=given.pitch,
-            field_beta_rad=abs(given.field),
-            principal_distance_across_m=given.principal_distance_across,
+            principal_distance_m=spec.principal_distance,
+            separation_m=spec.separation,
+            pitch_m=spec.pitch,
+            field_beta_rad=abs(spec.field),
+            principal_distance_across_m=spec.principal_distance_across,
         )
         by_pixel = coefficients("derived", geometry)
         labels = ("d_alpha", "d_beta", "d_gamma", "d_f")
         cameras[name] = CameraCalibration(
-            geometry, given.look, np.asarray(np.linalg.inv(by_pixel), np.float64), np.eye(4), labels, SIDES
+            geometry, spec.look, np.asarray(np.linalg.inv(by_pixel), np.float64), np.eye(4), labels, SIDES
         )
     exposure = setup.test.exposure or 0.0
     detector = EmvaDetector.from_sheet(setup.detector, exposure)
     pitches = {camera.geometry.pitch_m for camera in cameras.values()}
-    return _Bench(cameras, detector.noise_model(exposure), None, max(pitches))
+    return _Calibrated(cameras, detector.noise_model(exposure), None, max(pitches))
 
 
 def _measured(
-    setup: MeasurementSetup, bench: _Bench, channels: Sequence[ChannelFrames], advance: Advance
+    setup: MeasurementSetup, bench: _Calibrated, channels: Sequence[ChannelFrames], advance: Advance
 ) -> tuple[tuple[ChannelResult, ...], list[Recovery], SmoothedCourse | None]:
     """Return the results of all channels, the recovery of each state, and the smoothed series."""
     test = setup.test
-    found: list[ChannelMeasurement] = []
+    measurements: list[ChannelMeasurement] = []
     issues: list[Issue] = []
     for number, channel in enumerate(channels):
         advance(MEASURE, number, len(channels))
@@ -244,28 +248,28 @@ def _measured(
         if test.template == "twin":
             assert bench.calibration is not None
             shape = one_shape(bench.calibration.template, number, channel.ccd)
-        worker = ChannelMeasurement(setup.test, channel, shape)
-        issues += worker.search()
-        found.append(worker)
+        measurement = ChannelMeasurement(setup.test, channel, shape)
+        issues += measurement.search()
+        measurements.append(measurement)
     advance(MEASURE, len(channels), len(channels))
     if issues:
         raise InputError(*issues)
-    if bench.calibration is not None and test.template == "twin" and all(one.plain for one in found):
-        # clean frames of whole CCDs: to the bit what the main job makes of them
+    if bench.calibration is not None and test.template == "twin" and all(item.plain for item in measurements):
+        # clean frames of whole CCDs give exactly the numbers of the main job
         try:
-            states, smoothed = _plain(setup, bench, bench.calibration, channels)
+            states, smoothed = _recover_clean(setup, bench, bench.calibration, channels)
         except SpotError as error:
             raise InputError(*_spot_issues(setup, channels, error)) from error
-        return tuple(one.result() for one in found), states, smoothed
-    for one in found:
-        issues += one.measure()
+        return tuple(item.result() for item in measurements), states, smoothed
+    for item in measurements:
+        issues += item.measure()
     if issues:
         raise InputError(*issues)
-    return tuple(one.result() for one in found), *_corrected(setup, bench, found)
+    return tuple(item.result() for item in measurements), *_recover_corrected(setup, bench, measurements)
 
 
-def _plain(
-    setup: MeasurementSetup, bench: _Bench, calibration: MonitorCalibration, channels: Sequence[ChannelFrames]
+def _recover_clean(
+    setup: MeasurementSetup, bench: _Calibrated, calibration: MonitorCalibration, channels: Sequence[ChannelFrames]
 ) -> tuple[list[Recovery], SmoothedCourse | None]:
     """Recover clean states in the way, and in the portions, of the main job."""
     states, count = len(channels[0].after), len(channels[0].after[0].frames)
@@ -282,42 +286,42 @@ def _plain(
     for piece in pieces(states, sum(channel.after[0].frames.size for channel in channels)):
         after = np.stack([means([c.after[k] for c in channels]) for k in range(piece.start, piece.stop)])
         try:
-            found = recover_monitor(
+            recovery = recover_monitor(
                 before, after, calibration, centroid,
                 disturbances=bench.disturbances, keep_parts=smoother is not None, motions=bench.motions, frames=count,
             )  # fmt: skip
         except SpotError as error:
             raise SpotError({piece.start * len(channels) + n: why for n, why in error.reasons.items()}) from error
         if smoother is not None:
-            found = smoother.add(found)
-        out += [found.at(slice(k, k + 1)) for k in range(piece.stop - piece.start)]
+            recovery = smoother.add(recovery)
+        out += [recovery.at(slice(k, k + 1)) for k in range(piece.stop - piece.start)]
     return out, None if smoother is None else smoother.smoothed()
 
 
-def _corrected(
-    setup: MeasurementSetup, bench: _Bench, found: Sequence[ChannelMeasurement]
+def _recover_corrected(
+    setup: MeasurementSetup, bench: _Calibrated, measurements: Sequence[ChannelMeasurement]
 ) -> tuple[list[Recovery], SmoothedCourse | None]:
     """Recover states whose spots were measured channel by channel."""
     calibration = bench.calibration
     if calibration is None:
-        template = found[0].shape
+        template = measurements[0].shape
         assert template is not None
         calibration = MonitorCalibration(bench.cameras, template, bench.noise)
     smoother = _smoother(setup, bench)
-    first = _joined([one.positions[0] for one in found])
+    first = _joint_positions([measurement.positions[0] for measurement in measurements])
     out: list[Recovery] = []
-    for k in range(1, len(found[0].positions)):
-        second = _joined([one.positions[k] for one in found])
-        spread = [one.shift_covariance(k) for one in found]
-        noise, stated = np.concatenate(spread), bench.disturbances
+    for k in range(1, len(measurements[0].positions)):
+        second = _joint_positions([measurement.positions[k] for measurement in measurements])
+        covariances = [measurement.shift_covariance(k) for measurement in measurements]
+        noise, stated = np.concatenate(covariances), bench.disturbances
         out.append(recovery_of(first, second, noise, calibration, stated, motions=bench.motions))
         if smoother is not None:
-            before, after = zip(*(one.noise_parts(k) for one in found), strict=True)
-            smoother.take(out[-1].shift, _together(before), _together(after))
+            before, after = zip(*(measurement.noise_parts(k) for measurement in measurements), strict=True)
+            smoother.take(out[-1].shift, _joint_noise(before), _joint_noise(after))
     return out, None if smoother is None else smoother.smoothed()
 
 
-def _smoother(setup: MeasurementSetup, bench: _Bench) -> CourseSmoother | None:
+def _smoother(setup: MeasurementSetup, bench: _Calibrated) -> CourseSmoother | None:
     """Return the smoother of a series whose prior has time laws; None for a single state or without a prior."""
     times = setup.test.times
     if times is None or bench.disturbances is None:
@@ -326,12 +330,12 @@ def _smoother(setup: MeasurementSetup, bench: _Bench) -> CourseSmoother | None:
     return CourseSmoother(bench.disturbances, bench.cameras, ground, times)
 
 
-def _together(each: Sequence[NoiseParts]) -> NoiseParts:
+def _joint_noise(each: Sequence[NoiseParts]) -> NoiseParts:
     """Return the joint noise of spots on different CCDs."""
     return NoiseParts(np.concatenate([one.temporal for one in each]), np.concatenate([one.pattern for one in each]))
 
 
-def _joined(positions: Sequence[SpotPositions]) -> SpotPositions:
+def _joint_positions(positions: Sequence[SpotPositions]) -> SpotPositions:
     """Return all spots together, without their maps, which may differ in size."""
     names = ["row", "column", "temporal_covariance", "fixed_covariance", "flux", "background", "converged"]
     names.append("reduced_chi_square")
@@ -341,14 +345,14 @@ def _joined(positions: Sequence[SpotPositions]) -> SpotPositions:
 
 def _spot_issues(setup: MeasurementSetup, channels: Sequence[ChannelFrames], error: SpotError) -> list[Issue]:
     """Return issues of spots that are numbered state by state."""
-    out = []
+    issues = []
     for number, reason in error.reasons.items():
         channel = channels[number % len(channels)]
-        # the nominal state is measured first, and of it nothing says which of both it was
+        # the nominal state is measured first, and the error does not say in which of both states the spot is
         states = channel.states
         state = states[min(number // len(channels) + 1, len(states) - 1)]
-        out.append(cannot_measure(setup.test, state, channel.name, reason, remedy(reason)))
-    return out
+        issues.append(cannot_measure(setup.test, state, channel.name, reason, remedy(reason)))
+    return issues
 
 
 def state_name(times: Sequence[float] | None, number: int) -> str:
@@ -380,60 +384,63 @@ def _worst(
         judged = (
             (suspect(spot), state_name(times, k + first * (k > 0))) for k, (_, spot) in enumerate(result.states())
         )
-        found = [(why, state) for why, state in judged if why is not None]
-        if found:
-            why, state = max(found)
-            others = f", the worst of {len(found)} states" if len(found) > 1 else ""
-            yield f"{result.channel.name} {state}{others}", why
+        suspects = [(numbers, state) for numbers, state in judged if numbers is not None]
+        if suspects:
+            numbers, state = max(suspects)
+            others = f", the worst of {len(suspects)} states" if len(suspects) > 1 else ""
+            yield f"{result.channel.name} {state}{others}", numbers
 
 
-def _of_readings(readings: Sequence[MonitorReading], times: Sequence[float] | None) -> tuple[str, ...]:
+def _reading_warnings(readings: Sequence[MonitorReading], times: Sequence[float] | None) -> tuple[str, ...]:
     """Return doubts and notes of the readings that the frames gave no warning of; for a series the first of each."""
-    told: dict[str, list[str]] = {}
+    texts: dict[str, list[str]] = {}
     for k, reading in enumerate(readings):
         for text in (*reading.doubts, *reading.notes):
-            # the worst contradiction of a series has a limit of its own
-            if text not in reading.found_wrong and text not in reading.contradiction:
-                # the same words about other numbers are one warning
-                told.setdefault(text.partition(":")[0], []).append(f"{state_name(times, k + 1)}: {text}")
-    return tuple(same[0] if len(same) == 1 else f"{same[0]} (first of {len(same)} states)" for same in told.values())
+            # the worst contradiction of a series has another limit and is reported separately
+            if text not in reading.earlier_doubts and text not in reading.contradiction:
+                # texts that differ in numbers only are one warning
+                texts.setdefault(text.partition(":")[0], []).append(f"{state_name(times, k + 1)}: {text}")
+    return tuple(
+        repeated[0] if len(repeated) == 1 else f"{repeated[0]} (first of {len(repeated)} states)"
+        for repeated in texts.values()
+    )
 
 
-def _unlike(results: Sequence[ChannelResult], times: Sequence[float] | None, first: int = 0) -> tuple[str, ...]:
+def _shape_warnings(results: Sequence[ChannelResult], times: Sequence[float] | None, first: int = 0) -> tuple[str, ...]:
     """Return warnings of spots whose core does not have the calibrated shape, for a series the worst of each channel.
 
     ``first`` is the index of the first state after in the results.
     """
     return tuple(
         f"{where}: the spot does not have the calibrated shape, reduced chi-square of its"
-        f" core {chi:.2f} over {pixels} pixels; possible causes are defocus, a reflection too near to be separated, and"
-        " vibration (`vibration: fitted` allows for it); sigma does not cover the effect on the position"
+        f" core {chi:.2f} over {pixels} pixels; possible causes are defocus, a reflection too close to be separated, "
+        "and vibration (`vibration: fitted` allows for it); sigma does not cover the effect on the position"
         for where, (chi, pixels) in _worst(results, times, lambda spot: None if spot.fits else spot.core, first)
     )
 
 
-def _coarse(channels: Sequence[ChannelFrames], setup: MeasurementSetup) -> tuple[str, ...]:
+def _coarse_warnings(channels: Sequence[ChannelFrames], setup: MeasurementSetup) -> tuple[str, ...]:
     """Return warnings of CCDs whose noise, specified or measured, is too small for the steps of their grey values."""
     if setup.test.photon_transfer == "stated":
-        return told_of_steps(channels[0].raw_noise, f"area CCD {setup.detector.name}")
+        return coarse_step_warnings(channels[0].raw_noise, f"area CCD {setup.detector.name}")
     whose = f"area CCD {setup.detector.name}, as measured,"
-    return tuple(text for one in channels for text in told_of_steps(one.raw_noise, f"{one.name}: {whose}"))
+    return tuple(text for one in channels for text in coarse_step_warnings(one.raw_noise, f"{one.name}: {whose}"))
 
 
-def _why(ratio: float) -> str:
+def _noise_causes(ratio: float) -> str:
     """Return possible causes of noise other than specified, and its consequences, as text."""
     if ratio > 1.0:
         return (
-            "another gain or read-out, or interference; σ of noise and the search for defects take what is more for"
-            " read noise, and rest on the stated gain"
+            "another gain or read-out, or interference; the noise σ and the search for artefacts treat the excess as"
+            " read noise, and use the specified gain"
         )
     return (
-        "another gain or read-out, or frames that were averaged, smoothed or compressed; σ of noise and the search for"
-        " defects rest on the stated noise"
+        "another gain or read-out, or frames that were averaged, smoothed or compressed; the noise σ and the search for"
+        " artefacts use the specified noise"
     )
 
 
-def _noisy(
+def _noise_warnings(
     results: Sequence[ChannelResult], times: Sequence[float] | None, source: str, first: int = 0
 ) -> tuple[str, ...]:
     """Return warnings of frames with noise other than specified, for a series the worst of each channel.
@@ -445,8 +452,8 @@ def _noisy(
         return None if spot.noise_ratio is None else (abs(math.log(spot.noise_ratio)), spot.noise_ratio)
 
     return tuple(
-        f"{where}: beside the spot the frames are {ratio:.2f} times as noisy as {source}: {_why(ratio)}: name the right"
-        " `detector`, or measure it with dark and flat frames and `photon_transfer: measured`"
+        f"{where}: beside the spot the frames are {ratio:.2f} times as noisy as {source}: {_noise_causes(ratio)}: name "
+        "the correct `detector`, or measure it with dark and flat frames and `photon_transfer: measured`"
         for where, (_, ratio) in _worst(results, times, apart, first)
     )
 

@@ -1,16 +1,16 @@
-"""Area detector described by its EMVA 1288 data-sheet numbers: expected photons in, recorded frames out.
+"""Area detector described by its EMVA 1288 data sheet: expected photons in, recorded frames out.
 
 The signal chain is the linear camera model of EMVA Standard 1288 (release 3.1, chapter 2, eq. 1-12):
 
-    n_e  = Poisson( QE * (1 + prnu) * photons + dark_current * exposure )         electrons, exact Poisson
-    n_e  = min(n_e, full_well)                                                    the well fills before the read-out
-    y    = K * (n_e + dsnu_offset + dark_noise * normal + further) + offset       grey value, not yet digitised
-    y_DN = clip(rint(y), 0, 2**bit_depth - 1)                                     uint16
+    n_e  = Poisson( QE * (1 + prnu) * photons + dark_current * exposure )         electrons, exact Poisson n_e  =
+    min(n_e, full_well)                                                    the well fills before the read-out y    = K *
+    (n_e + dsnu_offset + dark_noise * normal + further) + offset       grey value, not yet digitised y_DN =
+    clip(rint(y), 0, 2**bit_depth - 1)                                     uint16
 
 PRNU scales the response to light only; DSNU is a fixed additive pattern in electrons that adds no shot noise. Further
 noise is what a data sheet lists beyond the model, term by term (``NOISE_TERMS``). The Poisson numbers are exact at
-every mean (``twin.sensors.poisson_numbers``); no normal approximation is made anywhere. Pixel coordinates are
-(row, column); arrays are (..., H, W).
+every mean (``twin.sensors.poisson_numbers``); no normal approximation is used. Pixel coordinates are (row, column);
+arrays are (..., H, W).
 """
 
 from __future__ import annotations
@@ -36,22 +36,22 @@ from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.spec import Spec
 from twin.framework.frame_store import allocate_frames, largest_of, release_memory
 from twin.framework.random_streams import stream
-from twin.sensors.exposure_kernel import FEWEST, Reading, exposing_bytes, kernels_there
+from twin.sensors.exposure_kernel import FEWEST, Reading, exposing_bytes, kernels_available
 from twin.sensors.poisson_numbers import poisson_pieces
 
 
 class NoiseTerm(FurtherNoise, Protocol):
-    """What a term adds to the electrons of a pixel, after the well is clipped and before the grey value is made.
+    """Noise term added to the electrons of a pixel after clipping at the well and before digitisation.
 
-    It is independent from pixel to pixel and of mean zero, and its variances are those that ``FurtherNoise`` tells.
+    It is independent from pixel to pixel and has mean zero; its variances are those of ``FurtherNoise``.
     """
 
     def fixed_e(self, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray | None:
-        """Electrons (..., H, W) that stay from frame to frame, for detectors of that shape; None for nothing."""
+        """Return electrons (..., H, W) that stay the same in all frames of detectors of that shape; None for none."""
         ...
 
     def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
-        """New in every frame: electrons of the shape of those collected, (frames, H, W); None for nothing.
+        """Return new electrons for every frame, in the shape (frames, H, W) of those collected; None for none.
 
         Many frames come in pieces, one after the other with the same ``rng``.
         """
@@ -60,31 +60,31 @@ class NoiseTerm(FurtherNoise, Protocol):
 
 @dataclass(frozen=True)
 class ReadNoise:
-    """Normal noise of the electronics, new in every frame.
+    """Normal read noise of the electronics, new in every frame.
 
     Attributes
     ----------
     sigma_e : float
-        Electrons rms.
+        Standard deviation, in electrons.
     """
 
     sigma_e: float
 
     @property
     def fixed_variance_e2(self) -> float:
-        """Read noise adds nothing that stays from frame to frame, electrons squared."""
+        """Variance that stays from frame to frame, in electrons squared: zero."""
         return 0.0
 
     def temporal_variance_e2(self, electrons: Any) -> float:
-        """Variance within a pixel, the same at every signal, electrons squared."""
+        """Return the variance within a pixel, the same at every signal, in electrons squared."""
         return self.sigma_e**2
 
     def fixed_e(self, shape: tuple[int, ...], rng: np.random.Generator) -> None:
-        """Nothing is drawn for what stays."""
+        """Return None, since nothing is fixed."""
         return
 
     def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
-        """Electrons drawn for every pixel of every frame; no number is drawn for a sigma of zero."""
+        """Return electrons drawn for every pixel of every frame; for a sigma of zero nothing is drawn."""
         if self.sigma_e <= 0:
             return None
         out = rng.standard_normal(electrons.shape)
@@ -94,46 +94,46 @@ class ReadNoise:
 
 @dataclass(frozen=True)
 class FixedOffsets:
-    """Normal differences of the pixels' offsets.
+    """Normally distributed differences of the pixels' offsets.
 
     Attributes
     ----------
     sigma_e : float
-        Electrons rms.
+        Standard deviation, in electrons.
     """
 
     sigma_e: float
 
     @property
     def fixed_variance_e2(self) -> float:
-        """Variance over the pixels, electrons squared."""
+        """Variance over the pixels, in electrons squared."""
         return self.sigma_e**2
 
     def temporal_variance_e2(self, electrons: Any) -> float:
-        """Offsets do not change from frame to frame, electrons squared."""
+        """Return the variance from frame to frame, in electrons squared: zero."""
         return 0.0
 
     def fixed_e(self, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-        """Electrons drawn for every pixel."""
+        """Return electrons drawn for every pixel."""
         return self.sigma_e * rng.standard_normal(shape)
 
     def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> None:
-        """Nothing is drawn anew."""
+        """Return None, since nothing changes from frame to frame."""
         return
 
 
 NOISE_TERMS = ExtensionTable[Callable[[float], NoiseTerm]]("noise_terms", {"read": ReadNoise, "offset": FixedOffsets})
-"""Name that a data sheet may write under ``noise`` -> the term of the number that stands there, electrons rms where the
-term does not say otherwise. A new one is added here.
+"""Name under ``noise`` of a data sheet -> function of the number there (electrons rms unless the term defines it
+otherwise) that returns the noise term. New terms are added here.
 """
 
 
 Seed = int | np.random.SeedSequence
 
-# Beyond this the input is certainly in the wrong unit; NumPy's generator, which draws the largest, works up to 9e18.
+# Above this the input must be in a wrong unit; NumPy's generator, which draws the largest means, works up to 9e18.
 _MAX_PHOTONS = 1e12
-# Numbers of read noise that are drawn at once: 9 frames of a CCD of 682 x 682 pixels, 455 of one of 96 x 96. Every
-# thread has room for those of further noise, which are fewer.
+# Read-noise numbers drawn at once: 9 frames of a CCD of 682 x 682 pixels, 455 of one of 96 x 96. With further
+# noise terms each thread needs its own memory, so fewer are drawn.
 _FRAMES_PIXELS, _FURTHER_PIXELS = 1 << 22, 1 << 20
 # A pixel counts as saturated from this many read-noise sigmas below the clipped level, because read noise is added
 # after the well is clipped: half of all full wells would otherwise read below "full".
@@ -142,10 +142,14 @@ _SATURATION_SIGMAS = 4.0
 
 @dataclass(frozen=True, eq=False)
 class FixedPattern:
-    """The pixel-to-pixel differences of one detector, the same in every frame it records.
+    """Pixel-to-pixel differences of one detector, the same in every frame.
 
-    gain: (..., H, W) relative response to light, 1 + prnu * normal, dimensionless, >= 0.
-    offset_e: (..., H, W) additive offset in electrons, dsnu_e * normal and what further terms add.
+    Attributes
+    ----------
+    gain : (..., H, W) ndarray
+        Relative response to light, 1 + prnu * normal, dimensionless, >= 0.
+    offset_e : (..., H, W) ndarray
+        Additive offset in electrons, dsnu_e * normal plus further fixed terms.
     """
 
     gain: NDArray[np.float64]
@@ -163,10 +167,14 @@ class FixedPattern:
 
 @dataclass(frozen=True, eq=False)
 class SaturationReport:
-    """Which images hold saturated pixels.
+    """Count of saturated pixels in images.
 
-    level_dn: grey value from which a pixel counts as saturated.
-    pixels: (...,) number of pixels per image that reach the level in at least one of its frames.
+    Attributes
+    ----------
+    level_dn : float
+        Grey value from which a pixel counts as saturated.
+    pixels : (...,) ndarray of int
+        Number of pixels per image that reach the level in at least one of its frames.
     """
 
     level_dn: float
@@ -174,25 +182,38 @@ class SaturationReport:
 
     @property
     def any(self) -> bool:
-        """True when at least one pixel of one image is saturated."""
+        """True if at least one pixel of one image is saturated."""
         return bool(np.any(self.pixels > 0))
 
 
 @dataclass(frozen=True)
 class EmvaDetector:
-    """A detector by the numbers of its EMVA 1288 data sheet. Raises ValueError, naming the field, for values outside
-    the limits of `scenes.specs.detector`.
+    """Detector described by the numbers of its EMVA 1288 data sheet.
 
-    quantum_efficiency: electrons per photon.
-    system_gain_dn_per_e: K, grey values per electron.
-    dark_noise_e: temporal read noise, electrons rms.
-    dark_current_e_per_s: electrons per pixel and second.
-    full_well_e: electrons at which the pixel saturates.
-    prnu: photo-response non-uniformity (PRNU_1288), rms fraction.
-    dsnu_e: dark-signal non-uniformity (DSNU_1288), electrons rms.
-    bit_depth: of the converter.
-    offset_dn: black level, grey values.
-    noise: further terms.
+    Raises ValueError, naming the field, for values outside the limits of `scenes.specs.detector`.
+
+    Attributes
+    ----------
+    quantum_efficiency : float
+        Electrons per photon.
+    system_gain_dn_per_e : float
+        System gain K, in grey values per electron.
+    dark_noise_e : float
+        Temporal read noise, in electrons rms.
+    dark_current_e_per_s : float
+        Dark current, in electrons per pixel and second.
+    full_well_e : float
+        Electrons at which the pixel saturates.
+    prnu : float
+        Photo-response non-uniformity (PRNU_1288), rms fraction.
+    dsnu_e : float
+        Dark-signal non-uniformity (DSNU_1288), in electrons rms.
+    bit_depth : int
+        Bits of the converter.
+    offset_dn : float
+        Black level, in grey values.
+    noise : tuple of NoiseTerm
+        Further noise terms.
     """
 
     quantum_efficiency: float
@@ -218,12 +239,12 @@ class EmvaDetector:
 
     @classmethod
     def from_sheet(cls, sheet: DetectorSpec, exposure: float) -> EmvaDetector:
-        """The detector of a data sheet's file, for frames of that exposure, seconds.
+        """Return the detector of a data sheet's file, for frames with an exposure time in seconds.
 
         Raises
         ------
         InputError
-            The dark current alone saturates the pixels, or the sheet names a noise that is not known.
+            The dark current alone saturates the pixels, or the sheet names an unknown noise term.
         """
         sheet.check_exposure(exposure)
         for name in sheet.noise or {}:
@@ -234,16 +255,16 @@ class EmvaDetector:
 
     @classmethod
     def _sheet_names(cls) -> list[str]:
-        """Names of the numbers, as a data sheet has them."""
+        """Return the names of the numbers in a data sheet."""
         return [field.name for field in fields(cls) if field.name != "noise"]
 
     @cached_property
     def _sheet(self) -> DetectorSpec:
-        """These numbers as a data sheet, which knows their limits and what follows from them."""
+        """Data sheet with these numbers, which checks their limits and derives further numbers."""
         return DetectorSpec.model_validate({"name": "detector", **self._numbers()})
 
     def _numbers(self) -> dict[str, Any]:
-        """The detector's numbers as Python's own, not numpy's."""
+        """Return the detector's numbers as Python's own types, not NumPy's."""
         values = {name: getattr(self, name) for name in self._sheet_names()}
         return {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
 
@@ -254,11 +275,11 @@ class EmvaDetector:
 
     @property
     def saturation_dn(self) -> float:
-        """Grey value where the response stops being linear, as the data sheet has it."""
+        """Grey value above which the response is no longer linear, as in the data sheet."""
         return self._sheet.saturation_dn
 
     def noise_model(self, exposure_s: float) -> NoiseModel:
-        """The noise description that the analysis needs, for frames of exposure_s seconds."""
+        """Return the noise model for the analysis, for frames of exposure_s seconds."""
         return NoiseModel(
             gain_dn_per_e=self.system_gain_dn_per_e,
             dark_noise_e=self.dark_noise_e,
@@ -286,11 +307,18 @@ class EmvaDetector:
     def expected_dn(
         self, photons: ArrayLike, exposure_s: float, pattern: FixedPattern | None = None
     ) -> NDArray[np.float64]:
-        """Noise-free, unrounded grey values (..., H, W) for `photons` per pixel and frame, clipped at the well and
-        converter.
+        """Return noise-free, unrounded grey values (..., H, W), clipped at the well and the converter.
 
-        Without `pattern` the detector is taken as perfectly uniform. Close to saturation this is the clipped mean and
-        not the mean of clipped values.
+        Near saturation this is the clipped mean and not the mean of clipped values.
+
+        Parameters
+        ----------
+        photons : (..., H, W) array_like
+            Expected photons per pixel and frame.
+        exposure_s : float
+            Exposure time of one frame, in seconds.
+        pattern : FixedPattern | None
+            Fixed pattern; None for a perfectly uniform detector.
         """
         light = _photons(photons)
         gain: Any = 1.0 if pattern is None else pattern.gain
@@ -308,18 +336,34 @@ class EmvaDetector:
         seed: Seed | Sequence[Seed],
         threads: int | None = None,
     ) -> NDArray[np.uint16]:
-        """Record `frames` frames of each image.
+        """Record frames of images.
 
-        photons: (..., H, W) expected photons per pixel and frame, >= 0.
-        pattern: fixed pattern whose shape broadcasts to that of photons, e.g. (4, H, W) for photons (states, 4, H, W).
-        frames: number of frames, >= 1.
-        exposure_s: exposure of one frame, s (it sets the dark signal; photons are given per frame).
-        seed: integer or SeedSequence. Each image draws from its own stream, numbered by its place in the flattened
-            leading axes, so the result does not depend on `threads`, and image i does not depend on how many follow
-            it. Several seeds, one for each entry of the first axis, expose these as calls of their own would.
-        threads: worker threads (numpy's generators release the GIL); default: the cores this process may use, at most
-            8.
-        Returns uint16 (..., frames, H, W) grey values. Raises ValueError for bad input.
+        Parameters
+        ----------
+        photons : (..., H, W) array_like
+            Expected photons per pixel and frame, >= 0.
+        pattern : FixedPattern
+            Fixed pattern whose shape broadcasts to that of photons, e.g. (4, H, W) for photons (states, 4, H, W).
+        frames : int
+            Number of frames of each image, >= 1.
+        exposure_s : float
+            Exposure time of one frame, in seconds (it sets the dark signal; photons are given per frame).
+        seed : int | SeedSequence | sequence of these
+            Seed. Each image draws from its own stream, numbered by its position in the flattened leading axes, so the
+            result does not depend on `threads`, and image i does not depend on how many follow it. Several seeds, one
+            for each entry of the first axis, expose these entries as separate calls would.
+        threads : int | None
+            Worker threads (NumPy's generators release the GIL); None for the available cores, at most 8.
+
+        Returns
+        -------
+        (..., frames, H, W) ndarray of uint16
+            Grey values.
+
+        Raises
+        ------
+        ValueError
+            An argument is invalid.
         """
         light = _photons(photons)
         if isinstance(frames, bool) or int(frames) != frames or frames < 1:
@@ -350,15 +394,15 @@ class EmvaDetector:
             shift += self.offset_dn
             return mean_e, shift
 
-        if not self.noise and out.size >= FEWEST and kernels_there():
+        if not self.noise and out.size >= FEWEST and kernels_available():
             images = out.reshape(len(indices), int(frames), -1)
             self._reading.frames(lambda number: expected(indices[number]), streams, images, together, threads)
             return out
 
-        def image(index: tuple[int, ...], own: np.random.SeedSequence) -> None:
-            rng = np.random.Generator(np.random.SFC64(own))
-            # numbers of one term do not depend on how many another one draws, nor on what is drawn together
-            others = [np.random.Generator(np.random.SFC64(stream(own, k))) for k in range(len(self.noise))]
+        def image(index: tuple[int, ...], image_seed: np.random.SeedSequence) -> None:
+            rng = np.random.Generator(np.random.SFC64(image_seed))
+            # each term has its own stream, so that its numbers do not depend on other terms or on the pieces
+            others = [np.random.Generator(np.random.SFC64(stream(image_seed, k))) for k in range(len(self.noise))]
             mean_e, shift = expected(index)
             start = 0
             for collected in poisson_pieces(mean_e, int(frames), rng, together):
@@ -367,37 +411,36 @@ class EmvaDetector:
                 start += together
 
         if threads == 1 or len(indices) == 1:
-            for index, own in zip(indices, streams, strict=True):
-                image(index, own)
+            for index, image_seed in zip(indices, streams, strict=True):
+                image(index, image_seed)
             return out
         with ThreadPoolExecutor(max_workers=threads) as pool:
             list(pool.map(image, indices, streams))
         return out
 
     def frames_at_once(self, frames: int, pixels: int) -> int:
-        """Frames of an image whose numbers are drawn at once: so many that memory stays bounded; the frames do not
-        depend on it.
+        """Return the number of frames of an image drawn at once, which limits memory; the frames do not depend on it.
 
         Parameters
         ----------
         frames : int
-            Of the image.
+            Number of frames of the image.
         pixels : int
-            Of a frame.
+            Number of pixels of a frame.
         """
         return min(frames, max(1, (_FURTHER_PIXELS if self.noise else _FRAMES_PIXELS) // pixels))
 
     def exposing_bytes(self, frames: int, pixels: int, threads: int) -> int:
-        """Memory that the exposure of images takes for a while, beside the frames that it gives, bytes.
+        """Return the temporary memory of an exposure, in addition to the resulting frames, in bytes.
 
         Parameters
         ----------
         frames : int
-            Of an image.
+            Number of frames of an image.
         pixels : int
-            Of a frame.
+            Number of pixels of a frame.
         threads : int
-            That expose.
+            Number of threads that expose.
         """
         together = self.frames_at_once(frames, pixels)
         # electrons, read noise, and electrons as they were collected for noise that depends on them
@@ -405,21 +448,25 @@ class EmvaDetector:
 
     @property
     def _reading(self) -> Reading:
+        """Read-out of electrons to grey values."""
         return Reading(self.dark_noise_e, self.system_gain_dn_per_e, self.full_well_e, self.max_dn)
 
     def _read_out(self, level: np.ndarray, shift: np.ndarray, each: Sequence[np.random.Generator]) -> np.ndarray:
-        """Grey values of frames (N, H, W) from electrons, whose array they take over; of each term its own numbers."""
+        """Return grey values of frames (N, H, W) from electrons, in whose array they are written.
+
+        Each noise term draws from its own generator.
+        """
         np.minimum(level, self.full_well_e, out=level)
         before = level.copy() if self.noise else level
         terms = ReadNoise(self.dark_noise_e), *self.noise
         added = [term.temporal_e(before, rng) for term, rng in zip(terms, each, strict=True)]
-        return self._reading.read_out(level, [one for one in added if one is not None], shift)
+        return self._reading.read_out(level, [noise for noise in added if noise is not None], shift)
 
     def saturated(self, frames: NDArray[np.uint16]) -> SaturationReport:
         """Count saturated pixels in recorded frames (..., frames, H, W); counts have shape (...,).
 
-        A pixel is saturated when it comes within 4 sigmas of the full well, of the read noise and of further temporal
-        noise at a full well, or reaches the converter's end.
+        A pixel is saturated if it comes within 4 sigmas of the full well (of the read noise and further temporal noise
+        at a full well), or reaches the converter's largest value.
         """
         if frames.ndim < 3:
             raise ValueError(f"detector: frames must be (..., frames, H, W), found shape {frames.shape}")
@@ -429,7 +476,7 @@ class EmvaDetector:
 
     @property
     def _read_sigma_e(self) -> float:
-        """Temporal noise without shot noise at a full well, electrons rms."""
+        """Temporal noise without shot noise at a full well, in electrons rms."""
         if not self.noise:
             return self.dark_noise_e
         further = sum(float(term.temporal_variance_e2(self.full_well_e)) for term in self.noise)
@@ -437,16 +484,17 @@ class EmvaDetector:
 
 
 def _streams(seed: Seed | Sequence[Seed], lead: tuple[int, ...]) -> list[np.random.SeedSequence]:
-    """Stream of each image of some leading axes."""
+    """Return the random stream of each image of some leading axes."""
     if not isinstance(seed, Sequence):
         root = _sequence(seed)
         return [stream(root, number) for number in range(math.prod(lead))]
     if len(seed) != lead[0]:
         raise ValueError(f"detector: {len(seed)} seeds for {lead[0]} exposures")
-    return [own for one in seed for own in _streams(one, lead[1:])]
+    return [child for entry in seed for child in _streams(entry, lead[1:])]
 
 
 def _sequence(seed: Seed) -> np.random.SeedSequence:
+    """Return a seed as a SeedSequence, or raise ValueError."""
     if isinstance(seed, np.random.SeedSequence):
         return seed
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
@@ -455,12 +503,14 @@ def _sequence(seed: Seed) -> np.random.SeedSequence:
 
 
 def _exposure(exposure_s: float) -> float:
+    """Return an exposure time, or raise ValueError if it is out of range."""
     if not (math.isfinite(exposure_s) and 0 <= exposure_s <= 1e6):
         raise ValueError(f"detector: exposure_s must be in [0, 1e6] s, found {exposure_s!r}")
     return float(exposure_s)
 
 
 def _photons(photons: ArrayLike) -> NDArray[np.float64]:
+    """Return photons as float64, or raise ValueError or UnphysicalError if they are out of range."""
     light = np.asarray(photons, dtype=np.float64)
     if light.ndim < 2 or light.size == 0:
         raise ValueError(f"detector: photons must be (..., H, W), found shape {light.shape}")
@@ -473,47 +523,53 @@ def _photons(photons: ArrayLike) -> NDArray[np.float64]:
     return light
 
 
-def told_of_steps(noise: NoiseModel, whose: str) -> tuple[str, ...]:
-    """A warning for a detector whose noise does not spread over the steps of its grey values where there are few DN of
-    light; none for others. It depends on the detector's numbers alone, and nothing is drawn.
+def coarse_step_warnings(noise: NoiseModel, whose: str) -> tuple[str, ...]:
+    """Return a warning if the noise does not cover the steps of the grey values at low signal; otherwise none.
+
+    It depends on the detector's numbers alone.
 
     Parameters
     ----------
     noise : NoiseModel
-        Of the detector.
+        Noise model of the detector.
     whose : str
-        How a reader knows it.
+        Name of the detector for the reader.
     """
     few = float(noise.frame_variance_dn2(noise.dark_level_dn + FEW)) - ROUNDING_VARIANCE
     if few >= COARSE**2:
         return ()
     return (
-        f"{whose} has coarse grey values: noise of {math.sqrt(few):.2g} DN at {FEW:g} DN of light, less than "
-        f"{COARSE:g}; there rounding is the same in every frame, does not average down and is alike in neighbouring "
-        "pixels, while σ takes it for another one in each; a larger system_gain_dn_per_e, with the bit_depth for it, "
-        "makes the steps finer",
+        f"{whose} has coarse grey values: its noise is {math.sqrt(few):.2g} DN at {FEW:g} DN of light, less than "
+        f"{COARSE:g}; rounding errors are then equal in all frames, do not average out and are correlated between "
+        "neighbouring pixels, while σ assumes independent ones; increase system_gain_dn_per_e, with a sufficient "
+        "bit_depth",
     )
 
 
 def coarse_warnings(setup: Spec) -> tuple[str, ...]:
-    """Warnings as of `told_of_steps` for the area CCDs of an instrument that a job or test refers to; none without one.
+    """Return the warnings about coarse grey values for the area CCDs that a job or test refers to.
 
     Parameters
     ----------
     setup : Spec
-        a job or test with all it refers to.
+        Job or test with everything it refers to.
 
     Raises
     ------
     InputError
-        As `EmvaDetector.from_sheet`.
+        A data sheet is invalid, see `EmvaDetector.from_sheet`.
     """
     instrument, sheet = getattr(setup, "instrument", None), getattr(setup, "detector", None)
     if not isinstance(instrument, InstrumentSpec) or not isinstance(sheet, DetectorSpec):
         return ()
     exposure = instrument.autocollimator.area_ccd.exposure
-    chosen = {sheet.name: sheet, **{one.name: one for one in getattr(setup, "detectors", {}).values()}}
+    chosen = {
+        sheet.name: sheet,
+        **{data_sheet.name: data_sheet for data_sheet in getattr(setup, "detectors", {}).values()},
+    }
     out: list[str] = []
-    for name, one in chosen.items():
-        out += told_of_steps(EmvaDetector.from_sheet(one, exposure).noise_model(exposure), f"area CCD {name}")
+    for name, data_sheet in chosen.items():
+        out += coarse_step_warnings(
+            EmvaDetector.from_sheet(data_sheet, exposure).noise_model(exposure), f"area CCD {name}"
+        )
     return tuple(out)

@@ -1,16 +1,16 @@
-"""Recorded frames of many images by kernels: what ``EmvaDetector`` does pixel by pixel, in one pass over its random
-numbers.
+"""Recording of frames of many images by compiled kernels.
 
-The frames are those that NumPy would make of the same streams, bit for bit: a Poisson number is the quantile of its
-mean (``twin.sensors.poisson_numbers``), and whatever a kernel cannot tell with certainty is decided there. A first
-kernel looks every number of a small mean up in the table of quantiles, which tells nineteen of twenty, works those of
-larger means out by Giles' expansion in single precision, and reads the electrons out. A second one compares what the
-table leaves open with the distribution function between its rows. Some of ten thousand numbers remain; they lie within
-the bounds of these approximations.
+The result is the same as that of ``EmvaDetector`` pixel by pixel, but faster.
 
-All frames of a pixel share its mean, so that a kernel runs over the pixels of some images, frame after frame: then no
-number has to be gathered but those of the table. Images of one stream share their numbers, too, which are then drawn
-once.
+The frames are bit for bit those that NumPy would make from the same streams: a Poisson number is the quantile of its
+mean (``twin.sensors.poisson_numbers``), and any number that a kernel cannot determine with certainty is computed
+there. A first kernel looks up every number of a small mean in the table of quantiles, which determines nineteen of
+twenty, computes those of larger means by Giles' expansion in single precision, and reads the electrons out. A second
+kernel compares the open ones with the distribution function between the table's rows. A few of ten thousand numbers
+remain, within the error bounds of these approximations.
+
+All frames of a pixel share its mean, so a kernel runs over the pixels of some images, frame after frame; then only
+table values have to be gathered. Images with the same stream share their random numbers, which are drawn once.
 """
 
 from __future__ import annotations
@@ -41,34 +41,38 @@ from twin.sensors.poisson_numbers import (
 )
 
 FEWEST = 50_000
-"""Numbers of an exposure from which it is done by kernels: fewer take as long to hand over as to work out."""
+"""Number of random numbers of an exposure from which kernels are used: for fewer the transfer takes as long as the
+work.
+"""
 
 _TOGETHER = 1 << 20
-"""Numbers that are drawn and read out at once; their words and normal numbers take 16 MiB, and as much again while the
-next are drawn.
+"""Random numbers drawn and read out at once; their words and normal numbers take 16 MiB, and as much again while the
+next ones are drawn.
 """
 
 _MOST_KEPT = 1 << 22
-"""Numbers of streams of several images that are kept until all of these are exposed; they take 64 MiB."""
+"""Largest number of random numbers kept for streams of several images, until all of these are exposed; they take 64
+MiB.
+"""
 
 _LANES = 16
 """Numbers of pixels are rounded up to a multiple of this, so that each frame begins at an aligned address."""
 
 _NORMAL_ERROR = 4e-6
-"""More than the error of the normal quantile in single precision, of numbers up to 6."""
+"""Upper bound of the error of the normal quantile in single precision, for arguments up to 6."""
 
 _SINGLE = 4e-7
-"""More than what single precision does to a distribution function, and to u."""
+"""Upper bound of the single-precision rounding of a distribution function, and of u."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """How electrons become grey values.
+    """Read-out of electrons to grey values.
 
     Attributes
     ----------
     sigma_e : float
-        Read noise, electrons rms; 0 for none, for which no number is drawn.
+        Read noise, in electrons rms; for 0 no numbers are drawn.
     gain_dn_per_e : float
         Grey values per electron.
     full_well_e : float
@@ -83,16 +87,16 @@ class Reading:
     most_dn: int
 
     def read_out(self, level: np.ndarray, noise: Sequence[np.ndarray], shift: np.ndarray) -> np.ndarray:
-        """Grey values of electrons, whose array they take over.
+        """Return the grey values of electrons, written into their array.
 
         Parameters
         ----------
-        level : np.ndarray
-            Electrons, of any shape.
-        noise : Sequence[np.ndarray]
-            Terms that are added to them one after the other, electrons.
-        shift : np.ndarray
-            Black level with the pixels' own offsets, grey values.
+        level : ndarray
+            Electrons, of any shape; overwritten.
+        noise : sequence of ndarray
+            Noise terms that are added in turn, in electrons.
+        shift : ndarray
+            Black level with the pixels' own offsets, in grey values.
         """
         np.minimum(level, self.full_well_e, out=level)
         for term in noise:
@@ -114,36 +118,37 @@ class Reading:
 
         Parameters
         ----------
-        expected : Callable[[int], tuple[np.ndarray, np.ndarray]]
-            Number of an image -> its expected electrons, and ``shift`` as of ``read_out``, P numbers each.
-        streams : Sequence[np.random.SeedSequence]
-            Of the I images, each a stream of words, of Poisson numbers of huge means and of normal numbers; some may be
-            the same.
-        out : np.ndarray
-            The frames, (I, F, P) uint16.
+        expected : callable
+            Function of the number of an image that returns its expected electrons, and ``shift`` as in ``read_out``, P
+            numbers each.
+        streams : sequence of SeedSequence
+            Random streams of the I images, each for words, Poisson numbers of huge means and normal numbers; some may
+            be equal.
+        out : (I, F, P) ndarray of uint16
+            Frames to fill.
         together : int
-            Frames of an image that are done at once.
+            Number of frames of an image that are exposed at once.
         threads : int
-            That draw.
+            Number of threads that draw random numbers.
         """
         images, frames, pixels = out.shape
         together = min(together, frames)
         size = min(images, max(1, _TOGETHER // (together * pixels)))
         pieces = (images > size) + (frames > together)
         rooms = [_Numbers.room(together, size * pixels, self.sigma_e > 0) for _ in range(min(2, 1 + pieces))]
-        same = {} if together < frames else _same_numbers(streams, _MOST_KEPT // (frames * pixels))
-        # the next numbers are drawn while kernels work on the last ones
+        same = {} if together < frames else _shared_numbers(streams, _MOST_KEPT // (frames * pixels))
+        # the next numbers are drawn while kernels process the previous ones
         drawn: _Drawn | None = None
         with one_kernel_thread(), ThreadPoolExecutor(threads) as pool:
             for first in range(0, images, size):
-                some = range(first, min(first + size, images))
+                batch = range(first, min(first + size, images))
                 group: _Group | None = None
                 for start in range(0, frames, together):
                     numbers = rooms[(first // size * len(range(0, frames, together)) + start // together) % len(rooms)]
-                    numbers.expect(expected, some)
+                    numbers.expect(expected, batch)
                     if group is None:
-                        group = _Group(self, numbers, [streams[k] for k in some], same, together, frames, pixels)
-                    following = group.draw(numbers, out[some.start : some.stop, start : start + together], pool)
+                        group = _Group(self, numbers, [streams[k] for k in batch], same, together, frames, pixels)
+                    following = group.draw(numbers, out[batch.start : batch.stop, start : start + together], pool)
                     if drawn is not None:
                         drawn.read_out()
                         release_memory(out)
@@ -153,30 +158,32 @@ class Reading:
 
 
 def exposing_bytes(frames: int, pixels: int) -> int:
-    """Memory that an exposure by kernels takes for a while, bytes.
+    """Return the temporary memory of an exposure by kernels, in bytes.
 
     Parameters
     ----------
     frames : int
-        Of an image that are done at once.
+        Number of frames of an image that are exposed at once.
     pixels : int
-        Of a frame.
+        Number of pixels of a frame.
     """
     return max(_TOGETHER, frames * pixels) * 40 + pixels * 64
 
 
 @dataclass(frozen=True, eq=False)
 class _Numbers:
-    """What a group of images is made of; its memory serves one group after the other.
+    """Means and random numbers of a group of images; the memory is reused by the next group.
 
     Attributes
     ----------
-    mean : np.ndarray
-        Expected electrons of all pixels, (lanes,), likewise ``shift`` as of ``Reading.read_out``.
-    words : np.ndarray
-        Of 64 bits, frame by frame, (frames, lanes).
-    normals : np.ndarray | None
-        Of the read noise, likewise; None without.
+    mean : (lanes,) ndarray
+        Expected electrons of all pixels.
+    shift : (lanes,) ndarray
+        Black level with offsets, see ``Reading.read_out``.
+    words : (frames, lanes) ndarray of uint64
+        Random words, frame by frame.
+    normals : (frames, lanes) ndarray | None
+        Normal numbers of the read noise; None without read noise.
     """
 
     mean: np.ndarray
@@ -186,103 +193,103 @@ class _Numbers:
 
     @classmethod
     def room(cls, frames: int, pixels: int, noisy: bool) -> _Numbers:
-        """Memory for so many frames of all pixels of a group."""
+        """Return memory for a number of frames of all pixels of a group."""
         lanes = -(-pixels // _LANES) * _LANES
         mean, shift = _aligned(np.float64, 2, lanes)
         normals = _aligned(np.float64, frames, lanes) if noisy else None
         return cls(mean, shift, _aligned(np.uint64, frames, lanes), normals)
 
     def expect(self, expected: Callable[[int], tuple[np.ndarray, np.ndarray]], images: range) -> None:
-        """Set what is expected of some images."""
-        for place, image in enumerate(images):
+        """Set the expected electrons of some images."""
+        for position, image in enumerate(images):
             for row, values in zip((self.mean, self.shift), expected(image), strict=True):
-                row[place * values.size : (place + 1) * values.size] = values.reshape(-1)
+                row[position * values.size : (position + 1) * values.size] = values.reshape(-1)
 
 
 @dataclass(eq=False)
-class _SameNumbers:
-    """Random numbers of a stream of several images, none of whose means is huge: whoever comes first draws them.
+class _SharedNumbers:
+    """Random numbers of a stream shared by several images without huge means; the first image draws them.
 
     Attributes
     ----------
-    words, normals : np.ndarray | None
-        Of all frames, (frames, pixels); None before they are drawn, normals also without read noise.
+    words, normals : (frames, pixels) ndarray | None
+        Random numbers of all frames; None before they are drawn, normals also without read noise.
     """
 
     words: np.ndarray | None = None
     normals: np.ndarray | None = None
     drawing: threading.Lock = field(default_factory=threading.Lock)
 
-    def put(self, numbers: _Numbers, own: slice, count: int, draw: Callable[[], None]) -> None:
-        """Put the numbers where an image has its own.
+    def put(self, numbers: _Numbers, lanes: slice, count: int, draw: Callable[[], None]) -> None:
+        """Copy the random numbers to the lanes of an image.
 
         Parameters
         ----------
         numbers : _Numbers
-            Of a group of images.
+            Numbers of a group of images.
         own : slice
-            The image's lanes.
+            Lanes of the image.
         count : int
-            Of frames.
-        draw : Callable[[], None]
-            Draws them to this place.
+            Number of frames.
+        draw : callable
+            Draws the numbers into these lanes.
         """
         with self.drawing:
             if self.words is None:
                 draw()
-                self.words = numbers.words[:count, own].copy()
+                self.words = numbers.words[:count, lanes].copy()
                 if numbers.normals is not None:
-                    self.normals = numbers.normals[:count, own].copy()
+                    self.normals = numbers.normals[:count, lanes].copy()
                 return
-        numbers.words[:count, own] = self.words
+        numbers.words[:count, lanes] = self.words
         if numbers.normals is not None:
-            numbers.normals[:count, own] = self.normals
+            numbers.normals[:count, lanes] = self.normals
 
 
 _Key = tuple[str, tuple[int, ...], int]
 
 
 def _key(stream: np.random.SeedSequence) -> _Key:
-    """What two streams of the same numbers have in common."""
+    """Return a key that is equal for streams with the same numbers."""
     return str(stream.entropy), tuple(stream.spawn_key), stream.pool_size
 
 
-def _same_numbers(streams: Sequence[np.random.SeedSequence], most: int) -> dict[_Key, _SameNumbers]:
-    """Room for the numbers of each stream of several images, of so many streams at most."""
+def _shared_numbers(streams: Sequence[np.random.SeedSequence], most: int) -> dict[_Key, _SharedNumbers]:
+    """Return memory for the numbers of each stream of several images, for ``most`` streams at most."""
     several = [key for key, times in Counter(map(_key, streams)).items() if times > 1]
-    return {key: _SameNumbers() for key in several[:most]}
+    return {key: _SharedNumbers() for key in several[:most]}
 
 
 class _Group:
-    """Some images whose frames are drawn together, and their streams."""
+    """Images whose frames are drawn together, with their streams."""
 
     def __init__(
         self,
         how: Reading,
         numbers: _Numbers,
         streams: Sequence[np.random.SeedSequence],
-        same: Mapping[_Key, _SameNumbers],
+        same: Mapping[_Key, _SharedNumbers],
         together: int,
         frames: int,
         pixels: int,
     ) -> None:
         self.how, self.pixels = how, pixels
-        self.same = [same.get(_key(own)) for own in streams]
+        self.same = [same.get(_key(sequence)) for sequence in streams]
         self.huge: list[np.ndarray] = []
         self.sources = []
         self.last: list[Future[np.ndarray | None] | None] = [None] * len(streams)
-        for image, own in enumerate(streams):
+        for image, sequence in enumerate(streams):
             mean = numbers.mean[self.own(image)]
             self.huge.append(np.flatnonzero(mean >= SERIES_END))
-            rng = np.random.Generator(np.random.SFC64(own))
+            rng = np.random.Generator(np.random.SFC64(sequence))
             self.sources.append((*split_stream(rng, mean[self.huge[image]], frames, pixels, together), rng))
 
     def own(self, image: int) -> slice:
-        """Lanes of an image."""
+        """Return the lanes of an image."""
         return slice(image * self.pixels, (image + 1) * self.pixels)
 
     def draw(self, numbers: _Numbers, out: np.ndarray, pool: ThreadPoolExecutor) -> _Drawn:
-        """Begin to draw the numbers of the next frames (images, frames, pixels)."""
+        """Start drawing the random numbers of the next frames (images, frames, pixels)."""
         work = [pool.submit(self._drawn, numbers, image, out.shape[1], self.last[image]) for image in range(len(out))]
         self.last = list(work)
         return _Drawn(self, numbers, out, work)
@@ -290,29 +297,33 @@ class _Group:
     def _drawn(
         self, numbers: _Numbers, image: int, count: int, before: Future[np.ndarray | None] | None
     ) -> np.ndarray | None:
-        """Draw the random numbers of an image; its Poisson numbers of huge means, (count, huge), None where no mean
-        is.
+        """Draw the random numbers of an image.
+
+        Returns
+        -------
+        (count, huge) ndarray | None
+            Poisson numbers of huge means; None if there are none.
         """
         if before is not None:
-            before.result()  # another thread may still draw the image's last frames from the same streams
+            before.result()  # another thread may still draw the image's previous frames from the same streams
         words, huge, rng = self.sources[image]
-        own, which = self.own(image), self.huge[image]
-        found: np.ndarray | None = None
+        lanes, which = self.own(image), self.huge[image]
+        huge_numbers: np.ndarray | None = None
 
         def draw() -> None:
-            nonlocal found
-            numbers.words[:count, own] = words_of(words, count, self.pixels)
-            found = huge.poisson(numbers.mean[own][which], (count, which.size)) if which.size else None
+            nonlocal huge_numbers
+            numbers.words[:count, lanes] = words_of(words, count, self.pixels)
+            huge_numbers = huge.poisson(numbers.mean[lanes][which], (count, which.size)) if which.size else None
             if numbers.normals is not None:
                 for row in numbers.normals[:count]:
-                    rng.standard_normal(out=row[own])
+                    rng.standard_normal(out=row[lanes])
 
-        # numbers of huge means are drawn before the normal ones, which then are this image's own
+        # with huge means the normal numbers follow others in the stream and cannot be shared
         if (same := self.same[image]) is None or which.size:
             draw()
         else:
-            same.put(numbers, own, count, draw)
-        return found
+            same.put(numbers, lanes, count, draw)
+        return huge_numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,13 +333,13 @@ class _Drawn:
     Attributes
     ----------
     group : _Group
-        Their images.
+        Images.
     numbers : _Numbers
-        Where they are drawn to.
-    out : np.ndarray
-        The frames, (images, frames, pixels).
-    work : Sequence[Future[np.ndarray | None]]
-        Draws each image.
+        Destination of the random numbers.
+    out : (images, frames, pixels) ndarray
+        Frames to fill.
+    work : sequence of Future
+        Drawing of each image.
     """
 
     group: _Group
@@ -338,18 +349,18 @@ class _Drawn:
 
     def read_out(self) -> None:
         """Fill the frames."""
-        huge = [one.result() for one in self.work]
+        huge = [drawing.result() for drawing in self.work]
         numbers, group = self.numbers, self.group
         frame, lane = _kernels(group.how, numbers, self.out)
         if frame.size:
             self._put(frame, lane, poisson_quantile(numbers.mean[lane], numbers.words[frame, lane]))
-        for image, (which, found) in enumerate(zip(group.huge, huge, strict=True)):
-            if found is not None:
-                frame, lane = np.divmod(np.arange(found.size), which.size)
-                self._put(frame, image * group.pixels + which[lane], found.astype(np.float64).reshape(-1))
+        for image, (which, huge_numbers) in enumerate(zip(group.huge, huge, strict=True)):
+            if huge_numbers is not None:
+                frame, lane = np.divmod(np.arange(huge_numbers.size), which.size)
+                self._put(frame, image * group.pixels + which[lane], huge_numbers.astype(np.float64).reshape(-1))
 
     def _put(self, frame: np.ndarray, lane: np.ndarray, electrons: np.ndarray) -> None:
-        """Read numbers of electrons out into some pixels of some frames."""
+        """Read electrons out into some pixels of some frames."""
         numbers, how = self.numbers, self.group.how
         noise = [] if numbers.normals is None else [numbers.normals[frame, lane] * how.sigma_e]
         image, pixel = np.divmod(lane, self.group.pixels)
@@ -357,15 +368,15 @@ class _Drawn:
 
 
 def _aligned(kind: type, rows: int, columns: int) -> np.ndarray:
-    """An array (rows, columns) of zeros at an address that kernels expect."""
+    """Return an array (rows, columns) of zeros at an aligned address for kernels."""
     room: np.ndarray = np.zeros(rows * columns + _LANES, kind)
     start = (-room.__array_interface__["data"][0] % 128) // room.itemsize
     return room[start : start + rows * columns].reshape(rows, columns)
 
 
 @cache
-def kernels_there() -> bool:
-    """Whether there are kernels for the processor; looked for once in a process."""
+def kernels_available() -> bool:
+    """Return True if kernels are available for the processor; checked once per process."""
     ensure_llvm()
     import drjit as dr
 
@@ -374,16 +385,16 @@ def kernels_there() -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """The table of quantiles in the kernels' memory.
+    """Table of quantiles in the kernels' memory.
 
     Attributes
     ----------
-    known : Any
-        Four cells a word: the least quantile of each, and in its highest bit whether it has others.
-    law : Any
-        Distribution functions at the rows' means, single precision.
-    bound : Any
-        Of each row, of the error of an interpolation of them.
+    known : UInt32
+        Four cells per word: the least quantile of each, and in its highest bit whether it has others.
+    law : Float32
+        Distribution functions at the rows' means.
+    bound : Float32
+        For each row, bound of the error of their interpolation.
     """
 
     known: Any
@@ -393,6 +404,7 @@ class _Table:
 
 @cache
 def _table() -> _Table:
+    """Return the table of quantiles in the kernels' memory."""
     import drjit as dr
     from drjit.llvm import Float32, UInt32
 
@@ -403,7 +415,7 @@ def _table() -> _Table:
 
 
 def _kernels(how: Reading, numbers: _Numbers, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fill frames (images, frames, pixels); frames and lanes of the numbers that are not certain."""
+    """Fill frames (images, frames, pixels), and return frames and lanes of the numbers that are uncertain."""
     import drjit as dr
     from drjit.llvm import Float64, UInt32, UInt64
 
@@ -413,17 +425,17 @@ def _kernels(how: Reading, numbers: _Numbers, out: np.ndarray) -> tuple[np.ndarr
     read = [dr.opaque(Float64, value) for value in (how.sigma_e, how.gain_dn_per_e, how.full_well_e, how.most_dn)]
     normals = numbers.normals
     done = []
-    for place in range(count):
-        normal = None if normals is None else Float64(normals[place])
-        found = _looked_up(means, UInt64(numbers.words[place]), normal, shifts, read)
-        dr.eval(*found)
-        done.append(found)
+    for row in range(count):
+        normal = None if normals is None else Float64(normals[row])
+        result = _looked_up(means, UInt64(numbers.words[row]), normal, shifts, read)
+        dr.eval(*result)
+        done.append(result)
     open_ = []
-    for place, (grey, left) in enumerate(done):
-        np.copyto(out[:, place], grey.numpy()[:used].reshape(images, pixels), casting="unsafe")
+    for row, (grey, left) in enumerate(done):
+        np.copyto(out[:, row], grey.numpy()[:used].reshape(images, pixels), casting="unsafe")
         open_.append(np.flatnonzero(left.numpy()[:used]))
     lane = np.concatenate(open_)
-    frame = np.repeat(np.arange(count), [one.size for one in open_])
+    frame = np.repeat(np.arange(count), [lanes.size for lanes in open_])
     if not lane.size:
         return frame, lane
     normal = None if normals is None else Float64(normals.reshape(-1))
@@ -437,7 +449,7 @@ def _kernels(how: Reading, numbers: _Numbers, out: np.ndarray) -> tuple[np.ndarr
 
 
 def _grey(electrons: Any, normal: Any, shift: Any, numbers: Sequence[Any]) -> Any:
-    """Grey values, as ``Reading.read_out`` has them."""
+    """Return grey values as ``Reading.read_out`` does."""
     import drjit as dr
     from drjit.llvm import UInt32
 
@@ -449,18 +461,18 @@ def _grey(electrons: Any, normal: Any, shift: Any, numbers: Sequence[Any]) -> An
 
 
 def _cell(mean: Any, word: Any) -> tuple[Any, Any, Any]:
-    """Row of the table, and the least quantile in the cell of it with whether it has others."""
+    """Return the row of the table, the least quantile in its cell, and whether the cell has others."""
     import drjit as dr
     from drjit.llvm import UInt32
 
     row = UInt32(dr.select(mean < TABLE_END, mean, 0.0) * float(CELLS_PER_UNIT))
-    place = (row << TABLE_BITS) + UInt32(word >> (64 - TABLE_BITS))
-    cell = (dr.gather(UInt32, _table().known, place >> 2) >> ((place & 3) << 3)) & 255
+    position = (row << TABLE_BITS) + UInt32(word >> (64 - TABLE_BITS))
+    cell = (dr.gather(UInt32, _table().known, position >> 2) >> ((position & 3) << 3)) & 255
     return row, cell & 127, cell >= 128
 
 
 def _looked_up(mean: Any, word: Any, normal: Any, shift: Any, numbers: Sequence[Any]) -> tuple[Any, Any]:
-    """Grey values of one frame, and where the table or the expansion leaves the number open."""
+    """Return the grey values of one frame, and whether the table or the expansion leaves each number open."""
     import drjit as dr
     from drjit.llvm import Float64
 
@@ -478,30 +490,30 @@ def _looked_up(mean: Any, word: Any, normal: Any, shift: Any, numbers: Sequence[
 def _compared(
     mean: Any, word: Any, normal: Any, shift: Any, numbers: Sequence[Any], at: tuple[Any, Any]
 ) -> tuple[Any, Any]:
-    """Grey values of what ``_looked_up`` left open, and where the number still is not certain.
+    """Return grey values of the numbers that ``_looked_up`` left open, and whether each is still uncertain.
 
     Parameters
     ----------
-    mean : Any
-        Of all lanes.
-    word : Any
-        Of all frames, one after the other.
-    normal : Any
-        likewise.
-    shift : Any
-        Of all lanes.
-    numbers : Sequence[Any]
-        Of the read-out.
-    at : tuple[Any, Any]
-        Places in all frames, and lanes, of the open ones.
+    mean : Float64
+        Means of all lanes.
+    word : UInt64
+        Random words of all frames, one after the other.
+    normal : Float64 | None
+        Normal numbers of all frames, one after the other.
+    shift : Float64
+        Black levels of all lanes.
+    numbers : sequence
+        Parameters of the read-out.
+    at : tuple
+        Positions in all frames, and lanes, of the open numbers.
     """
     import drjit as dr
     from drjit.llvm import Bool, Float32, Float64, UInt32, UInt64
 
-    place, lane = at
+    position, lane = at
     mean, shift = dr.gather(Float64, mean, lane), dr.gather(Float64, shift, lane)
-    word = dr.gather(UInt64, word, place)
-    normal = None if normal is None else dr.gather(Float64, normal, place)
+    word = dr.gather(UInt64, word, position)
+    normal = None if normal is None else dr.gather(Float64, normal, position)
     table = _table()
     row, number, _ = _cell(mean, word)
     small = mean < TABLE_END
@@ -515,8 +527,8 @@ def _compared(
         ahead = u - law
         close = close | (going & (dr.abs(ahead) <= bound))
         going = going & (ahead > bound)
-        one = dr.select(going, UInt32(1), UInt32(0))
-        return going, number + one, index + one, close
+        increment = dr.select(going, UInt32(1), UInt32(0))
+        return going, number + increment, index + increment, close
 
     _, number, _, close = dr.while_loop(
         (small, number, index, ~small & Bool(True)), lambda going, *rest: going, passed, mode="symbolic"
@@ -525,7 +537,10 @@ def _compared(
 
 
 def _by_series(mean: Any, word: Any) -> tuple[Any, Any]:
-    """Quantiles of means from ``TABLE_END`` on, and where they are not certain: as ``poisson_numbers._by_series``."""
+    """Return quantiles of means from ``TABLE_END`` on, and whether they are uncertain.
+
+    The method is that of ``poisson_numbers._by_series``.
+    """
     import drjit as dr
     from drjit.llvm import Float32, Float64
 
@@ -537,9 +552,9 @@ def _by_series(mean: Any, word: Any) -> tuple[Any, Any]:
     inverse, square = 1.0 / Float32(root), x * x
     rest = dr.fma(dr.fma(square, 1.0 / 270.0, 7.0 / 810.0), square, -8.0 / 405.0) * inverse
     rest = (rest - dr.fma(square, 1.0 / 72.0, 1.0 / 36.0) * x) * inverse + dr.fma(square, 1.0 / 6.0, 1.0 / 3.0)
-    at = dr.fma(Float64(x), root, mean) + Float64(rest)
-    number = dr.floor(at)
-    left = Float32(at - number)
+    quantile = dr.fma(Float64(x), root, mean) + Float64(rest)
+    number = dr.floor(quantile)
+    left = Float32(quantile - number)
     term = dr.fma(square * square * square, 0.001, 0.1) * inverse * inverse * inverse
     term = term + _NORMAL_ERROR * (1.0 + dr.abs(x) / 6.0) * (Float32(root) + 4.0)
     return dr.maximum(number, 0.0), (left < term) | (left > 1.0 - term) | far
@@ -559,13 +574,13 @@ the root of w less 3, w = -log(4 t (1 - t)).
 
 
 def _normal_quantile(tail: Any) -> tuple[Any, Any]:
-    """Normal quantile, at most 0, of a chance up to 1/2, single precision; and where it is too far out for that."""
+    """Return the normal quantile of a probability up to 1/2, and whether it is too far out for single precision."""
     import drjit as dr
 
     def polynomial(coefficients: Sequence[float], at: Any) -> Any:
         value = coefficients[0]
-        for one in coefficients[1:]:
-            value = dr.fma(value, at, one)
+        for coefficient in coefficients[1:]:
+            value = dr.fma(value, at, coefficient)
         return value
 
     w = -dr.log(4.0 * tail * (1.0 - tail))

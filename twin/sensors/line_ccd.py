@@ -1,31 +1,31 @@
-"""A TDI line CCD: what its pixels, its charge and its clocking do to the image, and the frames it records.
+"""TDI line CCD: the effect of pixels, charge and clocking on the image, and the frames that it records.
 
-What an oscillation of the image does while a TDI line collects light: exact, for any frequency.
+The second part is the exact effect of image oscillations of any frequency during the collection of a TDI line.
 
-The charge of a pixel is collected in M = stages x phases steps, one every D = line time / phases, of which light falls
-in for a share o. A motion of the image by x(t), against the charge that follows the image's mean motion, multiplies the
-image's spectrum at nu cycles per pixel by
+The charge of a pixel is collected in M = stages x phases steps, one every D = line time / phases; light falls in during
+a fraction o of each step. A displacement x(t) of the image, relative to charge that follows the image's mean motion,
+multiplies the image's spectrum at nu cycles per pixel by
 
     T(nu) = mean over the light of exp(-2 pi i nu x(t)).
 
-For x = A sin(2 pi f t + p) the expansion of Jacobi and Anger makes each of its terms an integral over the steps that
-has a closed form,
+For x = A sin(2 pi f t + p) the Jacobi-Anger expansion turns each term into an integral over the steps with a closed
+form,
 
     T(nu) = sum over n of J_n(2 pi nu A) exp(-i n p) W(n f),    W(f) = sinc(o D f) sin(pi M D f) / (M sin(pi D f)),
 
-t counting from the middle of the collection. Its limits, with the length T = M D of the collection:
+with t counted from the middle of the collection. Its limits, with the length T = M D of the collection:
 
-- slow, f T << 1: the image moves on by A cos(p) 2 pi f T while light is collected, and |T| is the sinc of a linear
-  smear of that length. The displacement A sin(p) is in the phase of T and does not blur.
-- fast, f T >> 1: only n = 0 is left, and T = J_0(2 pi nu A) whatever the phase.
+- slow, f T << 1: the image moves by A cos(p) 2 pi f T while light is collected, and |T| is the sinc of a linear smear
+  of that length. The displacement A sin(p) is in the phase of T and does not blur.
+- fast, f T >> 1: only n = 0 remains, and T = J_0(2 pi nu A) for any phase.
 
-The mean of |T|^2 over the phases needs no sum: two moments of the collection that lie s apart move by
-2 A sin(pi f s) cos(q) against each other with q as random as p, so that
+The mean of |T|^2 over the phases needs no sum: between two instants of the collection with a lag s, the image moves by
+2 A sin(pi f s) cos(q) with q as random as p, so that
 
-    E |T|^2 = mean over pairs of moments of J_0(4 pi nu A |sin(pi f s)|) for each line,
+    E |T|^2 = mean over pairs of instants of J_0(4 pi nu A |sin(pi f s)|) for each line,
               times exp(-4 pi^2 nu^2 (R(0) - R(s))) for noise of a band with the autocovariance R.
 
-This holds for any number of independent lines and bands at once.
+This holds for any number of independent lines and bands together.
 """
 
 from __future__ import annotations
@@ -45,25 +45,27 @@ if TYPE_CHECKING:
     from scenes.specs.detector import DetectorSpec
 
 WIDEST_STEP = 100e-9
-"""Mean distance of the wavelengths of a band, metres: mean transfer functions are then right to 1e-4."""
+"""Mean spacing of the wavelengths of a band, in metres: mean transfer functions are then accurate to 1e-4."""
 
 _SIGMAS = 5.0
 
 
 def band_wavelengths(band: BandSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss' wavelengths (K,), metres, and their weights, which sum to 1, for means over the band's signal."""
+    """Return Gauss wavelengths (K,), in metres, and weights with sum 1, for means over the band's signal."""
     first, last = band.spectrum.ends
     return band.spectrum.rule(2 + int(np.ceil((last - first) / WIDEST_STEP)))
 
 
 def band_factors(band: BandSpec, fx: np.ndarray, fy: np.ndarray) -> dict[str, np.ndarray]:
-    """What a line CCD does to an image, at frequencies along the line (fx) and along the track (fy), cycles/m.
+    """Return the factors of a line CCD's transfer function.
+
+    The frequencies fx are along the line and fy along the track, in cycles/m.
 
     Returns
     -------
-    dict[str, np.ndarray]
-        ``pixel``: its square area; ``diffusion``: charge that spreads to neighbours; ``tdi_step``: the image moves on
-        while the charge waits for its next step; ``tdi_rate``: image and charge drift apart over the stages.
+    dict of str to ndarray
+        ``pixel``: square pixel area; ``diffusion``: charge diffusion to neighbours; ``tdi_step``: image motion while
+        the charge waits for its next step; ``tdi_rate``: drift between image and charge over the stages.
     """
     p, tdi = band.pitch, band.tdi
     return {
@@ -76,7 +78,7 @@ def band_factors(band: BandSpec, fx: np.ndarray, fy: np.ndarray) -> dict[str, np
 
 @dataclass(frozen=True)
 class LineCcd:
-    """One band's line CCD. Images have columns along the line (+Y') and rows along the track (+X').
+    """Line CCD of one band. Images have columns along the line (+Y') and rows along the track (+X').
 
     Every row of an image is collected over all stages of a column's pixels, so that pixel differences are those of
     columns.
@@ -86,7 +88,7 @@ class LineCcd:
     band : BandSpec
         Geometry and clocking.
     detector : EmvaDetector
-        Of the sum over all stages.
+        Detector model for the sum over all stages.
     """
 
     band: BandSpec
@@ -94,7 +96,7 @@ class LineCcd:
 
     @classmethod
     def from_specs(cls, band: BandSpec, sheet: DetectorSpec) -> LineCcd:
-        """From what the files say.
+        """Return the line CCD of a band and a data sheet.
 
         Raises
         ------
@@ -104,54 +106,57 @@ class LineCcd:
         return cls(band, EmvaDetector.from_sheet(sheet, band.exposure))
 
     def factors(self, fx: np.ndarray, fy: np.ndarray) -> dict[str, np.ndarray]:
-        """Each effect's transfer, see ``band_factors``."""
+        """Return the transfer function of each effect, see ``band_factors``."""
         return band_factors(self.band, fx, fy)
 
     def transfer(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
-        """Product of all factors."""
+        """Return the product of all factors."""
         out: np.ndarray = np.ones(np.broadcast_shapes(np.shape(fx), np.shape(fy)))
         for factor in self.factors(fx, fy).values():
             out = out * factor
         return out
 
     def white_photons(self, share: float) -> float:
-        """Photons per pixel over all stages that fill the well to that share."""
+        """Return the photons per pixel over all stages that fill the well to a fraction ``share``."""
         return share * self.detector.full_well_e / self.detector.quantum_efficiency
 
     @property
     def largest_white(self) -> float:
-        """Share of the full well up to which no pixel of an even field saturates, at five sigma of a pixel's response
-        and of its noise.
+        """Fraction of the full well up to which no pixel of an even field saturates.
+
+        It allows five sigma of the pixels' response and of their noise.
         """
         sheet, noise = self.detector, self.noise
         level = (sheet.saturation_dn - sheet.offset_dn) / sheet.system_gain_dn_per_e - noise.dark_signal_e
         # electrons e with e (1 + 5 prnu) + 5 sqrt(e + dark + read noise^2) = level, by iteration from above
         electrons = level
         for _ in range(20):
-            own = max(electrons, 0.0) + noise.dark_signal_e
-            further = sum(float(term.temporal_variance_e2(own)) + term.fixed_variance_e2 for term in noise.further)
-            spread = np.sqrt(own + sheet.dark_noise_e**2 + further)
+            signal = max(electrons, 0.0) + noise.dark_signal_e
+            further = sum(float(term.temporal_variance_e2(signal)) + term.fixed_variance_e2 for term in noise.further)
+            spread = np.sqrt(signal + sheet.dark_noise_e**2 + further)
             electrons = (level - _SIGMAS * spread) / (1.0 + _SIGMAS * sheet.prnu)
         return float(electrons / sheet.full_well_e)
 
     @property
     def exposure(self) -> float:
-        """Time over which dark current is collected, seconds."""
+        """Time over which dark current is collected, in seconds."""
         return self.band.exposure
 
     @property
     def noise(self) -> NoiseModel:
-        """What the analysis may know of the noise of one frame."""
+        """Noise model of one frame, for the analysis."""
         return self.detector.noise_model(self.exposure)
 
     def pattern(self, seed: np.random.SeedSequence) -> FixedPattern:
-        """Gain and offset of every column of the line, (1, pixels)."""
+        """Return gain and offset of every column of the line, (1, pixels)."""
         return self.detector.fixed_pattern((1, self.band.pixels), seed)
 
     def expose(
         self, photons: np.ndarray, column: int, pattern: FixedPattern, frames: int, seed: np.random.SeedSequence
     ) -> np.ndarray:
-        """Frames of images (..., H, W) whose first column is the line's pixel ``column``, uint16 (..., frames, H, W).
+        """Return frames of images (..., H, W), uint16 (..., frames, H, W).
+
+        ``column`` is the pixel of the line at their first column.
 
         Raises
         ------
@@ -160,31 +165,31 @@ class LineCcd:
         """
         last = column + photons.shape[-1]
         if column < 0 or last > self.band.pixels:
-            raise ValueError(f"columns {column} to {last - 1} are not all on a line of {self.band.pixels} pixels")
-        own = FixedPattern(pattern.gain[:, column:last], pattern.offset_e[:, column:last])
-        return self.detector.expose(photons, own, frames, self.exposure, seed, threads=1)
+            raise ValueError(f"columns {column} to {last - 1} reach beyond a line of {self.band.pixels} pixels")
+        window = FixedPattern(pattern.gain[:, column:last], pattern.offset_e[:, column:last])
+        return self.detector.expose(photons, window, frames, self.exposure, seed, threads=1)
 
 
 _BEYOND = 30
-"""Terms of the expansion beyond the size of its argument; they fall off faster than (e z / 2 n)^n."""
+"""Number of terms of the expansion beyond its argument; they fall off faster than (e z / 2 n)^n."""
 _PER_STEP = 8
-"""Moments by which a quadrature knows the light of a step, where the light of a step is not all."""
+"""Number of nodes per step, if light falls in during only a part of the step."""
 _PER_CYCLE = 6
-"""Gauss' points for each cycle of what is meant over a step."""
+"""Gauss points per cycle of the function that is averaged over a step."""
 
 
 @dataclass(frozen=True)
 class Collection:
-    """When the charge of a pixel is collected, about the middle of it.
+    """Times at which the charge of a pixel is collected, about the middle.
 
     Attributes
     ----------
     steps : int
-        How often the charge stands still, stages x phases.
+        Number of positions of the charge, stages x phases.
     step : float
-        From one to the next, seconds.
+        Time from one step to the next, in seconds.
     open_share : float
-        Share of each step in which light falls in, in its middle.
+        Fraction of each step, centred in it, during which light falls in.
     """
 
     steps: int
@@ -193,57 +198,60 @@ class Collection:
 
     def __post_init__(self) -> None:
         if self.steps < 1 or not self.step > 0.0 or not 0.0 < self.open_share <= 1.0:
-            raise ValueError("a collection has a step or more, of a length above zero, open for a share within 0 to 1")
+            raise ValueError(
+                "a collection needs one step or more, a positive step and an open fraction above 0, at most 1"
+            )
 
     @classmethod
     def of(cls, tdi: TdiSpec, line_time: float | None = None) -> Collection:
-        """Of a line CCD as its file says it; line_time: seconds, in place of the file's."""
+        """Return the collection of a line CCD; line_time, in seconds, replaces that of the file."""
         time = tdi.line_time if line_time is None else line_time
         return cls(tdi.stages * tdi.phases, time / tdi.phases, tdi.open_share)
 
     @property
     def length(self) -> float:
-        """From its begin to its end, seconds."""
+        """Duration of the collection, in seconds."""
         return self.steps * self.step
 
     def mean(self, frequency: np.ndarray | float) -> np.ndarray:
-        """W: what is left of an oscillation in the mean over the collection, at frequencies (...), hertz."""
+        """Return the collection of a line CCD; line_time, in seconds, replaces that of the file."""
         cycles = self.step * np.asarray(frequency, np.float64)
         near = np.sinc(cycles)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.sinc(self.steps * cycles) / near
-        # a whole number of cycles in a step: all steps see the same
+        # for a whole number of cycles per step, all steps have equal terms
         whole = np.round(cycles)
         aligned = np.where((self.steps - 1) * whole % 2 == 0, 1.0, -1.0)
         return np.asarray(np.sinc(self.open_share * cycles) * np.where(np.abs(near) < 1e-9, aligned, ratio))
 
-    def moments(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Gauss' rule for means over the collection: moments (K,), seconds from its middle, and weights that sum to 1.
+    def gauss_rule(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return a Gauss rule for means over the collection: times (K,), s from its middle, and weights with sum 1.
 
-        Polynomials up to 2 K - 1 in time are meant exactly; K is ``count``, or what the collection has moments of.
+        Polynomials in time up to degree 2 K - 1 are averaged exactly; K is ``count``, or the number of nodes of the
+        collection if that is smaller.
         """
         if self.open_share == 1.0:
             x, w = np.polynomial.legendre.leggauss(count)
             return 0.5 * self.length * x, 0.5 * w
         within, weight = np.polynomial.legendre.leggauss(_PER_STEP)
-        at = np.arange(self.steps) - 0.5 * (self.steps - 1)
-        place = ((at[:, None] + 0.5 * self.open_share * within) / self.steps).ravel()
+        centres = np.arange(self.steps) - 0.5 * (self.steps - 1)
+        nodes = ((centres[:, None] + 0.5 * self.open_share * within) / self.steps).ravel()
         mass = np.tile(0.5 * weight / self.steps, self.steps)
-        return _gauss(place, mass, min(count, len(place)), self.length)
+        return _gauss(nodes, mass, min(count, len(nodes)), self.length)
 
     def transfer(self, nu: np.ndarray | float, frequency: float, amplitude: float, phase: float) -> np.ndarray:
-        """T of one oscillation, complex, (...).
+        """Return the transfer function T of one oscillation, complex, (...).
 
         Parameters
         ----------
-        nu : np.ndarray | float
-            Cycles per pixel, (...).
+        nu : (...) ndarray | float
+            Spatial frequency, in cycles per pixel.
         frequency : float
-            hertz.
+            Frequency of the oscillation, in hertz.
         amplitude : float
-            pixels.
+            Amplitude, in pixels.
         phase : float
-            In the middle of the collection, radians.
+            Phase at the middle of the collection, in radians.
         """
         z = 2.0 * np.pi * amplitude * np.asarray(nu, np.float64)
         most = int(np.ceil(np.max(np.abs(z), initial=0.0))) + _BEYOND
@@ -252,23 +260,26 @@ class Collection:
         return np.asarray(np.tensordot(jv(order, z[..., None]), weight, axes=(-1, 0)))
 
     def mean_square(self, nu: np.ndarray | float, motion: Motion) -> np.ndarray:
-        """E |T|^2 over random phases, (...), of independent oscillations and bands at ``nu`` (...) cycles per pixel."""
-        at = np.asarray(nu, np.float64)
-        lag, weight = self._lags(motion.highest + 2.0 * motion.speed * float(np.max(np.abs(at), initial=0.0)))
-        return np.asarray(np.tensordot(motion.agreement(at[..., None], lag), weight, axes=(-1, 0)))
+        """Return E |T|^2 over random phases, (...), at ``nu`` (...) cycles per pixel.
+
+        The oscillations and bands are independent.
+        """
+        frequency = np.asarray(nu, np.float64)
+        lag, weight = self._lags(motion.highest + 2.0 * motion.speed * float(np.max(np.abs(frequency), initial=0.0)))
+        return np.asarray(np.tensordot(motion.characteristic(frequency[..., None], lag), weight, axes=(-1, 0)))
 
     def mtf(self, nu: np.ndarray | float, motion: Motion) -> np.ndarray:
-        """Root mean square of the modulation transfer over random phases, (...)."""
+        """Return the root mean square of the MTF over random phases, (...)."""
         return np.sqrt(np.maximum(self.mean_square(nu, motion), 0.0))
 
     def smear(self, motion: Motion) -> float:
-        """Rms of the image's motion about its mean over the collection, pixels."""
+        """Return the rms displacement of the image about its mean over the collection, in pixels."""
         lag, weight = self._lags(motion.highest)
         # the variance about a mean is half of the mean square of all differences
         return float(np.sqrt(max(float(weight @ (motion.variance - motion.covariance(lag))), 0.0)))
 
     def _lags(self, highest: float) -> tuple[np.ndarray, np.ndarray]:
-        """Quadrature over the time between two moments of the collection, for what changes up to a frequency."""
+        """Return a quadrature over the lag between two times of the collection, for functions up to a frequency."""
         if self.open_share == 1.0:
             # the whole collection is one step: its density falls linearly
             points = 16 + int(np.ceil(_PER_CYCLE * highest * self.length))
@@ -280,22 +291,22 @@ class Collection:
         share = 0.5 * (x + 1.0)
         part = np.concatenate([-share[::-1], share]) * self.open_share * self.step
         within = 0.5 * np.concatenate([(w * (1.0 - share))[::-1], w * (1.0 - share)])
-        apart = np.arange(self.steps)
-        often = np.where(apart == 0, 1.0, 2.0) * (self.steps - apart) / self.steps**2
-        lag = self.step * apart[:, None] + part
-        return np.abs(lag).ravel(), (often[:, None] * within).ravel()
+        steps_apart = np.arange(self.steps)
+        count_share = np.where(steps_apart == 0, 1.0, 2.0) * (self.steps - steps_apart) / self.steps**2
+        lag = self.step * steps_apart[:, None] + part
+        return np.abs(lag).ravel(), (count_share[:, None] * within).ravel()
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A random motion of the image in one direction: oscillations of random phase and bands of noise, independent.
+    """Random motion of the image in one direction: independent oscillations of random phase and bands of noise.
 
     Attributes
     ----------
-    frequency, amplitude : np.ndarray
-        (K,) hertz and pixels, of the oscillations.
-    first, last, level : np.ndarray
-        (B,) hertz and pixels^2/Hz, of the bands, one-sided.
+    frequency, amplitude : (K,) ndarray
+        Frequency, in hertz, and amplitude, in pixels, of the oscillations.
+    first, last, level : (B,) ndarray
+        Edges of the bands, in hertz, and one-sided spectral density, in pixels^2/Hz.
     """
 
     frequency: np.ndarray
@@ -306,49 +317,49 @@ class Motion:
 
     @classmethod
     def of(cls, lines: Sequence[tuple[float, float]] = (), bands: Sequence[tuple[float, float, float]] = ()) -> Motion:
-        """From (frequency, amplitude) of lines and (first, last, level) of bands.
+        """Return the motion of lines (frequency, amplitude) and bands (first, last, level).
 
         Raises
         ------
         ValueError
-            a frequency that is not above zero, an amplitude or level below zero, an empty band.
+            A frequency is not above zero, an amplitude or level is below zero, or a band is empty.
         """
         line, band = np.array(lines, np.float64).reshape(-1, 2), np.array(bands, np.float64).reshape(-1, 3)
         if not (np.all(line[:, 0] > 0.0) and np.all(line[:, 1] >= 0.0)):
             raise ValueError("oscillations have frequencies above zero and amplitudes of zero or more")
         if not (np.all(band[:, 0] >= 0.0) and np.all(band[:, 1] > band[:, 0]) and np.all(band[:, 2] >= 0.0)):
-            raise ValueError("bands reach from a frequency to a higher one, with a level of zero or more")
+            raise ValueError("bands extend from a frequency to a higher one, with a level of zero or more")
         return cls(*line.T, *band.T)
 
     @property
     def highest(self) -> float:
-        """Highest frequency of it, hertz; 0 without any motion."""
+        """Highest frequency of the motion, in hertz; 0 without any motion."""
         return float(np.max(np.concatenate([self.frequency, self.last]), initial=0.0))
 
     @property
     def speed(self) -> float:
-        """What it hardly exceeds, pixels per second."""
+        """Speed that the motion hardly exceeds, in pixels per second."""
         square = self.level @ (self.last**3 - self.first**3) / 3.0
         return float(2.0 * np.pi * (self.frequency @ self.amplitude + 4.0 * np.sqrt(square)))
 
     @property
     def variance(self) -> float:
-        """Of the motion, pixels^2."""
+        """Variance of the motion, in pixels^2."""
         return float(0.5 * self.amplitude @ self.amplitude + self.level @ (self.last - self.first))
 
     def covariance(self, lag: np.ndarray) -> np.ndarray:
-        """Of the motion at two times that lie so far apart, seconds; (...) -> (...), pixels^2."""
+        """Return the autocovariance of the motion at lags (...), in seconds; (...) in pixels^2."""
         s = np.asarray(lag, np.float64)[..., None]
         lines = np.cos(2.0 * np.pi * self.frequency * s) @ (0.5 * self.amplitude**2)
         return np.asarray(lines + self._of_bands(s))
 
     def _of_bands(self, s: np.ndarray) -> np.ndarray:
-        """Covariance of the bands' noise at lags (..., 1) -> (...): the integral of level cos(2 pi f s)."""
+        """Return the autocovariance of the bands at lags (..., 1) -> (...): the integral of level cos(2 pi f s)."""
         ends = self.last * np.sinc(2.0 * self.last * s) - self.first * np.sinc(2.0 * self.first * s)
         return np.asarray(ends @ self.level)
 
-    def agreement(self, nu: np.ndarray, lag: np.ndarray) -> np.ndarray:
-        """E exp(-2 pi i nu (x(t) - x(t + lag))) over all phases and draws: shapes that broadcast."""
+    def characteristic(self, nu: np.ndarray, lag: np.ndarray) -> np.ndarray:
+        """Return E exp(-2 pi i nu (x(t) - x(t + lag))) over all phases and draws; the arguments broadcast."""
         nu, lag = np.broadcast_arrays(np.asarray(nu, np.float64), np.asarray(lag, np.float64))
         out: np.ndarray = np.ones(nu.shape)
         for frequency, amplitude in zip(self.frequency, self.amplitude, strict=True):
@@ -359,12 +370,12 @@ class Motion:
         return out
 
 
-def _gauss(place: np.ndarray, mass: np.ndarray, count: int, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss' rule of a discrete even measure (Stieltjes' procedure, Golub and Welsch)."""
-    before, now = np.zeros_like(place), np.full_like(place, 1.0 / np.sqrt(mass.sum()))
+def _gauss(position: np.ndarray, mass: np.ndarray, count: int, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the Gauss rule of a discrete even measure (Stieltjes' procedure, Golub and Welsch)."""
+    before, now = np.zeros_like(position), np.full_like(position, 1.0 / np.sqrt(mass.sum()))
     off, last = [], 0.0
     for _ in range(count - 1):
-        after = place * now - last * before
+        after = position * now - last * before
         last = float(np.sqrt(mass @ after**2))
         before, now = now, after / last
         off.append(last)

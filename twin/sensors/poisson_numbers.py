@@ -1,24 +1,23 @@
-"""Poisson numbers of images, by exact inversion of the distribution function: one uniform number for every pixel and
-frame.
+"""Poisson random numbers of images by exact inversion of the distribution function, from one uniform number each.
 
-The number of a mean m and a uniform u is the quantile, the smallest n whose distribution function
+The number for a mean m and a uniform u is the quantile, the smallest n whose distribution function
 
     F(n; m) = Q(n + 1, m)        (Q: regularised upper incomplete gamma function)
 
-is at least u. No other distribution stands in for Poisson's: what is cheap below only says *where* the quantile is,
-and wherever that leaves a choice, F itself decides.
+is at least u. No other distribution replaces Poisson's: the fast methods below only locate the quantile, and wherever
+they leave a choice, F itself decides.
 
 - Means below ``TABLE_END``: a guide table (Chen and Asau 1974; Devroye, Non-Uniform Random Variate Generation, III.2.4)
-  over cells of the mean and of u. The quantile grows with both, so that where it is the same at a cell's two far
-  corners it is that in the whole cell; this holds for 19 of 20 numbers. For the others u is compared with F
-  interpolated between the cell's two means, and within the bound of the interpolation's error with F itself.
+  over cells of the mean and of u. The quantile grows with both, so if it is equal at a cell's two opposite corners it
+  is equal in the whole cell; this holds for 19 of 20 numbers. For the others u is compared with F interpolated between
+  the cell's two means, and within the error bound of the interpolation with F itself.
 - Means from there to ``SERIES_END``: Giles' expansion of the quantile for large means (ACM TOMS 42, 2016, Algorithm
-  955) with a bound of what it leaves out; within the bound of a whole number, for one of some hundred, F is compared
+  955) with a bound of its remainder; if a whole number is within the bound, for about one of a hundred, F is compared
   with u.
 - Larger means: NumPy's ``Generator.poisson``, Hoermann's exact rejection PTRS.
 
-u has 64 bits and is compared from the end of [0, 1] that is nearer, so that both tails are right to 2^-64. The quantile
-grows with the mean: the same stream gives images of almost the same expectation almost the same noise.
+u has 64 bits and is compared from the nearer end of [0, 1], so that both tails are accurate to 2^-64. The quantile
+grows with the mean: the same stream gives images of almost equal expectation almost equal noise.
 """
 
 from __future__ import annotations
@@ -34,35 +33,36 @@ from scipy.special import gammainc, gammaincc, ndtri
 TABLE_END = 32.0
 """Mean from which no table is used."""
 SERIES_END = 65536.0
-"""Mean from which NumPy draws; SciPy's incomplete gamma functions keep all their digits in the tails up to 1e5."""
+"""Mean from which NumPy draws; SciPy's incomplete gamma functions keep full precision in the tails up to 1e5."""
 
 CELLS_PER_UNIT = 32
-"""Cells of the mean, per electron."""
+"""Cells of the table per unit of the mean, in electrons."""
 TABLE_BITS = 10
-"""Bits of u that choose a cell of the table."""
+"""Number of bits of u that select a cell of the table."""
 _SHIFT = np.uint64(64 - TABLE_BITS)
 MOST_IN_TABLE = 120
 """Numbers in the table: beyond it lies 1e-31 of the largest mean's distribution, less than the last cell of u."""
 _UNDECIDED = 255
 _LAST = 2**64 - 1
 _INTERPOLATED = 1.01 * (1.0 / CELLS_PER_UNIT) ** 2 / 8.0
-"""Largest error of a linear interpolation of F between two means of the table: dF/dm = -p(n), the second derivative is
-p(n) - p(n - 1) and so nowhere larger than 1."""
+"""Largest error of a linear interpolation of F between two means of the table: dF/dm = -p(n), so the second derivative
+is p(n) - p(n - 1), nowhere larger than 1.
+"""
 _ROOM = 1 << 17
-"""Numbers that are drawn at once, for arrays of a megabyte: fewer spend as much time between the calls as in them."""
+"""Numbers drawn at once, for arrays of a megabyte: with fewer, the calls take as long as the work."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Guide:
-    """Quantiles in the cells of mean and u, row-major: of the mean 32 to the electron, of u 2^10.
+    """Quantiles in the cells of mean and u, row-major: 32 cells of the mean per electron, 2^10 of u.
 
     Attributes
     ----------
-    known : np.ndarray
-        The quantile where the cell has one, else ``_UNDECIDED``, uint8.
-    least : np.ndarray
-        The smallest in the cell, uint8.
-    law : np.ndarray
+    known : ndarray of uint8
+        Quantile if the cell has only one, otherwise ``_UNDECIDED``.
+    least : ndarray of uint8
+        Smallest quantile in the cell.
+    law : ndarray
         F of the numbers below ``MOST_IN_TABLE`` at the cells' means and at the table's end.
     """
 
@@ -73,10 +73,11 @@ class _Guide:
 
 @cache
 def _guide() -> _Guide:
+    """Return the guide table."""
     means = np.arange(round(TABLE_END * CELLS_PER_UNIT) + 1) / CELLS_PER_UNIT
     buckets = 1 << TABLE_BITS
     law = gammaincc(np.arange(1.0, MOST_IN_TABLE + 1.0), means[:, None])
-    # n is passed from the first edge j / 2^10 on that lies beyond F(n); at an edge the quantile is how many are passed
+    # n is passed at the first edge j / 2^10 beyond F(n); the quantile at an edge is the count of passed numbers
     first = np.floor(law * buckets).astype(np.int64) + 1
     passed = np.zeros((len(means), buckets + 2), np.int64)
     np.add.at(passed, (np.arange(len(means))[:, None], np.minimum(first, buckets + 1)), 1)
@@ -91,15 +92,17 @@ def _guide() -> _Guide:
 
 @cache
 def quantile_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The guide table as kernels read it.
+    """Return the guide table in the form that kernels read.
 
     Returns
     -------
-    tuple[np.ndarray, np.ndarray, np.ndarray]
-        The least quantile in each cell of mean and u, row-major, with the highest bit set where the cell has others,
-        uint8; F of the numbers below ``MOST_IN_TABLE`` at the cells' means, one after the other; and for each row a
-        bound of what a linear interpolation of F between its mean and the next is off. The second derivative of F by
-        the mean is p(n) - p(n - 1), whose own derivative is a difference of two such.
+    cells : ndarray of uint8
+        Least quantile in each cell of mean and u, row-major, with the highest bit set if the cell has others.
+    law : ndarray
+        F of the numbers below ``MOST_IN_TABLE`` at the cells' means, one after the other.
+    bound : ndarray
+        For each row, error bound of a linear interpolation of F between its mean and the next. The second derivative of
+        F by the mean is p(n) - p(n - 1), whose own derivative is a difference of two such terms.
     """
     guide = _guide()
     cells = np.where(guide.known == _UNDECIDED, guide.least | 128, guide.known).astype(np.uint8)
@@ -117,41 +120,41 @@ def poisson_numbers(mean: np.ndarray, count: int, rng: np.random.Generator) -> n
 
     Parameters
     ----------
-    mean : np.ndarray
-        Of any shape (...), finite and >= 0; not checked.
+    mean : (...) ndarray
+        Means, finite and >= 0; not checked.
     count : int
-        Numbers of each mean.
+        Number of draws for each mean.
     rng : np.random.Generator
-        Is asked for one word of 64 bits for every number, in the order of the result, and then for the numbers of means
-        beyond ``SERIES_END``.
+        Generator: one word of 64 bits for every number, in the order of the result, then the numbers of means beyond
+        ``SERIES_END``.
 
     Returns
     -------
-    np.ndarray
-        Whole numbers as float64, (count, ...).
+    (count, ...) ndarray
+        Whole numbers as float64.
     """
     (out,) = poisson_pieces(mean, count, rng, count)
     return out
 
 
 def poisson_pieces(mean: np.ndarray, count: int, rng: np.random.Generator, together: int) -> Iterator[np.ndarray]:
-    """The numbers of ``poisson_numbers`` some at a time, so that they need not all be held.
+    """Yield the numbers of ``poisson_numbers`` in pieces, to limit memory.
 
     Parameters
     ----------
-    mean : np.ndarray
-        As there.
+    mean : (...) ndarray
+        Means, see ``poisson_numbers``.
     count : int
-        As there.
+        Number of draws for each mean.
     rng : np.random.Generator
-        As there. When the first numbers have come, it stands where it would after all of them.
+        Generator. Once the first piece is returned, its state is that after all numbers.
     together : int
-        Numbers of each mean in a piece.
+        Number of draws for each mean in a piece.
 
     Yields
     ------
-    np.ndarray
-        Whole numbers as float64, (together or fewer, ...).
+    (together or fewer, ...) ndarray
+        Whole numbers as float64.
     """
     flat = np.ascontiguousarray(mean, dtype=np.float64).reshape(-1)
     plan, huge = _Plan.of(flat), np.flatnonzero(flat >= SERIES_END)
@@ -166,7 +169,7 @@ def poisson_pieces(mean: np.ndarray, count: int, rng: np.random.Generator, toget
 
 
 def _steps(first: int, last: int, size: int) -> Iterator[tuple[int, int]]:
-    """Ranges of numbers that are drawn at once."""
+    """Return ranges of numbers that are drawn at once."""
     step = max(1, _ROOM // max(size, 1))
     return ((start, min(start + step, last)) for start in range(first, last, step))
 
@@ -174,20 +177,23 @@ def _steps(first: int, last: int, size: int) -> Iterator[tuple[int, int]]:
 def split_stream(
     rng: np.random.Generator, huge: np.ndarray, count: int, size: int, together: int
 ) -> tuple[np.random.Generator, np.random.Generator]:
-    """Generators of the words and of the numbers of huge means, whose streams follow each other in that of ``rng``.
+    """Return generators for the words and for the numbers of huge means.
+
+    Their streams follow each other in that of ``rng``.
 
     Parameters
     ----------
     rng : np.random.Generator
-        Stands after both when this returns, where not all numbers are drawn together; else it is both.
-    huge : np.ndarray
-        Means from ``SERIES_END`` on, (H,).
+        Generator. Unless all numbers are drawn at once, it is advanced beyond both streams; otherwise it serves as
+        both.
+    huge : (H,) ndarray
+        Means from ``SERIES_END`` on.
     count : int
-        Numbers of each mean.
+        Number of draws for each mean.
     size : int
         Number of all means.
     together : int
-        Numbers of each mean that are drawn at once.
+        Number of draws for each mean at once.
     """
     if together >= count:
         return rng, rng
@@ -201,14 +207,14 @@ def split_stream(
 
 
 def words_of(rng: np.random.Generator, count: int, size: int) -> np.ndarray:
-    """Words of 64 bits, (count, size); not the raw ones, which some bit generators have of 32.
+    """Draw words of 64 bits, (count, size); not raw words, which have 32 bits in some bit generators.
 
     Parameters
     ----------
     rng : np.random.Generator
-        Is asked for them.
+        Generator.
     count : int
-        Of each mean.
+        Number of words for each mean.
     size : int
         Number of means.
     """
@@ -216,19 +222,19 @@ def words_of(rng: np.random.Generator, count: int, size: int) -> np.ndarray:
 
 
 def poisson_quantile(mean: np.ndarray, word: np.ndarray) -> np.ndarray:
-    """Quantiles of Poisson distributions.
+    """Return quantiles of Poisson distributions.
 
     Parameters
     ----------
-    mean : np.ndarray
-        (N,), at least 0 and below ``SERIES_END``.
-    word : np.ndarray
-        u = (word + 1/2) / 2^64, uint64, (..., N).
+    mean : (N,) ndarray
+        Means, at least 0 and below ``SERIES_END``.
+    word : (..., N) ndarray of uint64
+        Words; u = (word + 1/2) / 2^64.
 
     Returns
     -------
-    np.ndarray
-        The smallest whole numbers whose distribution function is at least u, float64, (..., N).
+    (..., N) ndarray
+        Smallest whole numbers whose distribution function is at least u, as float64.
     """
     flat = np.ascontiguousarray(mean, dtype=np.float64)
     out = np.empty(word.shape)
@@ -238,15 +244,15 @@ def poisson_quantile(mean: np.ndarray, word: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """Means (N,) and how the number of each is found.
+    """Means (N,), sorted by method.
 
     Attributes
     ----------
-    mean : np.ndarray
+    mean : ndarray
         All means.
-    row : np.ndarray
-        Where a mean's row of the table begins; of larger means the first row's.
-    large : np.ndarray
+    row : ndarray
+        Start of each mean's row in the table; for larger means that of the first row.
+    large : ndarray
         Indices of the means beyond the table and below ``SERIES_END``.
     """
 
@@ -256,39 +262,40 @@ class _Plan:
 
     @classmethod
     def of(cls, mean: np.ndarray) -> _Plan:
+        """Return the plan of means."""
         small = np.where(mean < TABLE_END, mean, 0.0)
         row = (small * CELLS_PER_UNIT).astype(np.int64) << TABLE_BITS
         return cls(mean, row, np.flatnonzero((mean >= TABLE_END) & (mean < SERIES_END)))
 
     def fill(self, out: np.ndarray, word: np.ndarray) -> None:
-        """Quantiles of words (K, N), into ``out``; those of means beyond ``SERIES_END`` are left without a meaning."""
+        """Write quantiles of words (K, N) into ``out``; entries of means beyond ``SERIES_END`` are meaningless."""
         guide = _guide()
-        place = (word >> _SHIFT).view(np.int64)
-        place += self.row
-        known = guide.known.take(place)
+        cell = (word >> _SHIFT).view(np.int64)
+        cell += self.row
+        known = guide.known.take(cell)
         np.copyto(out, known)
         open_ = np.flatnonzero(known == _UNDECIDED)
         if open_.size:
-            number = self._decided(guide, open_ % self.mean.size, place.reshape(-1)[open_], word.reshape(-1)[open_])
+            number = self._decided(guide, open_ % self.mean.size, cell.reshape(-1)[open_], word.reshape(-1)[open_])
             out.reshape(-1)[open_] = number
         if self.large.size:
             out[:, self.large] = _by_series(self.mean[self.large], word.take(self.large, axis=1))
 
-    def _decided(self, guide: _Guide, which: np.ndarray, place: np.ndarray, word: np.ndarray) -> np.ndarray:
-        """Quantiles that the table leaves open, of the means of the given indices."""
+    def _decided(self, guide: _Guide, which: np.ndarray, cell: np.ndarray, word: np.ndarray) -> np.ndarray:
+        """Return the quantiles that the table leaves open, for the means of the given indices."""
         mean = self.mean[which]
         mean[mean >= TABLE_END] = 0.0
-        number = guide.least.take(place).astype(np.int64)
-        row = place >> TABLE_BITS
-        u, share, at = word * 2.0**-64, mean * CELLS_PER_UNIT - row, row * MOST_IN_TABLE + number
+        number = guide.least.take(cell).astype(np.int64)
+        row = cell >> TABLE_BITS
+        u, share, index = word * 2.0**-64, mean * CELLS_PER_UNIT - row, row * MOST_IN_TABLE + number
         left, close = np.arange(number.size), []
         while left.size:
-            law = guide.law.take(at)
-            law += share * (guide.law.take(at + MOST_IN_TABLE) - law)
+            law = guide.law.take(index)
+            law += share * (guide.law.take(index + MOST_IN_TABLE) - law)
             ahead = u - law
             close.append(left[np.abs(ahead) <= _INTERPOLATED])
             on = np.flatnonzero(ahead > _INTERPOLATED)
-            left, u, share, at = left[on], u[on], share[on], at[on] + 1
+            left, u, share, index = left[on], u[on], share[on], index[on] + 1
             number[left] += 1
         last = np.concatenate(close)
         number[last] = _climbed(number[last].astype(np.float64), mean[last], word[last])
@@ -296,7 +303,7 @@ class _Plan:
 
 
 def _tail(word: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Whether u lies in the upper half, and its distance from the nearer end of [0, 1]."""
+    """Return whether u is in the upper half, and its distance from the nearer end of [0, 1]."""
     sign = word.view(np.int64) >> 63  # -1 in the upper half
     tail = (word.view(np.int64) ^ sign).astype(np.float64)
     tail += 0.5
@@ -305,7 +312,7 @@ def _tail(word: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _beyond(number: np.ndarray, mean: np.ndarray, upper: np.ndarray, tail: np.ndarray) -> np.ndarray:
-    """Whether u lies beyond F(number)."""
+    """Return True where u exceeds F(number)."""
     below = np.empty(number.shape, bool)
     low = ~upper
     below[low] = gammaincc(number[low] + 1.0, mean[low]) < tail[low]
@@ -314,7 +321,7 @@ def _beyond(number: np.ndarray, mean: np.ndarray, upper: np.ndarray, tail: np.nd
 
 
 def _climbed(number: np.ndarray, mean: np.ndarray, word: np.ndarray) -> np.ndarray:
-    """Quantiles (N,) from numbers that are not larger; ``number`` is used up."""
+    """Return quantiles (N,), searched upwards from lower bounds; ``number`` is overwritten."""
     upper, tail = _tail(word)
     left = np.arange(number.size)
     while left.size:
@@ -324,43 +331,43 @@ def _climbed(number: np.ndarray, mean: np.ndarray, word: np.ndarray) -> np.ndarr
 
 
 def _by_series(mean: np.ndarray, word: np.ndarray) -> np.ndarray:
-    """Quantiles (K, N) of means (N,) from ``TABLE_END`` on."""
+    """Return quantiles (K, N) of means (N,) from ``TABLE_END`` on."""
     upper, tail = _tail(word)
     x = ndtri(tail)
     x *= 1.0 - 2.0 * upper
     root = np.sqrt(mean)
     inverse = 1.0 / root
     square = x * x
-    # the x at which Q(x, mean) = u, in falling powers of the root of the mean; the quantile is its whole part
-    at = square * (1.0 / 270.0)
-    at += 7.0 / 810.0
-    at *= square
-    at -= 8.0 / 405.0
-    at *= inverse
+    # the x with Q(x, mean) = u, in falling powers of the root of the mean; the quantile is its integer part
+    quantile = square * (1.0 / 270.0)
+    quantile += 7.0 / 810.0
+    quantile *= square
+    quantile -= 8.0 / 405.0
+    quantile *= inverse
     term = square * (1.0 / 72.0)
     term += 1.0 / 36.0
     term *= x
-    at -= term
-    at *= inverse
+    quantile -= term
+    quantile *= inverse
     np.multiply(square, 1.0 / 6.0, out=term)
     term += 1.0 / 3.0
-    at += term
+    quantile += term
     x *= root
-    at += x
-    at += mean
-    number = np.floor(at)
-    # what the series leaves out is less than half of this from a mean of 32 on, for all u of 64 bits
+    quantile += x
+    quantile += mean
+    number = np.floor(quantile)
+    # the remainder of the series is less than half of this for means from 32 on and all u of 64 bits
     np.multiply(square, square, out=term)
     term *= square
     term *= 0.001
     term += 0.1
     term *= inverse**3
     term += 1e-14 * mean
-    at -= number
-    open_ = np.flatnonzero((at < term) | (at > 1.0 - term))
+    quantile -= number
+    open_ = np.flatnonzero((quantile < term) | (quantile > 1.0 - term))
     if open_.size:
         flat = number.reshape(-1)
-        # a number that is certainly not larger
-        start = np.floor(flat[open_] + at.reshape(-1)[open_] - term.reshape(-1)[open_])
+        # a lower bound of the quantile
+        start = np.floor(flat[open_] + quantile.reshape(-1)[open_] - term.reshape(-1)[open_])
         flat[open_] = _climbed(np.maximum(start, 0.0), mean[open_ % mean.size], word.reshape(-1)[open_])
     return number

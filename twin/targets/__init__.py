@@ -1,1 +1,1 @@
-"""Cameras that look at test targets, and what is measured in the images."""
+"""Camera images of test targets, and measurements in them."""

@@ -1,15 +1,15 @@
 """Images of test targets at infinity on the cameras' line CCDs, and of slanted edges at any defocus.
 
-The image of a straight edge depends on the optical transfer function along the edge's normal alone. So for every site
-and edge it is worked out once, over frequency and defocus, and interpolated: a move of the detector along its normal
+The image of a straight edge depends only on the optical transfer function along the edge's normal. It is computed once
+for every site and edge, over frequency and defocus, and interpolated: a displacement of the detector along its normal
 by micrometres, or of the collimator's target through focus, changes nothing else that matters (a tilt of the detector
 by arcminutes scales the direction cosines by 1e-6).
 
-A target stands still in the direction that a place on the line sees in the nominal state. Coordinates in an image are
-(along, across) = (Y', X') of the focal plane: columns run along the line, rows along the track. The window that is
-recorded follows the image by whole pixels, so that the image lies on the pixels as it does in the camera.
+A target is fixed in the direction that a position on the line sees in the nominal state. Coordinates in an image are
+(along, across) = (Y', X') of the focal plane: columns run along the line, rows along the track. The recorded window
+follows the image by whole pixels, so that the image lies on the pixels as it does in the camera.
 
-Pupils of an image in the light of a band: one that serves all wavelengths, or one of each where lenses are.
+The pupils of an image in the light of a band are one for all wavelengths, or, with lenses, one for each wavelength.
 """
 
 from __future__ import annotations
@@ -39,24 +39,24 @@ from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.target_path import LocalMap, TargetPath
 
 WORST_CHANGE = 5e-4
-"""Largest change of an MTF by a rule of more wavelengths at which it is taken as it is."""
+"""Largest accepted change of an MTF by a rule of more wavelengths."""
 
 LARGEST_RULE = 65
-"""Wavelengths of the last rule, beyond which there is no MTF over a light."""
+"""Wavelengths of the last rule; if the MTF still changes there, none is given."""
 
 
 @dataclass(frozen=True, eq=False)
 class BandPupils:
-    """Pupils of one image, all about one point of it, so that colours that stand apart blur it.
+    """Pupils of one image, all referred to one of its points, so that lateral colour blurs it.
 
     Attributes
     ----------
-    pupils : tuple[PupilFunction, ...]
-        Of every wavelength, (K,), or one alone, the same at all of them.
-    wavelengths : np.ndarray
-        (K,), metres.
-    weights : np.ndarray
-        Share of the signal at each, (K,), which sum to 1.
+    pupils : tuple of PupilFunction
+        Pupils of the K wavelengths, or a single one for all of them.
+    wavelengths : (K,) ndarray
+        Wavelengths, in metres.
+    weights : (K,) ndarray
+        Fraction of the signal at each wavelength, with sum 1.
     """
 
     pupils: tuple[PupilFunction, ...]
@@ -65,28 +65,31 @@ class BandPupils:
 
     @classmethod
     def alike(cls, pupil: PupilFunction, band: BandSpec) -> BandPupils:
-        """The pupil of mirrors, in a band's light."""
+        """Return the pupils of a mirror system, the same at all wavelengths of a band."""
         return cls((pupil,), *band_wavelengths(band))
 
     @property
     def shortest(self) -> PupilFunction:
-        """Of the shortest wavelength, which has the finest image."""
+        """Pupil of the shortest wavelength, which has the finest image."""
         return self.pupils[0 if len(self.pupils) == 1 else int(np.argmin(self.wavelengths))]
 
     @property
     def light(self) -> float:
-        """Share of the light that nothing stops."""
+        """Fraction of the light that is not blocked."""
         if len(self.pupils) == 1:
             return self.pupils[0].light
         return float(np.dot(self.weights, [pupil.light for pupil in self.pupils]) / np.sum(self.weights))
 
     def transfer(self, frequency: np.ndarray, defocus: np.ndarray) -> np.ndarray:
-        """Optical transfer function, complex (Z, M); arguments as of ``polychromatic_transfer``."""
+        """Return the optical transfer function, complex (Z, M); arguments as for ``polychromatic_transfer``."""
         pupil = self.pupils if len(self.pupils) > 1 else self.pupils[0]
         return polychromatic_transfer(pupil, frequency, self.wavelengths, self.weights, defocus)
 
     def table(self) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-        """The same at focus for many frequencies, interpolated: fx, fy (cycles/m) of one shape -> complex of it."""
+        """Return a function that interpolates the in-focus transfer function at many frequencies.
+
+        The function takes fx, fy (cycles/m) of one shape and returns complex values of that shape.
+        """
         if len(self.pupils) == 1:
             return TransferTable.build(self.pupils[0], self.wavelengths, self.weights)
         shares = self.weights / np.sum(self.weights)
@@ -103,23 +106,23 @@ class BandPupils:
 def wavelengths_enough(
     spectrum: SpectrumSpec, first: int, values: Callable[[int], np.ndarray], largest: int = LARGEST_RULE
 ) -> int:
-    """How many wavelengths an MTF over a spectrum takes.
+    """Return the number of wavelengths needed for an MTF over a spectrum.
 
     Parameters
     ----------
     spectrum : SpectrumSpec
-        The light.
+        Spectrum of the light.
     first : int
-        Count of the first rule.
-    values : Callable[[int], np.ndarray]
-        Of the MTF by the rule of so many wavelengths, or of other numbers of this kind.
+        Number of wavelengths of the first rule.
+    values : callable
+        Function of the number of wavelengths that returns MTF values, or other numbers of this kind.
     largest : int
-        Wavelengths of the last rule.
+        Number of wavelengths of the last rule.
 
     Raises
     ------
     UnphysicalError
-        It still changes by more than ``WORST_CHANGE`` at ``largest`` wavelengths.
+        The values still change by more than ``WORST_CHANGE`` at ``largest`` wavelengths.
     """
     if spectrum.lines or spectrum.ends[0] == spectrum.ends[1]:
         return first
@@ -133,33 +136,34 @@ def wavelengths_enough(
         before = after
     raise UnphysicalError(
         f"the MTF over {1e9 * spectrum.ends[0]:.6g} to {1e9 * spectrum.ends[1]:.6g} nm still changes by {change:.2g} "
-        f"with {count} wavelengths (at most {WORST_CHANGE:g}): colours stand too far apart"
+        f"with {count} wavelengths (at most {WORST_CHANGE:g}): the lateral colour is too large"
     )
 
 
 ALONG, TRACK = "along", "track"
 DIRECTIONS = (ALONG, TRACK)
-"""In which the MTF is measured: along the line, and along the track."""
+"""Directions in which the MTF is measured: along the line, and along the track."""
 
 DIRECTION_NAMES: Mapping[str, str] = {ALONG: "along the line", TRACK: "along the track"}
-"""Directions for readers."""
+"""Directions in the words of reports."""
 
 EDGE_RUNS: Mapping[str, Literal["x", "y"]] = {ALONG: "y", TRACK: "x"}
 """Direction -> axis of the image along which its edge runs."""
 
 FREQUENCIES = 97
-"""Samples of a transfer function from 0 to the cut-off."""
+"""Number of samples of a transfer function from 0 to the cut-off."""
 
 DEFOCUS_STEP = 25e-6
-"""Step of the table over defocus, metres. The transfer function of an F/9 beam turns by one cycle in 250 um or
-more, and quintic splines through ten samples per cycle are right to 2e-4."""
+"""Step of the table over defocus, in metres. The phase of the transfer function of an F/9 beam changes by one cycle in
+250 µm or more, and quintic splines through ten samples per cycle are accurate to 2e-4.
+"""
 
 TABLE_REACH = 0.6e-3
-"""Defocus up to which the table goes, metres; a few images farther out are worked out one by one."""
+"""Largest defocus of the table, in metres; a few images beyond it are computed one by one."""
 
 
 def knife_edge(direction: str, angle: float) -> HalfPlane:
-    """The knife edge, on the target, that measures in a direction and is turned by ``angle``, radians."""
+    """Return the knife edge, on the target, that measures in a direction and is rotated by ``angle``, in radians."""
     shape = slanted_edge(angle, EDGE_RUNS[direction]).parts[0][1]
     assert isinstance(shape, HalfPlane)
     return shape
@@ -174,11 +178,11 @@ class EdgeOptics:
     light : BandPupils
         Pupils of the site in the band's light.
     band : BandSpec
-        Whose light it is.
-    normal : np.ndarray
-        Direction of the frequencies in the image, unit, (2,).
+        Band of the light.
+    normal : (2,) ndarray
+        Direction of the frequencies in the image, unit vector.
     cutoff : float
-        cycles/m, of the shortest wavelength.
+        Cut-off frequency of the shortest wavelength, in cycles/m.
     table : BSpline
         Spline over defocus of the samples at ``frequencies``, complex as (real, imaginary).
     """
@@ -191,28 +195,28 @@ class EdgeOptics:
 
     @classmethod
     def build(
-        cls, light: PupilFunction | BandPupils, band: BandSpec, normal: np.ndarray, reach: float = TABLE_REACH
+        cls, light: PupilFunction | BandPupils, band: BandSpec, normal: np.ndarray, extent: float = TABLE_REACH
     ) -> EdgeOptics:
-        """Work the table out for defocus up to +-reach, metres. One pupil alone serves all of the band's light."""
+        """Compute the table for defocus up to +-reach, in metres; a single pupil serves all of the band's light."""
         light = BandPupils.alike(light, band) if isinstance(light, PupilFunction) else light
         cutoff = float(light.shortest.cutoff(normal[None], band.spectrum.ends[0])[0])
-        steps = max(int(np.ceil(reach / DEFOCUS_STEP)), 3)
-        defocus = np.linspace(-reach, reach, 2 * steps + 1)
+        steps = max(int(np.ceil(extent / DEFOCUS_STEP)), 3)
+        defocus = np.linspace(-extent, extent, 2 * steps + 1)
         samples = _samples(light, normal, cutoff, defocus)
         return cls(light, band, normal, cutoff, make_interp_spline(defocus, samples, k=5))
 
     @property
     def pupil(self) -> PupilFunction:
-        """Of the site; of the shortest wavelength where each has its own."""
+        """Pupil of the site; with one pupil per wavelength, that of the shortest."""
         return self.light.shortest
 
     @property
     def frequencies(self) -> np.ndarray:
-        """Samples along the normal, cycles/m."""
+        """Samples along the normal, in cycles/m."""
         return np.linspace(0.0, self.cutoff, FREQUENCIES)
 
     def at(self, defocus: float, frequency: np.ndarray) -> np.ndarray:
-        """Complex transfer function at frequencies along the normal, cycles/m, not negative."""
+        """Return the complex transfer function at non-negative frequencies along the normal, in cycles/m."""
         if abs(defocus) <= self.table.t[-1]:
             samples = self.table(defocus)
         else:
@@ -222,30 +226,30 @@ class EdgeOptics:
 
 
 def _samples(light: BandPupils, normal: np.ndarray, cutoff: float, defocus: np.ndarray) -> np.ndarray:
-    """Real and imaginary part at evenly spaced frequencies, (Z, FREQUENCIES, 2)."""
+    """Return real and imaginary part at evenly spaced frequencies, (Z, FREQUENCIES, 2)."""
     frequency = np.linspace(0.0, cutoff, FREQUENCIES)[:, None] * normal
     values = light.transfer(frequency, defocus)
     return np.stack([values.real, values.imag], axis=-1)
 
 
 _ROUND_CUTOFF = 10e3
-"""Cut-offs are rounded up to multiples of this, cycles/m,"""
+"""Step to which cut-offs are rounded up, in cycles/m."""
 _ROUND_REACH = 4.0
-"""and reaches to multiples of this, pixels."""
+"""Step to which extents are rounded up, in pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeImager:
-    """Images of one edge at one site as a line CCD takes them.
+    """Images of one edge at one site as a line CCD records them.
 
     Attributes
     ----------
     optics : EdgeOptics
         Transfer function along the edge's normal.
     ccd : LineCcd
-        The line CCD.
+        Line CCD.
     region : int
-        Side of the square image, pixels.
+        Side of the square image, in pixels.
     """
 
     optics: EdgeOptics
@@ -253,23 +257,26 @@ class EdgeImager:
     region: int
 
     def transfer(self, defocus: float, frequency: np.ndarray) -> np.ndarray:
-        """Optics, pixel, diffusion and TDI together along the normal, complex."""
+        """Return the complex transfer function of optics, pixel, diffusion and TDI along the normal."""
         x, y = self.optics.normal
         return self.optics.at(defocus, frequency) * self.ccd.transfer(frequency * x, frequency * y)
 
     def mtf(self, defocus: float, frequency: float) -> float:
-        """Modulus of ``transfer`` at one frequency, cycles/m: the truth that a measurement is compared with."""
+        """Return the modulus of ``transfer`` at one frequency, in cycles/m.
+
+        It is the true value for comparison with a measurement.
+        """
         return float(np.abs(self.transfer(defocus, np.array([frequency])))[0])
 
     def image(self, defocus: float, offset: float) -> np.ndarray:
-        """Share of the white signal in every pixel, (region, region).
+        """Return the fraction of the white signal in every pixel, (region, region).
 
         Parameters
         ----------
         defocus : float
-            Of the detector, metres, positive downstream.
+            Defocus of the detector, in metres, positive downstream.
         offset : float
-            Of the edge from the middle of the image along its normal, metres.
+            Distance of the edge from the centre of the image along its normal, in metres.
         """
         pitch, normal = self.ccd.band.pitch, self.optics.normal
         grid = Grid(-0.5 * (self.region - 1) * pitch, pitch, self.region)
@@ -277,57 +284,58 @@ class EdgeImager:
         def transfer(fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
             return self.transfer(defocus, np.hypot(fx, fy))
 
-        # the same rounded numbers for all sites of a band, so that the profile's sampling is worked out once
-        reach = (0.5 * self.region * float(np.sum(np.abs(normal))) + abs(offset) / pitch) // _ROUND_REACH + 1.0
+        # rounded, so that all sites of a band share one sampling of the profile
+        extent = (0.5 * self.region * float(np.sum(np.abs(normal))) + abs(offset) / pitch) // _ROUND_REACH + 1.0
         cutoff = _ROUND_CUTOFF * (self.optics.cutoff // _ROUND_CUTOFF + 1.0)
-        profile = EdgeProfile.build(transfer, normal, cutoff, _ROUND_REACH * reach * pitch)
+        profile = EdgeProfile.build(transfer, normal, cutoff, _ROUND_REACH * extent * pitch)
         return np.maximum(profile.image(HalfPlane(offset * profile.normal, profile.normal), grid, grid), 0.0)
 
 
 PLACES = {"left": 1.0, "centre": 0.0, "right": -1.0}
-"""Places on the line by their share of its usable half; left is the +Y' end."""
+"""Positions on the line as fractions of its usable half; left is the +Y' end."""
 
 MARGIN = 0.02
-"""Share of the line's pixels kept between each end and the nominal windows, so that an image may move."""
+"""Fraction of the line's pixels kept between each end and the nominal windows, so that an image can move."""
 
 BAR_TILT = float(np.radians(7.0))
-"""Tilt of the bars' normal from the axis, radians: within the group every sampling phase occurs four times, even in 112
-pixels."""
+"""Tilt of the bars' normal from the axis, in radians: within the group every sampling phase occurs four times, even in
+112 pixels.
+"""
 
 BAR_SHARE = 0.45
-"""Side of the bar group, as a share of the region's."""
+"""Side of the bar group, as a fraction of the region's side."""
 
 CLEARANCE = 6.0
-"""Pixels of the group about the part that is measured."""
+"""Margin of the group around the measured part, in pixels."""
 
 _FOCUS = 1e-6
-"""Defocus to which the tables of the edges reach, metres; they are used at 0 only."""
+"""Defocus range of the edges' tables, in metres; they are used at 0 only."""
 
 
 class TargetLostError(PhysicalError):
-    """A target cannot be imaged in this state; the message says where and why."""
+    """Target that cannot be imaged in this state; the message says where and why."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One place of a camera's line in one state.
+    """Position on a camera's line in one state.
 
     Attributes
     ----------
     ccd : LineCcd
-        The line CCD.
+        Line CCD.
     light : BandPupils
         Pupils of the image in the band's light.
     local : LocalMap
         Mapping from target coordinates (metres on the nominal image scale) to the image, about the chief ray.
-    shift : np.ndarray
-        Of the chief ray's place on the focal plane against the nominal state, (along, across), metres.
+    shift : (2,) ndarray
+        Displacement of the chief ray on the focal plane from the nominal state, (along, across), in metres.
     column : int
         First column of the window on the line.
-    offset : np.ndarray
-        Of the chief ray from the middle of the window, (along, across), metres.
+    offset : (2,) ndarray
+        Distance of the chief ray from the centre of the window, (along, across), in metres.
     region : int
-        Side of the window, pixels.
+        Side of the window, in pixels.
     """
 
     ccd: LineCcd
@@ -345,60 +353,63 @@ class View:
 
     @property
     def pupil(self) -> PupilFunction:
-        """Of the image; of the shortest wavelength where each has its own."""
+        """Pupil of the image; with one pupil per wavelength, that of the shortest."""
         return self.light.shortest
 
     def transfer(self, frequency: np.ndarray) -> np.ndarray:
-        """Transfer function of the traced pupil and the detector at frequencies (M, 2), cycles/m, complex (M,)."""
+        """Return the transfer function of traced pupil and detector at frequencies (M, 2), cycles/m, complex (M,)."""
         optics = self.light.transfer(frequency, np.zeros(1))[0]
         return np.asarray(optics * self.ccd.transfer(frequency[:, 0], frequency[:, 1]))
 
     def edge(self, direction: str, angle: float) -> EdgeImager:
-        """Images of the knife edge that measures in a direction and is turned by ``angle``, radians."""
+        """Return the imager of the knife edge that measures in a direction and is rotated by ``angle``, in radians."""
         normal = knife_edge(direction, angle).mapped(self.local).normal
         optics = EdgeOptics.build(self.light, self.band, normal, _FOCUS)
         return EdgeImager(optics, self.ccd, self.region)
 
     def edge_image(self, imager: EdgeImager) -> np.ndarray:
-        """Share of the white signal in every pixel, (region, region)."""
+        """Return the fraction of the white signal in every pixel, (region, region)."""
         return imager.image(0.0, float(self.offset @ imager.optics.normal))
 
     def image(self, target: Target) -> np.ndarray:
-        """Share of the white signal in every pixel of a target of finite shapes, (region, region)."""
+        """Return the fraction of the white signal in every pixel of a target of finite shapes, (region, region)."""
         half = 0.5 * (self.region - 1) * self.band.pitch
         x, y = (Grid(float(-half - shift), self.band.pitch, self.region) for shift in self.offset)
-        # rounding and the series' guard leave up to 1e-6 below zero
+        # rounding and the guard band of the series give values down to -1e-6
         return np.maximum(target_image(target.mapped(self.local), self._transfer, self._cutoff, x, y), 0.0)
 
     def _transfer(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
+        """Return the transfer function of optics and detector."""
         return np.asarray(self._table(fx, fy) * self.ccd.transfer(fx, fy))
 
     @cached_property
     def _table(self) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        """Interpolated transfer function of the optics."""
         return self.light.table()
 
     @cached_property
     def _cutoff(self) -> float:
+        """Largest cut-off frequency over all directions, in cycles/m."""
         angle = np.linspace(0.0, np.pi, 64, endpoint=False)
-        ways = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        # between the directions the cut-off of a smooth pupil is higher by less than 1e-3
-        return 1.001 * float(np.max(self.pupil.cutoff(ways, self.band.spectrum.ends[0])))
+        directions = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        # between these directions the cut-off of a smooth pupil exceeds them by less than 1e-3
+        return 1.001 * float(np.max(self.pupil.cutoff(directions, self.band.spectrum.ends[0])))
 
 
 @dataclass(frozen=True, eq=False)
 class BarDesign:
-    """Bars in a window's middle that have the Nyquist frequency on the nominal image, and what is measured of them.
+    """Bars at the centre of a window with the Nyquist frequency on the nominal image, and the region measured.
 
     Attributes
     ----------
     target : Target
-        The bars.
-    frequency : np.ndarray
-        On the target, (2,), cycles/m.
-    nominal : np.ndarray
-        On the nominal image, (2,), cycles/m.
-    group : tuple[slice, slice]
-        (rows, columns) of the window that lie well inside the group.
+        Bars.
+    frequency : (2,) ndarray
+        Frequency on the target, in cycles/m.
+    nominal : (2,) ndarray
+        Frequency on the nominal image, in cycles/m.
+    group : tuple of slice
+        (rows, columns) of the window that are well inside the group.
     """
 
     target: Target
@@ -408,54 +419,54 @@ class BarDesign:
 
     @classmethod
     def build(cls, view: View, direction: str) -> BarDesign:
-        """For the nominal view of a place."""
+        """Return the design for the nominal view of a position."""
         pitch, jacobian = view.band.pitch, view.local.jacobian
-        turn = BAR_TILT if direction == ALONG else BAR_TILT + 0.5 * np.pi
-        nominal = view.band.nyquist * np.array([np.cos(turn), np.sin(turn)])
+        rotation = BAR_TILT if direction == ALONG else BAR_TILT + 0.5 * np.pi
+        nominal = view.band.nyquist * np.array([np.cos(rotation), np.sin(rotation)])
         # phases agree on target and image: f_target . q = f_image . (J q)
         frequency = jacobian.T @ nominal
         size, angle = float(np.hypot(*frequency)), float(np.arctan2(frequency[1], frequency[0]))
         bars = round(BAR_SHARE * view.region * pitch * view.band.nyquist)
-        # as long on the image as the group is wide there
-        stretch = float(np.hypot(*(jacobian @ np.array([-np.sin(angle), np.cos(angle)]))))
-        target = bar_group(size, bars, bars / (view.band.nyquist * stretch), angle)
-        # the upright square in a tilted one; the image lies up to half a pixel beside the middle
+        # the bars are as long on the image as the group is wide
+        scale = float(np.hypot(*(jacobian @ np.array([-np.sin(angle), np.cos(angle)]))))
+        target = bar_group(size, bars, bars / (view.band.nyquist * scale), angle)
+        # upright square inside a tilted one; the image is up to half a pixel off centre
         inside = bars - CLEARANCE - 0.5
         half = int(inside / (np.cos(BAR_TILT) + np.sin(BAR_TILT)))
         sides = slice(view.region // 2 - half, view.region - view.region // 2 + half)
         return cls(target, frequency, nominal, (sides, sides))
 
     def seen(self, view: View) -> np.ndarray:
-        """Frequency on the image of a view, (2,), cycles/m."""
+        """Return the frequency on the image of a view, (2,), in cycles/m."""
         return np.asarray(np.linalg.solve(view.local.jacobian.T, self.frequency))
 
     @property
     def per_pixel(self) -> tuple[float, float]:
-        """Nominal frequency over the Nyquist frequency's 0.5 cycles/pixel: (down the column, along the row)."""
+        """Nominal frequency, of magnitude 0.5 cycles/pixel: (down the column, along the row)."""
         along, across = 0.5 * self.nominal / float(np.hypot(*self.nominal))
         return float(across), float(along)
 
 
 def usable_pixels(pixels: int, region: int) -> float:
-    """How far the windows' middles may spread on a line, pixels; not positive where they do not fit."""
+    """Return the range of the windows' centres on a line, in pixels; not positive if they do not fit."""
     return (1.0 - 2.0 * MARGIN) * pixels - region
 
 
 class TargetCamera:
-    """A camera before targets at infinity.
+    """Camera that images targets at infinity.
 
     Parameters
     ----------
     path
-        Of its light.
+        Optical path of the camera.
     ccd
-        The line CCD.
+        Line CCD.
     region
-        Side of the windows, pixels.
+        Side of the windows, in pixels.
 
     Raises
     ------
-    ValueError
+    UnphysicalError
         The line is too short for the windows.
     """
 
@@ -473,7 +484,7 @@ class TargetCamera:
         self.directions = path.directions(self.places)
 
     def views(self, state: State) -> dict[str, View]:
-        """Every place in a state.
+        """Return the view of every position in a state.
 
         Raises
         ------
@@ -483,26 +494,29 @@ class TargetCamera:
         try:
             hits = self.path.places(state, self.directions)
             lights = self._lights(state, hits)
-            reach = self.region * self.ccd.band.pitch
-            maps = [self.path.local_map(state, direction, reach) for direction in self.directions]
+            extent = self.region * self.ccd.band.pitch
+            maps = [self.path.local_map(state, direction, extent) for direction in self.directions]
         except (AimError, BeamMissedError, ValueError) as error:
             raise TargetLostError(f"the line CCD of camera {self.path.name}: {error}") from error
         return {name: self._view(name, hits[i], self.places[i], lights[i], maps[i]) for i, name in enumerate(PLACES)}
 
     def _lights(self, state: State, hits: np.ndarray, count: int | None = None) -> list[BandPupils]:
-        """Pupils of every place in the band's light; of lenses at each wavelength of the rule of ``count``, or of as
-        many as the MTF takes.
+        """Return the pupils of every position in the band's light.
+
+        With lenses there is one for each wavelength of the rule of ``count``, or of the number that the MTF needs.
         """
         band = self.ccd.band
         if not lenses(self.path.model.spec):
-            return [BandPupils.alike(one, band) for one in self.path.pupils(state, self.directions, hits)]
+            return [BandPupils.alike(pupil, band) for pupil in self.path.pupils(state, self.directions, hits)]
         wavelengths, weights = band.spectrum.rule(self._wavelengths if count is None else count)
-        every = [self.path.pupils(state, self.directions, hits, wavelength=float(colour)) for colour in wavelengths]
-        return [BandPupils(own, wavelengths, weights) for own in zip(*every, strict=True)]
+        by_wavelength = [
+            self.path.pupils(state, self.directions, hits, wavelength=float(colour)) for colour in wavelengths
+        ]
+        return [BandPupils(pupils, wavelengths, weights) for pupils in zip(*by_wavelength, strict=True)]
 
     @cached_property
     def _wavelengths(self) -> int:
-        """How many the MTF of the camera as designed takes; of a moved one they serve as well."""
+        """Number of wavelengths for the MTF of the camera as designed; it is used for perturbed states as well."""
         hits = self.path.places({}, self.directions)
 
         def at_nyquist(count: int) -> np.ndarray:
@@ -513,6 +527,7 @@ class TargetCamera:
         return wavelengths_enough(self.ccd.band.spectrum, len(band_wavelengths(self.ccd.band)[0]), at_nyquist)
 
     def _view(self, name: str, hit: np.ndarray, nominal: np.ndarray, light: BandPupils, local: LocalMap) -> View:
+        """Return the view of one position."""
         band, shift = self.ccd.band, hit - nominal
         half = 0.5 * (self.region - 1)
         middle = hit[0] / band.pitch + 0.5 * (band.pixels - 1)

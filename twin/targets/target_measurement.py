@@ -1,6 +1,4 @@
-"""Test targets in the main job: rendered, exposed and measured for every camera, before and after; the contract of
-mtf.json.
-"""
+"""Test targets of the main job: rendering, exposure and measurement for every camera before and after; mtf.json."""
 
 from __future__ import annotations
 
@@ -29,7 +27,7 @@ from twin.targets.target_images import DIRECTIONS, PLACES, BarDesign, TargetCame
 from twin.targets.target_path import TargetPath
 
 NYQUIST = 0.5
-"""Nyquist frequency of any pixel, cycles/pixel."""
+"""Nyquist frequency of any pixel, in cycles/pixel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +37,14 @@ class TargetReading:
     Attributes
     ----------
     reason : str
-        Why the frames cannot be measured; empty if they can.
+        Reason why the frames cannot be measured; empty if they can.
     true_nyquist : float
         MTF of the traced pupil and the detector at ``at_nyquist``.
-    at_nyquist : tuple[float, float]
-        Frequency of what is called the MTF at Nyquist, (along, track), cycles/pixel.
+    at_nyquist : tuple of float
+        Frequency of the result called MTF at Nyquist, (along, track), in cycles/pixel.
     true_axis : float
-        What ``true_nyquist`` would be without the target's tilt, at the Nyquist frequency along the line or along the
-        track: that of image quality at this place.
+        Value of ``true_nyquist`` without the target's tilt, at the Nyquist frequency along the line or along the track:
+        that of image quality at this position.
     """
 
     reason: str
@@ -62,11 +60,11 @@ class EdgeReading(TargetReading):
     Attributes
     ----------
     measured : EdgeMtf | None
-        From the frames, None if they cannot be measured.
-    frequency : np.ndarray
-        (F,) along the edge's normal, cycles/m.
-    true : np.ndarray
-        (F,) MTF of the traced pupil and the detector there.
+        Result from the frames; None if they cannot be measured.
+    frequency : (F,) ndarray
+        Frequencies along the edge's normal, in cycles/m.
+    true : (F,) ndarray
+        MTF of the traced pupil and the detector at these frequencies.
     """
 
     measured: EdgeMtf | None
@@ -80,7 +78,7 @@ class EdgeReading(TargetReading):
 
     @property
     def nyquist_bias(self) -> float | None:
-        """How much noise lengthens the measured MTF at the Nyquist frequency on the average."""
+        """Mean increase of the measured MTF at the Nyquist frequency by noise."""
         edge = self.measured
         return None if edge is None else float(np.interp(NYQUIST, edge.frequency, edge.noise_bias))
 
@@ -92,7 +90,7 @@ class BarReading(TargetReading):
     Attributes
     ----------
     measured : BarMtf | None
-        From the frames, None if they cannot be measured.
+        Result from the frames; None if they cannot be measured.
     """
 
     measured: BarMtf | None
@@ -105,18 +103,18 @@ class BarReading(TargetReading):
 
 @dataclass(frozen=True, eq=False)
 class TargetShots:
-    """All targets at one place in one state.
+    """Images of all targets at one position in one state.
 
     Attributes
     ----------
-    frames : Mapping[str, np.ndarray]
+    frames : mapping of str to ndarray
         Name of the image -> grey values, uint16 (N, H, W).
     column : int
-        Of the windows' first pixels on the line.
-    edges, bars : Mapping[str, EdgeReading]
+        Position of the windows' first pixels on the line.
+    edges, bars : mapping
         Direction -> reading; empty if not rendered.
     light_lost : float
-        Share of the light that bodies in the beam take.
+        Fraction of the light that bodies in the beam block.
     """
 
     frames: Mapping[str, np.ndarray]
@@ -128,16 +126,16 @@ class TargetShots:
 
 @dataclass(frozen=True, eq=False)
 class PlaceTargets:
-    """Before and after at one place of a line.
+    """Targets before and after the perturbation at one position of a line.
 
     Attributes
     ----------
-    place : np.ndarray
-        Nominal (along, across) on the focal plane, metres.
-    shift : np.ndarray
-        True move of the image of a fixed direction on the focal plane, (along, across), metres.
+    place : (2,) ndarray
+        Nominal (along, across) on the focal plane, in metres.
+    shift : (2,) ndarray
+        True displacement of the image of a fixed direction on the focal plane, (along, across), in metres.
     before, after : TargetShots
-        The images.
+        Images in both states.
     """
 
     place: np.ndarray
@@ -147,22 +145,22 @@ class PlaceTargets:
 
     @property
     def shots(self) -> dict[str, TargetShots]:
-        """By their names in files and results."""
+        """Images by the names of the states in files and results."""
         return {"before": self.before, "after": self.after}
 
 
 @dataclass(frozen=True, eq=False)
 class CameraTargets:
-    """One camera.
+    """Targets of one camera.
 
     Attributes
     ----------
     band : str
         Name of the line CCD's band.
     pitch : float
-        Of its pixels, metres.
-    places : Mapping[str, PlaceTargets]
-        Left, centre, right.
+        Pixel pitch, in metres.
+    places : mapping of str to PlaceTargets
+        Positions left, centre, right.
     """
 
     band: str
@@ -172,16 +170,16 @@ class CameraTargets:
 
 @dataclass(frozen=True, eq=False)
 class TargetRun:
-    """All cameras.
+    """Targets of all cameras.
 
     Attributes
     ----------
-    cameras : Mapping[str, CameraTargets]
-        By name.
+    cameras : mapping of str to CameraTargets
+        Targets by camera.
     frames : int
-        Of each image.
+        Number of frames of each image.
     obstruction : bool
-        Whether what stands in the beams is missing in the pupils.
+        True if light blocked by bodies in the beams is missing in the pupils.
     """
 
     cameras: Mapping[str, CameraTargets]
@@ -189,41 +187,45 @@ class TargetRun:
     obstruction: bool = True
 
     def images(self) -> Iterator[tuple[str, str, np.ndarray, FrameFacts]]:
-        """Every image: the stem of its file, its name, the frames (N, H, W) and what is known of them."""
-        for camera, found in self.cameras.items():
-            for place, targets in found.places.items():
+        """Yield every image: stem of its file, name, frames (N, H, W) and their description."""
+        for camera, targets_of_camera in self.cameras.items():
+            for place, targets in targets_of_camera.places.items():
                 for when, shots in targets.shots.items():
                     for name, frames in shots.frames.items():
                         facts = FrameFacts(
-                            f"{camera}, line CCD {found.band}", found.pitch, note=f"{name}, {place}, {when}"
+                            f"{camera}, line CCD {targets_of_camera.band}",
+                            targets_of_camera.pitch,
+                            note=f"{name}, {place}, {when}",
                         )
                         yield f"{camera}_{place}_{name}_{when}", name, frames, facts
 
     @property
     def has_edges(self) -> bool:
-        """Whether there are curves."""
+        """True if there are MTF curves of knife edges."""
         return any(place.before.edges for camera in self.cameras.values() for place in camera.places.values())
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What could not be measured, and why."""
+        """Warnings about targets that could not be measured, with the reason."""
         out = []
-        for camera, found in self.cameras.items():
-            for place, targets in found.places.items():
+        for camera, targets_of_camera in self.cameras.items():
+            for place, targets in targets_of_camera.places.items():
                 for when, shots in targets.shots.items():
                     kinds = (("knife edge", shots.edges), ("bars", shots.bars))
                     for what, readings in kinds:
                         for direction, reading in readings.items():
                             if reading.measured is None:
                                 out.append(
-                                    f"{what} ({direction}) at the {place} of {camera} {when}: no MTF at Nyquist, truly "
-                                    f"{reading.true_nyquist:.3f}: {reading.reason}"
+                                    f"{what} ({direction}) at the {place} of {camera} {when}: no MTF at Nyquist "
+                                    f"(true value {reading.true_nyquist:.3f}): {reading.reason}"
                                 )
         return tuple(out)
 
     def to_dict(self) -> dict[str, Any]:
-        """Contents of mtf.json. What could not be measured is null; ``truth`` has the shape of ``cameras``, and the MTF
-        on the axes, which tilted edges and bars do not see, beside it.
+        """Return the contents of mtf.json.
+
+        Values that could not be measured are null. ``truth`` has the shape of ``cameras`` and adds the MTF on the axes,
+        which tilted edges and bars do not measure.
         """
         cameras, truth = {}, {}
         for name, camera in self.cameras.items():
@@ -248,7 +250,7 @@ class TargetRun:
 
 
 def _directions(targets: PlaceTargets, say: Any) -> dict[str, Any]:
-    """Direction -> before/after -> what ``say`` makes of the readings."""
+    """Return direction -> before/after -> result of ``say`` for the readings."""
     out: dict[str, Any] = {}
     for when, shots in targets.shots.items():
         for direction in sorted({*shots.edges, *shots.bars}):
@@ -257,12 +259,13 @@ def _directions(targets: PlaceTargets, say: Any) -> dict[str, Any]:
 
 
 def _measured(edge: EdgeReading | None, bars: BarReading | None) -> dict[str, Any]:
+    """Return the measured values of one direction as plain data."""
     out: dict[str, Any] = {}
     if edge is not None:
         value, sigma = edge.nyquist or (None, None)
-        found = edge.measured
+        result = edge.measured
         out |= {"mtf_nyquist": value, "mtf_nyquist_sigma": sigma, "mtf_nyquist_noise_bias": edge.nyquist_bias}
-        out["curve"] = None if found is None else {**_curve(edge, found.mtf), "mtf_sigma": found.sigma.tolist()}
+        out["curve"] = None if result is None else {**_curve(edge, result.mtf), "mtf_sigma": result.sigma.tolist()}
     if bars is not None:
         value, sigma = bars.nyquist or (None, None)
         out |= {"bars_mtf": value, "bars_mtf_sigma": sigma}
@@ -270,6 +273,7 @@ def _measured(edge: EdgeReading | None, bars: BarReading | None) -> dict[str, An
 
 
 def _true(edge: EdgeReading | None, bars: BarReading | None) -> dict[str, Any]:
+    """Return the true values of one direction as plain data."""
     out: dict[str, Any] = {}
     if edge is not None:
         out |= {"mtf_nyquist": edge.true_nyquist, "curve": _curve(edge, edge.true)}
@@ -281,29 +285,30 @@ def _true(edge: EdgeReading | None, bars: BarReading | None) -> dict[str, Any]:
 
 
 def _curve(edge: EdgeReading, mtf: np.ndarray) -> dict[str, list[float]]:
+    """Return an MTF curve as plain data."""
     return {"frequency_per_mm": (1e-3 * edge.frequency).tolist(), "mtf": mtf.tolist()}
 
 
 CURVE = np.linspace(0.0, 1.0, 65)
-"""Frequencies of the measured curves, cycles/pixel: to twice the Nyquist frequency."""
+"""Frequencies of the measured curves, in cycles/pixel, up to twice the Nyquist frequency."""
 
 LARGEST_FRAMES = 400_000_000
-"""Pixels of all frames together, which are kept: 0.8 GB."""
+"""Largest number of pixels of all frames together, which stay in memory: 0.8 GB."""
 
 EVEN_FIELDS = {"dark": 0.0, "bright": 1.0}
-"""Recorded with bars: share of the white signal."""
+"""Even fields recorded with bars, as fractions of the white signal."""
 
 _PATTERN, _EXPOSURE = 3, 4
 """Random streams of the job's seed, beside those of the monitor."""
 
 
 def target_pixels(resolved: ResolvedJob) -> int:
-    """Pixels of all frames of a job's test targets, before and after.
+    """Return the number of pixels of all frames of a job's test targets, before and after.
 
     Parameters
     ----------
     resolved : ResolvedJob
-        The job.
+        Job.
     """
     settings, names = resolved.targets, resolved.job.render.target_images
     kinds = sum({"knife_edge": len(DIRECTIONS), "bars": len(DIRECTIONS) + len(EVEN_FIELDS)}.get(n, 1) for n in names)
@@ -312,7 +317,7 @@ def target_pixels(resolved: ResolvedJob) -> int:
 
 
 def check_targets(resolved: ResolvedJob) -> None:
-    """See before any work whether the targets can be recorded as the job says.
+    """Raise InputError if the targets cannot be recorded as the job requires, before any work.
 
     Raises
     ------
@@ -345,23 +350,23 @@ def check_targets(resolved: ResolvedJob) -> None:
 
 
 def _band(resolved: ResolvedJob, name: str) -> str:
-    """Name of the band whose line CCD of a camera images targets."""
+    """Return the name of the band whose line CCD images targets."""
     return target_band(resolved.cameras[resolved.instrument.cameras[name].camera])
 
 
 def target_camera(resolved: ResolvedJob, instrument: Instrument, name: str, backend: Backend) -> TargetCamera:
-    """A camera of an instrument before targets, with the line CCD, the windows and the obstruction that a job asks for.
+    """Return a camera for targets, with the line CCD, windows and obstruction of a job.
 
     Parameters
     ----------
     resolved : ResolvedJob
-        The job, with the data sheets of its line CCDs.
+        Job with the data sheets of its line CCDs.
     instrument : Instrument
-        As built from it.
+        Instrument built from the job.
     name : str
-        Of the camera.
+        Name of the camera.
     backend : Backend
-        Where to trace.
+        Backend of the ray trace.
     """
     assert resolved.line_detectors is not None
     model, sheet = instrument.cameras[name], resolved.line_detectors[resolved.instrument.cameras[name].camera]
@@ -384,22 +389,22 @@ def render_targets(
     Parameters
     ----------
     resolved : ResolvedJob
-        The job, with targets among its images, as ``check_targets`` lets it pass.
+        Job with targets among its images, accepted by ``check_targets``.
     instrument : Instrument
-        As built from it.
+        Instrument built from the job.
     backend : Backend
-        Where to trace.
+        Backend of the ray trace.
     state : State
-        After the perturbation.
+        State after the perturbation.
     seed : int
-        Of the noise.
-    advance : Callable[[int, int], None]
-        Told how many of how many windows are done.
+        Seed of the noise.
+    advance : callable
+        Called with the number of windows that are done, and their total.
 
     Raises
     ------
     TargetLostError
-        The perturbation moves the light off.
+        The perturbation moves the light off the line or the mirrors.
     """
     settings, images = resolved.targets, resolved.job.render.target_images
     frames = settings.frames or 1
@@ -413,7 +418,7 @@ def render_targets(
         pattern = ccd.pattern(stream(seed, _PATTERN, number))
         places = {}
         for k, place in enumerate(PLACES):
-            shooter = _Shooter(settings, frames, images, before[place], pattern)
+            shooter = _TargetRecorder(settings, frames, images, before[place], pattern)
             shots = []
             for when, view in enumerate((before[place], after[place])):
                 advance(done, total)
@@ -425,8 +430,8 @@ def render_targets(
     return TargetRun(cameras, frames, resolved.job.render.obstructed)
 
 
-class _Shooter:
-    """Takes the images of all targets at one place."""
+class _TargetRecorder:
+    """Recorder of the images of all targets at one position."""
 
     def __init__(
         self, settings: TargetsSpec, frames: int, images: tuple[str, ...], nominal: View, pattern: FixedPattern
@@ -455,7 +460,7 @@ class _Shooter:
                 edges[direction] = read_edge(view, direction, imager.optics.normal, mean, self.count)
         if self.bars:
             means = {d: expose(f"bars_{d}", view.image(design.target)) for d, design in self.bars.items()}
-            # the levels as a bench takes them: shutter closed, and the source without a target
+            # the levels as measured on a bench: shutter closed, and the source without a target
             even = np.ones((view.region, view.region))
             dark, bright = (expose(f"bars_{name}", level * even) for name, level in EVEN_FIELDS.items())
             bars = {
@@ -468,59 +473,59 @@ class _Shooter:
 
 
 def on_axis(view: View, direction: str) -> float:
-    """MTF of the traced pupil and the detector at the Nyquist frequency along the line or along the track."""
+    """Return the MTF of traced pupil and detector at the Nyquist frequency along the line or along the track."""
     axis = np.eye(2)[DIRECTIONS.index(direction)]
     return float(np.abs(view.transfer(NYQUIST / view.band.pitch * axis[None]))[0])
 
 
 def read_edge(view: View, direction: str, normal: np.ndarray, mean: np.ndarray, frames: int) -> EdgeReading:
-    """Measure the mean (H, W) of some frames of a knife edge with this normal, and trace the truth."""
+    """Measure the mean (H, W) of frames of a knife edge with this normal, and compute the true MTF."""
     frequency = CURVE / view.band.pitch
     wanted = np.append(frequency, NYQUIST / view.band.pitch)
     true = np.abs(view.transfer(wanted[:, None] * normal))
-    found: EdgeMtf | None = None
+    measured: EdgeMtf | None = None
     reason = ""
     try:
-        found = slanted_edge_mtf(mean, noise=view.ccd.noise, frames=frames, frequency=CURVE, uniform_light=True)
+        measured = slanted_edge_mtf(mean, noise=view.ccd.noise, frames=frames, frequency=CURVE, uniform_light=True)
     except EdgeError as error:
         reason = str(error)
     at_nyquist = NYQUIST * float(normal[0]), NYQUIST * float(normal[1])
-    own = reason, float(true[-1]), at_nyquist, on_axis(view, direction)
-    return EdgeReading(*own, found, frequency, true[:-1])
+    common = reason, float(true[-1]), at_nyquist, on_axis(view, direction)
+    return EdgeReading(*common, measured, frequency, true[:-1])
 
 
 def read_bars(
     view: View, direction: str, design: BarDesign, mean: np.ndarray, dark: np.ndarray, bright: np.ndarray, frames: int
 ) -> BarReading:
-    """Measure the mean (H, W) of some frames of a bar target, and trace the truth.
+    """Measure the mean of frames of a bar target, and compute the true MTF.
 
     Parameters
     ----------
     view : View
-        The place.
+        View of the position.
     direction : str
-        That they measure.
+        Direction that the bars measure.
     design : BarDesign
-        The bars.
-    mean : np.ndarray
-        (H, W) of their frames, grey values.
-    dark : np.ndarray
-        (H, W) of as many frames with the shutter closed.
-    bright : np.ndarray
-        (H, W) of as many frames of an even field, as bright as the bars.
+        Design of the bars.
+    mean : (H, W) ndarray
+        Mean of the frames, in grey values.
+    dark : (H, W) ndarray
+        Mean of as many frames with the shutter closed.
+    bright : (H, W) ndarray
+        Mean of as many frames of an even field, as bright as the bars.
     frames : int
-        How many.
+        Number of frames.
     """
     frequency = design.seen(view)
     true = float(np.abs(view.transfer(frequency[None]))[0])
     along, track = (frequency * view.band.pitch).tolist()
-    found: BarMtf | None = None
+    measured: BarMtf | None = None
     reason = ""
     try:
-        found = bar_mtf(
+        measured = bar_mtf(
             mean[design.group], dark[design.group], bright[design.group], design.per_pixel,
             noise=view.ccd.noise, frames=frames,
         )  # fmt: skip
     except BarError as error:
         reason = str(error)
-    return BarReading(reason, true, (along, track), on_axis(view, direction), found)
+    return BarReading(reason, true, (along, track), on_axis(view, direction), measured)

@@ -1,8 +1,8 @@
-"""From a target in front of a camera to its image: pupils and the exact mapping of the field, by ray tracing.
+"""Optical path from a target in front of a camera to its image: pupils and exact field mapping, by ray tracing.
 
-Image coordinates are (along, across) = (Y', X') of the focal-plane frame, metres: columns of an image run along the
-line CCD, rows along the track. A target stands in the collimator's focal plane with its own coordinates in the same
-sense, so that its image is ``f / focal_length`` times its size and upright in these coordinates.
+Image coordinates are (along, across) = (Y', X') of the focal-plane frame, in metres: columns of an image run along the
+line CCD, rows along the track. A target is in the collimator's focal plane with its own coordinates in the same sense,
+so that its image is ``f / focal_length`` times its size and upright in these coordinates.
 """
 
 from __future__ import annotations
@@ -29,25 +29,24 @@ from optics.targets.collimator import Collimator
 from optics.waves.diffraction import PupilField
 from optics.waves.edge_shadow import StopOutlines, converged_shadows
 from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupil_field
-from optics.waves.line_transfer import LINE_SIDES, VignettedPupil, vignetted_pupils, unvignetted_at
+from optics.waves.line_transfer import LINE_SIDES, VignettedPupil, unvignetted_at, vignetted_pupils
 from optics.waves.optical_transfer import with_enough_nodes
 from optics.waves.pupil_shadow import SMALLEST
-from optics.waves.pupil_stack import VIGNETTED_RESIDUAL, VIGNETTED_RINGS, DEGREE, PupilFunction, fit_pupils
+from optics.waves.pupil_stack import DEGREE, VIGNETTED_RESIDUAL, VIGNETTED_RINGS, PupilFunction, fit_pupils
 from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, coloured, line_body
 from scenes.models.shadow import ImagingShadows, SeenEdges, TracedBeams
 
 RINGS = 14
-"""Rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond what mirrors and figures make."""
+"""Rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond those of mirrors and figures."""
 
 MORE_RINGS = 28
-"""Of the quadrature of a pupil that edges leave a wavefront which polynomials through fewer rays do not follow."""
+"""Rings of the quadrature for a vignetted pupil whose wavefront polynomials through fewer rays do not fit."""
 
 SMOOTH = 1e-6
-"""Rms eikonal that the polynomials of a wavefront leave which is smooth, wavelengths."""
+"""Largest rms residual of the eikonal beyond the polynomials of a smooth wavefront, in wavelengths."""
 
 WORST_PLACED = 5e-3
-"""Share of the rays through the pupil's quadrature that may pass edges where outlines tell otherwise: four, close to
-an edge."""
+"""Largest fraction of the quadrature's rays that the outlines of edges may misjudge: four rays, close to an edge."""
 
 MAP_POINTS = 7
 MAP_ORDER = 4
@@ -61,11 +60,11 @@ class LocalMap:
     Attributes
     ----------
     scale : float
-        Largest target coordinate, metres; coordinates are divided by it.
-    coefficients : np.ndarray
-        (terms, 2), of the monomials of ``_monomials``.
+        Largest target coordinate, in metres; coordinates are divided by it.
+    coefficients : (terms, 2) ndarray
+        Coefficients of the monomials of ``_monomials``.
     residual : float
-        Largest distance of the traced chief rays from the polynomial, metres.
+        Largest distance of the traced chief rays from the polynomial, in metres.
     """
 
     scale: float
@@ -73,30 +72,30 @@ class LocalMap:
     residual: float
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Image coordinates (N, 2) relative to the middle's chief ray, of target coordinates (N, 2), metres."""
+        """Return image coordinates (N, 2) relative to the central chief ray, for target coordinates (N, 2), metres."""
         return np.asarray(_monomials(points / self.scale) @ self.coefficients)
 
     @property
     def jacobian(self) -> np.ndarray:
-        """d(along, across)/d(target coordinates) in the middle, (2, 2)."""
+        """Derivative d(along, across)/d(target coordinates) at the centre, (2, 2)."""
         return np.asarray(self.coefficients[1:3].T / self.scale)
 
 
 @shows("position [mm]", "path [m]", "valid")
 @dataclass(frozen=True, eq=False)
 class LineRays:
-    """Rays of F beams, N each, where they meet the line CCD, in its own frame: X' along the track, Y' along the line.
+    """Rays of F beams, N each, at the line CCD, in its own frame: X' along the track, Y' along the line.
 
     Attributes
     ----------
-    position, direction : np.ndarray
-        (F, N, 3), metres and unit.
-    path : np.ndarray
-        Optical path from the incoming plane wavefront, (F, N), metres.
-    valid : np.ndarray
-        False where an aperture stops the ray, (F, N).
+    position, direction : (F, N, 3) ndarray
+        Positions, in metres, and unit directions.
+    path : (F, N) ndarray
+        Optical path from the incoming plane wavefront, in metres.
+    valid : (F, N) ndarray of bool
+        False if an aperture stops the ray.
     size : float
-        Of the line CCD relative to nominal.
+        Size of the line CCD relative to nominal.
     """
 
     position: np.ndarray
@@ -107,29 +106,30 @@ class LineRays:
 
 
 def _monomials(q: np.ndarray) -> np.ndarray:
+    """Return the monomials of the local mapping."""
     powers = [(a - b, b) for a in range(MAP_ORDER + 1) for b in range(a + 1)]
     return np.stack([q[..., 0] ** a * q[..., 1] ** b for a, b in powers], axis=-1)
 
 
 class TargetPath:
-    """A camera that looks at targets.
+    """Optical path of a camera that looks at targets.
 
     Parameters
     ----------
     assembly
-        That holds the camera.
+        Assembly that contains the camera.
     name
         Prefix of its sequences ``NAME/imaging``, ``NAME/to_stop``, ``NAME/image_to_stop`` ...
     root
         Path of its body.
     model
-        Its derived numbers.
+        Derived numbers of the camera.
     backend
-        Where to trace.
+        Backend of the ray trace.
     collimator
-        What it looks into; None for a far scene.
+        Collimator before the camera; None for a distant scene.
     shadows
-        What stands in its beams; None for a camera alone, or to ignore it.
+        Bodies in its beams; None for a camera alone, or to ignore them.
     """
 
     def __init__(
@@ -157,14 +157,19 @@ class TargetPath:
 
     @property
     def target_distance(self) -> float:
-        """Divides target coordinates into angles: the collimator's focal length, or that of the camera along its line,
-        so that a far target is measured on the image.
+        """Distance that converts target coordinates to angles, in metres.
+
+        It is the collimator's focal length, or the principal distance of the camera along its line, so that a distant
+        target is measured on the image.
         """
         return self.model.line_principal_distance if self.collimator is None else self.collimator.focal_length
 
     def directions(self, places: np.ndarray, state: State | None = None) -> np.ndarray:
-        """Directions of the light, world, (F, 3), that the camera images at places (F, 2), (along, across), metres, of
-        its line CCD; as designed unless a ``state`` is given.
+        """Return the directions of light, world, (F, 3), imaged at positions (F, 2) of the line CCD.
+
+        Positions are (along, across), in metres.
+
+        They are those of the camera as designed unless a ``state`` is given.
         """
         states = [state or {}]
         placed = self.assembly.place(states)
@@ -182,50 +187,52 @@ class TargetPath:
         return np.asarray(-sight[0])
 
     def coloured(self, state: State, wavelength: float) -> State:
-        """The state as light of another wavelength (metres) than the design's meets it, see
-        ``scenes.models.camera_model.coloured``.
+        """Return the state as it acts on light of another wavelength, in metres.
+
+        See ``scenes.models.camera_model.coloured``.
 
         Raises
         ------
         ValueError
-            a lens whose glass is not named, or not known there.
+            The glass of a lens has no name, or its index at this wavelength is unknown.
         """
         return coloured(self.model.spec, self.root, state, wavelength)
 
     def places(self, state: State, directions: np.ndarray) -> np.ndarray:
-        """Where chief rays of directions (F, 3) meet the line CCD, (F, 2) (along, across).
+        """Return where chief rays of directions (F, 3) hit the line CCD, (F, 2) (along, across).
 
-        In metres of the nominal CCD: its pixels keep their pitch in these coordinates when it grows.
+        Positions are in metres of the nominal CCD: in these coordinates the pixel pitch is constant when the CCD
+        expands.
 
         Raises
         ------
         BeamMissedError
-            a chief ray does not reach the line CCD.
+            A chief ray does not reach the line CCD.
         """
-        # a chief ray that a mirror in the middle of the beam stops is still the beam's middle
+        # a chief ray blocked by a mirror at the centre of the beam is still the centre of the beam
         rays = self.rays(state, directions, np.zeros((1, 2)), edges=False)
         return np.asarray(rays.position[:, 0, 1::-1] / rays.size)
 
     def rays(self, state: State, directions: np.ndarray, points: np.ndarray, edges: bool = True) -> LineRays:
-        """Rays of beams of directions (F, 3), world, through points of the stop in units of its radius.
+        """Trace rays of beams of directions (F, 3), world, through points of the stop in units of its radius.
 
         Parameters
         ----------
         state : State
-            Of the assembly.
-        directions : np.ndarray
-            Of the light.
-        points : np.ndarray
-            Of the stop, (N, 2); without ``edges`` also of each beam, (F, N, 2).
+            State of the assembly.
+        directions : (F, 3) ndarray
+            Directions of the light.
+        points : (N, 2) ndarray
+            Points of the stop; without ``edges`` also one set for each beam, (F, N, 2).
         edges : bool
-            Whether edges of the camera's surfaces and bodies in the beams stop rays.
+            True if edges of the camera's surfaces and bodies in the beams stop rays.
 
         Raises
         ------
         AimError
-            a beam does not reach the stop.
+            A beam does not reach the stop.
         BeamMissedError
-            Nothing of one reaches the line CCD.
+            No ray of a beam reaches the line CCD.
         """
         placed = self.assembly.place([state])
         systems, to_stop = self._systems(state, len(directions), placed)
@@ -248,12 +255,14 @@ class TargetPath:
         return LineRays(position, leaving, path, valid, float(systems.size[0]))
 
     def shadow_pieces(self, state: State, directions: np.ndarray) -> np.ndarray:
-        """What bodies take of beams of directions (F, 3): convex polygons on the stop's unit disk, (F, K, V, 2).
+        """Return the shadows of bodies in beams of directions (F, 3), (F, K, V, 2).
+
+        They are convex polygons on the stop's unit disk.
 
         Raises
         ------
         AimError, BeamMissedError
-            As ``rays``.
+            Light is lost, see ``rays``.
         """
         if self.shadows is None:
             return np.zeros((len(directions), 0, 3, 2))
@@ -266,7 +275,7 @@ class TargetPath:
     def _imaging(
         self, state: State, directions: np.ndarray, nodes: PupilNodes | None = None
     ) -> tuple[PlacedBodies, SystemBatch, ImagingRays]:
-        """Beams through nodes of the stop, ``self.nodes`` by default, to the line CCD."""
+        """Trace beams through nodes of the stop, by default ``self.nodes``, to the line CCD."""
         nodes = self.nodes if nodes is None else nodes
         placed = self.assembly.place([state])
         systems, to_stop = self._systems(state, len(directions), placed)
@@ -282,108 +291,118 @@ class TargetPath:
         target_shift: float = 0.0,
         wavelength: float | None = None,
     ) -> tuple[PupilFunction, ...]:
-        """Pupil of the image of each direction (F, 3), about its own place (F, 2) on the line CCD.
+        """Return the pupil of the image of each direction (F, 3), about its own position (F, 2) on the line CCD.
 
-        Its lengths are those of ``places``.
+        Its lengths are in the units of ``places``.
 
         Parameters
         ----------
         state : State
-            Of the assembly.
-        directions : np.ndarray
-            Of the light, world.
-        places : np.ndarray
-            As ``places`` gives them for the same state; what they are at the design wavelength is what all colours of
-            an image count from.
+            State of the assembly.
+        directions : (F, 3) ndarray
+            Directions of the light, world.
+        places : (F, 2) ndarray
+            Positions from ``places`` for the same state; those at the design wavelength are the reference for all
+            colours of an image.
         target_shift : float
-            Of the collimator's target, see ``Collimator.path``.
+            Displacement of the collimator's target, see ``Collimator.path``.
         wavelength : float | None
-            Of the light, metres; the design wavelength by default.
+            Wavelength, in metres; None for the design wavelength.
 
         Raises
         ------
         BeamMissedError, AimError
-            The beam does not get through.
+            The beam is lost.
         ValueError
-            It is vignetted, or a glass is not known at that wavelength.
+            The beam is vignetted, or the index of a glass is unknown at that wavelength.
         """
         colour = self.model.spec.wavelength if wavelength is None else wavelength
         state = self.coloured(state, colour)
         placed, systems, rays = self._imaging(state, directions)
-        taken, _ = self._taken(placed, systems, rays, directions)
-        turned = self._field(rays, systems, places, colour, target_shift)
-        if not self.model.edges or taken is None:
-            return fit_pupils(turned, self.nodes, DEGREE, taken)
+        shadows, _ = self._taken(placed, systems, rays, directions)
+        field = self._field(rays, systems, places, colour, target_shift)
+        if not self.model.edges or shadows is None:
+            return fit_pupils(field, self.nodes, DEGREE, shadows)
         points = np.stack([self.nodes.x, self.nodes.y], axis=-1)
-        lit = ~covered(taken, points, SMALLEST)
-        cut = fit_pupils(turned, self.nodes, DEGREE, taken, lit)
-        return tuple(with_enough_nodes(pupil, turned.wavelength) for pupil in cut)
+        illuminated = ~covered(shadows, points, SMALLEST)
+        vignetted = fit_pupils(field, self.nodes, DEGREE, shadows, illuminated)
+        return tuple(with_enough_nodes(pupil, field.wavelength) for pupil in vignetted)
 
     def _field(
         self, rays: ImagingRays, systems: SystemBatch, places: np.ndarray, wavelength: float, target_shift: float = 0.0
     ) -> PupilField:
-        """Field of traced beams in the pupil, along the line CCD and across, with arguments of ``pupils``."""
+        """Return the field of traced beams in the pupil, along the line CCD and across; arguments as for ``pupils``."""
         origin = systems.size[:, None] * np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
         collimator = self.collimator
         incoming = None if collimator is None else lambda point: collimator.path(point, target_shift)
         field = pupil_field(rays, wavelength, origin, incoming)
-        turned = PupilField(field.v, field.u, field.eikonal, field.amplitude, field.wavelength)
-        return turned.scaled_by(systems.size)
+        swapped = PupilField(field.v, field.u, field.eikonal, field.amplitude, field.wavelength)
+        return swapped.scaled_by(systems.size)
 
     def vignetted_pupils(
         self, state: State, directions: np.ndarray, places: np.ndarray, wavelength: float | None = None
     ) -> tuple[VignettedPupil, ...]:
-        """Pupils of a camera with edges for ``optics.waves.line_transfer``; arguments and exceptions as ``pupils``.
+        """Return pupils of a camera with edges for ``optics.waves.line_transfer``.
 
-        A smooth wavefront needs no more nodes than a free pupil's; any other is traced at those of ``nodes``, and at
-        more where polynomials through these do not follow it.
+        Arguments and exceptions are those of ``pupils``.
+
+        A smooth wavefront needs no more nodes than that of a free pupil; any other is traced at those of ``nodes``,
+        and at more if polynomials through these do not fit it.
         """
         colour = self.model.spec.wavelength if wavelength is None else wavelength
-        for nodes, rest in ((quadrature.disk(RINGS), SMOOTH), (self.nodes, VIGNETTED_RESIDUAL)):
+        for nodes, tolerance in ((quadrature.disk(RINGS), SMOOTH), (self.nodes, VIGNETTED_RESIDUAL)):
             with suppress(UnphysicalError):
-                cut = self._cut_pupils(state, directions, places, colour, nodes)
-                if all(one.pupil.eikonal_residual <= rest * colour for one in cut):
-                    return cut
+                vignetted = self._cut_pupils(state, directions, places, colour, nodes)
+                if all(pupil.pupil.eikonal_residual <= tolerance * colour for pupil in vignetted):
+                    return vignetted
         return self._cut_pupils(state, directions, places, colour, quadrature.disk(MORE_RINGS))
 
     def _cut_pupils(
         self, state: State, directions: np.ndarray, places: np.ndarray, colour: float, nodes: PupilNodes
     ) -> tuple[VignettedPupil, ...]:
+        """Return vignetted pupils traced at some nodes."""
         state = self.coloured(state, colour)
         placed, systems, rays = self._imaging(state, directions, nodes)
         owner = np.zeros(len(directions), dtype=int)
         beams = TracedBeams(self.assembly, placed, owner, systems, rays, directions, nodes)
         bodies = np.zeros((len(directions), 0, 3, 2)) if self.shadows is None else self.shadows.cast(beams).pieces
-        seen = SeenEdges.of(beams, self.model, self.name, self.backend)
-        outlines = seen.outlines(LINE_SIDES) + StopOutlines((), tuple(np.moveaxis(bodies, 1, 0)))
-        lit = seen.passed[-1] & ~covered(bodies, np.stack([nodes.x, nodes.y], axis=-1), SMALLEST)
+        edges = SeenEdges.of(beams, self.model, self.name, self.backend)
+        outlines = edges.outlines(LINE_SIDES) + StopOutlines((), tuple(np.moveaxis(bodies, 1, 0)))
+        illuminated = edges.passed[-1] & ~covered(bodies, np.stack([nodes.x, nodes.y], axis=-1), SMALLEST)
         field = self._field(rays, systems, places, colour)
-        cut = vignetted_pupils(fit_pupils(field, nodes, DEGREE, None, lit), field.u, field.v, nodes, outlines, lit)
-        for k, pupil in enumerate(cut):
+        vignetted = vignetted_pupils(
+            fit_pupils(field, nodes, DEGREE, None, illuminated), field.u, field.v, nodes, outlines, illuminated
+        )
+        for k, pupil in enumerate(vignetted):
             (x, y), (a, b) = (
                 np.linalg.inv(pupil.pupil.axes),
                 np.stack([field.u[k], field.v[k]]) - pupil.pupil.centre[:, None],
             )
-            off = float(nodes.share @ (unvignetted_at(pupil, (x[0] * a + x[1] * b) + 1j * (y[0] * a + y[1] * b)) != lit[k]))
-            if off > WORST_PLACED:
-                raise UnphysicalError(f"outlines of its edges are wrong about {off:.2g} of a traced beam's rays")
-        return cut
+            misjudged = float(
+                nodes.share
+                @ (unvignetted_at(pupil, (x[0] * a + x[1] * b) + 1j * (y[0] * a + y[1] * b)) != illuminated[k])
+            )
+            if misjudged > WORST_PLACED:
+                raise UnphysicalError(
+                    f"the outlines of its edges misjudge a fraction {misjudged:.2g} of a traced beam's rays"
+                )
+        return vignetted
 
     def shadows_on_stop(self, state: State, directions: np.ndarray) -> tuple[np.ndarray, float]:
-        """What edges of the camera's surfaces and bodies take of beams of directions (F, 3).
+        """Return the shadows of edges of the camera's surfaces and of bodies in beams of directions (F, 3).
 
         Returns
         -------
-        tuple[np.ndarray, float]
-            Convex polygons on the stop's unit disk that do not overlap, (F, K, V, 2), and how much of its area their
-            shares are right to.
+        tuple of (ndarray, float)
+            Convex polygons on the stop's unit disk that do not overlap, (F, K, V, 2), and the accuracy of their
+            fractions of its area.
 
         Raises
         ------
         AimError, BeamMissedError
-            As ``rays``.
+            Light is lost, see ``rays``.
         UnphysicalError
-            Edges that no polygons follow.
+            Polygons cannot follow the edges.
         """
         taken, error = self._taken(*self._imaging(state, directions), directions)
         return (np.zeros((len(directions), 0, 3, 2)) if taken is None else taken), error
@@ -391,31 +410,31 @@ class TargetPath:
     def _taken(
         self, placed: PlacedBodies, systems: SystemBatch, rays: ImagingRays, directions: np.ndarray
     ) -> tuple[np.ndarray | None, float]:
-        """``shadows_on_stop`` of traced beams; None for free ones."""
+        """Return ``shadows_on_stop`` of traced beams; None for free ones."""
         owner = np.zeros(len(directions), dtype=int)
         beams = TracedBeams(self.assembly, placed, owner, systems, rays, directions, self.nodes)
-        taken = None if self.shadows is None else self.shadows.cast(beams).pieces
+        shadows = None if self.shadows is None else self.shadows.cast(beams).pieces
         if not self.model.edges:
-            return taken, 0.0
-        others = () if taken is None else tuple(np.moveaxis(taken, 1, 0))
-        seen = SeenEdges.of(beams, self.model, self.name, self.backend)
-        return converged_shadows(seen.outlines, len(directions), others)
+            return shadows, 0.0
+        other_shadows = () if shadows is None else tuple(np.moveaxis(shadows, 1, 0))
+        edges = SeenEdges.of(beams, self.model, self.name, self.backend)
+        return converged_shadows(edges.outlines, len(directions), other_shadows)
 
-    def local_map(self, state: State, direction: np.ndarray, reach: float) -> LocalMap:
-        """Mapping of target coordinates up to ``reach`` (metres) about a direction (3,) of the light."""
+    def local_map(self, state: State, direction: np.ndarray, extent: float) -> LocalMap:
+        """Return the mapping of target coordinates up to ``reach``, in metres, about a direction (3,) of the light."""
         along, across = self._target_axes(direction)
-        step = np.linspace(-reach, reach, MAP_POINTS)
+        step = np.linspace(-extent, extent, MAP_POINTS)
         points = np.stack([a.ravel() for a in np.meshgrid(step, step)], axis=-1)
         around = direction + (points[:, :1] * along + points[:, 1:] * across) / self.target_distance
         around = around / np.linalg.norm(around, axis=-1, keepdims=True)
         places = self.places(state, np.concatenate([direction[None], around]))
-        design, wanted = _monomials(points / reach), places[1:] - places[0]
+        design, wanted = _monomials(points / extent), places[1:] - places[0]
         terms, *_ = np.linalg.lstsq(design, wanted, rcond=None)
         residual = float(np.max(np.linalg.norm(design @ terms - wanted, axis=-1)))
-        return LocalMap(reach, terms, residual)
+        return LocalMap(extent, terms, residual)
 
     def _target_axes(self, direction: np.ndarray) -> np.ndarray:
-        """Directions in which light turns when its image moves along +Y' and +X', (2, 3).
+        """Return the directions in which light rotates when its image moves along +Y' and +X', (2, 3).
 
         With the camera's Z toward the scene, light that travels along -Z + t has its image at +f t; the second axis,
         direction x Y, is then near the camera's X.
@@ -423,16 +442,16 @@ class TargetPath:
         return transverse_axes(direction, self._axes[:, 1])
 
     def _launch(self, directions: np.ndarray) -> np.ndarray:
-        """Points of the beams before the first mirror, world, (F, 3)."""
+        """Return points of the beams before the first mirror, world, (F, 3)."""
         first = self.assembly.nominal_pose(f"{self.root}/{self.model.mirrors[0]}").translation
         return np.asarray(first - LAUNCH_DISTANCE * directions)
 
     def _systems(self, state: State, count: int, placed: PlacedBodies | None = None) -> tuple[SystemBatch, SystemBatch]:
-        """The way to the line CCD and the way to the stop, once for every direction."""
+        """Return the systems to the line CCD and to the stop, once for every direction."""
         placed = self.assembly.place([state]) if placed is None else placed
-        every = np.zeros(count, dtype=int)
+        zeros = np.zeros(count, dtype=int)
         systems, to_stop = (
-            assemble(self.assembly, [f"{self.name}/{way}"], [state], placed=placed).take(every)
-            for way in ("imaging", "to_stop")
+            assemble(self.assembly, [f"{self.name}/{sequence}"], [state], placed=placed).take(zeros)
+            for sequence in ("imaging", "to_stop")
         )
         return systems, to_stop

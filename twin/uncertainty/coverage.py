@@ -25,10 +25,10 @@ from twin.framework.procedure import Advance, silent
 from twin.framework.random_streams import stream
 from twin.monitor.image_sampling import ImageChecks
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.observation import Observing, observe
+from twin.monitor.observation import ObservationOptions, observe
 from twin.monitor.reading_table import reading_table
 from twin.sensors.area_detector import coarse_warnings
-from twin.uncertainty.monitor_limits import MonitorLimits, expected_covariance, find_limits, unseen_texts
+from twin.uncertainty.monitor_limits import MonitorLimits, expected_covariance, find_limits, unobserved_texts
 
 LEVELS = (0.68, 0.95)
 """Confidence levels of the intervals whose coverage is counted."""
@@ -190,7 +190,7 @@ def run_states(
     true: list[np.ndarray] = []
     read: dict[str, list[np.ndarray]] = {}
     sigma: dict[str, list[np.ndarray]] = {}
-    chances: dict[str, list[np.ndarray]] = {}
+    probabilities: dict[str, list[np.ndarray]] = {}
     squares: list[float] = []
     alarms = doubted = 0
 
@@ -200,35 +200,39 @@ def run_states(
     estimators = applicable(experiment.cameras, disturbances)
     chunk = max(1, min(CHUNK, _PIXELS // experiment.nominal_photons.size))
     # states that cannot be measured are omitted; their number is the difference to the states drawn
-    how = Observing(record, experiment.resolved.job.analysis.centroid, chunk, leave=lambda number, why: None)
+    observing = ObservationOptions(
+        record, experiment.resolved.job.analysis.centroid, chunk, omit=lambda number, why: None
+    )
     for first in range(0, count, chunk):
         advance(STATES, first, count)
         states = states_of(amounts[first : first + chunk], stated.components, experiment.thermal)
-        place = experiment.path.coarse_trace(states).place
-        kept = np.flatnonzero(np.all(np.abs(place) <= half, axis=(0, 2)))
+        position = experiment.path.coarse_trace(states).centre
+        inside = np.flatnonzero(np.all(np.abs(position) <= half, axis=(0, 2)))
         # each state has its own random streams, independent of lost states
-        for found in observe(experiment, [states[k] for k in kept], how, first + kept):
+        for observation in observe(experiment, [states[k] for k in inside], observing, first + inside):
             table = reading_table(
-                found.recovery, experiment.cameras, found.truth, experiment.ground, experiment.disturbances
+                observation.recovery, experiment.cameras, observation.truth, experiment.ground, experiment.disturbances
             )
             for name in estimators:
-                own = [table.row(one.group, one.key, name) for one in quantities]
-                read.setdefault(name, []).append(np.stack([row.value for row in own], axis=1))
-                sigma.setdefault(name, []).append(np.stack([row.sigma for row in own], axis=1))
-            true.append(np.stack([row.true for row in own], axis=1))
-            for name, chance in _chances(found.recovery, experiment, quantities).items():
-                chances.setdefault(name, []).append(chance)
-            for k in range(len(found.numbers)):
-                told = found.recovery.consistency(disturbances, k)
-                squares.append(told.chi_square)
-                alarms += not told.agrees
-                fits = found.recovery.evidence is None or bool(found.recovery.evidence.holds[k])
-                doubted += not (fits and all(curvature.holds[k] for curvature in found.recovery.curvature.values()))
+                rows = [table.row(quantity.group, quantity.key, name) for quantity in quantities]
+                read.setdefault(name, []).append(np.stack([row.value for row in rows], axis=1))
+                sigma.setdefault(name, []).append(np.stack([row.sigma for row in rows], axis=1))
+            true.append(np.stack([row.true for row in rows], axis=1))
+            for name, chance in _chances(observation.recovery, experiment, quantities).items():
+                probabilities.setdefault(name, []).append(chance)
+            for k in range(len(observation.numbers)):
+                test = observation.recovery.consistency(disturbances, k)
+                squares.append(test.chi_square)
+                alarms += not test.agrees
+                fits = observation.recovery.evidence is None or bool(observation.recovery.evidence.holds[k])
+                doubted += not (
+                    fits and all(curvature.holds[k] for curvature in observation.recovery.curvature.values())
+                )
     advance(STATES, count, count)
     truth = np.concatenate(true) if true else np.empty((0, len(quantities)))
     readings = {name: np.concatenate(parts) for name, parts in read.items()}
     levels = np.repeat(np.array(LEVELS)[:, None], len(quantities), axis=1)
-    every = len(truth) == count
+    all_measured = len(truth) == count
     return Coverage(
         quantities=quantities,
         drawn=count,
@@ -236,7 +240,8 @@ def run_states(
         errors={name: values - truth for name, values in readings.items()},
         sigmas={name: np.concatenate(parts) for name, parts in sigma.items()},
         expected={
-            name: levels if every else np.concatenate(parts, axis=1).mean(axis=1) for name, parts in chances.items()
+            name: levels if all_measured else np.concatenate(parts, axis=1).mean(axis=1)
+            for name, parts in probabilities.items()
         },
         chi_square=np.array(squares),
         alarms=alarms,
@@ -260,34 +265,41 @@ def _exposed(
         number = int(numbers[k])
         pattern = detector.fixed_pattern((channels, *experiment.path.shape), stream(seed, _DETECTOR, number))
         for kind, light, out in ((_BEFORE, experiment.nominal_photons, before), (_AFTER, photons[k], after)):
-            own = stream(seed, kind, number)
-            out[k] = detector.expose(light, pattern, frames, experiment.exposure, own, threads=1)
+            random_stream = stream(seed, kind, number)
+            out[k] = detector.expose(light, pattern, frames, experiment.exposure, random_stream, threads=1)
 
     with ThreadPoolExecutor(min(cores(), 8)) as pool:
         list(pool.map(expose, range(len(photons))))
     return before, after
 
 
-def _chances(found: Recovery, experiment: MonitorExperiment, quantities: tuple[Quantity, ...]) -> dict[str, np.ndarray]:
+def _chances(
+    recovery: Recovery, experiment: MonitorExperiment, quantities: tuple[Quantity, ...]
+) -> dict[str, np.ndarray]:
     """Return estimator -> (levels, N, Q) probability that an interval contains the truth, given the shifts.
 
     Errors of the posterior are independent of the shifts; relative to it, a reading is off by (gain - posterior's gain)
     times the shifts.
     """
-    stated, noise = experiment.disturbances, found.shift_covariance
-    assert stated is not None
-    rows, best = np.stack([quantity.row for quantity in quantities]), stated.best_gain(noise)
-    shifts = Shifts(found.before, found.after, noise, experiment.cameras, stated)
+    prior, noise = experiment.disturbances, recovery.shift_covariance
+    assert prior is not None
+    rows, best = np.stack([quantity.row for quantity in quantities]), prior.best_gain(noise)
+    shifts = Shifts(recovery.before, recovery.after, noise, experiment.cameras, prior)
 
     def spread(gain: np.ndarray) -> np.ndarray:
-        total = stated.misfit(gain) + gain @ noise @ np.swapaxes(gain, -1, -2)
+        total = prior.misfit(gain) + gain @ noise @ np.swapaxes(gain, -1, -2)
         return np.sqrt(np.einsum("qi,nij,qj->nq", rows, total, rows))
 
-    left, out = spread(best), {}
-    for name, estimator in applicable(experiment.cameras, stated).items():
+    posterior_sigma, out = spread(best), {}
+    for name, estimator in applicable(experiment.cameras, prior).items():
         gain = estimator.gain(shifts)
-        off, sigma = np.einsum("qi,nid,nd->nq", rows, gain - best, found.shift), spread(gain)
-        out[name] = np.stack([ndtr((w * sigma - off) / left) - ndtr((-w * sigma - off) / left) for w in HALF_WIDTHS])
+        bias, sigma = np.einsum("qi,nid,nd->nq", rows, gain - best, recovery.shift), spread(gain)
+        out[name] = np.stack(
+            [
+                ndtr((w * sigma - bias) / posterior_sigma) - ndtr((-w * sigma - bias) / posterior_sigma)
+                for w in HALF_WIDTHS
+            ]
+        )
     return out
 
 
@@ -369,6 +381,6 @@ def run_uncertainty(
     coverage = None
     if states:
         coverage = run_states(experiment, limits.quantities, states, resolved.frames, seed, advance)
-    hidden = unseen_texts(limits.stated, noise, limits.quantities, limits.gain)
-    given = (*blur_warnings(resolved, backend), *coarse_warnings(resolved))
-    return UncertaintyRun(resolved, limits, seed, coverage, (*given, *hidden), experiment.path.checked)
+    unobserved = unobserved_texts(limits.stated, noise, limits.quantities, limits.gain)
+    sensor_warnings = (*blur_warnings(resolved, backend), *coarse_warnings(resolved))
+    return UncertaintyRun(resolved, limits, seed, coverage, (*sensor_warnings, *unobserved), experiment.path.checked)

@@ -33,7 +33,7 @@ from twin.framework.artefact import significant, unit_for_reports
 from twin.monitor.crosstalk import estimator_gains
 from twin.monitor.monitor_derivative import disturbances_of
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.observation import LOST, Observing, observe
+from twin.monitor.observation import LOST, ObservationOptions, observe
 from twin.monitor.truth import half_fields
 
 BEST = "posterior"
@@ -135,8 +135,8 @@ class MonitorLimits:
         """
         split = self.splits[estimator or BEST]
         total = (split.sigma if estimator else split.sigma_before)[quantity] ** 2
-        found = self._by_label[estimator]
-        return sorted(((name, float(value[quantity] / total)) for name, value in found.items()), key=lambda x: -x[1])
+        shares = self._by_label[estimator]
+        return sorted(((name, float(value[quantity] / total)) for name, value in shares.items()), key=lambda x: -x[1])
 
     @cached_property
     def _by_label(self) -> Mapping[str, dict[str, np.ndarray]]:
@@ -162,10 +162,10 @@ class MonitorLimits:
     @cached_property
     def from_statement(self) -> np.ndarray:
         """Shares of the posterior's variances that remain without image noise and so rest on the prior, (Q,)."""
-        left, alone = (
+        with_noise, noise_free = (
             limits.posterior_sigma(self.rows, self.stated, noise) for noise in (self.noise, 0.0 * self.noise)
         )
-        return np.minimum(np.square(alone / np.where(left > 0.0, left, np.inf)), 1.0)
+        return np.minimum(np.square(noise_free / np.where(with_noise > 0.0, with_noise, np.inf)), 1.0)
 
     @cached_property
     def known(self) -> Mapping[str, np.ndarray]:
@@ -173,8 +173,8 @@ class MonitorLimits:
         names = {name for q in range(len(self.quantities)) for name, _ in self.lines(BEST, q)[:LINES]}
         # keep the order of the prior, since a set has none
         labels = [label for label in dict.fromkeys(self.stated.labels) if label in names]
-        left = limits.sigma_if_known(self.rows, self.stated, self.noise, [(label,) for label in labels])
-        return dict(zip(labels, left, strict=True))
+        sigmas = limits.sigma_if_known(self.rows, self.stated, self.noise, [(label,) for label in labels])
+        return dict(zip(labels, sigmas, strict=True))
 
 
 def expected_covariance(experiment: MonitorExperiment, frames: int) -> np.ndarray:
@@ -202,12 +202,12 @@ def expected_covariance(experiment: MonitorExperiment, frames: int) -> np.ndarra
 
     amounts = experiment.stated.draw(np.random.default_rng(1), _STATES)
     states = states_of(amounts, experiment.stated.components, experiment.thermal)
-    how = Observing(record, centroid, max(1, _PIXELS // nominal.size), stated=False, frames=frames)
+    observing = ObservationOptions(record, centroid, max(1, _PIXELS // nominal.size), use_prior=False, frames=frames)
     try:
-        seen = [found.recovery.shift_covariance for found in observe(experiment, states, how)]
+        covariances = [observation.recovery.shift_covariance for observation in observe(experiment, states, observing)]
     except (*LOST, SpotError):
         return np.asarray(joint(2.0 * before[0].covariance[None])[0])
-    return np.asarray(np.concatenate(seen).mean(axis=0))
+    return np.asarray(np.concatenate(covariances).mean(axis=0))
 
 
 def find_limits(
@@ -231,20 +231,22 @@ def find_limits(
     InputError
         The disturbances of the prior are not possible.
     """
-    stated = experiment.disturbances
-    if stated is None:
+    prior = experiment.disturbances
+    if prior is None:
         return None
     cameras = experiment.cameras
-    before = np.sqrt(np.diag(stated.parameter_covariance))
-    found = tuple(q for q in limits.quantities(cameras, experiment.ground) if float(np.abs(q.row) @ before) > _UNMOVED)
-    if not found:
+    before = np.sqrt(np.diag(prior.parameter_covariance))
+    changed = tuple(
+        q for q in limits.quantities(cameras, experiment.ground) if float(np.abs(q.row) @ before) > _UNMOVED
+    )
+    if not changed:
         return None
-    rows = np.stack([quantity.row for quantity in found])
-    gains = estimator_gains(cameras, stated, noise)
-    splits = {name: limits.split(rows, stated, noise, gain) for name, gain in gains.items()}
+    rows = np.stack([quantity.row for quantity in changed])
+    gains = estimator_gains(cameras, prior, noise)
+    splits = {name: limits.split(rows, prior, noise, gain) for name, gain in gains.items()}
     remedies = [
-        Remedy("more_frames", f"{_MORE_FRAMES} times the frames", _left(rows, stated, noise / _MORE_FRAMES)),
-        Remedy("no_noise", "images without noise", _left(rows, stated, 0.0 * noise)),
+        Remedy("more_frames", f"{_MORE_FRAMES} times the frames", _left(rows, prior, noise / _MORE_FRAMES)),
+        Remedy("no_noise", "images without noise", _left(rows, prior, 0.0 * noise)),
     ]
     fields = half_fields(experiment.instrument, experiment.nominal_truth.principal_distance)
     field = limits.field_covariance(FIELD, cameras, list(fields.values()))
@@ -253,24 +255,26 @@ def find_limits(
         ("field_day", DAY, "a test field a day before"),
         ("field_month", 30.0 * DAY, "a test field a month before"),
     ):
-        remedies.append(Remedy(name, text, limits.calibrated_sigma(rows, stated, noise, field, gap)))
-    why = ""
+        remedies.append(Remedy(name, text, limits.calibrated_sigma(rows, prior, noise, field, gap)))
+    reason = ""
     if second_monitor:
         try:
-            more = limits.with_further_spots(stated, _second_monitor(experiment).spots, _own(stated))
+            enlarged = limits.with_further_spots(prior, _second_monitor(experiment).spots, _own(prior))
             remedies.append(
                 Remedy(
                     "second_monitor",
                     "a second monitor on the other side of the pupil",
-                    _left(rows, more, np.kron(np.eye(2), noise)),
+                    _left(rows, enlarged, np.kron(np.eye(2), noise)),
                 )
             )
         except (InputError, MisplacedError, *LOST) as error:
-            why = str(error)
-    seen = tuple(limits.least_seen(row, stated, noise) for row in rows)
-    outside = _outside(experiment, stated, noise)
+            reason = str(error)
+    least_observable = tuple(limits.least_seen(row, prior, noise) for row in rows)
+    outside = _outside(experiment, prior, noise)
     name = experiment.instrument.spec.name
-    return MonitorLimits(name, stated, found, noise, frames, splits, seen, tuple(remedies), outside, why)
+    return MonitorLimits(
+        name, prior, changed, noise, frames, splits, least_observable, tuple(remedies), outside, reason
+    )
 
 
 def _left(rows: np.ndarray, stated: Disturbances, noise: np.ndarray) -> np.ndarray:
@@ -295,11 +299,11 @@ def _second_monitor(experiment: MonitorExperiment) -> Disturbances:
 def _outside(experiment: MonitorExperiment, stated: Disturbances, noise: np.ndarray) -> float:
     """Return the probability that a spot is beyond its CCD or too near its edge, from a fixed set of random shifts."""
     half = 0.5 * (np.array(experiment.path.shape) - 1) - EDGE_PX
-    middle = experiment.path.coarse_trace([{}]).place[:, 0]
+    middle = experiment.path.coarse_trace([{}]).centre[:, 0]
     root = np.linalg.cholesky(stated.spot_covariance + noise)
     shifts = np.random.default_rng(1).standard_normal((_DRAWS, len(root))) @ root.T
-    place = middle + shifts.reshape(_DRAWS, *middle.shape)
-    return float(np.mean(np.any(np.abs(place) > half, axis=(1, 2))))
+    positions = middle + shifts.reshape(_DRAWS, *middle.shape)
+    return float(np.mean(np.any(np.abs(positions) > half, axis=(1, 2))))
 
 
 def quantity_text(quantity: Quantity) -> str:
@@ -322,7 +326,7 @@ def unit_text(quantity: Quantity) -> str:
     return quantity.parameter.unit
 
 
-def unseen_texts(
+def unobserved_texts(
     stated: Disturbances, noise: np.ndarray, quantities: Sequence[Quantity], gain: np.ndarray
 ) -> tuple[str, ...]:
     """Return a warning for each body whose motions in the prior hardly move the spots but contribute to sigma.
@@ -376,19 +380,19 @@ def combination_text(limits: MonitorLimits, number: int, most: int = 4) -> str:
     most : int
         Largest number of motions to name.
     """
-    seen, quantity, stated = limits.least_seen[number], limits.quantities[number], limits.stated
-    order = sorted(range(len(seen.amounts)), key=lambda k: -abs(seen.amounts[k]))[:most]
+    combination, quantity, stated = limits.least_seen[number], limits.quantities[number], limits.stated
+    order = sorted(range(len(combination.amounts)), key=lambda k: -abs(combination.amounts[k]))[:most]
     named = [
-        f"{body_text(stated.labels[k])} {significant(seen.amounts[k] * stated.sigmas[k], 2, sign=True)} "
+        f"{body_text(stated.labels[k])} {significant(combination.amounts[k] * stated.sigmas[k], 2, sign=True)} "
         f"{unit_for_reports(stated.units[k])}"
         for k in order
-        if seen.amounts[k]
+        if combination.amounts[k]
     ]
-    change = f"{significant(seen.change, 2)} {unit_text(quantity)}"
-    return f"{', '.join(named)}: {change}, while no spot moves by more than {_moved(seen)}"
+    change = f"{significant(combination.change, 2)} {unit_text(quantity)}"
+    return f"{', '.join(named)}: {change}, while no spot moves by more than {_moved(combination)}"
 
 
-def _moved(seen: LeastObservable) -> str:
+def _moved(combination: LeastObservable) -> str:
     """Return how far a combination moves the spots, and their noise, as text."""
-    moved, noise = float(abs(seen.spots).max()), float(seen.noise.max())
+    moved, noise = float(abs(combination.spots).max()), float(combination.noise.max())
     return f"{moved:.1g} px (noise {noise:.1g} px)"

@@ -59,45 +59,46 @@ def limits_section(
     title = "What limits the readings"
     if limits is None:
         unknown = (
-            "There is no prior on disturbances. All sigmas are those of the noise of the images alone, and other "
-            "limits "
-            "are unknown. Give the expected motions and temperatures by `disturbances: orbit` in the job or in the "
-            "instrument: a file of scenes/library/disturbances or one of your own."
+            "There is no prior on disturbances. All sigmas contain the noise of the images only, and other limits are "
+            "unknown. Specify the expected motions and temperatures by `disturbances: orbit` in the job or in the "
+            "instrument: a file of scenes/library/disturbances or another file."
         )
         return Section(title, (unknown,))
     shown = SvgFigure(
         "limits",
         "What the measurement removes, and what remains",
         f"Prior: {limits.stated.name}. Left: standard deviation of every quantity's error after the "
-        "measurement over that before it. Right: whose motions make up the variance that the posterior leaves, bodies "
-        "of both cameras together.",
+        "measurement over that before it. Right: variance that remains in the posterior, by bodies; those of both "
+        "cameras together.",
         limits_svg(limits) if figure is None else figure,
     )
     text = [" ".join(map(sentence, _verdict(limits)))]
     if limits.outside > RARE:
-        text.append(f"{_lost(limits)}.")
-    return Section(title, tuple(text), (shown, _remedies(limits), _hidden(limits), _ledger(limits, lines)), folded)
+        text.append(f"{_loss_text(limits)}.")
+    return Section(
+        title, tuple(text), (shown, _remedies(limits), _least_observable(limits), _ledger(limits, lines)), folded
+    )
 
 
 def uncertainty_report(run: UncertaintyRun) -> Report:
     """Return the report of the command."""
     limits, coverage = run.limits, run.coverage
-    sections = [limits_section(limits, LINES, 0), _statement(limits), _before(limits)]
+    sections = [limits_section(limits, LINES, 0), _prior_section(limits), _before(limits)]
     if coverage is not None:
         sections.append(_states(coverage))
-    warnings = [*run.warnings, *([_lost(limits)] if limits.outside > RARE else [])]
+    warnings = [*run.warnings, *([_loss_text(limits)] if limits.outside > RARE else [])]
     if limits.without:
-        warnings.append(f"what a second monitor would leave is not known, it cannot be built: {limits.without}")
-    said = "" if coverage is None else _holds(coverage)
+        warnings.append(f"the benefit of a second monitor is not known, since it cannot be built: {limits.without}")
+    coverage_text = "" if coverage is None else _coverage_text(coverage)
     if coverage is not None and coverage.doubted:
         warnings.append(
-            f"in {coverage.doubted} of {coverage.measured} random states spots are not as calibrated or motions not "
-            "small, so that σ does not hold there"
+            f"in {coverage.doubted} of {coverage.measured} random states spots differ from their calibration or "
+            "motions are too large for a linear estimate, so that σ does not hold there"
         )
     if coverage is not None and coverage.alarms > coverage.alarm_limit:
         warnings.append(
-            f"in {coverage.alarms} of {coverage.measured} random states the shifts contradict the prior, by chance in "
-            f"{coverage.alarm_limit} at most: chi-square is larger than sigmas and prior say"
+            f"in {coverage.alarms} of {coverage.measured} random states the shifts contradict the prior, while "
+            f"chance allows at most {coverage.alarm_limit}: chi-square is larger than sigmas and prior predict"
         )
     if coverage is not None and coverage.outliers:
         warnings.append(
@@ -108,7 +109,7 @@ def uncertainty_report(run: UncertaintyRun) -> Report:
         )
     return Report(
         f"{limits.instrument}: what limits its monitor under {limits.stated.name}",
-        *answer(*_verdict(limits)[:1], said, *_verdict(limits)[1:]),
+        *answer(*_verdict(limits)[:1], coverage_text, *_verdict(limits)[1:]),
         (
             (
                 "Disturbances",
@@ -119,7 +120,7 @@ def uncertainty_report(run: UncertaintyRun) -> Report:
         _sigmas(limits),
         tuple(sections),
         warnings=tuple(warnings),
-        checks=(*run.images.told(), *checks_in(uncertainty_numbers(run))),
+        checks=(*run.images.self_checks(), *checks_in(uncertainty_numbers(run))),
     )
 
 
@@ -139,42 +140,41 @@ def _verdict(limits: MonitorLimits) -> tuple[str, ...]:
     unit, name = unit_text(quantity), short_text(quantity)
     motion, share = limits.lines(BEST, q)[0]
     best = min(limits.remedies, key=lambda remedy: float(remedy.sigma[q]))
-    helped = f"the most effective addition is {best.what}, which would leave {significant(best.sigma[q], 2)} {unit}"
+    advice = f"the most effective addition is {best.what}, which would leave {significant(best.sigma[q], 2)} {unit}"
     if best.sigma[q] > 0.95 * split.sigma[q]:
-        helped = "neither more frames nor ground points nor further spots would reduce it by 5%"
+        advice = "neither more frames nor ground points nor further spots would reduce it by 5 %"
     return (
         f"Under {limits.stated.name} the posterior leaves a standard deviation of "
         f"{significant(split.sigma[q], 2)} {unit} of the {name}, {significant(split.sigma_before[q], 2)} {unit} before "
         "the measurement",
-        f"{body_text(motion)} contributes {100 * share:.0f}% of the remaining variance, noise of the images "
+        f"{body_text(motion)} contributes {100 * share:.0f} % of the remaining variance, noise of the images "
         f"{_percent(float(split.noise[q]) / float(split.sigma[q]) ** 2)}",
-        helped,
+        advice,
     )
 
 
 def _percent(share: float) -> str:
-    return f"{100 * share:.1f}%" if share >= 5e-4 else "less than 0.1%"
+    return f"{100 * share:.1f} %" if share >= 5e-4 else "less than 0.1 %"
 
 
-def _lost(limits: MonitorLimits) -> str:
+def _loss_text(limits: MonitorLimits) -> str:
     return (
-        f"In {_percent(limits.outside)} of all states that {limits.stated.name} allows a spot leaves its area CCD, and "
-        "nothing is measured: a larger CCD or smaller motions of the cameras would help; all sigmas are those without "
-        "this loss"
+        f"In {_percent(limits.outside)} of all states of the prior {limits.stated.name} a spot leaves its area CCD, "
+        "and nothing is measured: a larger CCD or smaller motions of the cameras would help; sigmas ignore this loss"
     )
 
 
 def _sigmas(limits: MonitorLimits) -> Table:
     """Return the table of standard deviations before and after the measurement."""
-    heads = ("quantity", "before", *limits.splits, "of it noise")
+    heads = ("quantity", "before", *limits.splits, "noise part")
     rows: list[Sequence[Cell]] = []
     for q, quantity in enumerate(limits.quantities):
         after = [float(split.sigma[q]) for split in limits.splits.values()]
         values = [float(limits.splits[BEST].sigma_before[q]), *after, float(np.sqrt(limits.splits[BEST].noise[q]))]
         rows.append((quantity_text(quantity), *values))
     caption = (
-        "Standard deviation of the quantity before the measurement, and of each estimator's error after it: noise and "
-        "what it makes wrong of the stated motions. Last: what the noise of the images makes of the posterior's."
+        "Standard deviation of the quantity before the measurement, and of each estimator's error after it, from noise "
+        "and from misread motions of the prior. Last column: the part of the posterior's from image noise."
     )
     return Table("sigmas", "Standard deviations", caption, heads, rows, digits=3)
 
@@ -184,25 +184,31 @@ def _ledger(limits: MonitorLimits, lines: int) -> Table:
     split = limits.splits[BEST]
     rows: list[Sequence[Cell]] = []
     for q, quantity in enumerate(limits.quantities):
-        name, found = quantity_text(quantity), limits.lines(BEST, q)
+        name, contributions = quantity_text(quantity), limits.lines(BEST, q)
         prior = dict(limits.lines("", q))
-        for motion, share in found[:lines]:
-            left = float(limits.known[motion][q])
-            rows.append((name, body_text(motion), 100.0 * prior[motion], 100.0 * share, left))
-        rest = [motion for motion, _ in found[lines:]]
+        for motion, share in contributions[:lines]:
+            sigma_if_known = float(limits.known[motion][q])
+            rows.append((name, body_text(motion), 100.0 * prior[motion], 100.0 * share, sigma_if_known))
+        rest = [motion for motion, _ in contributions[lines:]]
         before = 100.0 * sum(prior[motion] for motion in rest)
-        after = 100.0 * sum(share for _, share in found[lines:])
+        after = 100.0 * sum(share for _, share in contributions[lines:])
         rows.append((name, f"the other {len(rest)} motions", before, after, None))
         noise = 100.0 * float(split.noise[q] / split.sigma[q] ** 2)
         rows.append((name, "noise of the images", None, noise, float(split.sigma[q])))
     caption = (
-        "Shares of the variance before the measurement and of what the posterior leaves of it, per cent. Last: "
-        "standard deviation that would be left if that motion were known, in the quantity's unit; beside the noise, "
-        "what is left as it is. Shares of motions that go together can be negative."
+        "Shares of the variance before the measurement and of the remaining variance in the posterior, per cent. Last "
+        "column: remaining standard deviation if that motion were known, in the quantity's unit; in the row of the "
+        "noise, the present one. Shares of correlated motions can be negative."
     )
-    heads = ("quantity", "motion", "before [%]", "after [%]", "left if known")
+    heads = ("quantity", "motion", "before [%]", "after [%]", "σ if known")
     return Table(
-        "limits-motions", f"The first {lines} motions of each quantity", caption, heads, rows, (None, None, 2, 2), 3
+        "limits-motions",
+        f"The {lines} largest contributions to each quantity",
+        caption,
+        heads,
+        rows,
+        (None, None, 2, 2),
+        3,
     )
 
 
@@ -215,12 +221,12 @@ def _before(limits: MonitorLimits) -> Section:
             rows.append((quantity_text(quantity), name or "before", ", ".join(first)))
     return Section(
         "Before the measurement, and the other estimators",
-        ("All ten lines of each are in uncertainty.json.",),
+        ("uncertainty.json has the ten largest contributions of each.",),
         (
             Table(
                 "limits-others",
                 "The largest shares of the variance",
-                "Before the measurement, and of what the estimators beside the posterior leave.",
+                "Before the measurement, and after it with the estimators other than the posterior.",
                 ("quantity", "estimator", "motions"),
                 rows,
             ),
@@ -228,21 +234,21 @@ def _before(limits: MonitorLimits) -> Section:
     )
 
 
-def _statement(limits: MonitorLimits) -> Section:
+def _prior_section(limits: MonitorLimits) -> Section:
     """Return the section on the sigmas' dependence on the prior: elasticities, and errors under heavy tails."""
     rows: list[Sequence[Cell]] = []
     for q, quantity in enumerate(limits.quantities):
-        found = sorted(limits.elasticities, key=lambda one: -float(one.elasticity[q]))[:FEW]
-        for one in found:
-            size = f"{significant(one.size, 3)} {unit_for_reports(one.unit)}"
-            told = (float(one.elasticity[q]), float(one.doubled[q]), float(one.told[q]))
-            rows.append((quantity_text(quantity), one.number.replace("_", " "), size, *told))
+        largest = sorted(limits.elasticities, key=lambda elasticity: -float(elasticity.elasticity[q]))[:FEW]
+        for elasticity in largest:
+            size = f"{significant(elasticity.size, 3)} {unit_for_reports(elasticity.unit)}"
+            numbers_of_row = (float(elasticity.elasticity[q]), float(elasticity.doubled[q]), float(elasticity.told[q]))
+            rows.append((quantity_text(quantity), elasticity.number.replace("_", " "), size, *numbers_of_row))
     numbers = Table(
         "limits-elasticities",
-        "How sigmas follow the stated numbers",
-        "Elasticity: relative change of the posterior's standard deviation per relative change of the number. Beside "
-        "it the standard deviation if the number is truly twice as large: unknown to the estimator, and stated so.",
-        ("quantity", "stated number", "as stated", "elasticity", "if twice as large", "and stated so"),
+        "Sensitivity of the sigmas to the prior",
+        "Elasticity: relative change of the posterior's standard deviation per relative change of the number. Then "
+        "the standard deviation if the true number is twice as large: with the prior unchanged, and with it doubled.",
+        ("quantity", "number of the prior", "value", "elasticity", "σ if twice as large", "σ if doubled in the prior"),
         rows,
         (None, None, None, 3, None, None),
         3,
@@ -255,26 +261,27 @@ def _statement(limits: MonitorLimits) -> Section:
         heavy.append((quantity_text(quantity), sigma, share, *widths, 100.0 * float(tail.beyond[q])))
     tails = Table(
         "limits-heavy-tails",
-        "What rests on the statement, and what heavy tails would leave",
-        "From the statement, not from the spots: share of the posterior's variance that no spot constrains, however "
-        f"little noise it has. Then the errors if each stated number is the scale of Student's distribution with "
-        f"{tail.degrees:g} degrees of freedom, wrong for all its motions at once: rms, half widths that hold as many "
-        "errors as 1, 2 and 3 sigma do of normal ones, and the chance of an error beyond 3 sigma, 0.27% if normal.",
-        ("quantity", "sigma", "from the statement [%]", "rms", "68.3%", "95.4%", "99.7%", "beyond 3 sigma [%]"),
+        "Part that rests on the prior, and errors with heavy tails",
+        "From the prior: share of the posterior's variance that remains without image noise. Then the errors if each "
+        "number of the prior is the scale of Student's t distribution with "
+        f"{tail.degrees:g} degrees of freedom, common to all its motions: rms, half-widths that contain as many "
+        "errors as 1, 2 and 3 sigma of a normal error, and the probability of an error beyond 3 sigma (0.27 % if "
+        "normal).",
+        ("quantity", "sigma", "from the prior [%]", "rms", "68.3%", "95.4%", "99.7%", "beyond 3 sigma [%]"),
         heavy,
         (None, None, 2, None, None, None, None, 2),
         3,
     )
-    most = max(limits.elasticities, key=lambda one: float(one.elasticity[_headline(limits)]))
+    most = max(limits.elasticities, key=lambda elasticity: float(elasticity.elasticity[_headline(limits)]))
     q = _headline(limits)
     unit = unit_text(limits.quantities[q])
     text = (
-        f"The sigmas are as good as the stated numbers. The {short_text(limits.quantities[q])} follows "
-        f"{most.number.replace('_', ' ')}, {significant(most.size, 3)} {unit_for_reports(most.unit)}, with an elasticity of "
-        f"{float(most.elasticity[q]):.2f}: if it is twice as large, {significant(float(most.doubled[q]), 2)} {unit} "
-        f"are left in place of {significant(float(split.sigma[q]), 2)} {unit}."
+        f"The sigmas are only as good as the prior. σ of the {short_text(limits.quantities[q])} is most sensitive to "
+        f"{most.number.replace('_', ' ')}, {significant(most.size, 3)} {unit_for_reports(most.unit)}, with an "
+        f"elasticity of {float(most.elasticity[q]):.2f}: if it is twice as large, σ is "
+        f"{significant(float(most.doubled[q]), 2)} {unit} instead of {significant(float(split.sigma[q]), 2)} {unit}."
     )
-    return Section("What rests on the stated numbers", (text,), (numbers, tails))
+    return Section("Sensitivity to the prior", (text,), (numbers, tails))
 
 
 def _remedies(limits: MonitorLimits) -> Table:
@@ -288,39 +295,39 @@ def _remedies(limits: MonitorLimits) -> Table:
     second = (
         ""
         if any(r.name == "second_monitor" for r in limits.remedies)
-        else " What a second monitor would leave is worked out by python -m twin.uncertainty config.yaml."
+        else " The benefit of a second monitor is computed by python -m twin.uncertainty config.yaml."
     )
     caption = (
-        "Standard deviations that the posterior would leave. A test field on the ground fixes the direction of the "
-        f"line's middle, and of its ends against it, to {FIELD / ARCSEC:.2g} arcsec; the monitor measures then as well "
-        "as now, so that what has not changed since is known: all of a cause whose law of time is constant, nothing of "
-        "one that has forgotten where it was. A second monitor has prisms of its own, which move as much, and "
-        f"shares cameras and central prism.{second}"
+        "Standard deviations of the posterior with further measurements. A test field on the ground fixes the "
+        f"direction of the line's middle, and of its ends relative to it, to {FIELD / ARCSEC:.2g} arcsec; the monitor "
+        "measures at that time too, so that disturbances without change since then are known: fully for a constant "
+        "cause, not at all for one that has lost its correlation. A second monitor has its own prisms, which move as "
+        f"much, and shares cameras and central prism.{second}"
     )
     return Table("limits-remedies", "What would help", caption, tuple(heads), rows, digits=3)
 
 
-def _hidden(limits: MonitorLimits) -> Table:
+def _least_observable(limits: MonitorLimits) -> Table:
     """Return the table of the least observable combinations of motions."""
     rows = [(quantity_text(q), combination_text(limits, k)) for k, q in enumerate(limits.quantities)]
     caption = (
-        "Of all motions that change a quantity by the standard deviation that the posterior leaves, the most likely "
-        "ones; the largest of them by their standard deviations are named, uncertainty.json has more."
+        "The most probable motions that change a quantity by the standard deviation of the posterior. The largest, in "
+        "units of their standard deviations, are listed; uncertainty.json has more."
     )
-    return Table("limits-hidden", "What the spots see least", caption, ("quantity", "motions that hide"), rows)
+    return Table("limits-hidden", "Least observable combinations", caption, ("quantity", "motions"), rows)
 
 
-def _holds(coverage: Coverage) -> str:
+def _coverage_text(coverage: Coverage) -> str:
     """Return a sentence on the coverage of the sigmas."""
     n, counts = coverage.measured, coverage.counts
     if coverage.outliers:
-        return f"in {n} random states {len(coverage.outliers)} of {counts} coverages are out of their limits"
-    return f"in {n} random states all {counts} coverages of 68 and 95% intervals are within their limits"
+        return f"in {n} random states {len(coverage.outliers)} of {counts} coverages are outside their limits"
+    return f"in {n} random states all {counts} coverages of 68 and 95 % intervals are within their limits"
 
 
 def _states(coverage: Coverage) -> Section:
     """Return the section on the random states."""
-    n, lost = coverage.measured, coverage.drawn - coverage.measured
+    n, unmeasured = coverage.measured, coverage.drawn - coverage.measured
     rows: list[Sequence[Cell]] = []
     for k, quantity in enumerate(coverage.quantities):
         for name in coverage.errors:
@@ -330,26 +337,34 @@ def _states(coverage: Coverage) -> Section:
                 low, high = (100.0 * float(end[k]) / n for end in coverage.limits(name, level))
                 cells += [100.0 * float(coverage.held(name, level)[k]) / n, f"{low:.1f} to {high:.1f}"]
             rows.append((quantity_text(quantity), name, rms, ratio, *cells))
-    said = f"{coverage.drawn} states were drawn from the prior, rendered, exposed and recovered"
+    drawn_text = f"{coverage.drawn} states were drawn from the prior, rendered, exposed and recovered"
     widths = " and ".join(f"{width:.3f}" for width in HALF_WIDTHS)
     text = [
-        f"{said}. Intervals of {widths} total sigma should contain the truth in 68 and 95% of them. The range "
+        f"{drawn_text}. Intervals of {widths} total sigma should contain the truth in 68 and 95% of them. The range "
         f"beside each share agrees with this; if every sigma is right, the chance that any share lies outside its "
         f"range is {100 * FALSE:g}%."
     ]
-    if lost:
+    if unmeasured:
         text.append(
-            f"In {lost} of them a spot left its CCD. The motions of the remaining states are smaller than the prior: "
-            "their chi-square is smaller, and so are errors that are correlated with the motions of the spots. The "
-            "limits take this into account; the errors of the posterior do not change."
+            f"In {unmeasured} of them a spot left its CCD. The motions of the remaining states are smaller than the "
+            "prior: their chi-square is smaller, and so are errors that are correlated with the motions of the spots. "
+            "The limits take this into account; the errors of the posterior do not change."
         )
     mean = float(np.mean(coverage.chi_square))
     text.append(
-        f"The chi-square of the shifts was {mean:.2f} in the mean and beyond its limit in {coverage.alarms} states; "
-        f"with its false-alarm rate of {FALSE_ALARM:g} up to {coverage.alarm_limit} are to be expected."
+        f"The chi-square of the shifts was {mean:.2f} on average and exceeded its limit in {coverage.alarms} states; "
+        f"at a false-alarm rate of {FALSE_ALARM:g}, chance allows up to {coverage.alarm_limit}."
     )
-    heads = ("quantity", "estimator", "rms error", "rms of error / sigma", "68% hold [%]", "limits", "95% hold [%]")
-    caption = "Readings minus truth in the quantity's unit, and the share of intervals that hold the truth."
+    heads = (
+        "quantity",
+        "estimator",
+        "rms error",
+        "rms of error / sigma",
+        "in 68 % interval [%]",
+        "limits",
+        "in 95 % interval [%]",
+    )
+    caption = "Readings minus truth in the quantity's unit, and the share of intervals that contain the truth."
     places = (None, None, None, 3, 1, None, 1, None)
     table = Table("coverage", "Random states", caption, (*heads, "limits of these"), rows, places, 3)
     return Section("Do the sigmas hold?", tuple(text), (table,))
@@ -385,8 +400,8 @@ def _figure(limits: MonitorLimits) -> Figure:
     left.set_yticks(range(count), [quantity_text(quantity) for quantity in limits.quantities])
     left.set_ylim(count - 0.5, -0.5)
     right.tick_params(left=False)
-    left.set_title("How much the measurement takes away")
-    right.set_title("Whose motions make up the rest")
+    left.set_title("Reduction by the measurement")
+    right.set_title("Contributions to the rest")
     svg.shared_legend(figure, left, "lower left", 3, columnspacing=1.2)
     svg.shared_legend(figure, right, "lower right", 4, columnspacing=1.2)
     return figure
@@ -447,6 +462,6 @@ def _by_body(axes: Axes, limits: MonitorLimits) -> None:
             label=name.replace("_", " "),
         )
         up, down = up + np.maximum(share, 0.0), down + np.minimum(share, 0.0)
-    axes.set_xlabel("share of the variance that the posterior leaves, %")
+    axes.set_xlabel("share of the posterior variance, %")
     if np.any(down < -1e-3):
         axes.axvline(0.0, color=svg.INK, lw=0.8)

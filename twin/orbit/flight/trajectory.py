@@ -144,7 +144,7 @@ class Jitter:
         instantaneous, size = replace(self, collection=None), self.amplitude / pixel
         exact = [collection.mean(k * self.frequency) for k in (1, 2)]
         for count in _MOMENTS:
-            moments, weights = collection.moments(count)
+            moments, weights = collection.gauss_rule(count)
             angle = 2.0 * np.pi * self.frequency[:, None] * moments
             # The rule is symmetric, so only parts even in time have an error.
             off = [np.abs(np.cos(k * angle) @ weights - w) for k, w in zip((1, 2), exact, strict=True)]

@@ -44,7 +44,7 @@ from twin.monitor.image_quality import ImageQuality, image_quality
 from twin.monitor.monitor_derivative import single_states, spot_jacobian
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.motions import ElementaryMotion
-from twin.monitor.observation import LOST, Observing, observe
+from twin.monitor.observation import LOST, ObservationOptions, observe
 from twin.monitor.truth import truth_jacobian
 from twin.orbit.monitoring.monitor_series import states_of
 from twin.orbit.monitoring.pair_flight import TOO_FAR, motions_at
@@ -391,7 +391,7 @@ def reader(model: LoopModel, spec: OrbitMonitorSpec, seed: int) -> Read:
             return first, experiment.expected_frames(photons)
         return first, mean_frames(experiment.frames_after(photons, frames, seed, numbers))
 
-    observing = Observing(record, centroid, stated=False, frames=frames)
+    observing = ObservationOptions(record, centroid, use_prior=False, frames=frames)
 
     def read(state: State, number: int) -> Recovery:
         try:

@@ -26,7 +26,7 @@ from scenes.specs.course import moment
 from scenes.specs.instrument import CENTRAL_PRISM
 from twin.framework.procedure import BenchError
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.observation import Observing, Record, light_of, read
+from twin.monitor.observation import ObservationOptions, Record, light_of, read
 from twin.monitor.truth import Truth
 from twin.orbit.monitoring.pair_flight import TOO_FAR, motions_at
 
@@ -421,8 +421,8 @@ class MonitorSeries:
             light = light_of(experiment, piece_states, np.arange(first, first + len(piece_states)), photons=photons)
             truths.append(light.truth)
             for k, record in enumerate(records):
-                observing = Observing(
-                    record, self.spec.analysis.centroid, stated=False, keep_parts=series, frames=self.frames
+                observing = ObservationOptions(
+                    record, self.spec.analysis.centroid, use_prior=False, keep_parts=series, frames=self.frames
                 )
                 with self._reporting_spot_errors(times[piece]):
                     result = read(experiment, light, observing)

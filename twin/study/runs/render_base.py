@@ -29,7 +29,7 @@ from twin.main_job.render_results import JobRun, RenderRun
 from twin.monitor.image_quality import QUALITY, quality_dicts
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import pieces
-from twin.monitor.observation import Observing, observe
+from twin.monitor.observation import ObservationOptions, observe
 from twin.monitor.truth import Truth
 from twin.study.runs.base_job import PHYSICS, Failure, Outcome, Run, Tree, one_line, with_values
 
@@ -92,21 +92,25 @@ def _run_together(
         out[k] = Failure(why)
 
     def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        own = [seeds[k] for k in numbers]
+        run_seeds = [seeds[k] for k in numbers]
         if len({*seeds}) == 1:
             # the same noise after, and the same frames before, which are then measured once
-            return before(frames, own[0]), experiment.frames_after(photons, frames, own[0], np.zeros(len(own), int))
+            return before(frames, run_seeds[0]), experiment.frames_after(
+                photons, frames, run_seeds[0], np.zeros(len(run_seeds), int)
+            )
         first, after = [], []
-        for part in pieces(len(own), photons[0].size * (frames + _PATTERN_FRAMES)):
-            first.append(experiment.frames_before(frames, own[part]))
-            after.append(experiment.frames_after(photons[part], frames, own[part], np.zeros(len(own[part]), int)))
+        for part in pieces(len(run_seeds), photons[0].size * (frames + _PATTERN_FRAMES)):
+            first.append(experiment.frames_before(frames, run_seeds[part]))
+            after.append(
+                experiment.frames_after(photons[part], frames, run_seeds[part], np.zeros(len(run_seeds[part]), int))
+            )
         return np.concatenate(first), np.concatenate(after)
 
-    how = Observing(record, runs[0][0].job.analysis.centroid, len(runs), leave=leave)
-    for found in observe(experiment, [state for _, state in runs], how):
-        for j, k in enumerate(found.numbers):
-            (resolved, state), one = runs[k], slice(j, j + 1)
-            out[k] = run_results(resolved, experiment, state, found.truth.at(one), found.recovery.at(one))
+    how = ObservationOptions(record, runs[0][0].job.analysis.centroid, len(runs), omit=leave)
+    for batch in observe(experiment, [state for _, state in runs], how):
+        for j, k in enumerate(batch.numbers):
+            (resolved, state), item = runs[k], slice(j, j + 1)
+            out[k] = run_results(resolved, experiment, state, batch.truth.at(item), batch.recovery.at(item))
     return out
 
 
@@ -124,7 +128,7 @@ def _traced_together(experiment: MonitorExperiment, runs: Sequence[MonitorRun]) 
     except PHYSICS as error:
         if len(runs) == 1:
             return [Failure(one_line(error))]
-        return [found for run in runs for found in _traced_together(experiment, [run])]
+        return [outcome for run in runs for outcome in _traced_together(experiment, [run])]
     return [
         run_results(resolved, experiment, state, truth.at(slice(k, k + 1))) for k, (resolved, state) in enumerate(runs)
     ]
@@ -198,15 +202,19 @@ class RenderBase:
             def before(frames: int, seed: int, name: str = name, one: MonitorExperiment = experiment) -> np.ndarray:
                 return self._frames_before(name, one, frames, seed)
 
-            own = [work for _, work in members]
-            done = _run_together(experiment, own, before) if experiment.monitored else _traced_together(experiment, own)
+            pairs = [work for _, work in members]
+            done = (
+                _run_together(experiment, pairs, before)
+                if experiment.monitored
+                else _traced_together(experiment, pairs)
+            )
             for (k, _), outcome in zip(members, done, strict=True):
                 out[k] = outcome
             asked = [(k, state, resolved.job.render.obstructed) for k, (resolved, state) in members if resolved.quality]
             for obstructed in (True, False):
                 part = [(k, state) for k, state, traced in asked if traced == obstructed]
-                found = _qualities(experiment.instrument, backend, [state for _, state in part], obstructed)
-                for (k, _), quality in zip(part, found, strict=True):
+                qualities = _qualities(experiment.instrument, backend, [state for _, state in part], obstructed)
+                for (k, _), quality in zip(part, qualities, strict=True):
                     so_far = out[k]
                     if not isinstance(so_far, Failure):
                         out[k] = quality if isinstance(quality, Failure) else {**(so_far or {}), "quality": quality}
@@ -241,7 +249,7 @@ def _qualities(
     except PHYSICS as error:
         if len(states) == 1:
             return [Failure(one_line(error))]
-    return [found for state in states for found in _qualities(instrument, backend, [state], obstructed)]
+    return [quality for state in states for quality in _qualities(instrument, backend, [state], obstructed)]
 
 
 def _alone(resolved: ResolvedJob, backend: Backend) -> Outcome:
@@ -261,10 +269,10 @@ def _alone(resolved: ResolvedJob, backend: Backend) -> Outcome:
     return out
 
 
-def _forget(kept: OrderedDict[Any, Any]) -> None:
+def _forget(cache: OrderedDict[Any, Any]) -> None:
     """Drop the least recently used items."""
-    while len(kept) > KEPT:
-        kept.popitem(last=False)
+    while len(cache) > KEPT:
+        cache.popitem(last=False)
 
 
 PERTURB = ("job", "perturb")

@@ -22,7 +22,7 @@ from scenes.specs.load import load_error_budget
 from scenes.specs.resolved import resolve_budget
 from twin.framework.artefact import Cell
 from twin.framework.svg import BLUE, INK
-from twin.monitor.simulated_budget import BudgetLine, ErrorBudget, Together
+from twin.monitor.simulated_budget import BudgetLine, CombinedErrors, ErrorBudget
 from twin.monitor.truth import line_points
 from twin.validation.check import SIGMAS, CheckResult, Chosen, Supposed
 from twin.validation.group import Context, drawing, group_of, load_printed
@@ -125,7 +125,7 @@ class BudgetImages:
         True and read change of d_f by the focal plane's temperature, m.
     halved : tuple[float, float, float] | None
         Glass path of the 180-deg prism before and after halving, m, and the ratio of its errors.
-    together : Together | None
+    together : CombinedErrors | None
         All causes at once.
     scatter : tuple[tuple[float, float], tuple[float, float]] | None
         Of the centroid in single frames and in means of FRAMES, radians, with standard deviations.
@@ -140,7 +140,7 @@ class BudgetImages:
     lines: dict[str, BudgetLine]
     focal_plane: tuple[float, float] | None
     halved: tuple[float, float, float] | None
-    together: Together | None
+    together: CombinedErrors | None
     scatter: tuple[tuple[float, float], tuple[float, float]] | None
     line_pixel: float
     roll_pixels: float | None
@@ -159,7 +159,7 @@ def measured(context: Context) -> BudgetImages:
     for i, name in enumerate(wanted):
         context.progress(0.05 + 0.4 * i / len(wanted), name)
         lines[name] = more_trials(budget, 2 if name in FEW_DRAWS else 1).line(name)
-    grown = budget.grown_focal_planes(three_sigma(budget, FOCAL_PLANE)) if FOCAL_PLANE in lines else None
+    grown = budget.warmed_focal_planes(three_sigma(budget, FOCAL_PLANE)) if FOCAL_PLANE in lines else None
     halved = None
     if "001.table3.prism_180_thermal.halved" in context.selected:
         context.progress(0.45, "half the glass path")
@@ -180,7 +180,7 @@ def measured(context: Context) -> BudgetImages:
 
 def three_sigma(budget: ErrorBudget, cause: str) -> float:
     """The input of a cause whose components are alike, SI."""
-    return 3.0 * budget.stated.of_causes((cause,)).components[0].sigma
+    return 3.0 * budget.prior.of_causes((cause,)).components[0].sigma
 
 
 def more_trials(budget: ErrorBudget, factor: int) -> ErrorBudget:
@@ -339,7 +339,7 @@ def _all_causes(value: float) -> list[Chosen]:
     return [Chosen.power("errors by all inputs of scenes/library/budgets/monitor_pair.yaml, times", 1.0, "1", value)]
 
 
-def _monitored(context: Context, images: BudgetImages, together: Together) -> Iterator[CheckResult]:
+def _monitored(context: Context, images: BudgetImages, together: CombinedErrors) -> Iterator[CheckResult]:
     """Rows of all causes at once, Table 5 among them, with its errors by formula and by Monte Carlo."""
     facts: dict[str, Any] = {"images": images, "frames": FRAMES}
 

@@ -29,7 +29,7 @@ from scenes.specs.instrument import BASE
 from twin.framework.artefact import Cell
 from twin.framework.svg import BLUE, GREY, INK, LIGHT
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.observation import Observing, observe, one_detector
+from twin.monitor.observation import ObservationOptions, observe, shared_detector
 from twin.monitor.truth import Truth
 from twin.validation.check import CheckResult, rms
 from twin.validation.group import Context, drawing, group_of
@@ -148,7 +148,7 @@ class MonitorImages:
         context.progress(0.2, "trace the truth")
         self.truth: Truth = experiment.sight.truth(every)
         context.progress(0.5, "render and measure the spots")
-        how = Observing(one_detector(experiment, FRAMES, context.seed), stated=False)
+        how = ObservationOptions(shared_detector(experiment, FRAMES, context.seed), use_prior=False)
         pieces = [found.recovery for found in observe(experiment, every, how)]
         self.before = np.concatenate([p.before for p in pieces])
         self.after = np.concatenate([p.after for p in pieces])

@@ -30,7 +30,7 @@ from scenes.specs.instrument import BASE
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.motions import ElementaryMotion, line_family
-from twin.monitor.observation import Observing, observe, one_detector
+from twin.monitor.observation import ObservationOptions, observe, shared_detector
 from twin.validation.group import load_printed
 from twin.validation.paper_001.formulas import PARAMETERS as NAMES
 from twin.validation.paper_001.formulas import focal_lengths
@@ -109,13 +109,13 @@ class Bench:
         """
         path = self.experiment.path
         known, scout = path.coarse_trace(states), path.scout
-        basis = zernike.basis(known.turn.shape[-1], scout.nodes.x, scout.nodes.y)
+        basis = zernike.basis(known.aim_change.shape[-1], scout.nodes.x, scout.nodes.y)
         start = np.repeat(scout.nominal.parameters, len(states), axis=0)
-        launch = known.fan.at(start + np.moveaxis(known.turn @ basis.T, 0, -1))
+        launch = known.fan.at(start + np.moveaxis(known.aim_change @ basis.T, 0, -1))
         rays = trace(self.experiment.backend, known.back, make_rays(self.experiment.backend, *launch)).numpy()
         if not rays[3].all():
             raise BeamMissedError("a clear aperture cuts a monitor beam")
-        return np.moveaxis(known.place, 0, 1)
+        return np.moveaxis(known.centre, 0, 1)
 
     def readings(self, start: np.ndarray, end: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
         """Camera -> form -> (S, 4) in the units of ``monitoring.PARAMETERS``, from positions (S, C, 2)."""
@@ -530,7 +530,7 @@ def separation(experiment: MonitorExperiment, bench: Bench, trials: int, seed: i
     wanted = {c: rng.uniform(-1.0, 1.0, (trials, 4)) * BOX for c in bench.cameras}
     states = joint_states(bench, wanted)
     truth = bench.truth(states)
-    how = Observing(one_detector(experiment, bench.frames, seed), stated=False)
+    how = ObservationOptions(shared_detector(experiment, bench.frames, seed), use_prior=False)
     seen = [found.recovery for found in observe(experiment, states, how)]
     parts = [bench.readings(found.before, found.after) for found in seen]
     readings = {c: {form: np.concatenate([part[c][form] for part in parts]) for form in FORMS} for c in bench.cameras}
