@@ -99,7 +99,7 @@ def test_predicted_rays_meet_the_aimed_ones(setup, monkeypatch) -> None:
     monkeypatch.setattr(monitor_beams, "aim", counted)
     predicted = path.rays(states, known)
     assert not calls
-    aimed = path.rays(states, replace(known, turn=np.zeros_like(known.aim_change)))
+    aimed = path.rays(states, replace(known, aim_change=np.zeros_like(known.aim_change)))
     assert len(calls) == 1
     # a nanometre off its node on the face, a ray is off by that part of the aperture in direction
     limit = 2.0 * monitor_beams.AIM_TOLERANCE / path.face_radius.min() * path.numerical_aperture
