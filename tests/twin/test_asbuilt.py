@@ -323,7 +323,7 @@ def test_a_run_from_file_to_numbers(backend, tmp_path) -> None:
     assert told["whole"]["agrees"]
     assert run.warnings == ()
     assert told["next_move"]["merit_after"] <= told["next_move"]["merit_before"]
-    assert told["next_move"]["worth"]["collimator"] > 0.0
+    assert told["next_move"]["merit_reductions"]["collimator"] > 0.0
     sigmas = [one["sigma"] for one in told["combinations"]]
     assert sigmas == sorted(sigmas)
     assert sigmas[-1] == pytest.approx(1.0, abs=1e-6)
@@ -391,10 +391,10 @@ def test_each_warning_is_there_where_it_holds_and_no_other() -> None:
         (
             state(whole=ConsistencyTest.of("", 80.0, 20), variance_factor=4.0),
             lit,
-            "all measurements together do not agree with the prior and their errors (chi-square 80 of 20); "
-            "all sigmas are 2 times larger",
+            "the measurements do not agree with the prior and their specified errors (chi-square 80 for 20 degrees of "
+            "freedom); all sigmas are multiplied by 2",
         ),
-        (state(measurements=[bad, bad.of("sight", 1.0, 10)]), lit, "focus does not agree with what all others predict"),
+        (state(measurements=[bad, bad.of("sight", 1.0, 10)]), lit, "focus does not agree with the prediction from all others"),
         (state(), dark, "1 of 5 states of the posterior have no light; they count as failed"),
     ):
         (said,) = _warnings(found, parts)
@@ -407,10 +407,12 @@ def test_estimates_that_do_not_settle_or_contradict_themselves_are_refused(whole
     names = [kind.name for kind in whole.kinds]
     each = [ConsistencyTest.of(name, 30.0 if name == "mtf" else 9.0, 10) for name in names]
     require_agreement(whole, state(whole=ConsistencyTest.of("", 180.0, 20), measurements=each))
-    with pytest.raises(InputError, match="miss what the instrument can do by 3 standard deviations") as caught:
+    with pytest.raises(InputError, match="their residuals are 3 standard deviations on average") as caught:
         require_agreement(whole, state(whole=ConsistencyTest.of("", 180.1, 20), measurements=each))
     assert "measurements.mtf.mtf" in str(caught.value)
-    with pytest.raises(InputError, match=r"not settled after 3 steps: one more changes the predicted readings by 0\.5"):
+    with pytest.raises(
+        InputError, match=r"not converged after 3 steps: one more changes the predicted readings by 0\.5"
+    ):
         require_agreement(whole, state(converged=False, settled=0.5))
 
 
@@ -475,5 +477,5 @@ def test_what_no_state_can_be_estimated_of_is_refused(backend, tmp_path, run, ch
 
 
 def test_an_instrument_as_built_is_not_drawn(backend, tmp_path) -> None:
-    with pytest.raises(InputError, match="an instrument as built already"):
+    with pytest.raises(InputError, match="this instrument is already as built"):
         bench_of(backend, tmp_path, ONE, instrument=str(EXAMPLES / "as_built_pair.yaml"))

@@ -29,7 +29,7 @@ from tests.twin.test_blurred_cameras import GF7, gf7_with
 from twin.camera.__main__ import app
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_plots import distortion_figure
-from twin.camera.camera_run import find_focus, kind_of, run_camera
+from twin.camera.camera_run import find_focus, aberration_name, run_camera
 from twin.camera.field_maps import distortion
 from twin.design.__main__ import app as design_app
 from twin.design.design_run import HELD_BY, _held_text, run_design
@@ -66,7 +66,7 @@ def test_distortion_is_that_of_the_papers_formula(gf7_alone) -> None:
 def test_kinds_of_aberration() -> None:
     kinds = {4: "defocus", 5: "astigmatism", 6: "astigmatism", 7: "coma", 9: "trefoil", 11: "spherical aberration"}
     kinds |= {13: "secondary astigmatism", 22: "secondary spherical aberration"}
-    assert {term: kind_of(term) for term in kinds} == kinds
+    assert {term: aberration_name(term) for term in kinds} == kinds
 
 
 @pytest.mark.second
@@ -292,7 +292,7 @@ def test_a_constraint_that_blocks_is_named(tmp_path) -> None:
     assert off == pytest.approx(5e-3 / 18.64**2 / (4 * np.sqrt(3)) / 650e-9, rel=0.02)
     assert held["worth_waves_per_mm"] > off
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
-    assert re.search(r"Not improved, held by the principal distance \(5.5\d* m; easing it by 1 mm is worth", page)
+    assert re.search(r"Not improved, limited by the principal distance \(5.5\d* m; easing it by 1 mm reduces the error by", page)
     assert "is blurred" in page
 
 
@@ -300,7 +300,7 @@ def test_an_anamorphism_is_a_share(backend) -> None:
     """Of a principal distance of 5 m across the line one of 0.05 m along it less or more is 1 %."""
     one = ActiveConstraint("anamorphism", 0.005, 0.05, 0.4)
     text = _held_text((one,), "old", 5.0)
-    assert text == "the anamorphism (0.5 %, which old breaks by 1 %; easing it by 1 % is worth 0.02 waves)"
+    assert text == "the anamorphism (0.5 %, violated by old by 1 %; easing it by 1 % reduces the error by 0.02 waves)"
     row = HELD_BY(one)
     assert (row["limit_m"], row["limit_percent"]) == (None, pytest.approx(0.5))
     assert HELD_BY(replace(one, name="envelope", limit=2.0))["limit_m"] == 2.0

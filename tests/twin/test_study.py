@@ -54,7 +54,7 @@ def done(tmp_path_factory):
     process = start(path, "--out", folder / "run", "--workers", 1, "--json")
     out, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
-    assert errors.startswith("warning: 1 of 110 runs failed and are in no statistic.")
+    assert errors.startswith("warning: 1 of 110 runs failed and are excluded from all statistics.")
     assert errors.count("\n") == 1
     return folder / "run", path, json.loads(out)
 

@@ -397,7 +397,7 @@ def test_a_share_of_noise_above_one_is_an_error_and_not_cut_off() -> None:
     assert share.share == pytest.approx(76.0**2, rel=0.5)
     fault = estimates.impossible(runs)
     assert fault.key == ("responses", "y", "noise")
-    assert re.search(r"responses\.y\.noise: states a variance of noise \d+ times.*_sigma_noise", str(fault))
+    assert re.search(r"responses\.y\.noise: the reported noise variance is \d+ times.*_sigma_noise", str(fault))
     # noise that all runs share is no part of what they differ by
     shared = noisy_runs(200, 1, 76.0, noise="shared")
     assert estimates.noise_share(shared.responses[0], shared.study) is None
@@ -444,4 +444,4 @@ def test_what_a_reader_must_know_is_a_warning(text) -> None:
     assert {one for one in WARNED for line in told if one in line} == wanted
     assert len(told) == len(wanted)
     if "doubts" in case:
-        assert "chi-square (3 runs). Which" in told[0]
+        assert "chi-square (3 runs). The column doubt" in told[0]

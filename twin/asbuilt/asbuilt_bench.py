@@ -69,25 +69,27 @@ class AsBuiltBench(Site):
     def __init__(self, setup: AsBuiltSetup, backend: Backend) -> None:
         self.setup, self.backend, self.test = setup, backend, setup.test
         if setup.base.instrument.as_built:
-            problem = "an instrument as built already: its measurements have to stand here with the others"
-            allowed = "the instrument of the drawing"
+            problem = "this instrument is already as built: list its earlier measurements here with the others"
+            allowed = "the nominal instrument"
             raise self.test.error(problem, ("instrument",), found=self.test.instrument, allowed=allowed)
         self.experiment = MonitorExperiment(setup.base, backend)
         self.camera = self._camera_name()
         self.line = line_points(self.experiment.instrument, self.camera)
         stated = self.experiment.stated
         if stated is None or not stated.components:
-            allowed = "a disturbances file with standard deviations greater than zero, as `assembled`"
-            raise self.test.error("nothing is expected to move", ("prior",), found=self.test.prior, allowed=allowed)
+            allowed = "a disturbances file with standard deviations greater than zero, such as `assembled`"
+            raise self.test.error("the prior has no motions", ("prior",), found=self.test.prior, allowed=allowed)
         self.stated: StatedMotions = stated
         self.parameters = Parameters.of(self.test, stated, self.experiment.instrument, self.experiment.thermal)
         self._beams: dict[tuple[tuple[float, float], ...], VariedBeams] = {}
         self.kinds = self._kinds(self.test.measurements, "measurements")
-        self.afters = tuple(one.after for _, _, one in self.test.measurements.named())
+        self.afters = tuple(measurement.after for _, _, measurement in self.test.measurements.named())
         for name, merit in self.test.merits.items():
             if merit.kind in OF_MONITOR:
-                problem = "what a monitor knows rests on its own disturbances, not on how the instrument was assembled"
-                allowed = "`twin.uncertainty` of the instrument that results"
+                problem = (
+                    "monitor merits depend on the disturbances in operation, not on the assembly errors of this prior"
+                )
+                allowed = "`twin.uncertainty` on the resulting instrument"
                 raise self.test.error(problem, ("merits", name, "kind"), found=merit.kind, allowed=allowed)
         self.merits = self.bench(dict(self.test.merits))
 
@@ -100,7 +102,7 @@ class AsBuiltBench(Site):
         return self.test.camera or names[0]
 
     def _kinds(self, measured: MeasurementsSpec, where: str) -> tuple[MeasuredKind, ...]:
-        return tuple(KINDS[kind](self, name, one, (where, kind, name)) for kind, name, one in measured.named())
+        return tuple(KINDS[kind](self, name, spec, (where, kind, name)) for kind, name, spec in measured.named())
 
     @cached_property
     def candidates(self) -> tuple[MeasuredKind, ...]:
@@ -143,10 +145,10 @@ class AsBuiltBench(Site):
         return self._predicted(values, self.kinds, self.afters)
 
     def _predicted(self, values: np.ndarray, kinds: Sequence[MeasuredKind], afters: Sequence[str | None]) -> np.ndarray:
-        def read(some: slice) -> np.ndarray:
-            views = {after: self.view(values[some], after) for after in afters}
-            each = [kind.predict(views[after]) for kind, after in zip(kinds, afters, strict=True)]
-            return np.concatenate(each, axis=1)
+        def read(rows: slice) -> np.ndarray:
+            views = {after: self.view(values[rows], after) for after in afters}
+            readings = [kind.predict(views[after]) for kind, after in zip(kinds, afters, strict=True)]
+            return np.concatenate(readings, axis=1)
 
         return where_lit(read, len(values), (sum(len(kind.labels) for kind in kinds),))
 
@@ -160,8 +162,8 @@ class AsBuiltBench(Site):
     def _by_parameters(self, values: np.ndarray, work: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Return the derivatives (D, K) of a function of states, (S, K) -> (S, D), at parameters (K,)."""
         steps = STEP * self.parameters.prior.sigma
-        found = work(np.concatenate([values + np.diag(steps), values - np.diag(steps)]))
-        ahead, behind = found[: len(steps)], found[len(steps) :]
+        outputs = work(np.concatenate([values + np.diag(steps), values - np.diag(steps)]))
+        ahead, behind = outputs[: len(steps)], outputs[len(steps) :]
         return np.asarray(((ahead - behind) / (2.0 * steps[:, None])).T)
 
     # the estimate
@@ -210,18 +212,18 @@ class AsBuiltBench(Site):
         covariance = prior.covariance.copy()
         if self.setup.drawn is not None:
             drawn = motions_of_spec(self.setup.drawn, self.experiment.instrument)
-            own = {one.name: k for k, one in enumerate(drawn.components)}
-            names = [one.name for one in self.stated.components]
-            strange = sorted(set(own) - set(names))
+            drawn_index = {component.name: k for k, component in enumerate(drawn.components)}
+            names = [component.name for component in self.stated.components]
+            strange = sorted(set(drawn_index) - set(names))
             if strange:
                 raise self.test.error(
-                    "the instrument moves as the prior does not", ("simulate", "prior"), found=names_text(strange[:3])
+                    "motions that the prior does not have", ("simulate", "prior"), found=names_text(strange[:3])
                 )
-            where = [k for k, name in enumerate(names) if name in own]
-            which = [own[names[k]] for k in where]
+            rows = [k for k, name in enumerate(names) if name in drawn_index]
+            drawn_rows = [drawn_index[names[k]] for k in rows]
             count = len(names)
             covariance[:count, :count] = 0.0
-            covariance[np.ix_(where, where)] = drawn.covariance[np.ix_(which, which)]
+            covariance[np.ix_(rows, rows)] = drawn.covariance[np.ix_(drawn_rows, drawn_rows)]
         root = type(prior).of(prior.labels, covariance).root
         half = np.sqrt(3.0)
         shape = root.shape[1]
@@ -251,7 +253,7 @@ class AsBuiltBench(Site):
     def merit_parts(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> np.ndarray:
         """Return the parts of the merits, (S, P), for parameters (S, K); NaN where the light is lost."""
         return where_lit(
-            lambda some: self.merits.parts_of(self.parameters.states(values[some], after, of_some(further, some))),
+            lambda rows: self.merits.parts_of(self.parameters.states(values[rows], after, of_some(further, rows))),
             len(values),
             (self.merits.parts,),
         )
@@ -273,14 +275,14 @@ class AsBuiltBench(Site):
         """Limits, steps and errors of the next move; the limits are what earlier moves have left of each range."""
         specs = tuple(self.test.actuators.values())
         moved = np.sum(self.parameters.wanted, axis=0) if self.parameters.moves else np.zeros(len(specs))
-        ranges = np.array([one.range_si for one in specs])
+        ranges = np.array([spec.range_si for spec in specs])
         return Actuators(
             tuple(self.test.actuators),
             np.minimum(0.0, -ranges - moved),
             np.maximum(0.0, ranges - moved),
-            np.array([one.step_si for one in specs]),
-            np.array([one.move_error for one in specs]),
-            np.array([one.accuracy_si for one in specs]),
+            np.array([spec.step_si for spec in specs]),
+            np.array([spec.move_error for spec in specs]),
+            np.array([spec.accuracy_si for spec in specs]),
         )
 
     def merit_slope(self, values: np.ndarray, after: str | None) -> np.ndarray:
@@ -290,7 +292,7 @@ class AsBuiltBench(Site):
     @cached_property
     def actuator_steps(self) -> np.ndarray:
         """Steps of the numerical derivatives by the actuators, SI, (C,)."""
-        return _SHARE * np.array([one.range_si or 1.0 for one in self.test.actuators.values()])
+        return _SHARE * np.array([spec.range_si or 1.0 for spec in self.test.actuators.values()])
 
 
 def where_lit(work: Callable[[slice], np.ndarray], count: int, shape: tuple[int, ...], first: int = 0) -> np.ndarray:
@@ -313,10 +315,10 @@ def where_lit(work: Callable[[slice], np.ndarray], count: int, shape: tuple[int,
         if count == 1:
             return np.full((1, *shape), np.nan)
     half = count // 2
-    both = ((half, first), (count - half, first + half))
-    return np.concatenate([where_lit(work, own, shape, start) for own, start in both])
+    halves = ((half, first), (count - half, first + half))
+    return np.concatenate([where_lit(work, size, shape, start) for size, start in halves])
 
 
-def of_some(further: np.ndarray | None, some: slice) -> np.ndarray | None:
+def of_some(further: np.ndarray | None, rows: slice) -> np.ndarray | None:
     """Return the moves of selected states; a move (C,) common to all states, or None, is returned unchanged."""
-    return further if further is None or further.ndim == 1 else further[some]
+    return further if further is None or further.ndim == 1 else further[rows]

@@ -41,46 +41,46 @@ def asbuilt_report(run: AsBuiltRun) -> Report:
     with look("asbuilt"):
         along = to_svg(_along_figure(run))
         known = to_svg(_known_figure(run))
-    told, more = answer(_verdict(run), _known_words(run), *_move_words(run))
+    verdict, more = answer(_verdict(run), _known_words(run), *_move_words(run))
     sections = (
         Section(
             "The camera",
             (
-                "Wavefront error along the line, as drawn and as built. Bands hold the middle 68 and 95 % of what is "
-                "possible: before the measurements, under the prior alone, with them, and after the next move.",
+                "Wavefront error along the line, nominal and as built. Bands hold the middle 68 and 95 % of the "
+                "possible states: under the prior, with the measurements, and after the next move.",
             ),
             (SvgFigure("along", "Wavefront error over the field", "", along), _range_table(run)),
             name="camera",
         ),
         Section(
-            "What is known",
+            "Observability",
             (
-                "Combinations of motions, the best known first, in standard deviations of the prior: 1 before the "
-                "measurements. A combination that the measurements do not tell keeps its 1, and what it may do to the "
-                "camera stands in the table of merits.",
+                "Combinations of motions, the best determined first. Sigmas are in units of the prior sigma, 1 before "
+                "the measurements. An unobservable combination keeps sigma 1; its effect on the camera is in the table "
+                "of merits.",
             ),
-            (SvgFigure("known", "What the measurements know", "", known), _known_table(run)),
+            (SvgFigure("known", "Sigma of each combination", "", known), _known_table(run)),
             name="known",
         ),
         Section(
             "Measurements",
-            ("Each measurement against what all others, the prior and the traced instrument predict of it.",),
+            ("Each measurement compared with its prediction from all others and the prior.",),
             (_measured_table(run),),
             name="measurements",
         ),
         *_move_sections(run),
         Section(
             "Motions",
-            ("Each motion by itself. Most are known in combinations alone.",),
+            ("Each motion by itself. Most are observable only in combinations.",),
             (_motion_table(run),),
             closed=True,
             name="motions",
         ),
         Section(
-            "The instrument that results",
+            "The resulting instrument",
             (
-                "`instrument.yaml` is the instrument as built, which every command takes as its instrument; "
-                "`posterior.yaml` beside it is what is still unknown of it, as its disturbances.",
+                "`instrument.yaml` is the instrument as built, which every command accepts; `posterior.yaml` beside it "
+                "is the posterior covariance as a disturbances file.",
             ),
             (CameraFile("instrument", "Instrument", "", instrument_text(run)), *_posterior(run)),
             closed=True,
@@ -94,10 +94,10 @@ def asbuilt_report(run: AsBuiltRun) -> Report:
         ("prior", f"{run.setup.test.prior}: {len(run.bench.parameters.components)} motions"),
         ("measurements", ", ".join(kinds)),
         ("moves made", ", ".join(run.bench.parameters.moves) or "none"),
-        ("truth", "drawn by the program" if run.true is not None else "not known"),
+        ("truth", "simulated" if run.true is not None else "not known"),
     )
     title = f"{run.bench.camera} as built"
-    return Report(title, told, more, facts, _summary(run), sections, warnings=run.warnings)
+    return Report(title, verdict, more, facts, _summary(run), sections, warnings=run.warnings)
 
 
 def _percent(share: float) -> str:
@@ -105,17 +105,17 @@ def _percent(share: float) -> str:
 
 
 def _verdict(run: AsBuiltRun) -> str:
-    parts = [f"{one.merit.name} with {_percent(one.meets)}" for one in run.standings]
+    parts = [f"{prediction.merit.name} {_percent(prediction.meets)}" for prediction in run.standings]
     return f"Probability that {run.bench.camera}, as built, meets its requirements: {', '.join(parts)}"
 
 
 def _known_words(run: AsBuiltRun) -> str:
-    known = sum(one.known for one in run.known)
+    known = sum(combination.known for combination in run.known)
     agreement = run.found.whole
-    fits = "fit" if agreement.passes() else "do not fit"
+    fits = "agree" if agreement.passes() else "do not agree"
     return (
-        f"The measurements tell {known} of {len(run.known)} combinations of motions and {fits} the prior and their "
-        f"errors (chi-square {agreement.chi_square:.0f} of {agreement.degrees})"
+        f"The measurements determine {known} of {len(run.known)} combinations of motions and {fits} with the prior and "
+        f"their errors (chi-square {agreement.chi_square:.0f} for {agreement.degrees} degrees of freedom)"
     )
 
 
@@ -129,12 +129,12 @@ def _move_words(run: AsBuiltRun) -> list[str]:
     text = ", ".join(f"{name} by {_short(amount)}" for name, amount in moves.items())
     out = [
         f"Next move: {text}; the expected merit falls from {step.before:.3g} to {step.after:.3g}, of which "
-        f"{step.ignorance:.3g} is what is not known and could be mended"
+        f"{step.ignorance:.3g} could be removed if the state were known"
     ]
     worth = sorted(step.worth.items(), key=lambda item: -item[1])[:_FEW]
     if worth:
-        text = ", ".join(f"{name} {value:.3g}" for name, value in worth)
-        out.append(f"One more measurement before the move would lower it further, by {text}")
+        text = ", ".join(f"{name} by {value:.3g}" for name, value in worth)
+        out.append(f"One more measurement before the move would reduce it further: {text}")
     return out
 
 
@@ -151,19 +151,19 @@ def _short(amount: str | float) -> str:
     return plain(amount, 4)
 
 
-def _cell(value: float, one: Standing) -> Cell:
-    found = shown_merit(value, one.merit)
-    if found is None:
+def _cell(value: float, prediction: Standing) -> Cell:
+    shown = shown_merit(value, prediction.merit)
+    if shown is None:
         return None
-    spread = shown_merit(one.now[3], one.merit) or 0.0
-    places = 3 if abs(spread) < 10.0 else 1
-    return DecimalNumber(found, places)
+    spread = shown_merit(prediction.now[3], prediction.merit) or 0.0
+    decimals = 3 if abs(spread) < 10.0 else 1
+    return DecimalNumber(shown, decimals)
 
 
-def _between(values: Sequence[float], one: Standing) -> str:
+def _between(values: Sequence[float], prediction: Standing) -> str:
     if not len(values):
         return ""
-    low, middle, high = (shown_merit(values[k], one.merit) for k in (1, 2, 3))
+    low, middle, high = (shown_merit(values[k], prediction.merit) for k in (1, 2, 3))
     if low is None or middle is None or high is None:
         return "no light"
     return f"{significant(middle)} ({significant(low)} to {significant(high)})"
@@ -172,25 +172,25 @@ def _between(values: Sequence[float], one: Standing) -> str:
 def _summary(run: AsBuiltRun) -> Table:
     rows: list[list[Cell]] = []
     moved, drawn = run.advice is not None, run.true is not None
-    for one in run.standings:
-        spec = one.merit.spec
+    for prediction in run.standings:
+        spec = prediction.merit.spec
         sign = "at least" if spec.more_is_better else "at most"
         row: list[Cell] = [
-            merit_head(one.merit),
-            f"{sign} {plain(spec.requirement / merit_unit(one.merit)[1])}",
-            _cell(one.designed, one),
-            _between(one.before, one),
-            _between(one.now, one),
-            _percent(one.meets),
+            merit_head(prediction.merit),
+            f"{sign} {plain(spec.requirement / merit_unit(prediction.merit)[1])}",
+            _cell(prediction.designed, prediction),
+            _between(prediction.before, prediction),
+            _between(prediction.now, prediction),
+            _percent(prediction.meets),
         ]
-        row += [_between(one.moved, one), _percent(one.meets_moved)] if moved else []
-        rows.append(row + ([_cell(one.true, one)] if drawn else []))
-    heads = ["merit", "asked", "designed", "prior", "as built", "meets"]
-    heads += ["after the next move", "meets then"] if moved else []
+        row += [_between(prediction.moved, prediction), _percent(prediction.meets_moved)] if moved else []
+        rows.append(row + ([_cell(prediction.true, prediction)] if drawn else []))
+    heads = ["merit", "requirement", "designed", "prior", "as built", "probability"]
+    heads += ["after the next move", "probability then"] if moved else []
     heads += ["true"] if drawn else []
     caption = (
-        "Median and the middle 68 % of what is possible, by exact traces of states drawn from the prior and from the "
-        "posterior distribution."
+        "Median and 16 to 84 % quantiles, by exact traces of states drawn from the prior and the posterior. "
+        "Probability: that the requirement is met."
     )
     return Table("merits", "Merits", caption, heads, rows)
 
@@ -212,8 +212,13 @@ def _range_table(run: AsBuiltRun) -> Table:
 def _known_table(run: AsBuiltRun) -> Table:
     factor = np.sqrt(run.found.variance_factor)
     rows: list[list[Cell]] = [
-        [one.name, one.value, min(1.0, one.sigma * factor), "known" if one.known else "not known"]
-        for one in run.known[:_MOST_COMBINATIONS]
+        [
+            combination.name,
+            combination.value,
+            min(1.0, combination.sigma * factor),
+            "observable" if combination.known else "unobservable",
+        ]
+        for combination in run.known[:_MOST_COMBINATIONS]
     ]
     heads = ("combination", "estimate", "sigma", "")
     caption = "Weights and values are in standard deviations of the prior."
@@ -223,18 +228,18 @@ def _known_table(run: AsBuiltRun) -> Table:
 def _measured_table(run: AsBuiltRun) -> Table:
     count = len(run.found.measurements)
     rows: list[list[Cell]] = []
-    for kind, one in zip(run.bench.kinds, run.found.measurements, strict=True):
-        left = [block for name, block, _ in run.found.excluded if name == one.name]
+    for kind, test in zip(run.bench.kinds, run.found.measurements, strict=True):
+        excluded = [block for name, block, _ in run.found.excluded if name == test.name]
         rows.append(
             [
-                one.name,
+                test.name,
                 kind.kind,
                 len(kind.labels),
-                one.chi_square,
-                one.degrees,
-                one.p_value,
-                "agrees" if one.passes(count) else "contradicts",
-                ", ".join(left),
+                test.chi_square,
+                test.degrees,
+                test.p_value,
+                "agrees" if test.passes(count) else "contradicts",
+                ", ".join(excluded),
             ]
         )
     heads = ("measurement", "kind", "numbers", "chi-square", "degrees", "p", "", "excluded")
@@ -249,49 +254,51 @@ def _move_sections(run: AsBuiltRun) -> tuple[Section, ...]:
         return ()
     bench = run.bench
     moves = moves_plain(run, step.move.amounts)
-    made = bench.parameters.moved(run.found.mean[None], bench.last)[0]
-    done = moves_plain(run, made)
+    travel = bench.parameters.moved(run.found.mean[None], bench.last)[0]
+    done = moves_plain(run, travel)
     rows: list[list[Cell]] = [
-        [name, one.motion, _short(done[name]), _short(moves[name]), str(one.range), str(one.step or "")]
-        for name, one in run.setup.test.actuators.items()
+        [name, entry.motion, _short(done[name]), _short(moves[name]), str(entry.range), str(entry.step or "")]
+        for name, entry in run.setup.test.actuators.items()
     ]
-    heads = ("actuator", "motion", "stands at", "move by", "range", "step")
-    caption = "Stands at: what all moves so far have come to, as estimated."
+    heads = ("actuator", "motion", "position", "move by", "range", "step")
+    caption = "Position: estimated sum of all moves so far."
     tables: list[Table] = [Table("move", "Next move", caption, heads, rows)]
     if step.worth:
         worth: list[list[Cell]] = [
             [name, value] for name, value in sorted(step.worth.items(), key=lambda item: -item[1])
         ]
-        caption = "By how much the expected merit after the move would be lower if this were measured before it."
-        tables.append(Table("worth", "Worth of a measurement", caption, ("measurement", "worth"), worth, (None, 4)))
-    told = responses(run)
-    if told:
-        lines: list[list[Cell]] = [[name, one["response"], one["sigma"]] for name, one in told.items()]
-        caption = "Of what was traced, from the moves that were made and measured."
-        told_by = ("actuator", "response", "sigma")
-        tables.append(Table("responses", "Responses of the actuators", caption, told_by, lines, (None, 3, 3)))
+        caption = "Expected reduction of the merit after the move if this is measured before it."
+        tables.append(
+            Table("worth", "Benefit of further measurements", caption, ("measurement", "reduction"), worth, (None, 4))
+        )
+    estimates = responses(run)
+    if estimates:
+        lines: list[list[Cell]] = [[name, entry["response"], entry["sigma"]] for name, entry in estimates.items()]
+        caption = "Ratio of the actual to the traced response, estimated from the measured moves."
+        truth_of = ("actuator", "response", "sigma")
+        tables.append(Table("responses", "Responses of the actuators", caption, truth_of, lines, (None, 3, 3)))
     text: tuple[str, ...] = (
-        f"The move makes the expected sum of squares of all merits least, each in units of its requirement: "
-        f"{step.before:.3g} before and {step.after:.3g} after it, over states of the posterior and the errors of the "
-        f"move, by exact traces. {step.ignorance:.3g} of it could be mended if the state were known.",
+        f"The move minimises the expected sum of squares of all merits, each in units of its requirement: "
+        f"{step.before:.3g} before and {step.after:.3g} after it, averaged over the posterior and the errors of the "
+        f"move by exact traces. {step.ignorance:.3g} of it could be removed if the state were known.",
     )
     if not step.move.searched:
-        text = (*text, "Not all whole steps were tried: a better move may exist.")
+        text = (*text, "Not all combinations of whole steps were tried: a better move may exist.")
     return (Section("The next move", text, tuple(tables), name="move"),)
 
 
 def _motion_table(run: AsBuiltRun) -> Table:
-    every = motions(run)
+    estimates = motions(run)
     rows: list[list[Cell]] = [
         [
-            one["motion"],
-            one["unit"],
-            one["prior_sigma"],
-            one["value"],
-            one["sigma"],
-            *([one["true"]] if "true" in one else []),
+            motion["motion"],
+            motion["unit"],
+            motion["prior_sigma"],
+            motion["value"],
+            motion["sigma"],
+            *([motion["true"]] if "true" in motion else []),
         ]
-        for one in every
+        for motion in estimates
     ]
     heads = ("motion", "unit", "prior sigma", "estimate", "sigma", *(["true"] if run.true is not None else []))
     return Table("motions", "Motions", "", heads, rows, (None, None, *[3] * (len(heads) - 2)))
@@ -299,8 +306,8 @@ def _motion_table(run: AsBuiltRun) -> Table:
 
 def _posterior(run: AsBuiltRun) -> tuple[CameraFile, ...]:
     text, table = posterior_files(run)
-    own = CameraFile(POSTERIOR, "Posterior", "", text)
-    return (own,) if table is None else (own, CsvFile(CORRELATION, "Its correlations", "", table))
+    file = CameraFile(POSTERIOR, "Posterior", "", text)
+    return (file,) if table is None else (file, CsvFile(CORRELATION, "Correlations of the posterior", "", table))
 
 
 def _along_figure(run: AsBuiltRun) -> Figure:
@@ -313,9 +320,11 @@ def _along_figure(run: AsBuiltRun) -> Figure:
         ax.fill_between(x, band[1], band[3], color=colour, alpha=0.25, lw=0)
         ax.plot(x, band[2], color=colour, lw=1.6, label=label)
     ax.plot(x, designed, color=INK, lw=1.0, ls="--", label="designed")
-    limits = [one.merit.spec.requirement for one in run.standings if one.merit.spec.kind == "wavefront"]
+    limits = [
+        prediction.merit.spec.requirement for prediction in run.standings if prediction.merit.spec.kind == "wavefront"
+    ]
     if limits:
-        ax.axhline(limits[0], color=VERMILION, lw=1.0, label="asked")
+        ax.axhline(limits[0], color=VERMILION, lw=1.0, label="requirement")
     ax.set_yscale("log")
     ax.set_ylim(0.5 * float(np.min(designed)))
     ax.set_xlabel("field along the line")
@@ -326,13 +335,13 @@ def _along_figure(run: AsBuiltRun) -> Figure:
 
 
 def _known_figure(run: AsBuiltRun) -> Figure:
-    sigma = np.array([one.sigma for one in run.known])
+    sigma = np.array([combination.sigma for combination in run.known])
     figure = new_figure(2.2)
     ax = figure.subplots()
     number = np.arange(1, len(sigma) + 1)
-    known = np.array([one.known for one in run.known])
-    for which, colour, label in ((known, BLUE, "known"), (~known, ORANGE, "not known")):
-        ax.bar(number[which], sigma[which], 0.8, color=colour, label=label)
+    known = np.array([combination.known for combination in run.known])
+    for selected, colour, label in ((known, BLUE, "observable"), (~known, ORANGE, "unobservable")):
+        ax.bar(number[selected], sigma[selected], 0.8, color=colour, label=label)
     ax.set_xlabel("combination")
     ax.set_ylabel("sigma over prior")
     ax.set_ylim(0.0, 1.05)

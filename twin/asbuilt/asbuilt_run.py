@@ -153,29 +153,38 @@ def run_asbuilt(
         except PhysicalError as error:
             allowed = "another seed, or smaller standard deviations"
             raise test.error(f"the drawn instrument has no light: {error}", ("simulate",), allowed=allowed) from error
-    found = bench.estimate(data)
-    require_agreement(bench, found)
+    estimate = bench.estimate(data)
+    require_agreement(bench, estimate)
     advance("state", 1, 4)
-    draws = found.draw(_random(seed, _POSTERIOR), test.draws)
+    draws = estimate.draw(_random(seed, _POSTERIOR), test.draws)
     prior = bench.parameters.prior
     blind = prior.mean + _random(seed, _PRIOR).standard_normal((test.draws, prior.root.shape[1])) @ prior.root.T
     last = bench.last
-    step = advice(bench, found, draws, _random(seed, _MOVE)) if bench.parameters.names else None
+    step = advice(bench, estimate, draws, _random(seed, _MOVE)) if bench.parameters.names else None
     advance("state", 2, 4)
-    moved, made = None, None
+    moved, executed = None, None
     if step is not None:
         errors = _random(seed, _MADE).standard_normal((len(draws), 2, len(step.move.amounts)))
-        made = bench.actuators.made(step.move.amounts, errors)
-        moved = bench.merit_parts(draws, last, made)
+        executed = bench.actuators.made(step.move.amounts, errors)
+        moved = bench.merit_parts(draws, last, executed)
     parts = (bench.merit_parts(blind, last), bench.merit_parts(draws, last), moved)
     truth = None if true is None else bench.merit_parts(true[None], last)[0]
     nominal = bench.merit_parts(np.zeros((1, len(prior.mean))), None)[0]
-    standings = tuple(_standing(one, nominal, parts, truth) for one in bench.merits.merits)
+    standings = tuple(_standing(merit, nominal, parts, truth) for merit in bench.merits.merits)
     advance("state", 3, 4)
-    along = _along(bench, ((blind, None), (draws, None), *(() if made is None else ((draws, made),))))
+    along = _along(bench, ((blind, None), (draws, None), *(() if executed is None else ((draws, executed),))))
     advance("state", 4, 4)
     return AsBuiltRun(
-        setup, bench, data, found, combinations(found), standings, along, step, true, tuple(_warnings(found, parts[1]))
+        setup,
+        bench,
+        data,
+        estimate,
+        combinations(estimate),
+        standings,
+        along,
+        step,
+        true,
+        tuple(_warnings(estimate, parts[1])),
     )
 
 
@@ -183,24 +192,29 @@ def _random(seed: int, number: int) -> np.random.Generator:
     return np.random.default_rng(stream(seed, number))
 
 
-def require_agreement(bench: AsBuiltBench, found: StateEstimate) -> None:
+def require_agreement(bench: AsBuiltBench, estimate: StateEstimate) -> None:
     """Raise InputError for an estimate that has not converged, or for measurements that contradict each other.
 
     The error is placed at the measurement that agrees least with all others.
     """
     test = bench.test
-    if not found.converged:
-        problem = f"the estimate has not settled after {found.steps} steps: one more changes the predicted readings by "
-        allowed = "a prior with smaller standard deviations, or a measurement of positions that brings it nearer"
-        raise test.error(f"{problem}{found.settled:.2g} of their errors", ("measurements",), allowed=allowed)
-    if found.whole.chi_square <= WORST_FACTOR * max(1, found.whole.degrees):
+    if not estimate.converged:
+        problem = (
+            f"the estimate has not converged after {estimate.steps} steps: one more changes the predicted readings by "
+        )
+        allowed = "a prior with smaller standard deviations, or a measurement of positions"
+        raise test.error(f"{problem}{estimate.settled:.2g} of their errors", ("measurements",), allowed=allowed)
+    if estimate.whole.chi_square <= WORST_FACTOR * max(1, estimate.whole.degrees):
         return
-    worst = min(found.measurements, key=lambda one: (one.p_value, -one.chi_square / max(1, one.degrees)))
+    worst = min(
+        estimate.measurements,
+        key=lambda consistency: (consistency.p_value, -consistency.chi_square / max(1, consistency.degrees)),
+    )
     key = next(kind.key for kind in bench.kinds if kind.name == worst.name)
-    ratio = np.sqrt(found.whole.chi_square / found.whole.degrees)
+    ratio = np.sqrt(estimate.whole.chi_square / estimate.whole.degrees)
     raise test.error(
-        f"the measurements contradict each other: they miss what the instrument can do by {ratio:.0f} standard "
-        "deviations on the average, this one most",
+        f"the measurements contradict each other: their residuals are {ratio:.0f} standard deviations on average, and "
+        "this one fits worst",
         key,
         allowed="its true standard deviation, fields, sign and orientation; `camtwin asbuilt-check` tries orientations",
     )
@@ -229,45 +243,44 @@ def _standing(
     )
 
 
-def _along(
-    bench: AsBuiltBench, several: Sequence[tuple[np.ndarray, np.ndarray | None]]
-) -> tuple[np.ndarray, np.ndarray]:
+def _along(bench: AsBuiltBench, cases: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> tuple[np.ndarray, np.ndarray]:
     """Return the nominal rms wavefront error along the line, and its quantiles over several sets of states."""
     field = bench.bench({"along": MeritSpec(kind="wavefront", fields=ALONG, at_most=1.0)})
 
     def rms(values: np.ndarray, further: np.ndarray | None) -> np.ndarray:
-        def work(some: slice) -> np.ndarray:
-            states = bench.parameters.states(values[some], bench.last, of_some(further, some))
+        def work(rows: slice) -> np.ndarray:
+            states = bench.parameters.states(values[rows], bench.last, of_some(further, rows))
             return np.asarray(np.sqrt(np.maximum(field.parts_of(states), 0.0)))
 
         return where_lit(work, len(values), (len(ALONG),))
 
     designed = np.sqrt(np.maximum(field.parts_of([{}])[0], 0.0))
-    return designed, np.stack([np.nanquantile(rms(*one), LEVELS, axis=0) for one in several])
+    return designed, np.stack([np.nanquantile(rms(*case), LEVELS, axis=0) for case in cases])
 
 
-def _warnings(found: StateEstimate, now: np.ndarray) -> list[str]:
+def _warnings(estimate: StateEstimate, now: np.ndarray) -> list[str]:
     out = []
-    for name, block, agreement in found.excluded:
+    for name, block, agreement in estimate.excluded:
         out.append(
-            f"{name}: {block} contradicts all other measurements (chi-square {agreement.chi_square:.0f} of "
-            f"{agreement.degrees}) and is left out"
+            f"{name}: {block} contradicts all other measurements (chi-square {agreement.chi_square:.0f} for "
+            f"{agreement.degrees} degrees of freedom) and is excluded"
         )
-    if not found.whole.passes():
-        factor = np.sqrt(found.variance_factor)
+    if not estimate.whole.passes():
+        factor = np.sqrt(estimate.variance_factor)
         out.append(
-            f"all measurements together do not agree with the prior and their errors (chi-square "
-            f"{found.whole.chi_square:.0f} of {found.whole.degrees}); all sigmas are {factor:.2g} times larger for it"
+            "the measurements do not agree with the prior and their specified errors (chi-square "
+            f"{estimate.whole.chi_square:.0f} for {estimate.whole.degrees} degrees of freedom); all sigmas are "
+            f"multiplied by {factor:.2g}"
         )
-    for one in found.measurements:
-        if not one.passes(len(found.measurements)):
+    for test in estimate.measurements:
+        if not test.passes(len(estimate.measurements)):
             out.append(
-                f"{one.name} does not agree with what all others predict of it: chi-square {one.chi_square:.0f} of "
-                f"{one.degrees}"
+                f"{test.name} does not agree with the prediction from all others: chi-square {test.chi_square:.0f} for "
+                f"{test.degrees} degrees of freedom"
             )
-    lost = int(np.sum(~np.all(np.isfinite(now), axis=1)))
-    if lost:
-        out.append(f"{lost} of {len(now)} states of the posterior have no light; they count as failed")
+    dark = int(np.sum(~np.all(np.isfinite(now), axis=1)))
+    if dark:
+        out.append(f"{dark} of {len(now)} states of the posterior have no light; they count as failed")
     return out
 
 
@@ -280,36 +293,36 @@ def _row(values: Sequence[float], merit: Merit) -> dict[str, float | None] | Non
     return {f"p{100 * level:g}": shown_merit(value, merit) for level, value in zip(LEVELS, values, strict=True)}
 
 
-def _standing_plain(one: Standing) -> dict[str, Any]:
-    merit = one.merit
+def _standing_plain(prediction: Standing) -> dict[str, Any]:
+    merit = prediction.merit
     out = {
         "kind": merit.spec.kind,
         "unit": merit_unit(merit)[0],
         "requirement": shown_merit(merit.spec.requirement, merit),
-        "designed": shown_merit(one.designed, merit),
-        "prior": _row(one.before, merit),
-        "as_built": _row(one.now, merit),
-        "meets": one.meets,
-        "after_move": _row(one.moved, merit),
-        "meets_after_move": None if np.isnan(one.meets_moved) else one.meets_moved,
+        "designed": shown_merit(prediction.designed, merit),
+        "prior": _row(prediction.before, merit),
+        "as_built": _row(prediction.now, merit),
+        "meets": prediction.meets,
+        "after_move": _row(prediction.moved, merit),
+        "meets_after_move": None if np.isnan(prediction.meets_moved) else prediction.meets_moved,
     }
-    return out if np.isnan(one.true) else {**out, "true": shown_merit(one.true, merit)}
+    return out if np.isnan(prediction.true) else {**out, "true": shown_merit(prediction.true, merit)}
 
 
-def _agreement_plain(one: ConsistencyTest) -> dict[str, Any]:
-    return {"chi_square": one.chi_square, "degrees": one.degrees, "p_value": one.p_value}
+def _agreement_plain(test: ConsistencyTest) -> dict[str, Any]:
+    return {"chi_square": test.chi_square, "degrees": test.degrees, "p_value": test.p_value}
 
 
 def _measured_plain(run: AsBuiltRun) -> dict[str, Any]:
     out = {}
     count = len(run.found.measurements)
-    for kind, one in zip(run.bench.kinds, run.found.measurements, strict=True):
-        out[one.name] = {
+    for kind, test in zip(run.bench.kinds, run.found.measurements, strict=True):
+        out[test.name] = {
             "kind": kind.kind,
             "numbers": len(kind.labels),
-            **_agreement_plain(one),
-            "agrees": one.passes(count),
-            "excluded": [block for name, block, _ in run.found.excluded if name == one.name],
+            **_agreement_plain(test),
+            "agrees": test.passes(count),
+            "excluded": [block for name, block, _ in run.found.excluded if name == test.name],
         }
     return out
 
@@ -318,12 +331,12 @@ def motions(run: AsBuiltRun) -> list[dict[str, Any]]:
     """Return each motion of the prior with its estimate, in reporting units."""
     out = []
     factor = np.sqrt(run.found.variance_factor)
-    for k, one in enumerate(run.bench.parameters.components):
-        size = one.unit_size
+    for k, component in enumerate(run.bench.parameters.components):
+        size = component.unit_size
         row = {
             "motion": run.bench.parameters.words[k],
-            "unit": one.unit,
-            "prior_sigma": one.sigma / size,
+            "unit": component.unit,
+            "prior_sigma": component.sigma / size,
             "value": float(run.found.mean[k]) / size,
             "sigma": float(run.found.sigma[k]) * factor / size,
         }
@@ -334,8 +347,13 @@ def motions(run: AsBuiltRun) -> list[dict[str, Any]]:
 def _known_plain(run: AsBuiltRun) -> list[dict[str, Any]]:
     factor = np.sqrt(run.found.variance_factor)
     return [
-        {"combination": one.name, "value": one.value, "sigma": min(1.0, one.sigma * factor), "known": one.known}
-        for one in run.known
+        {
+            "combination": combination.name,
+            "value": combination.value,
+            "sigma": min(1.0, combination.sigma * factor),
+            "known": combination.known,
+        }
+        for combination in run.known
     ]
 
 
@@ -355,8 +373,8 @@ def _advice_plain(run: AsBuiltRun) -> dict[str, Any] | None:
         "searched": step.move.searched,
         "merit_before": step.before,
         "merit_after": step.after,
-        "merit_of_ignorance": step.ignorance,
-        "worth": dict(step.worth),
+        "merit_of_uncertainty": step.ignorance,
+        "merit_reductions": dict(step.worth),
     }
 
 
@@ -366,24 +384,26 @@ def responses(run: AsBuiltRun) -> dict[str, Any] | None:
     names = [run.bench.parameters.names[k] for k in run.bench.parameters.gains]
     if not names:
         return None
-    own = slice(start, start + len(names))
-    mean, sigma = run.found.mean[own], run.found.sigma[own] * np.sqrt(run.found.variance_factor)
+    rows = slice(start, start + len(names))
+    mean, sigma = run.found.mean[rows], run.found.sigma[rows] * np.sqrt(run.found.variance_factor)
     return {
         name: {"response": 1.0 + float(m), "sigma": float(s)} for name, m, s in zip(names, mean, sigma, strict=True)
     }
 
 
 ASBUILT: Record[AsBuiltRun] = Record(
-    "asbuilt.json: the state of one instrument.",
+    "asbuilt.json: as-built state of one instrument.",
     Quantity("instrument", lambda run: run.setup.test.instrument),
-    Quantity("camera", lambda run: run.bench.camera, "the camera that is judged"),
+    Quantity("camera", lambda run: run.bench.camera, "camera that is evaluated"),
     Quantity(
         "whole",
         lambda run: {**_agreement_plain(run.found.whole), "agrees": run.found.whole.passes()},
-        "chi-square of all together",
+        "chi-square of all measurements together",
     ),
-    Quantity("false_alarm", lambda run: FALSE_ALARM, "chance that what is as stated is called a contradiction"),
-    Quantity("measurements", _measured_plain, "each as all others predict it"),
+    Quantity(
+        "false_alarm", lambda run: FALSE_ALARM, "probability that consistent measurements are called contradictory"
+    ),
+    Quantity("measurements", _measured_plain, "each compared with the prediction from all others"),
     Quantity("motions", motions, "each motion of the prior: its estimate and standard deviations"),
     Quantity("combinations", _known_plain, "in standard deviations of the prior, the best known first"),
     Quantity(
@@ -391,8 +411,14 @@ ASBUILT: Record[AsBuiltRun] = Record(
         lambda run: {one.merit.name: _standing_plain(one) for one in run.standings},
         "each in its unit, with quantiles in percent",
     ),
-    Quantity("next_move", _advice_plain, "of the actuators", where_known=True),
-    Quantity("responses", responses, "of the actuators over the traced ones", where_known=True),
+    Quantity("next_move", _advice_plain, "recommended move of the actuators", where_known=True),
+    Quantity(
+        "responses", responses, "estimated responses of the actuators relative to the traced ones", where_known=True
+    ),
     Quantity("steps", lambda run: run.found.steps, "Gauss-Newton steps"),
-    Quantity("settled", lambda run: run.found.settled, "change of the readings by the last step, over their errors"),
+    Quantity(
+        "settled",
+        lambda run: run.found.settled,
+        "change of the predicted readings by the last step, in standard deviations",
+    ),
 )

@@ -23,8 +23,8 @@ CORRELATION = f"{POSTERIOR}_correlation"
 def built_motions(run: AsBuiltRun) -> Mapping[str, Motion]:
     """Return the estimated motion of each body against the drawing, with all moves but without thermal effects."""
     values = run.found.mean.copy()
-    for k, one in enumerate(run.bench.parameters.components):
-        if one.kind in HEAT:
+    for k, component in enumerate(run.bench.parameters.components):
+        if component.kind in HEAT:
             values[k] = 0.0
     return run.bench.parameters.states(values[None], run.bench.last)[0]
 
@@ -43,7 +43,7 @@ def instrument_text(run: AsBuiltRun) -> str:
         built_motions(run),
         f"./{POSTERIOR}.yaml",
         f"{base} as estimated from {', '.join(kind.name for kind in run.bench.kinds)}",
-        "The instrument as built; every command takes it as its instrument",
+        "The instrument as built; every command accepts it as its instrument",
     )
 
 
@@ -52,20 +52,20 @@ def unknown(run: AsBuiltRun) -> tuple[list[Component], np.ndarray]:
 
     Errors of moves are added to the components of the bodies that were moved.
     """
-    parameters, found = run.bench.parameters, run.found
-    components = [one for one in parameters.components if one.kind not in HEAT]
-    places = {(one.body, one.kind, one.axis): k for k, one in enumerate(components)}
+    parameters, estimate = run.bench.parameters, run.found
+    components = [component for component in parameters.components if component.kind not in HEAT]
+    indices = {(component.body, component.kind, component.axis): k for k, component in enumerate(components)}
     rows: dict[int, np.ndarray] = {}
-    for k, one in enumerate(parameters.components):
-        if one.kind not in HEAT:
-            rows[places[one.body, one.kind, one.axis]] = np.eye(len(found.mean))[k]
+    for k, component in enumerate(parameters.components):
+        if component.kind not in HEAT:
+            rows[indices[component.body, component.kind, component.axis]] = np.eye(len(estimate.mean))[k]
     tree = run.bench.experiment.instrument.assembly.tree
 
     def add(body: str, kind: str, axis: int, pivot: str, amount: np.ndarray) -> None:
-        place = places.setdefault((body, kind, axis), len(components))
-        if place == len(components):
+        index = indices.setdefault((body, kind, axis), len(components))
+        if index == len(components):
             components.append(Component("moves", body, kind, axis, pivot, 0.0))
-        rows[place] = rows.get(place, np.zeros(len(found.mean))) + amount
+        rows[index] = rows.get(index, np.zeros(len(estimate.mean))) + amount
 
     for k, number in enumerate(parameters.actuators):
         pull = _pull(run, k)
@@ -76,22 +76,22 @@ def unknown(run: AsBuiltRun) -> tuple[list[Component], np.ndarray]:
                 if move.shift[axis]:
                     add(body, "shift", axis, "origin", move.shift[axis] * pull)
                 if move.rotate[axis]:
-                    own = places.get((body, "rotate", axis))
-                    pivot = "origin" if own is None else components[own].pivot
+                    rotation_index = indices.get((body, "rotate", axis))
+                    pivot = "origin" if rotation_index is None else components[rotation_index].pivot
                     add(body, "rotate", axis, pivot, move.rotate[axis] * pull)
-                    away = np.cross(
+                    offset = np.cross(
                         move.rotate[axis] * np.eye(3)[axis], np.array(tree[body].pivots[pivot]) - move.pivot
                     )
-                    for other in np.flatnonzero(np.abs(away) > 1e-12):
-                        add(body, "shift", int(other), "origin", away[other] * pull)
+                    for other in np.flatnonzero(np.abs(offset) > 1e-12):
+                        add(body, "shift", int(other), "origin", offset[other] * pull)
             for term, amount in move.figure.items():
                 add(body, "figure", term, "origin", amount * pull)
             for kind in ("radius", "conic", "index"):
                 if kind in move.shape:
                     add(body, kind, 0, "origin", move.shape[kind] * pull)
     table = np.stack([rows[k] for k in range(len(components))])
-    spread = table @ found.spread
-    return components, np.asarray(found.variance_factor * spread @ spread.T)
+    spread = table @ estimate.spread
+    return components, np.asarray(estimate.variance_factor * spread @ spread.T)
 
 
 def _pull(run: AsBuiltRun, actuator: int) -> np.ndarray:
@@ -115,8 +115,8 @@ def posterior_files(run: AsBuiltRun) -> tuple[str, str | None]:
         covariance,
         run.bench.experiment.instrument.nodes,
         f"posterior covariance of an estimate from {kinds}",
-        f"What is not known of {run.setup.base.instrument.name} as built.",
+        f"Posterior uncertainty of {run.setup.base.instrument.name} as built.",
     )
-    files = joint_files(spec, POSTERIOR, "What is still unknown of the instrument as built")
+    files = joint_files(spec, POSTERIOR, "Posterior uncertainty of the instrument as built")
     text = files[f"{POSTERIOR}.yaml"].replace(f"{POSTERIOR}.csv", f"{CORRELATION}.csv")
     return text, files.get(f"{POSTERIOR}.csv")

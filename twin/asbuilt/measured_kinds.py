@@ -152,9 +152,9 @@ class MeasuredKind(ABC):
         noise = np.linalg.cholesky(self.covariance()) @ rng.standard_normal(len(true))
         return np.asarray(true + noise + columns @ (typical * rng.standard_normal(len(typical))))
 
-    def file(self, key: str, value: str, what: str) -> Path:
+    def file(self, key: str, value: str, description: str) -> Path:
         """Return the path of a file that the measurement names."""
-        return Path(self.spec.file_at((key,), value, Path(self.site.test.source.file).parent, what))
+        return Path(self.spec.file_at((key,), value, Path(self.site.test.source.file).parent, description))
 
     def wrong(self, text: str, key: str, allowed: str | None = None, found: str | None = None) -> InputError:
         """Return an error at a key of the measurement."""
@@ -250,12 +250,12 @@ class FocusReadings(MeasuredKind):
         try:
             # how far the chips of the first band stand downstream of best focus, after the last round of shims
             sites = (data["rounds"][-1] if data.get("rounds") else data["initial"])["sites"]
-            own = [site for site in sites if site["band"] == sites[0]["band"]]
-            fields = tuple((float(site["field"]), 0.0) for site in own)
-            return fields, tuple(-1e-6 * float(site["defocus_um"]) for site in own)
+            first_band = [site for site in sites if site["band"] == sites[0]["band"]]
+            fields = tuple((float(site["field"]), 0.0) for site in first_band)
+            return fields, tuple(-1e-6 * float(site["defocus_um"]) for site in first_band)
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise self.wrong(
-                f"no best foci in it ({error!r})", "file", "the focus.json of a run of twin.lab focus", str(path)
+                f"it holds no best foci ({error!r})", "file", "the focus.json of a run of twin.lab focus", str(path)
             ) from error
 
 
@@ -270,7 +270,9 @@ class MtfReadings(MeasuredKind):
         spec = self.spec
         asked = MeritSpec(kind="mtf", fields=spec.fields, frequency=spec.frequency, at_least=0.0)
         self.tried = self.site.bench({self.name: asked})
-        self.labels = tuple(f"{field_text(field)} {way}" for field in spec.fields for way in ("line", "track"))
+        self.labels = tuple(
+            f"{field_text(field)} {direction}" for field in spec.fields for direction in ("line", "track")
+        )
         self.blocks = tuple(f"field {field_text(field)}" for field in spec.fields for _ in range(2))
 
     def predict(self, view: View) -> np.ndarray:
@@ -324,9 +326,9 @@ class DistortionReadings(MeasuredKind):
 
     def predict(self, view: View) -> np.ndarray:
         """Return the positions by a polynomial through the traced points of the line."""
-        seen = self._tangents(view.states)
-        size = np.max(np.abs(seen), axis=1, keepdims=True)
-        table = (seen / size)[..., None] ** np.arange(1, _LINE_DEGREE + 1)
+        tangents = self._tangents(view.states)
+        size = np.max(np.abs(tangents), axis=1, keepdims=True)
+        table = (tangents / size)[..., None] ** np.arange(1, _LINE_DEGREE + 1)
         terms = np.linalg.pinv(table) @ self.line[None, :, None]
         asked = (self.tangents / size)[..., None] ** np.arange(1, _LINE_DEGREE + 1)
         return np.asarray(np.squeeze(asked @ terms, -1))
@@ -352,12 +354,15 @@ class DistortionReadings(MeasuredKind):
             if isinstance(table, list):
                 table = {name: [row[name] for row in table] for name in table[0]}
             columns = [table[name] for name in ("field_deg", "position_mm", "distortion_compensated_um_sigma")]
-            angle, place, sigma = (np.array(column, dtype=np.float64) for column in columns)
+            angle, position, sigma = (np.array(column, dtype=np.float64) for column in columns)
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise self.wrong(
-                f"no places in it ({error!r})", "file", "the distortion.json of a run of twin.lab distortion", str(path)
+                f"it holds no image positions ({error!r})",
+                "file",
+                "the distortion.json of a run of twin.lab distortion",
+                str(path),
             ) from error
-        return np.radians(angle), 1e-3 * place, 1e-6 * sigma
+        return np.radians(angle), 1e-3 * position, 1e-6 * sigma
 
 
 class SpotReadings(MeasuredKind):
@@ -372,12 +377,12 @@ class SpotReadings(MeasuredKind):
         if not experiment.monitored:
             raise InputError(
                 self.spec.issue(
-                    Problem("the instrument has no monitor", None, "an instrument with one, as gf7_pair"), ()
+                    Problem("the instrument has no monitor", None, "an instrument with a monitor, such as gf7_pair"), ()
                 )
             )
         self.path = experiment.path.coarse
         channels = self.path.channels
-        self.labels = tuple(f"{c.camera} {c.name} {way}" for c in channels for way in ("row", "column"))
+        self.labels = tuple(f"{c.camera} {c.name} {axis}" for c in channels for axis in ("row", "column"))
         self.blocks = tuple(f"{c.camera} {c.name}" for c in channels for _ in range(2))
         self.nominal = self._places([{}])[0]
 
@@ -395,34 +400,34 @@ class SpotReadings(MeasuredKind):
     def read(self) -> np.ndarray:
         """Return the positions of the file minus the nominal ones."""
         path = self.file("file", self.spec.file, "a CSV file, or the recovered.json of a run")
-        found = self._recovered(path) if path.suffix.lower() == ".json" else self._table(path)
+        spots = self._recovered(path) if path.suffix.lower() == ".json" else self._table(path)
         out = []
         for channel in self.path.channels:
-            if (channel.camera, channel.name) not in found:
+            if (channel.camera, channel.name) not in spots:
                 raise self.wrong(f"no spot {channel.name} of {channel.camera}", "file", found=str(path))
-            out.append(np.array(found[channel.camera, channel.name]))
+            out.append(np.array(spots[channel.camera, channel.name]))
         return np.concatenate(out) - self.nominal
 
     def _recovered(self, path: Path) -> dict[tuple[str, str], tuple[float, float]]:
         data = read_json(self, path)
         try:
             return {
-                (camera, channel): (float(one[self.spec.state]["row"]), float(one[self.spec.state]["column"]))
+                (camera, channel): (float(spot[self.spec.state]["row"]), float(spot[self.spec.state]["column"]))
                 for camera, channels in data["spots"].items()
-                for channel, one in channels.items()
+                for channel, spot in channels.items()
             }
         except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
             raise self.wrong(
-                f"no spots in it ({error!r})", "file", "the recovered.json of twin.recover or twin.render", str(path)
+                f"it holds no spots ({error!r})", "file", "the recovered.json of twin.recover or twin.render", str(path)
             ) from error
 
     def _table(self, path: Path) -> dict[tuple[str, str], tuple[float, float]]:
-        found: dict[tuple[str, str], tuple[float, float]] = {}
+        spots: dict[tuple[str, str], tuple[float, float]] = {}
         with path.open(newline="", encoding="utf-8-sig") as stream:
             rows = csv.DictReader(line for line in stream if not line.startswith("#"))
             for row in rows:
                 try:
-                    found[row["camera"], row["channel"]] = (float(row["row_px"]), float(row["column_px"]))
+                    spots[row["camera"], row["channel"]] = (float(row["row_px"]), float(row["column_px"]))
                 except (KeyError, TypeError, ValueError) as error:
                     raise self.wrong(
                         f"line {rows.line_num}: not a spot ({error!r})",
@@ -430,7 +435,7 @@ class SpotReadings(MeasuredKind):
                         "columns camera, channel, row_px, column_px",
                         str(path),
                     ) from error
-        return found
+        return spots
 
 
 class SightReadings(MeasuredKind):
@@ -445,7 +450,7 @@ class SightReadings(MeasuredKind):
         self.which = [names.index(name) for name in self.spec.measured]
         self.labels = self.blocks = self.spec.measured
         if self.spec.correlation is not None and np.linalg.eigvalsh(self.spec.correlation)[0] <= 0.0:
-            raise self.wrong("errors that depend on each other altogether", "correlation", "a positive definite matrix")
+            raise self.wrong("the correlation matrix is singular", "correlation", "a positive definite matrix")
 
     def predict(self, view: View) -> np.ndarray:
         """Return the changes by exact chief rays."""
@@ -503,9 +508,9 @@ class PositionReadings(MeasuredKind):
     def _places(self, states: Sequence[State]) -> np.ndarray:
         placed = self.site.experiment.instrument.assembly.place(states)
         root = placed.index[self.bodies[0].split("/")[0]]
-        away = np.stack([placed.translation[:, placed.index[body]] for body in self.bodies], axis=1)
-        away = away - placed.translation[:, root, None]
-        return np.asarray(np.einsum("sji,sbj->sbi", placed.rotation[:, root], away).real)
+        offset = np.stack([placed.translation[:, placed.index[body]] for body in self.bodies], axis=1)
+        offset = offset - placed.translation[:, root, None]
+        return np.asarray(np.einsum("sji,sbj->sbi", placed.rotation[:, root], offset).real)
 
     def predict(self, view: View) -> np.ndarray:
         """Return the displacements against the drawing."""
@@ -547,21 +552,21 @@ KINDS: Mapping[str, type[MeasuredKind]] = FrozenMap(
 """Class of each kind of measurement, by its key under ``measurements``."""
 
 
-def named_bodies(one: MeasuredKind) -> tuple[str, ...]:
+def named_bodies(measurement: MeasuredKind) -> tuple[str, ...]:
     """Return the full paths of a measurement's bodies; raise InputError if a name is unknown or ambiguous."""
-    nodes = one.site.experiment.instrument.nodes
+    nodes = measurement.site.experiment.instrument.nodes
     out = []
-    for k, name in enumerate(one.spec.bodies):
+    for k, name in enumerate(measurement.spec.bodies):
         try:
             out.append(find_node(name, nodes))
         except Problem as problem:
-            raise InputError(one.spec.issue(problem, ("bodies", k))) from None
+            raise InputError(measurement.spec.issue(problem, ("bodies", k))) from None
     return tuple(out)
 
 
-def read_json(one: MeasuredKind, path: Path) -> Any:
+def read_json(measurement: MeasuredKind, path: Path) -> Any:
     """Return the contents of a JSON file; raise InputError if it is not one."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise one.wrong(f"not a JSON file ({error})", "file", found=str(path)) from error
+        raise measurement.wrong(f"not a JSON file ({error})", "file", found=str(path)) from error

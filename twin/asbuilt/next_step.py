@@ -56,16 +56,16 @@ def wanted_move(bench: AsBuiltBench, mean: np.ndarray, after: str | None) -> Nex
     """
     actuators = bench.actuators
     amounts = np.zeros(len(actuators.names))
-    found = None
+    move = None
     for _ in range(MOST_ROUNDS):
         residual, slope = _about(bench, mean, after, amounts)
         # the merit at no move, as it looks from where the last search led to
-        found = best_move(residual - slope @ amounts, slope, actuators)
-        if np.array_equal(found.amounts, amounts):
+        move = best_move(residual - slope @ amounts, slope, actuators)
+        if np.array_equal(move.amounts, amounts):
             break
-        amounts = found.amounts
-    assert found is not None
-    return found
+        amounts = move.amounts
+    assert move is not None
+    return move
 
 
 def _about(
@@ -75,18 +75,18 @@ def _about(
     count = len(amounts)
     steps = np.diag(bench.actuator_steps)
     moves = np.concatenate([amounts[None], amounts + steps, amounts - steps])
-    found = bench.merit_numbers(np.repeat(mean[None], len(moves), axis=0), after, moves)
-    return found[0], ((found[1 : 1 + count] - found[1 + count :]) / (2.0 * bench.actuator_steps[:, None])).T
+    residuals = bench.merit_numbers(np.repeat(mean[None], len(moves), axis=0), after, moves)
+    return residuals[0], ((residuals[1 : 1 + count] - residuals[1 + count :]) / (2.0 * bench.actuator_steps[:, None])).T
 
 
-def advice(bench: AsBuiltBench, found: StateEstimate, draws: np.ndarray, rng: np.random.Generator) -> Advice:
+def advice(bench: AsBuiltBench, estimate: StateEstimate, draws: np.ndarray, rng: np.random.Generator) -> Advice:
     """Return the next move, its effect over the posterior, and the expected benefit of measurements before it.
 
     Parameters
     ----------
     bench : AsBuiltBench
         Bench with actuators.
-    found : StateEstimate
+    estimate : StateEstimate
         Estimated state.
     draws : (S, K) ndarray
         States drawn from the posterior.
@@ -99,21 +99,21 @@ def advice(bench: AsBuiltBench, found: StateEstimate, draws: np.ndarray, rng: np
         The light of the estimated state is lost.
     """
     after = bench.last
-    move = wanted_move(bench, found.mean, after)
-    made = bench.actuators.made(move.amounts, rng.standard_normal((len(draws), 2, len(move.amounts))))
+    move = wanted_move(bench, estimate.mean, after)
+    executed = bench.actuators.made(move.amounts, rng.standard_normal((len(draws), 2, len(move.amounts))))
     # states without light are told by themselves, and have no merit
-    both = [float(np.nanmean(expected(bench, draws, after, own))) for own in (None, made)]
-    _, by_actuators = _about(bench, found.mean, after, np.zeros(len(move.amounts)))
-    unit_slope = bench.merit_slope(found.mean, after) @ found.prior.root
+    merits = [float(np.nanmean(expected(bench, draws, after, further))) for further in (None, executed)]
+    _, by_actuators = _about(bench, estimate.mean, after, np.zeros(len(move.amounts)))
+    unit_slope = bench.merit_slope(estimate.mean, after) @ estimate.prior.root
     candidates: dict[str, np.ndarray] = {}
     for kind in bench.candidates:
-        rows = bench.slope(found.mean, [kind], [after])
+        rows = bench.slope(estimate.mean, [kind], [after])
         white = kind.group(np.zeros(len(kind.labels))).whitener()
-        candidates[kind.name] = white @ rows @ found.prior.root
-    everything: dict[str, np.ndarray] = {"": np.asarray(np.linalg.pinv(found.root) * 1e6)}
-    worth = merit_reduction(found.root, unit_slope, bench.actuators, by_actuators, {**candidates, **everything})
+        candidates[kind.name] = white @ rows @ estimate.prior.root
+    everything: dict[str, np.ndarray] = {"": np.asarray(np.linalg.pinv(estimate.root) * 1e6)}
+    worth = merit_reduction(estimate.root, unit_slope, bench.actuators, by_actuators, {**candidates, **everything})
     ignorance = worth.pop("")
-    return Advice(move, both[0], both[1], ignorance, worth)
+    return Advice(move, merits[0], merits[1], ignorance, worth)
 
 
 def expected(
@@ -121,7 +121,7 @@ def expected(
 ) -> np.ndarray:
     """Return the merits of states (S,), sums of squares in units of the requirements; NaN where the light is lost."""
     return where_lit(
-        lambda some: np.sum(bench.merit_numbers(values[some], after, of_some(further, some)) ** 2, axis=1),
+        lambda rows: np.sum(bench.merit_numbers(values[rows], after, of_some(further, rows)) ** 2, axis=1),
         len(values),
         (),
     )

@@ -81,11 +81,13 @@ def run_check(
     advance("readings", 0, 1)
     bench = AsBuiltBench(setup, backend)
     pairs = [(kind, after) for kind, after in zip(bench.kinds, bench.afters, strict=True)]
-    own = [(kind, after) for kind, after in pairs if isinstance(kind, WavefrontReadings)]
-    if not own:
+    wavefronts = [(kind, after) for kind, after in pairs if isinstance(kind, WavefrontReadings)]
+    if not wavefronts:
         allowed = "at least one measurement under `wavefronts`"
-        raise test.error("no wavefronts whose orientation could be told", ("measurements",), allowed=allowed)
-    kinds, afters = [kind for kind, _ in own], [after for _, after in own]
+        raise test.error(
+            "no measured wavefronts whose orientation could be determined", ("measurements",), allowed=allowed
+        )
+    kinds, afters = [kind for kind, _ in wavefronts], [after for _, after in wavefronts]
     terms = tuple(kinds[0].spec.numbers)
     stated = stated_orientation(kinds[0])
     for kind in kinds[1:]:
@@ -133,79 +135,80 @@ def _lit(
     return out
 
 
-def _plain(one: Orientation) -> dict[str, Any]:
-    return {"orientation": one.name, "sign": one.sign}
+def _plain(orientation: Orientation) -> dict[str, Any]:
+    return {"orientation": orientation.name, "sign": orientation.sign}
 
 
 def _readings(check: OrientationCheck) -> list[dict[str, Any]]:
-    found = check.evidence
+    evidence = check.evidence
     return [
         {
-            **_plain(one),
-            "chi_square": float(found.chi_square[k]),
-            "chance": float(found.chance[k]),
-            "log_evidence": float(found.log_evidence[k]),
-            "allowed": one in found.allowed,
-            "like_the_best": one in found.indistinguishable,
+            **_plain(orientation),
+            "chi_square": float(evidence.chi_square[k]),
+            "p_value": float(evidence.chance[k]),
+            "log_evidence": float(evidence.log_evidence[k]),
+            "allowed": orientation in evidence.allowed,
+            "indistinguishable": orientation in evidence.indistinguishable,
         }
-        for k, one in enumerate(found.readings)
+        for k, orientation in enumerate(evidence.readings)
     ]
 
 
 ORIENTATION: Record[OrientationCheck] = Record(
-    "orientation.json: which way round measured wavefronts lie.",
-    Quantity("measurements", lambda check: check.names, "whose wavefronts share one reading"),
-    Quantity("stated", lambda check: _plain(check.stated), "as the file says"),
-    Quantity("degrees", lambda check: check.evidence.degrees, "of freedom"),
-    Quantity("readings", _readings, "all sixteen, the best one first"),
+    "orientation.json: orientation of measured wavefronts.",
+    Quantity("measurements", lambda check: check.names, "measurements whose wavefronts share one orientation"),
+    Quantity("stated", lambda check: _plain(check.stated), "orientation in the file"),
+    Quantity("degrees", lambda check: check.evidence.degrees, "degrees of freedom"),
+    Quantity("readings", _readings, "all sixteen orientations, the best first"),
 )
 
 
 def check_report(check: OrientationCheck) -> Report:
     """Return the report of a check of orientations."""
-    told, more = answer(*_words(check))
-    found = check.evidence
+    verdict, more = answer(*_words(check))
+    evidence = check.evidence
     rows: list[list[Cell]] = [
         [
-            one.name,
-            "+1" if one.sign > 0 else "\N{MINUS SIGN}1",
-            float(found.chi_square[k]),
-            float(found.chance[k]),
-            "yes" if one in found.allowed else "no",
-            "yes" if one in found.indistinguishable else "no",
-            "stated" if one == check.stated else "",
+            orientation.name,
+            "+1" if orientation.sign > 0 else "\N{MINUS SIGN}1",
+            float(evidence.chi_square[k]),
+            float(evidence.chance[k]),
+            "yes" if orientation in evidence.allowed else "no",
+            "yes" if orientation in evidence.indistinguishable else "no",
+            "as specified" if orientation == check.stated else "",
         ]
-        for k, one in enumerate(found.readings)
+        for k, orientation in enumerate(evidence.readings)
     ]
-    heads = ("orientation", "sign", "chi-square", "chance", "allowed", "like the best", "")
+    heads = ("orientation", "sign", "chi-square", "p", "allowed", "indistinguishable", "")
     caption = (
-        f"Chi-square of {found.degrees} degrees of freedom of the coefficients about what the prior and the moves "
-        "predict. Allowed: not rejected at 1 %. Like the best: at most a hundred times less probable."
+        f"Chi-square of the coefficients against the prediction of prior and moves, for {evidence.degrees} degrees of "
+        "freedom. Allowed: not rejected at the 1 % level. Indistinguishable: at most a hundred times less probable "
+        "than the best."
     )
-    table = Table("readings", "Readings", caption, heads, rows, (None, None, 1, 4, None, None, None))
+    table = Table("readings", "Orientations", caption, heads, rows, (None, None, 1, 4, None, None, None))
     facts = (("measurements", ", ".join(check.names)),)
     text = (
-        "Parts may stand to either side of the drawing, so that wavefronts look alike in several readings. A known "
-        "move of one part that makes coma or astigmatism tells them apart.",
+        "Deviations from the drawing may have either sign, so that several orientations can fit equally well. A known "
+        "move of one part that causes coma or astigmatism discriminates between them.",
     )
-    sections = (Section("How to tell more", text, ()),)
-    return Report("Orientation of wavefronts", told, more, facts, table, sections, code=check.code)
+    sections = (Section("How to discriminate", text, ()),)
+    return Report("Orientation of wavefronts", verdict, more, facts, table, sections, code=check.code)
 
 
 def _words(check: OrientationCheck) -> list[str]:
-    found, stated = check.evidence, check.stated
-    best = found.readings[0]
+    evidence, stated = check.evidence, check.stated
+    best = evidence.readings[0]
     if check.code == NONE:
-        return ["No reading of the wavefronts agrees with the prior and the moves: look at fields, units and moves"]
-    if found.found is not None:
-        same = "as stated" if best == stated else f"and not {_text(stated)}, as stated"
-        return [f"The wavefronts lie {_text(best)}, {same}"]
-    others = ", ".join(_text(one) for one in found.indistinguishable[1:])
-    head = f"The data do not tell {_text(best)} from {others}"
-    if stated in found.indistinguishable:
-        return [head, f"The stated reading, {_text(stated)}, is among them"]
-    return [head, f"The stated reading, {_text(stated)}, is excluded"]
+        return ["No orientation of the wavefronts agrees with the prior and the moves: check fields, units and moves"]
+    if evidence.found is not None:
+        same = "as specified" if best == stated else f"not {_text(stated)} as specified"
+        return [f"The orientation of the wavefronts is {_text(best)}, {same}"]
+    others = ", ".join(_text(orientation) for orientation in evidence.indistinguishable[1:])
+    head = f"The data do not discriminate between {_text(best)} and {others}"
+    if stated in evidence.indistinguishable:
+        return [head, f"The specified orientation, {_text(stated)}, is among them"]
+    return [head, f"The specified orientation, {_text(stated)}, is excluded"]
 
 
-def _text(one: Orientation) -> str:
-    return one.name if one.sign > 0 else f"{one.name} with the sign changed"
+def _text(orientation: Orientation) -> str:
+    return orientation.name if orientation.sign > 0 else f"{orientation.name} with reversed sign"

@@ -76,20 +76,22 @@ class Parameters:
         InputError
             The body of an actuator does not exist or does not allow its motion.
         """
-        actuators = tuple(actuator_number(test, instrument, thermal, name, one) for name, one in test.actuators.items())
+        actuators = tuple(
+            actuator_number(test, instrument, thermal, name, entry) for name, entry in test.actuators.items()
+        )
         names = tuple(test.actuators)
         wanted = np.zeros((len(test.moves), len(names)))
         errors, sigmas = [], []
         for j, move in enumerate(test.moves.values()):
             for name, amount in move.by.items():
-                k, one = names.index(name), test.actuators[name]
-                wanted[j, k] = amount_si(amount, one.parts[1])
+                k, entry = names.index(name), test.actuators[name]
+                wanted[j, k] = amount_si(amount, entry.parts[1])
                 errors.append((j, k))
-                sigmas.append(np.hypot(one.move_error * wanted[j, k], one.accuracy_si))
-        gains = tuple(k for k, one in enumerate(test.actuators.values()) if one.response > 0.0)
+                sigmas.append(np.hypot(entry.move_error * wanted[j, k], entry.accuracy_si))
+        gains = tuple(k for k, entry in enumerate(test.actuators.values()) if entry.response > 0.0)
         return cls(
             stated,
-            tuple(f"{short_name(one.body, instrument.nodes)} {one.what}" for one in stated.components),
+            tuple(f"{short_name(entry.body, instrument.nodes)} {entry.what}" for entry in stated.components),
             component_numbers(stated.components, instrument, thermal),
             actuators,
             names,
@@ -176,9 +178,9 @@ class Parameters:
         A body without its own temperature has that of the nearest body that carries it.
         """
         out = np.zeros((len(values), len(bodies)))
-        own = {component.body for component in self.components if component.kind == "temperature"}
+        heated = {component.body for component in self.components if component.kind == "temperature"}
         for b, body in enumerate(bodies):
-            above = next((path for path in _upward(body) if path in own), None)
+            above = next((path for path in _upward(body) if path in heated), None)
             for k, component in enumerate(self.components):
                 if component.kind == "temperature" and component.body == above:
                     out[:, b] += values[:, k]
@@ -205,28 +207,25 @@ def component_numbers(
         Thermal model of the instrument.
     """
     warm = {component.body: Temperature() for component in components if component.kind in HEAT}
-    return tuple(
-        VariedNumber(one.name, one.name, one.kind, one.sigma, _does(one, instrument, thermal, warm))
-        for one in components
-    )
+    return tuple(VariedNumber(c.name, c.name, c.kind, c.sigma, _does(c, instrument, thermal, warm)) for c in components)
 
 
 def _does(
-    one: Component, instrument: Instrument, thermal: ThermalModel, warm: Mapping[str, Temperature]
+    component: Component, instrument: Instrument, thermal: ThermalModel, warm: Mapping[str, Temperature]
 ) -> FrozenMap[str, BodyMove]:
-    if one.kind in HEAT:
-        return heat_moves(thermal, instrument, one.body, one.kind, one.axis, one.sigma, warm)
-    axis = np.eye(3)[one.axis] if one.kind in ("shift", "rotate") else np.zeros(3)
-    about = np.array(instrument.assembly.tree[one.body].pivots[one.pivot])
-    match one.kind:
+    if component.kind in HEAT:
+        return heat_moves(thermal, instrument, component.body, component.kind, component.axis, component.sigma, warm)
+    axis = np.eye(3)[component.axis] if component.kind in ("shift", "rotate") else np.zeros(3)
+    about = np.array(instrument.assembly.tree[component.body].pivots[component.pivot])
+    match component.kind:
         case "shift":
             move = BodyMove(shift=axis)
         case "rotate":
             move = BodyMove(rotate=axis, pivot=about)
         case "figure":
-            move = BodyMove(figure=FrozenMap({one.axis: 1.0}))
+            move = BodyMove(figure=FrozenMap({component.axis: 1.0}))
         case "scale":
             move = BodyMove(shift=-about, shape=FrozenMap({"scale": 1.0}))
         case kind:
             move = BodyMove(shape=FrozenMap({kind: 1.0}))
-    return FrozenMap({one.body: move})
+    return FrozenMap({component.body: move})

@@ -33,27 +33,27 @@ class NamesWavefronts(Protocol):
     spec: Any
     beams: VariedBeams
 
-    def file(self, key: str, value: str, what: str) -> Path:
+    def file(self, key: str, value: str, description: str) -> Path:
         """Return the path of a file given under a key; raise InputError if it does not exist."""
 
     def wrong(self, text: str, key: str, allowed: str | None = None, found: str | None = None) -> InputError:
         """Return an error at a key of the measurement."""
 
 
-def stated_orientation(one: NamesWavefronts) -> Orientation:
+def stated_orientation(measurement: NamesWavefronts) -> Orientation:
     """Return the specified orientation of maps and coefficients; raise InputError if its name is unknown."""
     try:
-        return Orientation.named(one.spec.orientation, one.spec.sign)
+        return Orientation.named(measurement.spec.orientation, measurement.spec.sign)
     except ValueError as error:
-        raise one.wrong(str(error), "orientation", found=one.spec.orientation) from error
+        raise measurement.wrong(str(error), "orientation", found=measurement.spec.orientation) from error
 
 
-def read_coefficients(one: NamesWavefronts, orientation: Orientation | None = None) -> np.ndarray:
+def read_coefficients(measurement: NamesWavefronts, orientation: Orientation | None = None) -> np.ndarray:
     """Return the Zernike terms of every field, (F, T), metres rms of the wavefront in single pass.
 
     Parameters
     ----------
-    one : NamesWavefronts
+    measurement : NamesWavefronts
         The measurement.
     orientation : Orientation, optional
         Orientation of its files; the specified one by default.
@@ -63,58 +63,60 @@ def read_coefficients(one: NamesWavefronts, orientation: Orientation | None = No
     InputError
         A file holds no wavefront, or has other fields or terms, or too small an illuminated area.
     """
-    lies = stated_orientation(one) if orientation is None else orientation
-    spec, terms = one.spec, tuple(one.spec.numbers)
+    recorded = stated_orientation(measurement) if orientation is None else orientation
+    spec, terms = measurement.spec, tuple(measurement.spec.numbers)
 
     def turned(table: np.ndarray) -> np.ndarray:
         try:
-            return lies.coefficients(table, terms)
+            return recorded.coefficients(table, terms)
         except MapError as error:
-            raise one.wrong(str(error), "terms") from error
+            raise measurement.wrong(str(error), "terms") from error
 
     if spec.zernikes is not None:
-        table = turned(_of_table(one, "zernikes", spec.zernikes, len(spec.fields)))
+        table = turned(_of_table(measurement, "zernikes", spec.zernikes, len(spec.fields)))
     else:
-        table = np.stack([_of_map(one, k, name, lies) for k, name in enumerate(spec.maps)])
+        table = np.stack([_of_map(measurement, k, name, recorded) for k, name in enumerate(spec.maps)])
     if spec.reference is not None and Path(spec.reference).suffix.lower() in TABLES:
-        table = table - turned(_of_table(one, "reference", spec.reference, 1))
+        table = table - turned(_of_table(measurement, "reference", spec.reference, 1))
     return np.asarray(table * (0.5 if spec.double_pass else 1.0))
 
 
-def _of_table(one: NamesWavefronts, key: str, name: str, fields: int) -> np.ndarray:
-    path = one.file(key, name, "a CSV file of coefficients")
+def _of_table(measurement: NamesWavefronts, key: str, name: str, fields: int) -> np.ndarray:
+    path = measurement.file(key, name, "a CSV file of coefficients")
     try:
-        found = read_zernikes(path, wavelength=one.beams.wavelength)
+        coefficients = read_zernikes(path, wavelength=measurement.beams.wavelength)
     except MeasurementError as error:
-        raise one.wrong(str(error), key) from error
-    wanted = tuple(one.spec.numbers)
-    missing = [f"Z{j}" for j in wanted if j not in found.terms]
+        raise measurement.wrong(str(error), key) from error
+    wanted = tuple(measurement.spec.numbers)
+    missing = [f"Z{j}" for j in wanted if j not in coefficients.terms]
     if missing:
-        allowed = f"Z{found.terms[0]} to Z{found.terms[-1]} as the table has them"
-        raise one.wrong(f"the table has no {', '.join(missing[:4])}", key, allowed, str(path))
-    if len(found.coefficients) != fields:
-        text = f"{len(found.coefficients)} wavefronts in the table, {fields} fields in the test"
-        raise one.wrong(text, key, "one row for each field, in their order", str(path))
-    return np.asarray(found.coefficients[:, [found.terms.index(j) for j in wanted]])
+        allowed = f"Z{coefficients.terms[0]} to Z{coefficients.terms[-1]} which the table has"
+        raise measurement.wrong(f"the table has no {', '.join(missing[:4])}", key, allowed, str(path))
+    if len(coefficients.coefficients) != fields:
+        text = f"{len(coefficients.coefficients)} wavefronts in the table, {fields} fields in the test"
+        raise measurement.wrong(text, key, "one row for each field, in their order", str(path))
+    return np.asarray(coefficients.coefficients[:, [coefficients.terms.index(j) for j in wanted]])
 
 
-def _of_map(one: NamesWavefronts, number: int, name: str, lies: Orientation) -> np.ndarray:
-    spec = one.spec
-    path = one.file("maps", name, "a file of a wavefront")
+def _of_map(measurement: NamesWavefronts, number: int, name: str, orientation: Orientation) -> np.ndarray:
+    spec = measurement.spec
+    path = measurement.file("maps", name, "a file of a wavefront")
     try:
-        measured = read_map(path, wavelength=one.beams.wavelength)
+        measured = read_map(path, wavelength=measurement.beams.wavelength)
         if spec.reference is not None and Path(spec.reference).suffix.lower() not in TABLES:
-            measured = _less(measured, read_map(one.file("reference", spec.reference, "a map")), one)
+            measured = _less(measured, read_map(measurement.file("reference", spec.reference, "a map")), measurement)
         last = spec.numbers[-1]
-        fitted = fit_wavefront_map(lies.apply(measured).values, tuple(range(1, last + 1)))
+        fitted = fit_wavefront_map(orientation.apply(measured).values, tuple(range(1, last + 1)))
     except MeasurementError as error:
-        raise one.wrong(f"map {number + 1}: {error}", "maps") from error
+        raise measurement.wrong(f"map {number + 1}: {error}", "maps") from error
     return np.asarray(fitted.parts[spec.numbers[0] - 1 :])
 
 
-def _less(measured: WavefrontMap, reference: WavefrontMap, one: NamesWavefronts) -> WavefrontMap:
+def _less(measured: WavefrontMap, reference: WavefrontMap, measurement: NamesWavefronts) -> WavefrontMap:
     """Return a map minus the error of the reference surface."""
     if measured.values.shape != reference.values.shape:
-        found = f"{reference.values.shape} points, the maps {measured.values.shape}"
-        raise one.wrong("the reference has another number of points than the maps", "reference", "the same", found)
+        shapes = f"{reference.values.shape} points, the maps {measured.values.shape}"
+        raise measurement.wrong(
+            "the reference has another number of points than the maps", "reference", "the same", shapes
+        )
     return replace(measured, values=measured.values - reference.values)

@@ -65,7 +65,7 @@ def monitor(
     workers: Annotated[
         int | None, typer.Option(min=0, max=1024, help="Number of worker processes. Default: one for each core.")
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a search that was broken off.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted search.")] = False,
 ) -> None:
     """Find the layout of a pair's monitor: number of beams, their positions in the pupil and their prisms.
 
@@ -84,11 +84,11 @@ def monitor(
 
     count = cores() if workers is None else workers
 
-    def run(*given: Any) -> Any:
-        return PROCEDURES["design monitor"].run(*given, workers=count, journal=kept.begin() / "trials.journal")
+    def run(*arguments: Any) -> Any:
+        return PROCEDURES["design monitor"].run(*arguments, workers=count, journal=store.begin() / "trials.journal")
 
-    kept = KeptWork(options.out, file.stem, "search", resume)
-    run_test("design monitor", file, options, kept, run=run)
+    store = KeptWork(options.out, file.stem, "search", resume)
+    run_test("design monitor", file, options, store, run=run)
 
 
 if __name__ == "__main__":

@@ -20,20 +20,20 @@ from twin.framework.svg import BLUE, GREY, INK, ORANGE, look, new_figure, plain_
 
 def design_report(run: DesignRun) -> Report:
     """Return the report of an optimised camera."""
-    setup, found = run.setup, run.found
-    before, after = found.before, found.after
+    setup, design = run.setup, run.found
+    before, after = design.before, design.after
     worst = float(after.errors.max())
-    told, more = answer(
+    head, more = answer(
         *verdict(run).split(". "),
         agreement(run),
         f"The worst field of {setup.test.name} has a wavefront error of {worst:.4f} waves rms "
         f"({before.errors.max():.4f} in {setup.camera.name})",
         f"its extent along the axis is {1e3 * after.envelope:.1f} mm ({1e3 * before.envelope:.1f} mm): see "
-        "the fields and the room between beams and edges",
+        "the fields and the clearances between beams and edges",
     )
     numbers = _numbers(before, after)
     summary = Table("merit", "The camera before and after", "", ("", "before", "after"), numbers, (None, 4, 4))
-    fields = np.degrees(found.merit.beams.fields)
+    fields = np.degrees(design.merit.beams.fields)
     by_field = Table(
         "fields",
         "Wavefront error by field",
@@ -47,47 +47,47 @@ def design_report(run: DesignRun) -> Report:
     )
     changed = Table(
         "variables",
-        "What was varied",
+        "Variables",
         "SI units.",
         ("variable", "before", "after"),
         [
-            [v.name, float(prescription_of(setup.camera).value(v)), float(found.prescription.value(v))]
-            for v in found.variables
+            [v.name, float(prescription_of(setup.camera).value(v)), float(design.prescription.value(v))]
+            for v in design.variables
         ],
     )
     starts = Table(
         "starts",
-        "What came of every start",
+        "Results of all starts",
         "Rms over the field and worst field, waves. The best of them is the camera above.",
         ("start", "envelope", "waves rms", "worst field", "Jacobians", "ended"),
         [_start_row(n, attempt) for n, attempt in enumerate(run.searched.attempts)],
         (None, None, 4, 4, 0, None),
     )
-    names = ("scene", *found.prescription.names)
+    names = ("scene", *design.prescription.names)
     passages = Table(
         "clearances",
-        "Room between beams and edges",
+        "Clearances between beams and edges",
         "Least distance in y of every stretch of the beams from the edge that it passes, in the plane of symmetry, mm.",
         ("from", "to", "passes", "before", "after"),
         [
             [names[p.segment], names[p.segment + 1], names[p.surface], 1e3 * float(b), 1e3 * float(a)]
-            for p, b, a in zip(found.merit.passages, before.clearances, after.clearances, strict=True)
+            for p, b, a in zip(design.merit.passages, before.clearances, after.clearances, strict=True)
         ],
         (None, None, None, 1, 1),
     )
     with look("design"):
-        layout = to_svg(_layout_figure(found, prescription_of(setup.camera)))
-        errors = to_svg(_error_figure(found))
+        layout = to_svg(_layout_figure(design, prescription_of(setup.camera)))
+        errors = to_svg(_error_figure(design))
     sections = (
         Section(
             "Layout",
             ("Chief ray and edges of the beam of the middle of the field, in the plane of symmetry.",),
-            (SvgFigure("layout", "Before and after", "To one scale.", layout), passages),
+            (SvgFigure("layout", "Before and after", "To the same scale.", layout), passages),
         ),
         Section("Image quality", (), (SvgFigure("errors", "Wavefront error over the field", "", errors), by_field)),
         Section(
             "Prescription",
-            (f"{found.evaluations} Jacobians were traced. The camera's file can be used as it is.",),
+            (f"{design.evaluations} Jacobians were traced. The camera's file can be used as it is.",),
             (
                 starts,
                 changed,
@@ -97,23 +97,23 @@ def design_report(run: DesignRun) -> Report:
     )
     facts = (
         ("start", setup.camera.name),
-        ("variables", str(len(found.variables))),
+        ("variables", str(len(design.variables))),
         ("starts", str(len(run.searched.attempts))),
     )
     warnings = (*run.warnings, *DESIGN.warnings(run))
-    return Report(f"Design of {setup.test.name}", told, more, facts, summary, sections, warnings=warnings)
+    return Report(f"Design of {setup.test.name}", head, more, facts, summary, sections, warnings=warnings)
 
 
 def _start_row(number: int, attempt: Attempt) -> list[str | float]:
     """Return a row of the table of starts."""
-    found = attempt.design
-    kind = "drawn" if attempt.drawn else "the camera"
-    way = "at once" if attempt.steps == 1 else f"in {attempt.steps} steps"
-    if found is None:
-        return [f"{number + 1}: {kind}", way, "", "", "", attempt.problem.partition(";")[0]]
-    ended = "settled" if found.converged else "out of iterations"
-    worst = float(found.after.errors.max())
-    return [f"{number + 1}: {kind}", way, rms_error(found.after), worst, float(found.evaluations), ended]
+    design = attempt.design
+    kind = "random" if attempt.drawn else "the camera"
+    start_text = "at once" if attempt.steps == 1 else f"in {attempt.steps} steps"
+    if design is None:
+        return [f"{number + 1}: {kind}", start_text, "", "", "", attempt.problem.partition(";")[0]]
+    ended = "converged" if design.converged else "out of iterations"
+    worst = float(design.after.errors.max())
+    return [f"{number + 1}: {kind}", start_text, rms_error(design.after), worst, float(design.evaluations), ended]
 
 
 def _numbers(before: Evaluation, after: Evaluation) -> list[list[str | float]]:
@@ -137,9 +137,9 @@ def _layout_figure(design: Design, start: Prescription) -> Figure:
     """Plot the beams in the plane of symmetry, before and after, to the same scale."""
     figure = new_figure(4.4)
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
-    for one, prescription, title in zip(axes, (start, design.prescription), ("before", "after"), strict=True):
-        _layout(one, design, prescription)
-        one.set_title(title)
+    for ax, prescription, title in zip(axes, (start, design.prescription), ("before", "after"), strict=True):
+        _layout(ax, design, prescription)
+        ax.set_title(title)
     axes[0].set_ylabel("y [m]")
     return figure
 

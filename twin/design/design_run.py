@@ -90,7 +90,7 @@ def run_design(
     try:
         first = MeritFunction.of(backend, start, beams, Operands(camera.wavelength)).evaluate(start)
     except (AimError, BeamMissedError) as error:
-        problem = f"no beams to design with come through: {str(error).partition(';')[0]}"
+        problem = f"the beams of the design do not pass the camera: {str(error).partition(';')[0]}"
         raise camera.error(problem, ("mirrors",), allowed="a camera whose whole field gets light") from error
     operands = camera_design.operands_of(setup, first.principal_distance, first.envelope)
     try:
@@ -113,13 +113,13 @@ def run_design(
             # a telescope about its axis, whose secondary stands in the beam
             remedies.insert(0, f"clearance: {np.floor(1e3 * least):g} mm, as {camera.name} obscures its own beams")
         raise BenchError(str(error), key, ", ".join([*remedies, "more to vary, or more starts"])) from error
-    found = searched.best
+    design = searched.best
     remark = REMARK.format(start=camera.name)
     if test.envelope is not None:
         remark += (
-            f"\nIts extent along z is {100 * found.after.envelope / found.before.envelope:.2f} % of {camera.name}'s."
+            f"\nIts extent along z is {100 * design.after.envelope / design.before.envelope:.2f} % of {camera.name}'s."
         )
-    spec = camera_design.camera_of(camera, found.prescription, test.name, test.description)
+    spec = camera_design.camera_of(camera, design.prescription, test.name, test.description)
     if camera.stop_diameter is not None:
         # its beams are as wide as the entrance pupil in the middle of the field
         free = derive_camera(spec.model_copy(update={"stop_diameter": None}), backend).first_order
@@ -127,10 +127,10 @@ def run_design(
         spec = spec.model_copy(update={"stop_diameter": float(width)})
     derive_camera(spec, backend)  # it can be used as a camera
     warnings = []
-    worst = float(found.after.errors.max())
+    worst = float(design.after.errors.max())
     if worst > BLURRED:
-        told = f"{worst:.3g} waves rms in its worst field, more than {BLURRED:g}"
-        warnings.append(f"camera {spec.name} is blurred: {told}")
+        text = f"{worst:.3g} waves rms in its worst field, more than {BLURRED:g}"
+        warnings.append(f"camera {spec.name} is blurred: {text}")
     return DesignRun(setup, searched, spec.file_text(remark), tuple(warnings))
 
 
@@ -146,13 +146,13 @@ def _pair(of: Callable[[Evaluation], Any]) -> Callable[[DesignRun], Any]:
 
 def _chief_rays(run: DesignRun) -> dict[str, np.ndarray]:
     """Return the angles of all chief rays from the normal of the focal plane, radians, before and after."""
-    found, merit = run.found, run.found.merit
+    design, merit = run.found, run.found.merit
 
     def angles(prescription: Prescription) -> np.ndarray:
         direction = trace_beams(merit.backend, prescription, merit.beams).direction[:, 0]
         return np.arctan2(np.hypot(direction[:, 0], direction[:, 1]), np.abs(direction[:, 2]))
 
-    return {"before": angles(found.initial), "after": angles(found.prescription)}
+    return {"before": angles(design.initial), "after": angles(design.prescription)}
 
 
 def _anamorphism(held: ActiveConstraint) -> bool:
@@ -160,32 +160,32 @@ def _anamorphism(held: ActiveConstraint) -> bool:
 
 
 HELD_BY: Record[ActiveConstraint] = Record(
-    "A constraint that keeps the camera from becoming better.",
+    "An active constraint, which limits the camera.",
     Quantity("constraint", lambda held: held.name, "its name"),
     Quantity("limit_m", lambda held: None if _anamorphism(held) else held.limit, "its limit"),
-    Quantity("limit_percent", lambda held: held.limit if _anamorphism(held) else None, "likewise of the anamorphism"),
-    Quantity("broken_at_start_m", lambda held: max(held.start, 0.0), "by how much the start breaks it"),
+    Quantity("limit_percent", lambda held: held.limit if _anamorphism(held) else None, "limit of the anamorphism"),
+    Quantity("broken_at_start_m", lambda held: max(held.start, 0.0), "violation by the start"),
     Quantity(
         "worth_waves_per_mm",
         lambda held: 1e-3 * held.sensitivity,
-        "fall of the error when it is eased",
+        "decrease of the error per millimetre of easing",
         converted=False,
     ),
 )
 START: Record[Attempt] = Record(
-    "One start of the search and what came of it.",
-    Quantity("drawn", lambda attempt: attempt.drawn, "whether it was drawn at random"),
+    "One start of the search and its result.",
+    Quantity("drawn", lambda attempt: attempt.drawn, "true if it was drawn at random"),
     Quantity("steps", lambda attempt: attempt.steps, "steps in which the constraints were brought in"),
     Quantity("wfe_rms_waves", _known(lambda found: rms_error(found.after)), "rms over the field"),
     Quantity("wfe_worst_waves", _known(lambda found: found.after.errors.max()), "rms in the worst field"),
-    Quantity("converged", lambda a: a.design is not None and a.design.converged, "whether the search settled"),
+    Quantity("converged", lambda a: a.design is not None and a.design.converged, "true if the search converged"),
     Quantity("jacobians", _known(lambda found: found.evaluations), "Jacobians that were traced"),
     Quantity("problem", lambda attempt: attempt.problem, "why the constraints cannot be held, empty where they can"),
 )
 
 
 def _unsettled(run: DesignRun) -> str:
-    return f"the search for {run.setup.test.name} was still getting better when it ended, after {ITERATIONS} steps"
+    return f"the search for {run.setup.test.name} had not converged when it ended, after {ITERATIONS} iterations"
 
 
 DESIGN: Record[DesignRun] = Record(
@@ -200,10 +200,10 @@ DESIGN: Record[DesignRun] = Record(
     Quantity("chief_ray_deg", _chief_rays, "angle of the chief ray from the normal of the focal plane, by field"),
     Quantity("clearance_m", _pair(lambda one: one.clearances), "room between beams and edges, by passage"),
     Quantity("improved", lambda run: run.found.improved, "whether the new camera is better"),
-    Quantity("held_by", lambda run: run.found.active, "what keeps it from more, the dearest first", record=HELD_BY),
+    Quantity("held_by", lambda run: run.found.active, "active constraints, the most costly first", record=HELD_BY),
     Quantity("jacobians", lambda run: run.found.evaluations, "Jacobians that were traced for the best"),
-    Quantity("converged", lambda run: run.found.converged, "whether the best search settled", warning=_unsettled),
-    Quantity("starts", lambda run: run.searched.attempts, "what came of every start", record=START),
+    Quantity("converged", lambda run: run.found.converged, "true if the best search converged", warning=_unsettled),
+    Quantity("starts", lambda run: run.searched.attempts, "results of all starts", record=START),
     Quantity("starts_at_best", lambda run: run.searched.agreeing, "starts that end within a share of the best"),
     Quantity("local_optimum", lambda run: run.searched.local, "whether starts end at different cameras"),
 )
@@ -213,7 +213,7 @@ def agreement(run: DesignRun) -> str:
     """Return a sentence on whether other starts end at an equally good camera."""
     searched, count = run.searched, len(run.searched.attempts)
     if count == 1:
-        return "A local optimum: from one start it is not known whether there is a better one (starts: 6 tries more)"
+        return "A local optimum: a single start does not show whether there is a better one (starts: 6 tries more)"
     failed = sum(attempt.design is None for attempt in searched.attempts)
     unheld = f", {failed} cannot hold the constraints" if failed else ""
     if not searched.local:
@@ -228,16 +228,18 @@ def agreement(run: DesignRun) -> str:
 
 def verdict(run: DesignRun) -> str:
     """Return one or two sentences on whether the camera has improved, and which constraints limit it."""
-    found, start, name = run.found, run.setup.camera.name, run.setup.test.name
-    across = found.before.distance_across
-    errors = f"{rms_error(found.after):.4f} waves rms over the field ({rms_error(found.before):.4f} in {start})"
-    held = tuple(one for one in found.active if 1e-3 * one.sensitivity > WORTH * rms_error(found.after))
-    if found.improved:
+    design, start, name = run.found, run.setup.camera.name, run.setup.test.name
+    across = design.before.distance_across
+    errors = f"{rms_error(design.after):.4f} waves rms over the field ({rms_error(design.before):.4f} in {start})"
+    held = tuple(
+        constraint for constraint in design.active if 1e-3 * constraint.sensitivity > WORTH * rms_error(design.after)
+    )
+    if design.improved:
         text = f"Improved: {name} has a wavefront error of {errors}"
-        return f"{text}; more is held by {_held_text(held, start, across)}." if held else f"{text}."
+        return f"{text}; limited by {_held_text(held, start, across)}." if held else f"{text}."
     if held:
-        return f"Not improved, held by {_held_text(held, start, across)}: a wavefront error of {errors}."
-    return f"Not improved: nothing that varies makes {start} better; {name} has a wavefront error of {errors}."
+        return f"Not improved, limited by {_held_text(held, start, across)}: a wavefront error of {errors}."
+    return f"Not improved: no variable makes {start} better; {name} has a wavefront error of {errors}."
 
 
 def _held_text(held: tuple[ActiveConstraint, ...], start: str, across: float) -> str:
@@ -253,13 +255,13 @@ def _held_text(held: tuple[ActiveConstraint, ...], start: str, across: float) ->
         Its principal distance across the line, metres, to which the anamorphism refers.
     """
     parts = []
-    for one in held[:3]:
-        limit = f"{one.limit:.6g} m" if one.limit > 1.0 else f"{1e3 * one.limit:.4g} mm"
+    for constraint in held[:3]:
+        limit = f"{constraint.limit:.6g} m" if constraint.limit > 1.0 else f"{1e3 * constraint.limit:.4g} mm"
         step, unit = 1e-3, "mm"
-        if _anamorphism(one):
-            limit, step, unit = f"{100 * one.limit:.4g} %", 1e-2 * across, "%"
-        text = f"the {one.name} ({limit}"
-        if one.start > HELD:
-            text += f", which {start} breaks by {one.start / step:.3g} {unit}"
-        parts.append(f"{text}; easing it by 1 {unit} is worth {step * one.sensitivity:.2g} waves)")
+        if _anamorphism(constraint):
+            limit, step, unit = f"{100 * constraint.limit:.4g} %", 1e-2 * across, "%"
+        text = f"the {constraint.name} ({limit}"
+        if constraint.start > HELD:
+            text += f", violated by {start} by {constraint.start / step:.3g} {unit}"
+        parts.append(f"{text}; easing it by 1 {unit} reduces the error by {step * constraint.sensitivity:.2g} waves)")
     return " and ".join(parts)

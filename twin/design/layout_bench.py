@@ -188,11 +188,11 @@ class LayoutBench:
         """Return the quantities whose worst is a goal's value: ``d_f`` of every camera."""
         return tuple(key for key in self.rows if key == name or key.endswith(f"/{name}"))
 
-    def boards_apart(self, one: monitor_layout.Beam, other: monitor_layout.Beam) -> bool:
+    def boards_apart(self, beam: monitor_layout.Beam, other: monitor_layout.Beam) -> bool:
         """Return True if the area CCDs of two beams fit beside each other at an end of every line."""
-        ccd = monitor_layout.layout_spec(self.setup, (one,)).autocollimator.area_ccd
+        ccd = monitor_layout.layout_spec(self.setup, (beam,)).autocollimator.area_ccd
         return all(
-            abs(camera.line_principal_distance * (np.tan(one.field) - np.tan(other.field))) >= ccd.rows * ccd.pitch
+            abs(camera.line_principal_distance * (np.tan(beam.field) - np.tan(other.field))) >= ccd.rows * ccd.pitch
             for camera in self.start.cameras.values()
         )
 
@@ -211,7 +211,7 @@ class LayoutBench:
         bodies = convex_bodies(instrument)
         return BeamFacts(
             beam,
-            seen=FrozenMap({name: _seen(one) for name, one in information.items()}),
+            seen=FrozenMap({name: _seen(info) for name, info in information.items()}),
             taken=np.packbits(taken),
             mass=mass,
             bodies=tuple(corners for path, corners in bodies.items() if prism_of(path) is not None),
@@ -257,14 +257,16 @@ class LayoutBench:
         goals = [key for name in self.setup.test.goal.wanted for key in self.goals_of(name)]
         return LayoutFacts(
             beams,
-            sigmas={name: {key: one.sigma(key) for key in one.quantities} for name, one in information.items()},
-            before={name: {key: one.sigma_before(key) for key in one.quantities} for name, one in information.items()},
-            shares={name: {key: one.shares(key) for key in goals} for name, one in information.items()},
-            shares_before={name: {key: one.shares(key, False) for key in goals} for name, one in information.items()},
+            sigmas={name: {key: info.sigma(key) for key in info.quantities} for name, info in information.items()},
+            before={
+                name: {key: info.sigma_before(key) for key in info.quantities} for name, info in information.items()
+            },
+            shares={name: {key: info.shares(key) for key in goals} for name, info in information.items()},
+            shares_before={name: {key: info.shares(key, False) for key in goals} for name, info in information.items()},
             pupil_share=share,
             mass=mass,
             glass_path=max(sum(lengths.values()) for lengths in instrument.glass_path.values()),
-            spot_sigma=max(float(one.spot_sigma.max()) for one in information.values()),
+            spot_sigma=max(float(info.spot_sigma.max()) for info in information.values()),
             brightest=next(iter(information.values())).brightest,
         )
 
@@ -283,7 +285,7 @@ class LayoutBench:
             See ``information_of``.
         """
         stated = self.setup.disturbances
-        found = information_of(
+        results = information_of(
             instrument,
             list(stated.values()),
             self.detector(beam.area_ccd),
@@ -292,22 +294,22 @@ class LayoutBench:
             alike,
             single,
         )
-        return dict(zip(stated, found, strict=True))
+        return dict(zip(stated, results, strict=True))
 
     def _check_limits(self, share: float, mass: float) -> None:
         limits = self.setup.test.limits
         if limits.pupil_share is not None and share > limits.pupil_share:
-            raise _OutsideLimitsError(f"its prisms take {100.0 * share:.3g} percent of the imaging pupil")
+            raise _OutsideLimitsError(f"its prisms block {100.0 * share:.3g} percent of the imaging pupil")
         if limits.mass is not None and mass > limits.mass:
             raise _OutsideLimitsError(f"its prisms have a mass of {mass:.4g} kg")
 
     def _check_spots(self, information: Mapping[str, Information], instrument: Instrument) -> None:
         ccd = instrument.spec.autocollimator.area_ccd
         room = 0.5 * min(ccd.rows, ccd.columns) - EDGE_PX
-        reach = self.setup.test.limits.spot_sigmas * max(float(one.spot_sigma.max()) for one in information.values())
-        if reach > room:
-            raise _OutsideLimitsError(f"its spots leave their area CCDs: {reach:.3g} px of {room:.3g} px")
-        fullest = max(float(one.brightest.max()) for one in information.values())
+        extent = self.setup.test.limits.spot_sigmas * max(float(info.spot_sigma.max()) for info in information.values())
+        if extent > room:
+            raise _OutsideLimitsError(f"its spots leave their area CCDs: {extent:.3g} px of {room:.3g} px")
+        fullest = max(float(info.brightest.max()) for info in information.values())
         if fullest > FULLEST:
             raise _OutsideLimitsError(f"its spots are too bright: pixels are filled to {100.0 * fullest:.3g} percent")
 
@@ -330,10 +332,14 @@ def is_own(body: str) -> bool:
 
 def _seen(information: Information) -> Seen:
     stated: Disturbances = information.disturbances
-    own = np.array([is_own(body) for body in stated.bodies])
-    root = stated.root[np.ix_(~own, ~own)]
-    mine = stated.spots[:, own] @ stated.root[np.ix_(own, own)]
-    return Seen(stated.spots[:, ~own] @ root, mine @ mine.T + information.noise, stated.parameters[:, ~own] @ root)
+    individual = np.array([is_own(body) for body in stated.bodies])
+    root = stated.root[np.ix_(~individual, ~individual)]
+    individual_shifts = stated.spots[:, individual] @ stated.root[np.ix_(individual, individual)]
+    return Seen(
+        stated.spots[:, ~individual] @ root,
+        individual_shifts @ individual_shifts.T + information.noise,
+        stated.parameters[:, ~individual] @ root,
+    )
 
 
 def _light(instrument: Instrument, backend: Backend) -> np.ndarray:
@@ -372,13 +378,13 @@ def touching(one: BeamFacts, other: BeamFacts) -> bool:
         Beams that were evaluated alone.
     """
     # as scenes.models.monitor_chain.facet_places: of two in one corner the one that leans more stands farther out
-    away = one.facets - other.facets
-    lean = away[:, :2]
-    apart = np.sum(lean * away[:, 2:], axis=1) / np.maximum(np.linalg.norm(lean, axis=1), 1e-12)
-    if np.any(apart < max(one.beam.width, other.beam.width)):  # the edge of two facets is half way between them
+    offset = one.facets - other.facets
+    lean = offset[:, :2]
+    distance = np.sum(lean * offset[:, 2:], axis=1) / np.maximum(np.linalg.norm(lean, axis=1), 1e-12)
+    if np.any(distance < max(one.beam.width, other.beam.width)):  # the edge of two facets is half way between them
         return True
     for light, planes in ((one.light, other.planes), (other.light, one.planes)):
-        if any(rays_taken(light, own).any() for own in planes):
+        if any(rays_taken(light, faces).any() for faces in planes):
             return True
     for a in one.bodies:
         for b in other.bodies:
@@ -398,14 +404,14 @@ def combined(facts: Sequence[BeamFacts], name: str) -> np.ndarray:
     name : str
         Name of the disturbances.
     """
-    seen = [one.seen[name] for one in facts]
-    shared = np.concatenate([one.shared for one in seen])
+    models = [entry.seen[name] for entry in facts]
+    shared = np.concatenate([entry.shared for entry in models])
     spread = shared @ shared.T
-    size = len(seen[0].own)
-    for k, one in enumerate(seen):
-        own = slice(size * k, size * (k + 1))
-        spread[own, own] += one.own
-    parameters = seen[0].parameters
+    size = len(models[0].own)
+    for k, entry in enumerate(models):
+        rows = slice(size * k, size * (k + 1))
+        spread[rows, rows] += entry.own
+    parameters = models[0].parameters
     across = parameters @ shared.T
     return np.asarray(parameters @ parameters.T - across @ np.linalg.solve(spread, across.T))
 

@@ -65,10 +65,10 @@ def ratios(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> dic
     """
     wanted = bench.setup.test.goal.wanted.items()
     return {
-        (name, key): own[key] / goal
-        for name, own in sigmas.items()
-        for what, goal in wanted
-        for key in bench.goals_of(what)
+        (name, key): values[key] / goal
+        for name, values in sigmas.items()
+        for name_of_goal, goal in wanted
+        for key in bench.goals_of(name_of_goal)
     }
 
 
@@ -97,38 +97,42 @@ def refined(
     list of LayoutFacts
         The starting layout and its improvements.
     """
-    way, box = [facts], FIRST_BOX
-    every = numbers = numbers_of(bench, facts.beams, _ORDER)
+    path, box = [facts], FIRST_BOX
+    all_numbers = numbers = numbers_of(bench, facts.beams, _ORDER)
     for _ in range(steps):
-        here = way[-1]
-        slopes = ask(f"{part}: slopes", [replace(one, beams=here.beams) for one in numbers])
-        slopes = [slope for slope in slopes if not slope.refused and _worth(bench, here, slope) > WORTH]
+        current = path[-1]
+        slopes = ask(f"{part}: slopes", [replace(number, beams=current.beams) for number in numbers])
+        slopes = [slope for slope in slopes if not slope.refused and _worth(bench, current, slope) > WORTH]
         if not slopes:
             break
         # what no goal depends on here it will not depend on a step away
         numbers = tuple(slope.number for slope in slopes)
         better = None
         while better is None and box >= LEAST_BOX:
-            change, promised = _step(bench, here, slopes, box)
+            change, promised = _step(bench, current, slopes, box)
             if promised <= 0.0:
                 break
-            wanted = _moved(bench, here.beams, numbers, change)
-            found = ask(f"{part}: layout", [wanted])[0]
-            if found.refused:
-                idle = [one for one in every if (one.beam, one.name) not in {(n.beam, n.name) for n in numbers}]
-                found = _with_room(bench, ask, part, wanted, idle, rng)
-            if found.refused:
-                found = _one_by_one(bench, ask, part, here, slopes, change)
-            gained = _largest(here, bench) - _largest(found, bench)
+            wanted = _moved(bench, current.beams, numbers, change)
+            layout = ask(f"{part}: layout", [wanted])[0]
+            if layout.refused:
+                idle = [
+                    number
+                    for number in all_numbers
+                    if (number.beam, number.name) not in {(n.beam, n.name) for n in numbers}
+                ]
+                layout = _with_room(bench, ask, part, wanted, idle, rng)
+            if layout.refused:
+                layout = _one_by_one(bench, ask, part, current, slopes, change)
+            gained = _largest(current, bench) - _largest(layout, bench)
             if gained > _KEPT * promised:
                 box = min(2.0 * box, 0.5)
             else:
                 box *= 0.5
-            better = found if gained > 0.0 else None
+            better = layout if gained > 0.0 else None
         if better is None:
             break
-        way.append(better)
-    return way
+        path.append(better)
+    return path
 
 
 def _largest(facts: LayoutFacts, bench: LayoutBench) -> float:
@@ -161,17 +165,17 @@ def _step(bench: LayoutBench, facts: LayoutFacts, slopes: Sequence[Slope], box: 
     full = np.stack([slope.brightest * (high - low) for slope, (low, high) in zip(slopes, ends, strict=True)], axis=1)
     bounds = []
     for slope, (low, high) in zip(slopes, ends, strict=True):
-        own = number_of(bench.setup, facts.beams[slope.number.beam], slope.number.name)
-        place = (own - low) / (high - low)
-        bounds.append((min(0.0, max(-box, -place)), max(0.0, min(box, 1.0 - place))))
+        value = number_of(bench.setup, facts.beams[slope.number.beam], slope.number.name)
+        position = (value - low) / (high - low)
+        bounds.append((min(0.0, max(-box, -position)), max(0.0, min(box, 1.0 - position))))
     # unknowns: the changes, and the largest ratio
     rows = np.concatenate([np.hstack([table, -np.ones((len(now), 1))]), np.hstack([full, np.zeros((len(full), 1))])])
     limits = np.concatenate([-now, np.maximum(FULLEST - facts.brightest, 0.0)])
     cost = np.concatenate([np.zeros(len(slopes)), [1.0]])
-    found = linprog(cost, rows, limits, bounds=[*bounds, (None, None)], method="highs")
-    if found.x is None:
+    solution = linprog(cost, rows, limits, bounds=[*bounds, (None, None)], method="highs")
+    if solution.x is None:
         return np.zeros(len(slopes)), 0.0
-    return found.x[:-1], float(now.max() - found.x[-1])
+    return solution.x[:-1], float(now.max() - solution.x[-1])
 
 
 def _moved(bench: LayoutBench, beams: Layout, numbers: Sequence[LayoutNumber], change: np.ndarray) -> Layout:
@@ -188,8 +192,8 @@ def _with_room(
 ) -> LayoutFacts:
     """Return the best feasible layout with the idle parameters drawn again; a refused one if none is feasible."""
     tried = [_moved(bench, beams, idle, ROOM_STEP * rng.standard_normal(len(idle))) for _ in range(ROOM if idle else 0)]
-    found = [facts for facts in ask(f"{part}: room", tried) if not facts.refused]
-    return min(found, key=lambda facts: _largest(facts, bench), default=LayoutFacts(beams, refused="no room"))
+    feasible = [facts for facts in ask(f"{part}: room", tried) if not facts.refused]
+    return min(feasible, key=lambda facts: _largest(facts, bench), default=LayoutFacts(beams, refused="no room"))
 
 
 def _one_by_one(
@@ -201,9 +205,9 @@ def _one_by_one(
     for k in np.argsort(gain)[::-1]:
         if change[k] == 0.0:
             continue
-        found = ask(f"{part}: layout", [_moved(bench, facts.beams, [slopes[k].number], change[[k]])])[0]
-        if not found.refused and _largest(found, bench) < _largest(facts, bench):
-            facts = found
+        layout = ask(f"{part}: layout", [_moved(bench, facts.beams, [slopes[k].number], change[[k]])])[0]
+        if not layout.refused and _largest(layout, bench) < _largest(facts, bench):
+            facts = layout
     return facts
 
 
@@ -253,9 +257,9 @@ class LayoutNumber:
         by : float
             Change, SI.
         """
-        own = self.beams[self.beam]
-        value = number_of(bench.setup, own, self.name) + by
-        return (*self.beams[: self.beam], own.changed({self.name: value}), *self.beams[self.beam + 1 :])
+        beam = self.beams[self.beam]
+        value = number_of(bench.setup, beam, self.name) + by
+        return (*self.beams[: self.beam], beam.changed({self.name: value}), *self.beams[self.beam + 1 :])
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,23 +344,23 @@ def slope_of(bench: LayoutBench, number: LayoutNumber) -> Slope:
     low, high = ranges(bench.setup)[number.name]
     step, high_order, low_order = STEP * (high - low), _WEIGHTS[number.order], _WEIGHTS.get(number.order - 2, {})
     try:
-        here = _known_here(bench, number.beams)
-        best, lower, jump = ({name: _Sum.none(one) for name, one in here.items()} for _ in range(3))
+        centre = _known_here(bench, number.beams)
+        best, lower, jump = ({name: _Sum.none(info) for name, info in centre.items()} for _ in range(3))
         jumps = _JUMP.get(number.order, {})
-        for name, one in here.items():
-            jump[name].add(-2.0 * sum(jumps.values()) / step, one)
+        for name, info in centre.items():
+            jump[name].add(-2.0 * sum(jumps.values()) / step, info)
         for k, weight in high_order.items():
             for sign in (1.0, -1.0):
-                for name, one in known_of(bench, number.moved(bench, sign * k * step)).items():
-                    best[name].add(sign * weight / step, one)
-                    lower[name].add(sign * low_order.get(k, 0.0) / step, one)
-                    jump[name].add(jumps.get(k, 0.0) / step, one)
+                for name, info in known_of(bench, number.moved(bench, sign * k * step)).items():
+                    best[name].add(sign * weight / step, info)
+                    lower[name].add(sign * low_order.get(k, 0.0) / step, info)
+                    jump[name].add(jumps.get(k, 0.0) / step, info)
     except (InputError, AimError, BeamMissedError, ValueError) as error:
         return Slope(number, refused=str(error))
     values: dict[str, dict[str, float]] = {}
     errors: dict[str, dict[str, float]] = {}
-    for name, one in here.items():
-        slopes = {key: one.slopes(key) for key in one.quantities if one.sigma(key) > 0.0}
+    for name, info in centre.items():
+        slopes = {key: info.slopes(key) for key in info.quantities if info.sigma(key) > 0.0}
         values[name] = {key: best[name].along(*slope) for key, slope in slopes.items()}
         if low_order:
             errors[name] = {
@@ -378,10 +382,10 @@ class _Sum:
     def none(cls, like: Information) -> _Sum:
         return cls(*(np.zeros_like(a) for a in (like.disturbances.spots, like.noise, like.brightest)))
 
-    def add(self, weight: float, one: Information) -> None:
-        self.spots += weight * one.disturbances.spots
-        self.noise += weight * one.noise
-        self.brightest += weight * one.brightest
+    def add(self, weight: float, info: Information) -> None:
+        self.spots += weight * info.disturbances.spots
+        self.noise += weight * info.noise
+        self.brightest += weight * info.brightest
 
     def along(self, by_spots: np.ndarray, by_noise: np.ndarray) -> float:
         return float(np.sum(by_spots * self.spots) + np.sum(by_noise * self.noise))

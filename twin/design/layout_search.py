@@ -303,8 +303,8 @@ class Search:
 
     def __init__(self, bench: LayoutBench, workers: int, seed: int, journal: Path | None, advance: Advance) -> None:
         self.bench, self.seed = bench, seed
-        kept = journal_of(journal, f"{seed}\n{bench.setup.to_yaml()}")
-        self.workers = Workers(bench, workers, kept, advance)
+        store = journal_of(journal, f"{seed}\n{bench.setup.to_yaml()}")
+        self.workers = Workers(bench, workers, store, advance)
 
     def run(self) -> Found:
         """Run the searches from all starts."""
@@ -316,15 +316,15 @@ class Search:
             for number in range(1, setup.test.search.starts + 1):
                 name = f"start {number}"
                 ends.append(_OneSearch(self.bench, workers.ask, self._rng(number), name).run(()))
-        every = sorted((f for end in ends for f in end.layouts), key=lambda one: merit(one.sigmas, self.bench))
-        return Found(start, tuple(every), tuple(ends), time.monotonic() - begun)
+        layouts = sorted((f for end in ends for f in end.layouts), key=lambda layout: merit(layout.sigmas, self.bench))
+        return Found(start, tuple(layouts), tuple(ends), time.monotonic() - begun)
 
     def _rng(self, number: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence([self.seed, number]))
 
 
-def _promise(one: Candidate) -> tuple[float, tuple[int, ...]]:
-    return one.merit, one.beams
+def _promise(candidate: Candidate) -> tuple[float, tuple[int, ...]]:
+    return candidate.merit, candidate.beams
 
 
 def spread(level: Sequence[Candidate], width: int) -> list[Candidate]:
@@ -387,16 +387,16 @@ class _OneSearch:
             progress.append(self._best())
             step = step if progress[-1] < 0.98 * progress[-2] else 0.5 * step
         layouts = self._standing()
-        way = (
+        path = (
             refined(self.bench, self.ask, self._part("refinement"), layouts[0], spec.refine, self.rng)
             if layouts
             else []
         )
         return End(
             self.name or self.setup.instrument.name,
-            (*reversed(way[1:]), *layouts),
+            (*reversed(path[1:]), *layouts),
             tuple(progress),
-            tuple(merit(facts.sigmas, self.bench) for facts in way[1:]),
+            tuple(merit(facts.sigmas, self.bench) for facts in path[1:]),
             len(self.tried),
             len(self.pool),
             len(self.compared),
@@ -409,7 +409,7 @@ class _OneSearch:
 
     def _standing(self) -> list[LayoutFacts]:
         standing = [facts for facts in self.built.values() if not facts.refused]
-        return sorted(standing, key=lambda one: merit(one.sigmas, self.bench))
+        return sorted(standing, key=lambda layout: merit(layout.sigmas, self.bench))
 
     def _with_other_ccds(self) -> list[Beam]:
         """Return the beams of the best layout with each other area CCD, which only all of them together can have."""
@@ -443,8 +443,11 @@ class _OneSearch:
 
     def _chosen(self, count: int) -> list[Candidate]:
         """Return the most promising layouts not built yet, in turn for each number of beams."""
-        by_size = [[one for one in some if one.beams not in self.built][:count] for some in reversed(self._ranked())]
-        turns = [one for turn in zip_longest(*by_size) for one in turn if one is not None]
+        by_size = [
+            [candidate for candidate in level if candidate.beams not in self.built][:count]
+            for level in reversed(self._ranked())
+        ]
+        turns = [candidate for group in zip_longest(*by_size) for candidate in group if candidate is not None]
         return turns[:count]
 
     def _ranked(self) -> list[list[Candidate]]:
@@ -456,31 +459,37 @@ class _OneSearch:
         """
         spec, size = self.setup.test, len(self.pool)
         level = sorted((self._candidate((k,)) for k in range(size)), key=_promise)
-        every = [level]
+        levels = [level]
         for _ in range(spec.beams - 1):
             width = max(spec.search.layouts // max((spec.beams - 1) * size, 1), 1)
             sets = {
-                tuple(sorted({*one.beams, k}))
-                for one in spread(level, width)
+                tuple(sorted({*candidate.beams, k}))
+                for candidate in spread(level, width)
                 for k in range(size)
-                if k not in one.beams
+                if k not in candidate.beams
             }
             promising = sorted((self._candidate(beams) for beams in sets if self._alike(beams)), key=_promise)
-            standing = (one for one in promising if one.beams in self.built or self._may_stand(one.beams))
+            standing = (
+                candidate
+                for candidate in promising
+                if candidate.beams in self.built or self._may_stand(candidate.beams)
+            )
             level = [*islice(standing, width + len(self.built))]
-            every.append(level)
-        return every
+            levels.append(level)
+        return levels
 
     def _candidate(self, beams: tuple[int, ...]) -> Candidate:
         if beams not in self.compared:
             facts, wanted = [self.pool[k] for k in beams], self.setup.test.goal.wanted
             worst = 0.0
             for name in self.setup.disturbances:
-                left = combined(facts, name)
+                covariance = combined(facts, name)
                 for goal, value in wanted.items():
                     for key in self.bench.goals_of(goal):
                         rows = self.bench.rows[key]
-                        worst = max(worst, float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", rows, left, rows)))) / value)
+                        worst = max(
+                            worst, float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", rows, covariance, rows)))) / value
+                        )
             self.compared[beams] = worst
         return Candidate(beams, self.compared[beams])
 
@@ -492,26 +501,28 @@ class _OneSearch:
 
         The channels of an instrument are traced together, which needs the same kinds of reflectors.
         """
-        some = [self.pool[k].beam for k in beams]
-        return len({(kinds_of(self.setup, beam), beam.area_ccd) for beam in some}) == 1
+        selected = [self.pool[k].beam for k in beams]
+        return len({(kinds_of(self.setup, beam), beam.area_ccd) for beam in selected}) == 1
 
     def _within(self, beams: Sequence[int]) -> bool:
         """Return True if beams together satisfy the limits of mass and pupil."""
         limits, facts = self.setup.test.limits, [self.pool[k] for k in beams]
-        if limits.mass is not None and sum(one.mass for one in facts) > limits.mass:
+        if limits.mass is not None and sum(beam.mass for beam in facts) > limits.mass:
             return False
         if limits.pupil_share is None:
             return True
-        taken = np.bitwise_or.reduce([one.taken for one in facts])
-        own = self.bench.imaging_shape
-        return float(np.unpackbits(taken)[: int(np.prod(own))].reshape(own).mean(axis=-1).max()) <= limits.pupil_share
+        taken = np.bitwise_or.reduce([beam.taken for beam in facts])
+        shape = self.bench.imaging_shape
+        return (
+            float(np.unpackbits(taken)[: int(np.prod(shape))].reshape(shape).mean(axis=-1).max()) <= limits.pupil_share
+        )
 
     def _fits(self, beams: Sequence[int]) -> bool:
         """Return True if the prisms of no two beams overlap."""
         for pair in combinations(beams, 2):
             if pair not in self.apart:
-                one, other = (self.pool[k] for k in pair)
-                self.apart[pair] = self.bench.boards_apart(one.beam, other.beam) and not touching(one, other)
+                first, second = (self.pool[k] for k in pair)
+                self.apart[pair] = self.bench.boards_apart(first.beam, second.beam) and not touching(first, second)
             if not self.apart[pair]:
                 return False
         return True
@@ -522,9 +533,9 @@ class _OneSearch:
         A pair may have to change before it is better than a single beam.
         """
         best = self._standing()
-        sizes = sorted({len(one.beams) for one in best})
-        kept = [[one for one in best if len(one.beams) == size][:KEPT] for size in sizes]
-        return list(dict.fromkeys(beam for some in reversed(kept) for one in some for beam in one.beams))
+        sizes = sorted({len(layout.beams) for layout in best})
+        groups = [[layout for layout in best if len(layout.beams) == size][:KEPT] for size in sizes]
+        return list(dict.fromkeys(beam for group in reversed(groups) for layout in group for beam in layout.beams))
 
     def _best(self) -> float:
         return min((merit(f.sigmas, self.bench) for f in self.built.values() if not f.refused), default=float("inf"))

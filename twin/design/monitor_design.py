@@ -30,7 +30,7 @@ _ASIDE = "other tilts of the prisms in the instrument that it starts from, or ot
 """Advice for a design with ghosts."""
 GOAL_NAMES = {"angle": "intersection angle", "d_f": "principal distance", "height": "height on the ground"}
 """Name of each goal in reports."""
-REMARK = """Made by python -m twin.design monitor from {start}. What its spots leave, one standard deviation:
+REMARK = """Made by python -m twin.design monitor from {start}. Posterior standard deviations:
 {sigmas}."""
 """Comment at the top of an instrument's file."""
 
@@ -77,7 +77,7 @@ class MonitorDesignRun:
 
     def worst(self, facts: LayoutFacts, goal: str) -> float:
         """Return the worst sigma of a goal's quantity over cameras and disturbances, SI."""
-        return max(own[key] for own in facts.sigmas.values() for key in self.bench.goals_of(goal))
+        return max(sigmas[key] for sigmas in facts.sigmas.values() for key in self.bench.goals_of(goal))
 
     def merit(self, facts: LayoutFacts) -> float:
         """Return the largest ratio of a standard deviation to its goal."""
@@ -120,14 +120,16 @@ def run_monitor_design(
     """
     bench = LayoutBench(setup, backend)
     _check_start(setup, backend, seed, advance)
-    found = Search(bench, workers, seed, journal, advance).run()
-    if not found.layouts:
-        most = max(found.refused.items(), key=lambda item: item[1], default=("", 0))
-        text = f"none of {found.beams} beams and {found.built} layouts that were tried can stand"
+    results = Search(bench, workers, seed, journal, advance).run()
+    if not results.layouts:
+        most = max(results.refused.items(), key=lambda item: item[1], default=("", 0))
+        text = f"none of {results.beams} beams and {results.built} layouts is feasible"
         raise BenchError(
-            f"{text}; {most[1]} times since {most[0]}", ("vary",), "other ranges, wider limits, or a longer search"
+            f"{text}; most frequent reason ({most[1]} times): {most[0]}",
+            ("vary",),
+            "other ranges, wider limits, or a longer search",
         )
-    clean = [facts for facts in _front(found.layouts, bench) if not _ghosts(setup, facts, backend, seed, advance)]
+    clean = [facts for facts in _front(results.layouts, bench) if not _ghosts(setup, facts, backend, seed, advance)]
     if not clean:
         raise BenchError("every layout on the front throws ghosts on its area CCDs", ("limits", "ghost_paths"), _ASIDE)
     points = []
@@ -137,7 +139,7 @@ def run_monitor_design(
         lines = [f"{GOAL_NAMES[goal]} {text}" for goal, text in _texts(facts, bench).items()]
         remark = REMARK.format(start=setup.instrument.name, sigmas="; ".join(lines))
         points.append(Point(name, facts, spec.file_text(remark)))
-    return MonitorDesignRun(setup, bench, found, tuple(points))
+    return MonitorDesignRun(setup, bench, results, tuple(points))
 
 
 def _check_start(setup: monitor_layout.MonitorDesignSetup, backend: Backend, seed: int, advance: Advance) -> None:
@@ -187,8 +189,8 @@ def _texts(facts: LayoutFacts, bench: LayoutBench) -> dict[str, str]:
     out = {}
     for goal in bench.setup.test.goal.wanted:
         unit, size = UNITS[goal]
-        each = {name: max(own[key] for key in bench.goals_of(goal)) for name, own in facts.sigmas.items()}
-        out[goal] = ", ".join(f"{value / size:.3g} {unit} ({name})" for name, value in each.items())
+        values = {name: max(sigmas[key] for key in bench.goals_of(goal)) for name, sigmas in facts.sigmas.items()}
+        out[goal] = ", ".join(f"{value / size:.3g} {unit} ({name})" for name, value in values.items())
     return out
 
 
@@ -199,11 +201,11 @@ def _front(layouts: tuple[LayoutFacts, ...], bench: LayoutBench) -> list[LayoutF
         return merit(facts.sigmas, bench), facts.pupil_share, facts.mass
 
     front = []
-    for one in layouts:
-        mine = cost(one)
-        others = [cost(other) for other in layouts if other is not one]
-        if not any(all(b <= a for a, b in zip(mine, other, strict=True)) and other != mine for other in others):
-            front.append(one)
+    for layout in layouts:
+        costs = cost(layout)
+        others = [cost(other) for other in layouts if other is not layout]
+        if not any(all(b <= a for a, b in zip(costs, other, strict=True)) and other != costs for other in others):
+            front.append(layout)
     if len(front) <= MOST_POINTS:
         return front
     step = (len(front) - 1) / (MOST_POINTS - 1)
@@ -217,7 +219,7 @@ def verdict(run: MonitorDesignRun) -> tuple[str, ...]:
     for goal, wanted in test.goal.wanted.items():
         unit, size = UNITS[goal]
         now, before = run.worst(best, goal), run.worst(start, goal)
-        met = "" if now <= wanted else f", {wanted / size:.3g} wanted"
+        met = "" if now <= wanted else f", goal {wanted / size:.3g}"
         less = f"{before / now:.3g} times less than {run.setup.instrument.name}"
         parts.append(f"{GOAL_NAMES[goal]} {now / size:.3g} {unit} ({less}{met})")
     head = "reaches its goal" if run.merit(best) <= 1.0 else "does not reach its goal"
@@ -237,14 +239,14 @@ def _limiting(run: MonitorDesignRun, facts: LayoutFacts) -> tuple[str, float]:
     """Return the largest cause of the variance of the goal that is farthest from being reached, and its share."""
     wanted = run.setup.test.goal.wanted
     cases = [
-        (own[key] / wanted[goal], name, key)
-        for name, own in facts.sigmas.items()
+        (sigmas[key] / wanted[goal], name, key)
+        for name, sigmas in facts.sigmas.items()
         for goal in wanted
         for key in run.bench.goals_of(goal)
     ]
     _, name, key = max(cases)
     shares = facts.shares[name][key]
-    cause = max(shares, key=lambda one: shares[one])
+    cause = max(shares, key=lambda candidate: shares[candidate])
     return cause, shares[cause] / sum(shares.values())
 
 
@@ -255,8 +257,10 @@ def _unit(key: str) -> tuple[str, float]:
 def _by_quantity(values: Mapping[str, Mapping[str, Any]], of: Callable[[Any, float], Any]) -> dict[str, Any]:
     """Return disturbances -> quantity with its unit as suffix -> ``of`` applied to a value and the unit's size."""
     return {
-        name: {f"{key.replace('/', '_')}_{_unit(key)[0]}": of(value, _unit(key)[1]) for key, value in own.items()}
-        for name, own in values.items()
+        name: {
+            f"{key.replace('/', '_')}_{_unit(key)[0]}": of(value, _unit(key)[1]) for key, value in quantities.items()
+        }
+        for name, quantities in values.items()
     }
 
 
@@ -297,26 +301,26 @@ class _Part:
 
 
 LAYOUT: Record[_Part] = Record(
-    "What a layout leaves, one standard deviation, and what it takes.",
-    Quantity("beams", lambda one: one.of.beams, "of every end of a line", record=BEAM),
-    Quantity("merit", lambda one: one.run.merit(one.of), "largest ratio of what is left to what is wanted"),
+    "Posterior standard deviations of a layout, and its costs.",
+    Quantity("beams", lambda one: one.of.beams, "beams at every end of a line", record=BEAM),
+    Quantity("merit", lambda one: one.run.merit(one.of), "largest ratio of a standard deviation to its goal"),
     Quantity("sigma", lambda one: _sigmas(one.of.sigmas), "by disturbances and quantity"),
     Quantity("sigma_unmeasured", lambda one: _sigmas(one.of.before), "without any measurement"),
     Quantity("by_cause", lambda one: _causes(one.of.shares), "standard deviations by cause; their squares add up"),
     Quantity("by_cause_unmeasured", lambda one: _causes(one.of.shares_before), "without any measurement"),
-    Quantity("pupil_share", lambda one: one.of.pupil_share, "share of the imaging pupil that the prisms take"),
+    Quantity("pupil_share", lambda one: one.of.pupil_share, "share of the imaging pupil that the prisms block"),
     Quantity("mass_kg", lambda one: one.of.mass, "of the prisms"),
-    Quantity("glass_path_mm", lambda one: one.of.glass_path, "longest way of a beam in glass, one way"),
-    Quantity("spot_px_sigma", lambda one: one.of.spot_sigma, "largest standard deviation of a spot's place"),
+    Quantity("glass_path_mm", lambda one: one.of.glass_path, "longest path of a beam in glass, one way"),
+    Quantity("spot_px_sigma", lambda one: one.of.spot_sigma, "largest prior standard deviation of a spot position"),
 )
 SEARCH: Record[Found] = Record(
-    "How much was tried.",
-    Quantity("beams_tried", lambda found: found.beams, "beams that were tried alone"),
-    Quantity("beams_standing", lambda found: found.standing, "of these, that can stand"),
-    Quantity("layouts_compared", lambda found: found.compared, "combinations whose merit was worked out"),
-    Quantity("layouts_built", lambda found: found.built, "of these, built as a whole"),
-    Quantity("layouts_standing", lambda found: len(found.layouts), "of these, that can stand"),
-    Quantity("refused", lambda found: found.refused, "why others cannot stand, with how many"),
+    "Extent of the search.",
+    Quantity("beams_tried", lambda found: found.beams, "beams that were evaluated alone"),
+    Quantity("beams_feasible", lambda found: found.standing, "feasible ones of these"),
+    Quantity("layouts_compared", lambda found: found.compared, "combinations whose merit was computed"),
+    Quantity("layouts_built", lambda found: found.built, "those of these that were built as a whole"),
+    Quantity("layouts_feasible", lambda found: len(found.layouts), "feasible ones of these"),
+    Quantity("refused", lambda found: found.refused, "reasons why others are not feasible, with their numbers"),
 )
 
 
@@ -325,10 +329,10 @@ def _best(end: _Part) -> _Part | None:
 
 
 END: Record[_Part] = Record(
-    "Where one search came to.",
+    "Result of one search.",
     Quantity("merit_by_round", lambda end: end.of.progress, "best merit after the first draw and after each round"),
-    Quantity("merit_by_refinement", lambda end: end.of.refined, "merits on the way by gradients"),
-    Quantity("best", _best, "its best layout, None where it found none that stands", record=LAYOUT),
+    Quantity("merit_by_refinement", lambda end: end.of.refined, "merits during the refinement by gradients"),
+    Quantity("best", _best, "its best layout, None if it found no feasible one", record=LAYOUT),
 )
 
 
@@ -338,12 +342,14 @@ def _goals(run: MonitorDesignRun) -> dict[str, float]:
 
 LAYOUTS: Record[MonitorDesignRun] = Record(
     "layouts.json: a search for the layout of a monitor.",
-    Quantity("instrument", lambda run: run.setup.instrument.name, "that it starts from"),
-    Quantity("goal", _goals, "standard deviations that are wanted"),
+    Quantity("instrument", lambda run: run.setup.instrument.name, "instrument from which the search starts"),
+    Quantity("goal", _goals, "goals, standard deviations"),
     Quantity("start", lambda run: _Part(run, run.found.start), "the layout of that instrument", record=LAYOUT),
     Quantity("layouts", lambda run: {p.name: _Part(run, p.facts) for p in run.points}, "on the front", record=LAYOUT),
-    Quantity("search", lambda run: run.found, "how much was tried", record=SEARCH),
-    Quantity("ends", lambda run: {e.name: _Part(run, e) for e in run.found.ends}, "of every search", record=END),
+    Quantity("search", lambda run: run.found, "extent of the search", record=SEARCH),
+    Quantity(
+        "ends", lambda run: {e.name: _Part(run, e) for e in run.found.ends}, "results of all searches", record=END
+    ),
     Quantity(
         "optima",
         lambda run: [[end.name for end in group] for group in optima(run.found, run.bench)],

@@ -27,9 +27,9 @@ _MOST_CAUSES = 6
 
 def monitor_design_report(run: MonitorDesignRun) -> Report:
     """Return the report of a search for a monitor's layout."""
-    setup, found = run.setup, run.found
+    setup, results = run.setup, run.found
     start, test = setup.instrument.name, setup.test
-    rows = [_row(run, start, found.start), *(_row(run, point.name, point.facts) for point in run.points)]
+    rows = [_row(run, start, results.start), *(_row(run, point.name, point.facts) for point in run.points)]
     heads = (
         "layout",
         "beams per end",
@@ -40,21 +40,23 @@ def monitor_design_report(run: MonitorDesignRun) -> Report:
         "glass path [m]",
         "spots, σ [px]",
     )
-    places = [decimals_for(min(run.worst(f, g) for _, f in _named(run)) / UNITS[g][1], 3) for g in test.goal.wanted]
-    decimals = (None, None, *places, 2, 1, 1, 2, 1)
+    goal_decimals = [
+        decimals_for(min(run.worst(f, g) for _, f in _named(run)) / UNITS[g][1], 3) for g in test.goal.wanted
+    ]
+    decimals = (None, None, *goal_decimals, 2, 1, 1, 2, 1)
     stated = ", ".join(setup.disturbances)
     caption = f"One standard deviation, the worst over cameras and disturbances ({stated})."
     summary = Table("layouts", "The start and the layouts on the front", caption, heads, rows, decimals)
     best = run.points[0]
     with look("layouts"):
-        front = SvgFigure("front", "What a smaller sigma costs", _FRONT, to_svg(_front_figure(run)))
+        front = SvgFigure("front", "Sigma against cost", _FRONT, to_svg(_front_figure(run)))
         causes = SvgFigure("causes", "What limits them", _CAUSES, to_svg(_cause_figure(run)))
         pupils = SvgFigure("pupils", "Beams in the entrance pupil", _PUPILS, to_svg(_pupil_figure(run)))
     drawings = tuple(_drawing(run, point) for point in run.points[:2])
     sections = (
         Section("The front", (_search_text(run),), (front, _beams_table(run))),
-        *([Section("Several starts", (starts_text(run),), (_starts_table(run),))] if len(found.ends) > 1 else []),
-        Section("What limits it", (), (causes, *(_cause_table(run, name) for name in setup.disturbances))),
+        *([Section("Several starts", (starts_text(run),), (_starts_table(run),))] if len(results.ends) > 1 else []),
+        Section("Limiting causes", (), (causes, *(_cause_table(run, name) for name in setup.disturbances))),
         Section("The layouts", (), (pupils, *drawings)),
         Section(
             "The instruments",
@@ -67,19 +69,19 @@ def monitor_design_report(run: MonitorDesignRun) -> Report:
     facts = (("start", start), ("disturbances", stated), ("best", best.name))
     lead = (f"The instrument of the best layout is artefacts/{best.name.lower()}.yaml.",)
     title = f"Layout of {test.name}"
-    told, more = answer(*verdict(run))
-    return Report(title, told, (*more, *lead), facts, summary, sections, warnings=coarse_warnings(run.setup))
+    head, more = answer(*verdict(run))
+    return Report(title, head, (*more, *lead), facts, summary, sections, warnings=coarse_warnings(run.setup))
 
 
 _FRONT = (
-    "Every layout that was built and stands: what it leaves of the goal that it is farthest from, relative to what is "
-    "wanted, against the share of the imaging pupil that its prisms take and against their mass. Named ones are on the "
-    "front: no other is better in all three."
+    "Every feasible layout: its largest ratio of a standard deviation to its goal, against the share of the imaging "
+    "pupil that its prisms block and against their mass. Named layouts are on the front: no other is better in all "
+    "three."
 )
 """Caption of the figure of the front."""
-_CAUSES = "Standard deviations by cause before any measurement and as the start and the best layout leave them."
+_CAUSES = "Standard deviations by cause: without measurement, with the start and with the best layout."
 """Caption of the figure of the causes."""
-_PUPILS = "Of the first camera as light comes in; X points toward the central prism. Filled: left; open: right."
+_PUPILS = "Seen along the light into the first camera; X points toward the central prism. Filled: left; open: right."
 """Caption of the figure of the pupils."""
 
 
@@ -90,15 +92,19 @@ def _row(run: MonitorDesignRun, name: str, facts: LayoutFacts) -> list[str | int
 
 
 def _search_text(run: MonitorDesignRun) -> str:
-    found = run.found
+    results = run.found
     text = (
-        f"{found.beams} beams were tried alone, of which {found.standing} can stand; {found.compared} combinations "
-        f"were compared, {found.built} built as a whole, {len(found.layouts)} of these stand."
+        f"{results.beams} beams were evaluated alone, of which {results.standing} are feasible; {results.compared} "
+        f"combinations were compared and {results.built} built as a whole, of which {len(results.layouts)} are feasible."
     )
-    refused = sorted(found.refused.items(), key=lambda item: -item[1])[:3]
+    refused = sorted(results.refused.items(), key=lambda item: -item[1])[:3]
     if refused:
-        text += " Most were refused since " + "; ".join(f"{reason} ({count})" for reason, count in refused) + "."
-    first = found.ends[0]
+        text += (
+            " Most frequent reasons of rejection: "
+            + "; ".join(f"{reason} ({count})" for reason, count in refused)
+            + "."
+        )
+    first = results.ends[0]
     steps = ", ".join(f"{value:.3g}" for value in first.progress)
     text += f" The best ratio to the goal after the first draw and after each round: {steps}"
     if first.refined:
@@ -109,20 +115,20 @@ def _search_text(run: MonitorDesignRun) -> str:
 def starts_text(run: MonitorDesignRun) -> str:
     """Return a sentence on whether all starts reach the same optimum."""
     groups, count = optima(run.found, run.bench), len(run.found.ends)
-    lost = count - sum(len(group) for group in groups)
+    infeasible = count - sum(len(group) for group in groups)
     best = [run.merit(group[0].layouts[0]) for group in groups]
     worst = max(run.merit(end.layouts[0]) for group in groups for end in group)
     if len(groups) == 1:
-        text = f"All {count - lost} searches end within {100.0 * (worst / best[0] - 1.0):.2g} % of the same goal"
+        text = f"All {count - infeasible} searches end within {100.0 * (worst / best[0] - 1.0):.2g} % of the same merit"
     else:
-        each = "; ".join(
+        texts = "; ".join(
             f"{value:.4g} ({', '.join(end.name for end in group)})" for value, group in zip(best, groups, strict=True)
         )
         text = (
-            f"The searches end at {len(groups)} goals that differ by more than {100.0 * ALIKE:.0f} %: {each}. These "
-            "are several optima, or searches that were too short to come to one"
+            f"The searches end at {len(groups)} merits that differ by more than {100.0 * ALIKE:.0f} %: {texts}. There "
+            "are several optima, or the searches were too short to converge"
         )
-    return f"{text}; {lost} found no layout that stands." if lost else f"{text}."
+    return f"{text}; {infeasible} found no feasible layout." if infeasible else f"{text}."
 
 
 def _starts_table(run: MonitorDesignRun) -> Table:
@@ -131,12 +137,12 @@ def _starts_table(run: MonitorDesignRun) -> Table:
         if not end.layouts:
             rows.append([end.name, 0, *[float("nan")] * 3, ""])
             continue
-        best, own = end.layouts[0], end.progress[-1]
+        best, ratio = end.layouts[0], end.progress[-1]
         through = "; ".join(f"{1e3 * beam.pupil_x:.0f}, {1e3 * beam.pupil_y:.0f}" for beam in best.beams)
-        rows.append([end.name, len(best.beams), own, run.merit(best), 100.0 * best.pupil_share, through])
+        rows.append([end.name, len(best.beams), ratio, run.merit(best), 100.0 * best.pupil_share, through])
     heads = ("from", "beams per end", "σ / goal before gradients", "σ / goal", "pupil [%]", "pupil x, y [mm]")
-    places = (None, None, 4, 4, 1, None)
-    return Table("starts", "Where each start ends", "The best layout of every search.", heads, rows, places)
+    decimals = (None, None, 4, 4, 1, None)
+    return Table("starts", "Results of all starts", "The best layout of every search.", heads, rows, decimals)
 
 
 def _beams_table(run: MonitorDesignRun) -> Table:
@@ -147,12 +153,12 @@ def _beams_table(run: MonitorDesignRun) -> Table:
         for n, beam in enumerate(facts.beams, 1):
             mm = [1e3 * v for v in (beam.pupil_x, beam.pupil_y, beam.width)]
             rest = [1e3 * v for v in (beam.shift, beam.spread_x, beam.spread_y)]
-            places = [float(np.degrees(beam.field)), beam.prism_180_distance, beam.prism_0_distance]
+            positions = [float(np.degrees(beam.field)), beam.prism_180_distance, beam.prism_0_distance]
             light = 1e-6 * number_of(run.setup, beam, "photons")
-            rows.append([name, n, *mm, *places, *rest, light, beam.prisms, beam.area_ccd])
+            rows.append([name, n, *mm, *positions, *rest, light, beam.prisms, beam.area_ccd])
     title = "Beams of the layouts"
-    places_shown = (None, None, 1, 1, 1, 3, 3, 3, 1, 1, 1, 1, None, None)
-    return Table("beams", title, "Each stands at both ends of both lines.", (*heads, *more), rows, places_shown)
+    decimals = (None, None, 1, 1, 1, 3, 3, 3, 1, 1, 1, 1, None, None)
+    return Table("beams", title, "Each is at both ends of both lines.", (*heads, *more), rows, decimals)
 
 
 def _named(run: MonitorDesignRun) -> list[tuple[str, LayoutFacts]]:
@@ -161,7 +167,7 @@ def _named(run: MonitorDesignRun) -> list[tuple[str, LayoutFacts]]:
 
 def _causes_of(run: MonitorDesignRun, facts: LayoutFacts, name: str, goal: str, measured: bool) -> dict[str, float]:
     """Return standard deviations by cause, for the camera in which the goal's quantity is worse, in the goal's unit."""
-    key = max(run.bench.goals_of(goal), key=lambda one: facts.sigmas[name][one])
+    key = max(run.bench.goals_of(goal), key=lambda quantity: facts.sigmas[name][quantity])
     shares = (facts.shares if measured else facts.shares_before)[name][key]
     return {cause: sqrt(max(share, 0.0)) / UNITS[goal][1] for cause, share in shares.items()}
 
@@ -179,9 +185,11 @@ def _cause_table(run: MonitorDesignRun, name: str) -> Table:
     rows: list[list[Cell]] = [[cause, *(column.get(cause, 0.0) for column in columns)] for cause in causes]
     totals = [sqrt(sum(v * v for v in column.values())) for column in columns]
     rows.append(["together", *totals])
-    places = (None, *(decimals_for(0.01 * total, 1) for total in totals))
+    decimals = (None, *(decimals_for(0.01 * total, 1) for total in totals))
     title = f"By cause: {name}"
-    return Table(f"causes-{name.lower()}".replace("/", "-").replace(".", "-"), title, "σ.", tuple(heads), rows, places)
+    return Table(
+        f"causes-{name.lower()}".replace("/", "-").replace(".", "-"), title, "σ.", tuple(heads), rows, decimals
+    )
 
 
 def _front_figure(run: MonitorDesignRun) -> Figure:
@@ -190,8 +198,10 @@ def _front_figure(run: MonitorDesignRun) -> Figure:
     left, right = figure.subplots(1, 2, sharey=True)
     costs = (("share of the imaging pupil [%]", lambda f: 100.0 * f.pupil_share), ("prisms [kg]", lambda f: f.mass))
     for axes, (label, cost) in zip((left, right), costs, strict=True):
-        every = run.found.layouts
-        axes.plot([cost(f) for f in every], [run.merit(f) for f in every], "o", ms=3.5, color=LIGHT, mec=GREY, mew=0.5)
+        layouts = run.found.layouts
+        axes.plot(
+            [cost(f) for f in layouts], [run.merit(f) for f in layouts], "o", ms=3.5, color=LIGHT, mec=GREY, mew=0.5
+        )
         for k, point in enumerate(run.points):
             x, y = cost(point.facts), run.merit(point.facts)
             axes.plot([x], [y], "o", ms=6, color=VERMILION if k == 0 else BLUE)
@@ -228,7 +238,9 @@ def _cause_figure(run: MonitorDesignRun) -> Figure:
 
 def _cause_bars(axes: Axes, run: MonitorDesignRun, goal: str) -> None:
     best = run.points[0].facts
-    name = max(best.sigmas, key=lambda one: max(best.sigmas[one][key] for key in run.bench.goals_of(goal)))
+    name = max(
+        best.sigmas, key=lambda disturbances: max(best.sigmas[disturbances][key] for key in run.bench.goals_of(goal))
+    )
     columns = [
         ("unmeasured", LIGHT, _causes_of(run, run.found.start, name, goal, False)),
         (run.setup.instrument.name, SKY, _causes_of(run, run.found.start, name, goal, True)),
@@ -261,8 +273,8 @@ def _pupil_figure(run: MonitorDesignRun) -> Figure:
         for k, beam in enumerate(facts.beams):
             colour = (VERMILION, BLUE, ORANGE, SKY)[k % 4]
             for sign, fill in ((1.0, True), (-1.0, False)):
-                place = (1e3 * beam.pupil_x, sign * 1e3 * beam.pupil_y)
-                axes.add_patch(Circle(place, 0.5e3 * beam.width, fill=fill, fc=colour, ec=colour, alpha=0.7, lw=1.2))
+                centre = (1e3 * beam.pupil_x, sign * 1e3 * beam.pupil_y)
+                axes.add_patch(Circle(centre, 0.5e3 * beam.width, fill=fill, fc=colour, ec=colour, alpha=0.7, lw=1.2))
         axes.set(xlim=(-1.1 * radius, 1.1 * radius), ylim=(-1.1 * radius, 1.1 * radius), aspect="equal", title=name)
         axes.set_xlabel("X [mm]")
         plain_axes(axes)

@@ -47,7 +47,7 @@ def main(
             "variables, see docs/studies.md."
         ),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the study in the folder --out.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the study in the folder --out.")] = False,
     gradient: Annotated[
         bool,
         typer.Option("--gradient", help="Differentiate the responses by the factors at the base, instead of the runs."),
@@ -101,22 +101,24 @@ def main(
         return setup
 
     def work(setup: StudySetup, session: Session) -> Result:
-        place, chosen = kept.begin(), (workers, scheduler)
-        if out is not None and finished and not (place / BLOCKS).exists():
-            copyfile(out / BLOCKS, place / BLOCKS)
-        said = Console(quiet=True) if options.silent else errors
-        say = partial(said.print, markup=False, highlight=False, soft_wrap=True)
+        folder, chosen = store.begin(), (workers, scheduler)
+        if out is not None and finished and not (folder / BLOCKS).exists():
+            copyfile(out / BLOCKS, folder / BLOCKS)
+        console = Console(quiet=True) if options.silent else errors
+        say = partial(console.print, markup=False, highlight=False, soft_wrap=True)
         if progress_fd is None:
-            return study_command.run_study(setup, session, place, chosen, say)
+            return study_command.run_study(setup, session, folder, chosen, say)
         from twin.study.scripted import tell_through  # what a script needs
 
-        return study_command.run_study(setup, session, place, chosen, say, tell_through(progress_fd))
+        return study_command.run_study(setup, session, folder, chosen, say, tell_through(progress_fd))
 
     # --resume of a finished study makes its report anew
     finished = resume and out is not None and isfile(out / BLOCKS) and read_manifest(out) is not None
-    again = f"python -m twin.study {file}{'' if out is None else f' --out {out}'}{' --force' if options.force else ''}"
-    kept = KeptWork(out, file.stem, "blocks", resume, options.force, again)
-    run_command(file.stem, replace(options, force=options.force or finished), resolve, work, kept)
+    command = (
+        f"python -m twin.study {file}{'' if out is None else f' --out {out}'}{' --force' if options.force else ''}"
+    )
+    store = KeptWork(out, file.stem, "blocks", resume, options.force, command)
+    run_command(file.stem, replace(options, force=options.force or finished), resolve, work, store)
 
 
 def _refuse_with_gradient(errors: Console, options: Mapping[str, object]) -> None:

@@ -128,15 +128,15 @@ def study(
         The study could not be completed; the message gives the reason.
     """
     config = config_text(instrument, vary, n, seed, design, responses)
-    with scratch("twin-study") as place:
-        file, target = place / "config.yaml", place / "study" if out is None else Path(out)
+    with scratch("twin-study") as folder:
+        file, target = folder / "config.yaml", folder / "study" if out is None else Path(out)
         file.write_text(config, "utf-8")
         # A process of its own: workers started from here would run the caller's script once more, each of them.
         command = [sys.executable, "-m", str(__package__), str(file), "--out", str(target), "--yes", "--json"]
         command += [] if workers is None else ["--workers", str(workers)]
-        code, said = _run(command, quiet, progress)
+        code, message = _run(command, quiet, progress)
         if code:
-            why = f": {said.strip()}" if quiet else "; see above"
+            why = f": {message.strip()}" if quiet else "; see above"
             raise RuntimeError(f"the study ended with exit code {code}{why}")
         with xr.open_dataset(target / "study.nc", engine="h5netcdf") as data:
             return data.load()
@@ -144,28 +144,28 @@ def study(
 
 def _run(command: list[str], quiet: bool, progress: bool | Told) -> tuple[int, str]:
     """Run a study's command to its end and return its exit code and, if quiet, its messages."""
-    told = progress if callable(progress) else _shown_bar() if progress and not quiet else _silent
+    callback = progress if callable(progress) else _shown_bar() if progress and not quiet else _silent
     reading, writing = os.pipe()
-    with os.fdopen(reading) as lines, tempfile.TemporaryFile("w+") as kept:
+    with os.fdopen(reading) as lines, tempfile.TemporaryFile("w+") as messages:
         words = [*command, "--progress-fd", str(writing)]
         try:
             done = subprocess.Popen(
-                words, stdout=subprocess.DEVNULL, stderr=kept if quiet else None, pass_fds=(writing,)
+                words, stdout=subprocess.DEVNULL, stderr=messages if quiet else None, pass_fds=(writing,)
             )
         finally:
             os.close(writing)
         try:
             for line in lines:  # until the other end is closed
                 there, runs = line.split()
-                told(int(there), int(runs))
+                callback(int(there), int(runs))
             code = done.wait()
         except BaseException:
             # what is told may break off the study, and so does Ctrl-C
             done.send_signal(signal.SIGINT)
             done.wait()
             raise
-        kept.seek(0)
-        return code, kept.read()
+        messages.seek(0)
+        return code, messages.read()
 
 
 def _silent(done: int, runs: int) -> None:
@@ -182,16 +182,16 @@ def _shown_bar() -> Told:
         return _silent
     begun = time.monotonic()
 
-    def told(done: int, total: int) -> None:
+    def show(done: int, total: int) -> None:
         full = _WIDTH * done // max(total, 1)
         spent = time.monotonic() - begun
-        left = f", about {spent * (total - done) / done:.0f} s left" if 0 < done < total else ""
-        bar = f"runs {'#' * full}{'.' * (_WIDTH - full)} {done} of {total}, {spent:.0f} s{left}"
+        remaining = f", about {spent * (total - done) / done:.0f} s left" if 0 < done < total else ""
+        bar = f"runs {'#' * full}{'.' * (_WIDTH - full)} {done} of {total}, {spent:.0f} s{remaining}"
         # the line before may have been longer
         stream.write(f"\r{bar:<79}" + ("\n" if done == total else ""))
         stream.flush()
 
-    return told
+    return show
 
 
 _WIDTH = 30
@@ -208,11 +208,11 @@ def tell_through(descriptor: int) -> Told:
     """
     os.set_inheritable(descriptor, False)
 
-    def told(done: int, total: int) -> None:
+    def write(done: int, total: int) -> None:
         with suppress(OSError):
             os.write(descriptor, f"{done} {total}\n".encode())
 
-    return told
+    return write
 
 
 def config_text(
@@ -226,8 +226,8 @@ def config_text(
     """Return the text of the study's config.yaml; arguments and errors as in `study`."""
     spreads: list[Spread] = []
     middle: dict[str, Any] = {}
-    for node, what in _by_node(vary).items():
-        middle[node] = {key: _taken(value, (node, key), spreads) for key, value in what.items()}
+    for node, keys in _by_node(vary).items():
+        middle[node] = {key: _taken(value, (node, key), spreads) for key, value in keys.items()}
     if not spreads:
         raise InputError(Issue("nothing varies", key=("vary",), allowed=_FORMS))
     resolved = instrument.perturbed(middle).resolved
@@ -248,22 +248,22 @@ def config_text(
 def _by_node(vary: Mapping[str, Mapping[str, Any] | str]) -> dict[str, dict[str, Any]]:
     """Return the keys of the perturbation by body, with motions given as text expanded."""
     out: dict[str, dict[str, Any]] = {}
-    for name, what in vary.items():
-        if isinstance(what, Mapping):
-            out.setdefault(name, {}).update(what)
+    for name, motion in vary.items():
+        if isinstance(motion, Mapping):
+            out.setdefault(name, {}).update(motion)
             continue
-        if not isinstance(what, str):
-            raise _wrong("not a perturbation", (name,), shown(what))
+        if not isinstance(motion, str):
+            raise _wrong("not a perturbation", (name,), shown(motion))
         try:
             node, kind, axis, quantity, pivot = motion_of(name)
         except Problem as problem:
             if " " not in name.strip():
-                raise _wrong("not a perturbation", (name,), shown(what)) from None
+                raise _wrong("not a perturbation", (name,), shown(motion)) from None
             raise InputError(problem.at("", key=("vary", name))) from None
-        if quantity or (match := _RANGE.search(what)) is None:
-            raise _wrong("not a range", (name,), shown(quantity or what))
-        nothing = f"0 {what[match.end() :].strip()}"
-        put(out.setdefault(node, {}), kind, axis, what, nothing)
+        if quantity or (match := _RANGE.search(motion)) is None:
+            raise _wrong("not a range", (name,), shown(quantity or motion))
+        nothing = f"0 {motion[match.end() :].strip()}"
+        put(out.setdefault(node, {}), kind, axis, motion, nothing)
         if pivot:
             out[node]["pivot"] = pivot
     return out
@@ -288,29 +288,31 @@ def _responses(resolved: ResolvedJob) -> Tree:
     out: Tree = {}
     if resolved.instrument.monitor is None:
         for camera in resolved.instrument.cameras:
-            for one in parameters.ESTIMATED:
-                out[f"{camera}_{one.key.rpartition('_')[0]}"] = {"key": ["truth", "cameras", camera, one.key]}
+            for parameter in parameters.ESTIMATED:
+                out[f"{camera}_{parameter.key.rpartition('_')[0]}"] = {
+                    "key": ["truth", "cameras", camera, parameter.key]
+                }
             out |= {f"{camera}_{name}": {"key": ["quality", "cameras", camera, *key]} for name, key in QUALITY.items()}
         if len(resolved.instrument.cameras) == 2:
             out["angle_change"] = {"key": ["truth", "intersection_angle", "change_arcsec"]}
         return out
-    own = "model" if resolved.disturbances is None else "posterior"
+    estimator = "model" if resolved.disturbances is None else "posterior"
     for camera in resolved.instrument.cameras:
-        for key in (one.key for one in parameters.CAMERA_PARAMETERS.values()):
+        for key in (parameter.key for parameter in parameters.CAMERA_PARAMETERS.values()):
             short = key.rpartition("_")[0]
-            read = ["recovered", "cameras", camera, own, key]
+            read = ["recovered", "cameras", camera, estimator, key]
             out[f"{camera}_{short}"] = _with_sigmas(read)
             out[f"{camera}_{short}_true"] = {"key": ["truth", "cameras", camera, key]}
     if len(resolved.instrument.cameras) == 2:
-        out["angle_change"] = _with_sigmas(["recovered", "intersection_angle", own, "change_arcsec"])
+        out["angle_change"] = _with_sigmas(["recovered", "intersection_angle", estimator, "change_arcsec"])
         out["angle_change_true"] = {"key": ["truth", "intersection_angle", "change_arcsec"]}
     return out
 
 
 def _with_sigmas(read: Sequence[str]) -> Tree:
     """Return the response of a monitor reading, with its total sigma and that of noise alone."""
-    *place, key = read
-    return {"key": [*read], **{name: [*place, f"{key}{end}"] for name, end in (("sigma", TOTAL), ("noise", NOISE))}}
+    *path, key = read
+    return {"key": [*read], **{name: [*path, f"{key}{end}"] for name, end in (("sigma", TOTAL), ("noise", NOISE))}}
 
 
 def _taken(value: Any, key: KeyPath, spreads: list[Spread]) -> Any:

@@ -49,7 +49,7 @@ def check_size(setup: StudySetup, confirmed: bool) -> None:
 def run_study(
     setup: StudySetup,
     session: Session,
-    place: Path,
+    store: Path,
     chosen: tuple[int | None, str | None],
     say: Callable[[str], None],
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -62,7 +62,7 @@ def run_study(
         The study.
     session : Session
         Session of the command.
-    place : Path
+    store : Path
         Folder in which finished blocks are kept.
     chosen : tuple
         Number of local processes, None for one per core; address of a running cluster, None for none.
@@ -95,11 +95,11 @@ def run_study(
     from twin.sensors.area_detector import coarse_warnings
 
     session.advance(START, 0, 1)
-    with journal_of(setup, place / BLOCKS) as journal:
+    with journal_of(setup, store / BLOCKS) as journal:
         engine = Engine(plan, journal, session.backend.name, advance, say, warn)
-        given = blur_warnings(base, session.backend) if cameras_of(base) else ()
-        given = (*given, *coarse_warnings(base))
-        warn(*given)
+        input_warnings = blur_warnings(base, session.backend) if cameras_of(base) else ()
+        input_warnings = (*input_warnings, *coarse_warnings(base))
+        warn(*input_warnings)
         count = 0
         if engine.missing:
             with cluster.chosen_workers(*chosen, warn, setup.study.limits) as workers:
@@ -114,8 +114,8 @@ def run_study(
     from twin.study.study_files import write_data
 
     numbers = write_data(plan, result, engine.seconds, engine.computed, folder)
-    folder.write_bytes(BLOCKS, (place / BLOCKS).read_bytes())
-    report = write_report(numbers.data, plan, folder, numbers.files, (*given, *numbers.unwritten))
+    folder.write_bytes(BLOCKS, (store / BLOCKS).read_bytes())
+    report = write_report(numbers.data, plan, folder, numbers.files, (*input_warnings, *numbers.unwritten))
     warn(*(text for text in report.warnings if text not in warnings))
     failed = int(result.failed.sum())
     entries: dict[str, Any] = {"backend": session.backend.name, "seed": setup.study.design.seed, "workers": count}
@@ -128,8 +128,10 @@ def run_study(
     fault = impossible(StudyRuns.of(numbers.data, setup.study))
     if fault is not None:  # everything is written: only what the file says of a response is wrong
         print_error(errors, str(fault))
-    told = {**numbers.summary, "verdict": report.verdict, "warnings": warnings}
-    return Result(told, lambda console: _show(told, console), "; ".join(missing), 0 if fault is None else BAD_INPUT)
+    results = {**numbers.summary, "verdict": report.verdict, "warnings": warnings}
+    return Result(
+        results, lambda console: _show(results, console), "; ".join(missing), 0 if fault is None else BAD_INPUT
+    )
 
 
 def _show(numbers: dict[str, Any], console: Console) -> None:

@@ -48,8 +48,8 @@ def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
         key = "; ".join([" = ".join(_path(place) for place in factor.places)] * bool(factor.places) + scaled)
         values = column.values.astype(object) if column.values.dtype.kind == "U" else column.values
         values = values.astype(np.int8) if values.dtype.kind == "b" else values
-        said = f"factor {column.name}, {key}"
-        data[column.name] = (RUN, values, {"units": column.unit, ROLE: "factor", "key": key, "long_name": said})
+        long_name = f"factor {column.name}, {key}"
+        data[column.name] = (RUN, values, {"units": column.unit, ROLE: "factor", "key": key, "long_name": long_name})
     for r, (name, response) in enumerate(study.responses.items()):
         minus = f" - {_path(response.minus)}" if response.minus is not None else ""
         key = f"{_path(response.key)}{minus}"
@@ -61,12 +61,12 @@ def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
             about["long_name"] = f"standard deviation of {name}{by}"
             data[f"{name}{ending}"] = (RUN, (result.noises if by else result.sigmas)[:, r], about)
     flags: dict[str, Any] = {"flag_values": np.array([0, 1], np.int8), "flag_meanings": "completed failed"}
-    kept = {"units": "", ROLE: "bookkeeping"}
-    data[FAILED] = (RUN, result.failed.astype(np.int8), {**kept, "long_name": "1: failed", **flags})
-    data[MESSAGE] = (RUN, np.array(result.messages, object), {**kept, "long_name": "why it failed"})
+    common = {"units": "", ROLE: "bookkeeping"}
+    data[FAILED] = (RUN, result.failed.astype(np.int8), {**common, "long_name": "1: failed", **flags})
+    data[MESSAGE] = (RUN, np.array(result.messages, object), {**common, "long_name": "why it failed"})
     if study.base.command == MONITOR:
         why = "why sigma does not hold, empty where it does"
-        data[DOUBT] = (RUN, np.array(result.doubts, object), {**kept, "long_name": why})
+        data[DOUBT] = (RUN, np.array(result.doubts, object), {**common, "long_name": why})
     if plan.seeds is not None:
         data[SEED] = (RUN, plan.seeds, {"units": "", ROLE: "bookkeeping", "long_name": "seed of the run's noise"})
     attributes = {
@@ -156,8 +156,11 @@ def _span(values: np.ndarray) -> dict[str, Any]:
 
 def _statistics(values: np.ndarray) -> dict[str, Any]:
     """Return count, mean, standard deviation (n - 1) and the 95 % and 99.7 % quantiles of the finite values."""
-    found = describe(values, False)
-    return {"count": found.count, **{key: _value(getattr(found, key)) for key in ("mean", "std", "p95", "p997")}}
+    description = describe(values, False)
+    return {
+        "count": description.count,
+        **{key: _value(getattr(description, key)) for key in ("mean", "std", "p95", "p997")},
+    }
 
 
 def _value(estimate: Estimate | None) -> float | None:

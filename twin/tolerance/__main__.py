@@ -30,7 +30,7 @@ def main(
     ] = None,
     workers: cli.Workers = None,
     scheduler: cli.Scheduler = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")] = False,
 ) -> None:
     """Find out how accurately a camera has to be made.
 
@@ -66,13 +66,13 @@ def main(
         setup = read_for("twin.tolerance", file, procedure.resolve)
         return setup if samples is None else setup.with_test(samples=samples)
 
-    def run(*given: Any) -> Any:
+    def run(*arguments: Any) -> Any:
         from twin.tolerance.samples import Workforce
 
-        return procedure.run(*given, Workforce(workers, scheduler, kept.begin()))
+        return procedure.run(*arguments, Workforce(workers, scheduler, store.begin()))
 
-    kept = KeptWork(options.out, file.stem, "samples", resume)
-    run_test("tolerance", file, options, kept, read, run=run)
+    store = KeptWork(options.out, file.stem, "samples", resume)
+    run_test("tolerance", file, options, store, read, run=run)
 
 
 if __name__ == "__main__":

@@ -121,8 +121,8 @@ def allocate(
     trade = _Trade(bench, model, samples, costs, share, samples.values)
     first, nothing = trade.passing(total), np.zeros(len(total))
     cheapest = (costs.of_level(total), total, trade) if trade.quantile(nothing)[0] <= 0.0 else None
-    for turn in range(ROUNDS):
-        advance("allocation", turn, ROUNDS)
+    for iteration in range(ROUNDS):
+        advance("allocation", iteration, ROUNDS)
         bounds = np.clip([low - total, high - total], -np.log(BOUND), np.log(BOUND))
         step = trade.cheapest(np.where(costs.kept, 0.0, bounds[0]), np.where(costs.kept, 0.0, bounds[1]), total)
         total, trade = total + step, _Trade.at(bench, total + step, samples, costs, share)
@@ -203,8 +203,10 @@ class _Costs:
     def of(cls, setup: ToleranceSetup) -> _Costs:
         """Return the costs of a budget."""
         entries = list(setup.test.tolerances.values())
-        kept = [one.kept or one.mean is not None or one.measured is not None for one in entries]
-        return cls(tuple(CostCurve(one.cost_points) for one in entries), np.array(kept))
+        fixed = [
+            tolerance.kept or tolerance.mean is not None or tolerance.measured is not None for tolerance in entries
+        ]
+        return cls(tuple(CostCurve(tolerance.cost_points) for tolerance in entries), np.array(fixed))
 
     def of_each(self, level: np.ndarray) -> np.ndarray:
         """Return the cost of every limit, (E,), with limits at exp(level) times the specified ones."""
@@ -216,8 +218,8 @@ class _Costs:
 
     def slope(self, level: np.ndarray) -> np.ndarray:
         """Return the derivatives of the costs with respect to the level, (E,)."""
-        both = np.array([curve(x) for curve, x in zip(self.curves, level.tolist(), strict=True)])
-        return np.asarray(np.exp(both[:, 0]) * both[:, 1])
+        values = np.array([curve(x) for curve, x in zip(self.curves, level.tolist(), strict=True)])
+        return np.asarray(np.exp(values[:, 0]) * values[:, 1])
 
 
 class _Trade:
@@ -255,8 +257,8 @@ class _Trade:
             errors = adjustment_errors(bench, samples.seeds[:count].tolist())
             values = bench.values(bench.try_out(samples.x[:count] * bench.sizes, errors).parts)
         exact = self._margins(values[:count])
-        own = self._worst(self.model.parts(np.ones(len(costs.kept))))[:count]
-        self.offset = float(np.quantile(exact, share) - np.quantile(own, share))
+        modelled = self._worst(self.model.parts(np.ones(len(costs.kept))))[:count]
+        self.offset = float(np.quantile(exact, share) - np.quantile(modelled, share))
 
     @classmethod
     def at(cls, bench: ToleranceBench, total: np.ndarray, samples: Samples, costs: _Costs, share: float) -> _Trade:
@@ -310,7 +312,7 @@ class _Trade:
         if self.costs.kept.all() or self.quantile(start)[0] > 0.0:
             return start
         size = self.costs.of_level(total)
-        found = minimize(
+        solution = minimize(
             lambda step: self.costs.of_level(total + step) / size,
             start,
             jac=lambda step: self.costs.slope(total + step) / size,
@@ -323,7 +325,7 @@ class _Trade:
             method="SLSQP",
             options={"maxiter": _STEPS, "ftol": 1e-4},
         )
-        return self._between(start, np.clip(found.x, low, high), total)
+        return self._between(start, np.clip(solution.x, low, high), total)
 
     def tightened(self, low: np.ndarray) -> np.ndarray:
         """Return the first step (E,) towards the tightest limits, ``low``, that passes, or ``low`` if none does."""
@@ -356,16 +358,16 @@ def _graded(
         Ratios of the limits to the specified ones.
     """
     entries = list(setup.test.tolerances.items())
-    old = np.array([one.limit_si for _, one in entries])
+    old = np.array([tolerance.limit_si for _, tolerance in entries])
     ladders: list[list[tuple[str | float, float]]] = []
-    for e, (_, one) in enumerate(entries):
-        stays = [(one.limit, one.limit_si)]
-        own = _ladder(one.limit, one.parts[1], one.limit_si * float(np.exp(total[e])), spec.grades)
-        ladders.append(stays if trade.costs.kept[e] else own)
+    for e, (_, tolerance) in enumerate(entries):
+        stays = [(tolerance.limit, tolerance.limit_si)]
+        steps = _ladder(tolerance.limit, tolerance.parts[1], tolerance.limit_si * float(np.exp(total[e])), spec.grades)
+        ladders.append(stays if trade.costs.kept[e] else steps)
     chosen = np.zeros(len(entries), dtype=int)
 
-    def scales(which: np.ndarray) -> np.ndarray:
-        return np.array([ladder[k][1] for ladder, k in zip(ladders, which, strict=True)]) / old
+    def scales(indices: np.ndarray) -> np.ndarray:
+        return np.array([ladder[k][1] for ladder, k in zip(ladders, indices, strict=True)]) / old
 
     if looser:
         gain = -trade.costs.slope(total)

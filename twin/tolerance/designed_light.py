@@ -161,10 +161,13 @@ def fixed_transfers(
                 if fixed is None:
                     problem = f"{1e-3 * size:.4g} cycles per mm lie beyond the cut-off at a field"
                     raise test.error(problem, ("merits", merit.name, "frequency"), allowed="a lower frequency")
-                own = pupils[f] if len(pupils[f]) > 1 else pupils[f][0]
-                problem, allowed = "the MTF of the designed camera is not settled", "a sharper camera, or another merit"
+                pupil = pupils[f] if len(pupils[f]) > 1 else pupils[f][0]
+                problem, allowed = (
+                    "the MTF of the designed camera has not converged",
+                    "a sharper camera, or another merit",
+                )
                 try:
-                    whole = abs(polychromatic_transfer(own, frequency[None], *light, np.zeros(1))[0, 0])
+                    whole = abs(polychromatic_transfer(pupil, frequency[None], *light, np.zeros(1))[0, 0])
                 except UnphysicalError as error:
                     raise test.error(f"{problem}: {error}", ("merits", merit.name), allowed=allowed) from error
                 if abs(fixed.known - whole) > TRANSFER:

@@ -12,7 +12,7 @@ from optics.geometry.tree import State
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.models.obstruction import moved_into_beams
 from scenes.specs.tolerance import ToleranceSetup
-from twin.camera.first_order_data import obscuration, unstated_shadows
+from twin.camera.first_order_data import obscuration, unmodelled_obscuration
 from twin.sensors.area_detector import coarse_warnings
 from twin.tolerance.tolerance_bench import ToleranceBench
 
@@ -23,7 +23,7 @@ FAR = 1e-3
 def given_warnings(setup: ToleranceSetup, bench: ToleranceBench) -> tuple[str, ...]:
     """Return the warnings about the nominal instrument."""
     model = bench.optics.model
-    shadow = unstated_shadows(model, obscuration(model, bench.backend))
+    shadow = unmodelled_obscuration(model, obscuration(model, bench.backend))
     return (
         *blur_warnings(setup.base, bench.backend),
         *((f"camera {model.spec.name}: {shadow}",) if shadow else ()),
@@ -41,12 +41,12 @@ def beam_warnings(bench: ToleranceBench, states: Sequence[State]) -> tuple[str, 
     states : sequence of State
         States of the worst cameras.
     """
-    found: dict[str, list[str]] = {}
+    texts_by_body: dict[str, list[str]] = {}
     for state in states:
         for text in moved_into_beams(bench.instrument, bench.backend, state):
-            found.setdefault(text.partition(" and would take")[0], []).append(text)
+            texts_by_body.setdefault(text.partition(" and would take")[0], []).append(text)
     return tuple(
-        f"in {len(texts)} of the {len(states)} worst cameras, {texts[0]}" for _, texts in sorted(found.items())
+        f"in {len(texts)} of the {len(states)} worst cameras, {texts[0]}" for _, texts in sorted(texts_by_body.items())
     )
 
 

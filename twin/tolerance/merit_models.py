@@ -64,7 +64,9 @@ class MeritModel:
     def quadratic(self, x: np.ndarray) -> np.ndarray:
         """Return the parts (S, P) to the second order at x (S, K)."""
         step = max(1, _AT_ONCE // max(1, self.curvature.shape[0] * x.shape[1]))
-        parts = [self.linear(own) + 0.5 * self._bent(own) for own in (x[s : s + step] for s in range(0, len(x), step))]
+        parts = [
+            self.linear(block) + 0.5 * self._bent(block) for block in (x[s : s + step] for s in range(0, len(x), step))
+        ]
         return np.concatenate(parts)
 
     def _bent(self, x: np.ndarray) -> np.ndarray:
@@ -104,10 +106,10 @@ class ScaledModel:
         """
         count, parts = len(entries), len(model.nominal)
         draws = x[: max(_FEWEST, _MOST_HELD // (parts * count**2))]
-        first = np.stack([draws[:, own] @ model.slope[:, own].T for own in map(list, entries)], axis=-1)
+        first = np.stack([draws[:, indices] @ model.slope[:, indices].T for indices in map(list, entries)], axis=-1)
         second = np.zeros((len(draws), parts, count, count))
-        for e, own in enumerate(map(list, entries)):
-            pulled = np.einsum("sk,pkl->spl", draws[:, own], model.curvature[:, own], optimize=True)
+        for e, indices in enumerate(map(list, entries)):
+            pulled = np.einsum("sk,pkl->spl", draws[:, indices], model.curvature[:, indices], optimize=True)
             for f, other in enumerate(map(list, entries[: e + 1])):
                 pair = 0.5 * np.einsum("spl,sl->sp", pulled[:, :, other], draws[:, other])
                 second[:, :, e, f] = second[:, :, f, e] = pair
@@ -117,9 +119,9 @@ class ScaledModel:
         """Return the parts (S, P) with the tolerances scaled by scales (E,)."""
         return np.asarray(self.nominal + (self.first + self.second @ scales) @ scales)
 
-    def slope(self, scales: np.ndarray, which: np.ndarray) -> np.ndarray:
+    def slope(self, scales: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return the derivatives (W, P, E) of the parts of selected draws by the logarithms of the scales."""
-        return np.asarray((self.first[which] + 2.0 * (self.second[which] @ scales)) * scales)
+        return np.asarray((self.first[rows] + 2.0 * (self.second[rows] @ scales)) * scales)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,15 +174,15 @@ def sensitivities(bench: ToleranceBench, advance: Advance = silent) -> Sensitivi
     values = np.empty((len(bench.entries), 2, len(bench.merits)))
     moves = np.full((len(bench.entries), 2, len(bench.ranges)), np.nan)
     problems = []
-    for e, own in enumerate(bench.entries.values()):
-        rows = np.array(own)
+    for e, indices in enumerate(bench.entries.values()):
+        rows = np.array(indices)
         if len(rows) == 1:
             ends = np.array([1 + count + rows[0], 1 + rows[0]])
             values[e], moves[e] = bench.values(tried.parts[ends]), tried.moves[ends]
         else:
             values[e] = bench.values(_spread(bench, model, rows, np.ones(1))[0])
-        told = [tried.problems[r] for r in (*(1 + rows), *(1 + count + rows))]
-        problems.append(next((text for text in told if text), ""))
+        reasons = [tried.problems[r] for r in (*(1 + rows), *(1 + count + rows))]
+        problems.append(next((text for text in reasons if text), ""))
     return Sensitivities(bench.values(nominal), values, moves, tuple(problems), model)
 
 
@@ -223,46 +225,50 @@ def default_losses(bench: ToleranceBench, nominal: np.ndarray) -> np.ndarray:
     share = 1.0 / np.sqrt(len(bench.entries))
     out = []
     for merit, value in zip(bench.merits, nominal, strict=True):
-        left = float(merit.worse(np.array(merit.spec.requirement), value))
+        margin = float(merit.worse(np.array(merit.spec.requirement), value))
         stated = merit.spec.loss_si
-        out.append(stated if stated is not None else left * share if left > 0.0 else np.nan)
+        out.append(stated if stated is not None else margin * share if margin > 0.0 else np.nan)
     return np.array(out)
 
 
-def inverse_limits(bench: ToleranceBench, found: Sensitivities, advance: Advance = silent) -> InverseLimits:
+def inverse_limits(bench: ToleranceBench, sensitivity: Sensitivities, advance: Advance = silent) -> InverseLimits:
     """Find the inverse limits by exact traces of both signs; those of figure errors by the model alone."""
-    losses = default_losses(bench, found.nominal)
+    losses = default_losses(bench, sensitivity.nominal)
     entries = list(bench.entries.values())
-    guess = np.array([[_modelled_share(bench, found, own, m, losses) for m in range(len(losses))] for own in entries])
-    open_ = [(e, m) for e, own in enumerate(entries) for m in range(len(losses)) if len(own) == 1 and losses[m] > 0.0]
+    guess = np.array(
+        [[_modelled_share(bench, sensitivity, indices, m, losses) for m in range(len(losses))] for indices in entries]
+    )
+    open_ = [
+        (e, m) for e, indices in enumerate(entries) for m in range(len(losses)) if len(indices) == 1 and losses[m] > 0.0
+    ]
     shares = guess.copy()
     if open_:
-        which = np.array(open_)
+        pairs = np.array(open_)
 
         def excess(rows: np.ndarray, level: np.ndarray) -> np.ndarray:
             """Return the logarithm of the larger loss of both signs over the allowed one, at ratios exp(level)."""
-            own, m = np.array([entries[e][0] for e in which[rows, 0]]), which[rows, 1]
+            indices, m = np.array([entries[e][0] for e in pairs[rows, 0]]), pairs[rows, 1]
             x = np.zeros((2, len(rows), len(bench.numbers)))
-            x[0, np.arange(len(rows)), own], x[1, np.arange(len(rows)), own] = np.exp(level), -np.exp(level)
+            x[0, np.arange(len(rows)), indices], x[1, np.arange(len(rows)), indices] = np.exp(level), -np.exp(level)
             values = bench.values(bench.try_out(x.reshape(-1, x.shape[-1]) * bench.sizes).parts).reshape(
                 2, len(rows), -1
             )
-            worst = np.max([_loss(bench, found, values[:, k, j], j) for k, j in enumerate(m)], axis=1)
+            worst = np.max([_loss(bench, sensitivity, values[:, k, j], j) for k, j in enumerate(m)], axis=1)
             return np.asarray(np.log(np.maximum(worst / losses[m], 1e-12)))
 
-        start = np.log(np.clip(guess[which[:, 0], which[:, 1]], FARTHEST**-2, FARTHEST))
-        shares[which[:, 0], which[:, 1]] = np.exp(_roots(excess, start, advance))
+        start = np.log(np.clip(guess[pairs[:, 0], pairs[:, 1]], FARTHEST**-2, FARTHEST))
+        shares[pairs[:, 0], pairs[:, 1]] = np.exp(_roots(excess, start, advance))
     return InverseLimits(losses, shares)
 
 
-def _loss(bench: ToleranceBench, found: Sensitivities, values: np.ndarray, m: int) -> np.ndarray:
+def _loss(bench: ToleranceBench, sensitivity: Sensitivities, values: np.ndarray, m: int) -> np.ndarray:
     """Return by how much values of a merit are worse than the nominal camera's; infinite where the light is lost."""
-    lost = bench.merits[m].worse(values, found.nominal[m])
-    return np.asarray(np.where(np.isnan(lost), np.inf, lost))
+    loss = bench.merits[m].worse(values, sensitivity.nominal[m])
+    return np.asarray(np.where(np.isnan(loss), np.inf, loss))
 
 
 def _modelled_share(
-    bench: ToleranceBench, found: Sensitivities, own: Sequence[int], m: int, losses: np.ndarray
+    bench: ToleranceBench, sensitivity: Sensitivities, indices: Sequence[int], m: int, losses: np.ndarray
 ) -> float:
     """Return the ratio to its limit at which a tolerance causes a merit's loss in the model, at most ``FARTHEST``.
 
@@ -271,14 +277,14 @@ def _modelled_share(
     if not losses[m] > 0.0:
         return np.nan
     share = np.geomspace(FARTHEST**-2, FARTHEST, _GRID)
-    model, rows = found.model, np.array(own)
+    model, rows = sensitivity.model, np.array(indices)
     if len(rows) > 1:
         parts = [_spread(bench, model, rows, share)]
     else:
         bent = model.nominal + 0.5 * np.outer(share**2, model.curvature[:, rows[0], rows[0]])
         parts = [bent + np.outer(sign * share, model.slope[:, rows[0]]) for sign in (1.0, -1.0)]
-    lost = np.max([_loss(bench, found, bench.merits[m].values(one), m) for one in parts], axis=0)
-    beyond = np.flatnonzero(lost >= losses[m])
+    loss = np.max([_loss(bench, sensitivity, bench.merits[m].values(part), m) for part in parts], axis=0)
+    beyond = np.flatnonzero(loss >= losses[m])
     return float(share[beyond[0]]) if beyond.size else np.inf
 
 
@@ -308,8 +314,8 @@ def _roots(excess: Callable[[np.ndarray, np.ndarray], np.ndarray], start: np.nda
         rows = np.flatnonzero(np.isnan(out))
         if not rows.size:
             break
-        here = np.clip(excess(rows, level[rows]), -60.0, 60.0)
-        for r, value in zip(rows, here, strict=True):
+        values = np.clip(excess(rows, level[rows]), -60.0, 60.0)
+        for r, value in zip(rows, values, strict=True):
             under = value < 0.0
             if abs(value) < _CLOSE:
                 out[r] = level[r]

@@ -36,7 +36,7 @@ from scenes.yaml.errors import names_text, unknown
 from scenes.yaml.units import LENGTH
 from twin.framework.artefact import unit_for_reports
 from twin.monitor.crosstalk import estimator_gains
-from twin.monitor.information import built_noise, quantity_rows, spot_noise
+from twin.monitor.information import noise_as_built, quantity_rows, spot_noise
 from twin.monitor.monitor_derivative import derivative_changes
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import SpotPath
@@ -132,11 +132,12 @@ class MonitorMerit:
         stated = replace(
             known, spots=known.spots @ root, parameters=known.parameters @ root, correlation=np.eye(len(root))
         )
-        every_one = states_of(numbers, np.array([[one.size for one in numbers]]))[0]
-        images = SpotPath(experiment.instrument, experiment.backend, cameras=path.moved_cameras(every_one))
+        limit_state = states_of(numbers, np.array([[number.size for number in numbers]]))[0]
+        images = SpotPath(experiment.instrument, experiment.backend, cameras=path.moved_cameras(limit_state))
         # derivatives are differentiated by these amounts
         sizes = [
-            0.0 if setup.test.tolerances[one.entry].spectrum else one.size for one in numbers[: -len(ranges) or None]
+            0.0 if setup.test.tolerances[number.entry].spectrum else number.size
+            for number in numbers[: -len(ranges) or None]
         ]
         steps = np.concatenate([sizes, STEP * ranges])
         moved = np.flatnonzero(steps)
@@ -146,10 +147,10 @@ class MonitorMerit:
         except PhysicalError as error:
             problem = f"the monitor has no derivatives at the limits: {error}"
             raise setup.test.error(problem, ("tolerances",), allowed="smaller limits") from error
-        every = tuple(np.zeros((len(numbers), *own.shape[1:])) for own in changes)
-        for out, own in zip(every, changes, strict=True):
-            out[moved] = own @ root / steps[moved, None, None]
-        return cls(experiment, path, images, stated, noise, (every[0], every[1]), asked)
+        per_unit = tuple(np.zeros((len(numbers), *change.shape[1:])) for change in changes)
+        for out, change in zip(per_unit, changes, strict=True):
+            out[moved] = change @ root / steps[moved, None, None]
+        return cls(experiment, path, images, stated, noise, (per_unit[0], per_unit[1]), asked)
 
     def variances(self, amounts: np.ndarray, states: Sequence[State]) -> dict[str, np.ndarray]:
         """Return the variances (S, Q) of all readings of every merit, SI.
@@ -168,7 +169,7 @@ class MonitorMerit:
         """
         noise = self._noise(states)
         used = np.flatnonzero(np.any(self.changes[0], axis=(1, 2)) | np.any(self.changes[1], axis=(1, 2)))
-        spots, parameters = (np.tensordot(amounts[:, used], own[used], 1) for own in self.changes)
+        spots, parameters = (np.tensordot(amounts[:, used], change[used], 1) for change in self.changes)
         return self._read(spots, parameters, noise)
 
     def exact(self, states: Sequence[State]) -> dict[str, np.ndarray]:
@@ -193,22 +194,24 @@ class MonitorMerit:
         """Return the covariance of the spot shifts by image noise in every state, (S, D, D), px^2."""
         out = np.tile(self.noise, (len(states), 1, 1))
         keys = [channel.key for channel in self.images.channels]
-        own = [2 * k + axis for k, channel in enumerate(self.path.channels) if channel.key in keys for axis in (0, 1)]
-        if own:
-            rows = np.ix_(range(len(states)), own, own)
-            out[rows] = built_noise(self.images, self.experiment.detector, states)
+        indices = [
+            2 * k + axis for k, channel in enumerate(self.path.channels) if channel.key in keys for axis in (0, 1)
+        ]
+        if indices:
+            rows = np.ix_(range(len(states)), indices, indices)
+            out[rows] = noise_as_built(self.images, self.experiment.detector, states)
         return out
 
     def _read(self, spots: np.ndarray, parameters: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
         """Return the variances for changes of the derivatives (S, D, M), (S, 4 J, M) and noise (S, D, D)."""
         out = {name: np.empty((len(noise), len(rows))) for name, (rows, _) in self.asked.items()}
-        for s, own in enumerate(noise):
+        for s, covariance in enumerate(noise):
             stated = replace(
                 self.stated, spots=self.stated.spots + spots[s], parameters=self.stated.parameters + parameters[s]
             )
-            best = stated.best_gain(own)
+            best = stated.best_gain(covariance)
             for name, (rows, gain) in self.asked.items():
-                out[name][s] = split(rows, stated, own, best if gain is None else gain).sigma ** 2
+                out[name][s] = split(rows, stated, covariance, best if gain is None else gain).sigma ** 2
         return out
 
 
@@ -217,11 +220,11 @@ def _require_monitor(setup: ToleranceSetup, experiment: MonitorExperiment, name:
     test, kind = setup.test, setup.test.merits[name].kind
     if not experiment.monitored:
         allowed = "an instrument with a monitor, such as gf7_pair; or other merits"
-        problem = f"{kind} is about the readings of a monitor, and {setup.base.instrument.name} has none"
+        problem = f"{kind} needs a monitor, and {setup.base.instrument.name} has none"
         raise test.error(problem, ("merits", name, "kind"), allowed=allowed)
     if experiment.stated is None:
         allowed = "`disturbances: NAME` at the top of this file, or in the instrument's"
-        problem = f"{kind} is a sigma under a prior on disturbances, and there is none"
+        problem = f"{kind} needs a prior on disturbances, and there is none"
         raise test.error(problem, ("merits", name, "kind"), allowed=allowed)
 
 
@@ -272,20 +275,20 @@ class Merit:
 
     def values(self, parts: np.ndarray) -> np.ndarray:
         """Return the merit (...,) from the bench's parts (..., P), SI; a change counts by its absolute value."""
-        own = parts[..., self.parts]
+        selected = parts[..., self.parts]
         match self.spec.kind:
             case "wavefront":
-                return np.sqrt(np.maximum(np.max(own, axis=-1), 0.0))
+                return np.sqrt(np.maximum(np.max(selected, axis=-1), 0.0))
             case "monitor_angle" | "monitor_focus":
-                return np.sqrt(np.maximum(np.max(own, axis=-1), 0.0))
+                return np.sqrt(np.maximum(np.max(selected, axis=-1), 0.0))
             case "mtf":
-                return np.asarray(np.min(own, axis=-1))
+                return np.asarray(np.min(selected, axis=-1))
             case "chief_ray":
-                return np.asarray(np.max(np.hypot(own[..., ::2], own[..., 1::2]), axis=-1))
+                return np.asarray(np.max(np.hypot(selected[..., ::2], selected[..., 1::2]), axis=-1))
             case "boresight":
-                return np.asarray(np.hypot(own[..., 0], own[..., 1]))
+                return np.asarray(np.hypot(selected[..., 0], selected[..., 1]))
             case _:
-                return np.asarray(np.max(np.abs(own), axis=-1))
+                return np.asarray(np.max(np.abs(selected), axis=-1))
 
     def passes(self, values: np.ndarray) -> np.ndarray:
         """Return True where values meet the requirement; NaN does not."""
@@ -344,7 +347,7 @@ def merits_of(
     out, start = [], 0
     for name, spec in specs.items():
         used = spec.fields if spec.kind in AT_FIELDS else ()
-        numbers = np.array([fields.setdefault(place, len(fields)) for place in used], dtype=int)
+        numbers = np.array([fields.setdefault(field, len(fields)) for field in used], dtype=int)
         count = part_count(spec, line_points, cameras)
         out.append(Merit(name, spec, numbers, slice(start, start + count)))
         start += count
@@ -382,7 +385,7 @@ def require_bodies(setup: ToleranceSetup, path: TargetPath) -> None:
     """Raise InputError if a budget asks for an obstruction and no body can block the beams of the camera."""
     for name, merit in setup.test.merits.items():
         if merit.kind == KIND and (path.shadows is None or not path.shadows.casters):
-            problem = f"no body of {setup.base.instrument.name} can stand in the beams of {path.name}"
+            problem = f"no body of {setup.base.instrument.name} can block the beams of {path.name}"
             allowed = "an instrument with a monitor, baffles or another camera; or other merits"
             raise setup.test.error(problem, ("merits", name, "kind"), allowed=allowed)
 
@@ -415,14 +418,14 @@ def obstructed_shares(
     axis = path.assembly.nominal_pose(path.root).rotation[:, 1]
     out = np.empty((len(states), fields))
     for first in range(0, len(states), AT_ONCE):
-        some = states[first : first + AT_ONCE]
-        placed, owner = path.assembly.place(some), np.repeat(np.arange(len(some)), fields)
+        batch = states[first : first + AT_ONCE]
+        placed, owner = path.assembly.place(batch), np.repeat(np.arange(len(batch)), fields)
         imaging, to_stop = (
-            assemble(path.assembly, [f"{path.name}/{way}"], some, placed=placed).take(owner)
-            for way in ("imaging", "to_stop")
+            assemble(path.assembly, [f"{path.name}/{sequence}"], batch, placed=placed).take(owner)
+            for sequence in ("imaging", "to_stop")
         )
-        heading, launch = (np.tile(one, (len(some), 1)) for one in (directions, start))
+        heading, launch = (np.tile(array, (len(batch), 1)) for array in (directions, start))
         rays = imaging_rays(path.backend, imaging, to_stop, heading, launch, path.stop, nodes, first=axis)
         shadows = path.shadows.cast(TracedBeams(path.assembly, placed, owner, imaging, rays, heading, nodes))
-        out[first : first + len(some)] = np.sum(shadows.areas, axis=1).reshape(-1, fields) / np.pi
+        out[first : first + len(batch)] = np.sum(shadows.areas, axis=1).reshape(-1, fields) / np.pi
     return out

@@ -58,20 +58,22 @@ class ToleranceBase:
             groups.setdefault(repr(other), []).append(k)
             others[repr(other)] = other
         for name, members in groups.items():
-            own = with_values(tree, others[name]) if others[name] else tree
-            for k, outcome in zip(members, self._together(own, [runs[k] for k in members], backend), strict=True):
+            varied_tree = with_values(tree, others[name]) if others[name] else tree
+            for k, outcome in zip(
+                members, self._together(varied_tree, [runs[k] for k in members], backend), strict=True
+            ):
                 out[k] = outcome
         return out
 
     def _together(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
         bench = self._bench(tree, backend)
-        place = {number.name: k for k, number in enumerate(bench.numbers)}
-        x = np.zeros((len(runs), len(place)))
-        x[:] = [float(tree[DRAWS].get(name, 0.0)) for name in place]
+        index = {number.name: k for k, number in enumerate(bench.numbers)}
+        x = np.zeros((len(runs), len(index)))
+        x[:] = [float(tree[DRAWS].get(name, 0.0)) for name in index]
         for s, run in enumerate(runs):
             for key, value in run.values:
                 if key[0] == DRAWS:
-                    x[s, place[str(key[1])]] = float(value)
+                    x[s, index[str(key[1])]] = float(value)
         seeds = [tree["test"].get("seed", 0) if run.seed is None else run.seed for run in runs]
         return outcomes(bench, x, seeds)
 
@@ -106,12 +108,12 @@ def outcomes(bench: ToleranceBench, x: np.ndarray, seeds: Sequence[int]) -> list
             continue
         named = zip(bench.merits, values[s].tolist(), strict=True)
         moved = zip(bench.compensators, tried.moves[s].tolist(), strict=True)
-        told = {
+        results = {
             "merits": {merit.name: value for merit, value in named},
             "moves": {number.name: move for number, move in moved},
             "settled_waves": float(tried.settled[s]),
         }
-        out.append({KIND: told})
+        out.append({KIND: results})
     return out
 
 
@@ -122,17 +124,17 @@ def adjustment_errors(bench: ToleranceBench, seeds: Sequence[int]) -> np.ndarray
     return np.stack([np.random.default_rng([seed, 1]).standard_normal(len(bench.ranges)) for seed in seeds])
 
 
-def law_of(one: ToleranceSpec) -> dict[str, Any]:
+def law_of(tolerance: ToleranceSpec) -> dict[str, Any]:
     """Return the distribution of a tolerance in units of its limit, in the form of a study's file."""
-    if one.measured is not None:
-        return {"values": list(one.measured_shares)}
-    middle = one.mean_share
+    if tolerance.measured is not None:
+        return {"values": list(tolerance.measured_shares)}
+    middle = tolerance.mean_share
     ends = [middle - 1.0, middle + 1.0]
-    if one.law == "uniform":
+    if tolerance.law == "uniform":
         return {"uniform": ends}
-    if one.law == "ends":
+    if tolerance.law == "ends":
         return {"values": ends}
-    return {"truncated": {"mean": middle, "sigma": 1.0 / one.sigmas, "limits": ends}}
+    return {"truncated": {"mean": middle, "sigma": 1.0 / tolerance.sigmas, "limits": ends}}
 
 
 def study_of(setup: ToleranceSetup, bench: ToleranceBench, samples: int, seed: int) -> StudySetup:
@@ -152,12 +154,12 @@ def study_of(setup: ToleranceSetup, bench: ToleranceBench, samples: int, seed: i
     test = setup.test
     factors: dict[str, Any] = {}
     for number in bench.numbers:
-        one = test.tolerances[number.entry]
-        law = {"normal": {"mean": 0.0, "sigma": 1.0}} if one.spectrum else law_of(one)
+        entry = test.tolerances[number.entry]
+        law = {"normal": {"mean": 0.0, "sigma": 1.0}} if entry.spectrum else law_of(entry)
         factors[number.name.replace(" ", "_")] = {"key": [DRAWS, number.name], **law}
     responses = {
         **{f"merit_{merit.name}": {"key": [KIND, "merits", merit.name]} for merit in bench.merits},
-        **{f"move_{one.name}": {"key": [KIND, "moves", one.name]} for one in bench.compensators},
+        **{f"move_{entry.name}": {"key": [KIND, "moves", entry.name]} for entry in bench.compensators},
         "settled": {"key": [KIND, "settled_waves"]},
     }
     data = {
@@ -272,12 +274,12 @@ def draw_samples(
     seeds = plan.seeds if plan.seeds is not None else np.zeros(samples, np.int64)
     advance(part, 0, samples)
     if force.journal is None:
-        found = []
+        block_results = []
         for numbers in map(plan.block, range(plan.blocks)):
-            own = slice(numbers.start, numbers.stop)
-            found.append(BlockResult.of(outcomes(bench, x[own], seeds[own].tolist()), study.study.responses))
+            rows = slice(numbers.start, numbers.stop)
+            block_results.append(BlockResult.of(outcomes(bench, x[rows], seeds[rows].tolist()), study.study.responses))
             advance(part, numbers.stop, samples)
-        result = BlockResult.joined(found)
+        result = BlockResult.joined(block_results)
     else:
         result = _by_engine(plan, backend, force, force.journal / f"{part}{JOURNAL}", part, advance)
     merits, moves = len(bench.merits), len(bench.compensators)

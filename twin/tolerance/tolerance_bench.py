@@ -26,7 +26,7 @@ from scenes.models.camera_model import lenses
 from scenes.specs.tolerance import OF_MONITOR, SPECTRUM, ToleranceSetup
 from scenes.yaml.errors import names_text, unknown
 from twin.camera.camera_optics import CameraOptics
-from twin.camera.varied_beams import AT_ONCE, BeamLight, CutError, RoughError, VariedBeams
+from twin.camera.varied_beams import AT_ONCE, BeamLight, RoughWavefrontError, VariedBeams, VignettedBeamError
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import LINE_POINTS, line_points
 from twin.targets.target_images import wavelengths_enough
@@ -118,8 +118,8 @@ class Adjustments:
         size = np.where(self.ranges > 0.0, self.ranges, 1.0)
         step = change / size
         norm = np.sum(step**2, axis=-1)
-        way = step / np.where(norm > 0.0, norm, 1.0)[:, None] / size
-        return np.asarray(slopes + miss[..., None] * way[:, None])
+        direction = step / np.where(norm > 0.0, norm, 1.0)[:, None] / size
+        return np.asarray(slopes + miss[..., None] * direction[:, None])
 
     @property
     def exact(self) -> bool:
@@ -143,18 +143,18 @@ class Adjustments:
             Errors in standard deviations.
         """
         free = np.ones(len(self.ranges), dtype=bool)
-        wanted, made = moves.copy(), moves.copy()
+        wanted, executed = moves.copy(), moves.copy()
         for c, (step, accuracy) in enumerate(zip(self.steps, self.accuracies, strict=True)):
             if self.ranges[c] == 0.0:
                 continue
-            own = wanted[:, c]
-            own = np.round(own / step) * step if step else own
-            made = wanted.copy()
-            made[:, c] = own + accuracy * errors[:, c]
+            move = wanted[:, c]
+            move = np.round(move / step) * step if step else move
+            executed = wanted.copy()
+            executed[:, c] = move + accuracy * errors[:, c]
             free[c] = False
-            residuals = residuals + told(slopes, made - wanted)
-            wanted = self.best(slopes, residuals, made, free)
-            residuals = residuals + told(slopes, wanted - made)
+            residuals = residuals + told(slopes, executed - wanted)
+            wanted = self.best(slopes, residuals, executed, free)
+            residuals = residuals + told(slopes, wanted - executed)
         return wanted
 
 
@@ -199,15 +199,15 @@ class Tried:
     paths: np.ndarray | None = None
 
     @classmethod
-    def joined(cls, several: Sequence[Tried]) -> Tried:
+    def joined(cls, results: Sequence[Tried]) -> Tried:
         """Return several results concatenated in order."""
-        paths = [one.paths for one in several if one.paths is not None]
+        paths = [result.paths for result in results if result.paths is not None]
         return cls(
-            np.concatenate([one.moves for one in several]),
-            np.concatenate([one.parts for one in several]),
-            tuple(text for one in several for text in one.problems),
-            np.concatenate([one.settled for one in several]),
-            np.concatenate(paths) if len(paths) == len(several) else None,
+            np.concatenate([result.moves for result in results]),
+            np.concatenate([result.parts for result in results]),
+            tuple(text for result in results for text in result.problems),
+            np.concatenate([result.settled for result in results]),
+            np.concatenate(paths) if len(paths) == len(results) else None,
         )
 
 
@@ -257,10 +257,10 @@ class ToleranceBench:
         self.merits, self.fields = merits_of(dict(test.merits), len(self._along), tuple(instrument.cameras))
         if not len(self.fields) and self.compensators:
             allowed = "a merit of kind wavefront, mtf or chief_ray, at whose fields the wavefront is made least"
-            raise test.error("compensators need fields", ("merits",), allowed=allowed)
-        self.ranges = np.array([one.range_si for one in test.compensators.values()])
-        self.grid_steps = np.array([one.step_si for one in test.compensators.values()])
-        self.accuracies = np.array([one.accuracy_si for one in test.compensators.values()])
+            raise test.error("compensators need merits with fields", ("merits",), allowed=allowed)
+        self.ranges = np.array([compensator.range_si for compensator in test.compensators.values()])
+        self.grid_steps = np.array([compensator.step_si for compensator in test.compensators.values()])
+        self.accuracies = np.array([compensator.accuracy_si for compensator in test.compensators.values()])
         self.parts = self.merits[-1].parts.stop
         self.optics = CameraOptics.within(instrument, self.camera, backend)
         self.wavelength = float(self.optics.model.spec.wavelength)
@@ -292,9 +292,9 @@ class ToleranceBench:
         """Return True if adjustments move the light at the stop, so that rays have to be aimed again."""
         path = self.optics.path
         chain = [path.assembly.elements[name] for name in path.assembly.sequences[f"{path.name}/to_stop"]]
-        bodies = {body for one in chain for body in (one.body, one.solid) if body is not None}
+        bodies = {body for element in chain for body in (element.body, element.solid) if body is not None}
         moved = {body for number in self.compensators for body in number.moves}
-        return any(body == own or body.startswith(f"{own}/") for body in bodies for own in moved)
+        return any(body == moved_body or body.startswith(f"{moved_body}/") for body in bodies for moved_body in moved)
 
     # what does not change from camera to camera
 
@@ -314,12 +314,12 @@ class ToleranceBench:
             if wavelengths_enough(spectrum, FIRST_RULE, values, LARGEST_RULE) == FIRST_RULE:
                 self._prepare_in(*spectrum.rule(FIRST_RULE))
         except UnphysicalError as error:
-            raise test.error(f"merits over the light: {error}", ("light",), allowed="light: design") from error
+            raise test.error(f"merits over the spectrum: {error}", ("light",), allowed="light: design") from error
 
     def _designed_values(self) -> np.ndarray:
         """Return rms wavefront errors and MTFs of the nominal camera in the current spectrum, before adjustment."""
         squares = np.sum(self._residuals(self.beams.designed.paths).reshape(len(self.fields), -1) ** 2, axis=-1)
-        mtfs = [one.known for rows in self._transfers.values() for row in rows for one in row]
+        mtfs = [transfer.known for rows in self._transfers.values() for row in rows for transfer in row]
         return np.concatenate([np.sqrt(squares), mtfs])
 
     def _prepare_in(self, colours: np.ndarray, shares: np.ndarray) -> None:
@@ -339,9 +339,9 @@ class ToleranceBench:
         self.traced_shares = shares if len(traced) == len(colours) else np.ones(1)
         try:
             self.beams = VariedBeams(self.optics, self.fields, traced, self.traced_shares, "mtf" in self._wanted)
-        except (CutError, RoughError) as error:
+        except (VignettedBeamError, RoughWavefrontError) as error:
             raise self.setup.test.error(str(error), ("merits",), allowed=error.allowed) from error
-        self._roots = LitRoots.of(self.beams.lit(), self.beams.degree)
+        self._roots = LitRoots.of(self.beams.illuminated_nodes(), self.beams.degree)
         self._transfers = fixed_transfers(
             self.optics,
             self.setup.test,
@@ -400,23 +400,23 @@ class ToleranceBench:
             The adjusted cameras; one whose light is lost does not affect the others.
         """
         starts = range(0, len(amounts), AT_ONCE)
-        found = [
+        results = [
             self._try(amounts[s : s + AT_ONCE], None if errors is None else errors[s : s + AT_ONCE]) for s in starts
         ]
-        return Tried.joined(found if paths else [replace(one, paths=None) for one in found])
+        return Tried.joined(results if paths else [replace(result, paths=None) for result in results])
 
     def _try(self, amounts: np.ndarray, errors: np.ndarray | None) -> Tried:
         try:
             return self._adjusted(amounts, errors)
         except PhysicalError as error:
             if len(amounts) == 1:
-                lost = np.full((1, self.parts), np.nan)
+                nan_parts = np.full((1, self.parts), np.nan)
                 paths = np.full((1, *self.beams.designed.paths.shape[1:]), np.nan) if len(self.fields) else None
                 moves = np.full((1, len(self.ranges)), np.nan)
-                return Tried(moves, lost, (str(error) or "lost",), np.full(1, np.nan), paths)
+                return Tried(moves, nan_parts, (str(error) or "lost",), np.full(1, np.nan), paths)
         half = len(amounts) // 2
-        both = slice(0, half), slice(half, None)
-        return Tried.joined([self._try(amounts[own], None if errors is None else errors[own]) for own in both])
+        halves = slice(0, half), slice(half, None)
+        return Tried.joined([self._try(amounts[rows], None if errors is None else errors[rows]) for rows in halves])
 
     @one_blas_thread()
     def _adjusted(self, amounts: np.ndarray, errors: np.ndarray | None) -> Tried:
@@ -424,42 +424,42 @@ class ToleranceBench:
         count = len(amounts)
         moves, settled = np.zeros((count, len(self.ranges))), np.zeros(count)
 
-        def state(moves: np.ndarray, which: np.ndarray | slice = slice(None)) -> list[State]:
-            own = np.concatenate([amounts[which], moves[which]], axis=1)
-            return states_of((*self.numbers, *self.compensators), own)
+        def state(moves: np.ndarray, rows: np.ndarray | slice = slice(None)) -> list[State]:
+            moved = np.concatenate([amounts[rows], moves[rows]], axis=1)
+            return states_of((*self.numbers, *self.compensators), moved)
 
         if not len(self.fields):
             return Tried(moves, self._parts(state(moves), amounts, moves, None), ("",) * count, settled)
         states = state(moves)
         light = self.beams.light(states)
 
-        def again(own: Sequence[State], which: np.ndarray) -> BeamLight:
+        def again(moved: Sequence[State], rows: np.ndarray) -> BeamLight:
             """Trace adjusted cameras; rays keep their starting points unless an adjustment moves the stop's beam."""
-            return self.beams.light(own, None if self._moves_stop else light.aimed[which])
+            return self.beams.light(moved, None if self._moves_stop else light.aimed[rows])
 
         if np.any(self.ranges > 0.0):
-            every = np.ones(len(self.ranges), dtype=bool)
+            all_free = np.ones(len(self.ranges), dtype=bool)
             residuals = self._residuals(light.paths)
             slopes = np.tile(self._adjust.slope, (count, 1, 1))
             for _ in range(MOST_STEPS):
-                target = self._adjust.best(slopes, residuals, moves, every)
+                target = self._adjust.best(slopes, residuals, moves, all_free)
                 expected = told(slopes, target - moves)
                 settled = np.sqrt(np.sum(expected**2, axis=1) / len(self.fields))
                 # what has settled stays, so that a camera's numbers do not depend on the others
                 going = settled > SETTLED * 1e-2
                 if not going.any():
                     break
-                some = np.flatnonzero(going)
-                change, moves = target[some] - moves[some], np.where(going[:, None], target, moves)
-                own = state(moves, some)
-                for k, one in zip(some, own, strict=True):
-                    states[k] = one
-                anew = again(own, some)
-                for known, new in zip(light[:3], anew[:3], strict=True):
-                    known[some] = new
-                arrived = self._residuals(anew.paths)
-                miss = arrived - residuals[some] - expected[some]
-                slopes[some], residuals[some] = self._adjust.corrected(slopes[some], change, miss), arrived
+                active = np.flatnonzero(going)
+                change, moves = target[active] - moves[active], np.where(going[:, None], target, moves)
+                moved = state(moves, active)
+                for k, new_state in zip(active, moved, strict=True):
+                    states[k] = new_state
+                traced = again(moved, active)
+                for known, new in zip(light[:3], traced[:3], strict=True):
+                    known[active] = new
+                arrived = self._residuals(traced.paths)
+                miss = arrived - residuals[active] - expected[active]
+                slopes[active], residuals[active] = self._adjust.corrected(slopes[active], change, miss), arrived
             if errors is not None and not self._adjust.exact:
                 moves = self._adjust.made(slopes, residuals, moves, errors)
                 states = state(moves)
@@ -494,12 +494,12 @@ class ToleranceBench:
                 continue
             if merit.spec.kind in ("wavefront", "mtf"):
                 assert terms is not None
-                own = terms[:, merit.fields].reshape(count, -1) / np.sqrt(len(merit.fields))
+                values = terms[:, merit.fields].reshape(count, -1) / np.sqrt(len(merit.fields))
                 size = merit.spec.requirement if merit.spec.kind == "wavefront" else 0.25
             else:
-                own = self._change(merit, line, light) / np.sqrt(merit.parts.stop - merit.parts.start)
+                values = self._change(merit, line, light) / np.sqrt(merit.parts.stop - merit.parts.start)
                 size = merit.spec.requirement
-            out.append(own / size)
+            out.append(values / size)
         return np.concatenate(out, axis=1) if out else np.zeros((count, 0))
 
     def pair_curvature(self, slopes: np.ndarray) -> np.ndarray:
@@ -521,9 +521,11 @@ class ToleranceBench:
                 for part, f in enumerate(merit.fields, merit.parts.start):
                     out[part] = 2.0 * residuals[:, f] @ residuals[:, f].T
             elif merit.spec.kind == "mtf":
-                every = [(f, one) for f, row in zip(merit.fields, self._transfers[k], strict=True) for one in row]
-                for part, (f, one) in enumerate(every, merit.parts.start):
-                    out[part] = one.curvature(slopes[:, f])
+                transfers = [
+                    (f, transfer) for f, row in zip(merit.fields, self._transfers[k], strict=True) for transfer in row
+                ]
+                for part, (f, transfer) in enumerate(transfers, merit.parts.start):
+                    out[part] = transfer.curvature(slopes[:, f])
         return out
 
     def _parts(
@@ -546,18 +548,18 @@ class ToleranceBench:
             kind = merit.spec.kind
             if kind == "wavefront":
                 assert squares is not None
-                own = squares[:, merit.fields]
+                columns = squares[:, merit.fields]
             elif kind == "mtf":
                 assert light is not None
-                own = self._modulations(k, merit, light.eikonals)
+                columns = self._modulations(k, merit, light.eikonals)
             elif kind == "obstruction":
                 assert taken is not None
-                own = taken[:, merit.fields]
+                columns = taken[:, merit.fields]
             elif kind in OF_MONITOR:
-                own = known[merit.name]
+                columns = known[merit.name]
             else:
-                own = self._change(merit, line, light)
-            out[:, merit.parts] = own
+                columns = self._change(merit, line, light)
+            out[:, merit.parts] = columns
         return out
 
     def _change(self, merit: Merit, line: dict[str, np.ndarray], light: BeamLight | None) -> np.ndarray:
@@ -565,16 +567,16 @@ class ToleranceBench:
         if merit.spec.kind != "chief_ray":
             return line[merit.spec.kind]
         assert light is not None
-        turn = light.chiefs[:, merit.fields, :2] - self.beams.designed.chiefs[0, merit.fields, :2]
-        return np.asarray(turn.reshape(len(turn), -1))
+        rotation = light.chiefs[:, merit.fields, :2] - self.beams.designed.chiefs[0, merit.fields, :2]
+        return np.asarray(rotation.reshape(len(rotation), -1))
 
     def _modulations(self, k: int, merit: Merit, eikonals: np.ndarray) -> np.ndarray:
         longer = eikonals - self.beams.designed.eikonals[0]
         return np.stack(
             [
-                one.modulation(longer[:, f])
+                transfer.modulation(longer[:, f])
                 for f, row in zip(merit.fields, self._transfers[k], strict=True)
-                for one in row
+                for transfer in row
             ],
             axis=-1,
         )
@@ -584,10 +586,10 @@ class ToleranceBench:
         if not self._wanted & {"boresight", "roll", "principal_distance", "distortion"}:
             return {}
         sight, axes = self.experiment.sight, self.experiment.sight.axes[self.camera]
-        own = list(self.instrument.cameras).index(self.camera)
-        seen = np.concatenate([sight.nominal[own], sight.trace(states)[own]])
-        change = line_change(seen, self.line, axes)
-        _, _, tangent = line_tangents(seen, self.line, axes)
+        index = list(self.instrument.cameras).index(self.camera)
+        directions = np.concatenate([sight.nominal[index], sight.trace(states)[index]])
+        change = line_change(directions, self.line, axes)
+        _, _, tangent = line_tangents(directions, self.line, axes)
         # what a shift and another principal distance explain is not distortion
         moved = (tangent[1:] - tangent[0]) * change.nominal_distance
         level = np.stack([np.ones_like(self.line), self.line], axis=-1)
@@ -608,7 +610,7 @@ class ToleranceBench:
         """Return the same bench with limits scaled by scales (E,)."""
         other = copy(self)
         by_entry = dict(zip(self.entries, scales.tolist(), strict=True))
-        other.numbers = tuple(replace(one, size=one.size * by_entry[one.entry]) for one in self.numbers)
+        other.numbers = tuple(replace(number, size=number.size * by_entry[number.entry]) for number in self.numbers)
         vars(other).pop("sizes", None)
         return other
 
@@ -631,10 +633,10 @@ class ToleranceBench:
 
     def worst_margins(self, values: np.ndarray) -> np.ndarray:
         """Return the worst margin of each camera, (S,), from merits (S, M); infinite without light."""
-        each = np.stack([merit.margin(values[:, k]) for k, merit in enumerate(self.merits)])
-        return np.asarray(np.where(np.isnan(each), np.inf, each).max(axis=0))
+        margins = np.stack([merit.margin(values[:, k]) for k, merit in enumerate(self.merits)])
+        return np.asarray(np.where(np.isnan(margins), np.inf, margins).max(axis=0))
 
     def passing(self, values: np.ndarray) -> np.ndarray:
         """Return True where merits (..., M) meet their requirements."""
-        each: Iterable[np.ndarray] = (merit.passes(values[..., k]) for k, merit in enumerate(self.merits))
-        return np.stack(list(each), axis=-1)
+        passes: Iterable[np.ndarray] = (merit.passes(values[..., k]) for k, merit in enumerate(self.merits))
+        return np.stack(list(passes), axis=-1)

@@ -39,28 +39,31 @@ def tolerance_report(run: ToleranceRun) -> Report:
     with look("tolerance"):
         curves = to_svg(_yield_figure(run))
         bars = to_svg(_share_figure(run))
-    told, more = answer(_verdict(run), _dear(run), *_further(run))
+    verdict, more = answer(_verdict(run), _dear(run), *_further(run))
     sections = (
         Section(
             "Yield",
-            ("Share of the cameras that keep a value, by exact traces and by the models; the line is what is asked.",),
+            (
+                "Cumulative share of the cameras over the value of each merit, by exact traces and by the models; the "
+                "red line is the requirement.",
+            ),
             (SvgFigure("yield", "Merits over all cameras", "", curves), _levels_table(run)),
             name="yield",
         ),
         Section(
-            "What costs most",
+            "Shares of variance",
             (
-                "Share of the variance of each merit that is gone without the tolerance. Shares of merits that are the "
-                "worst of several fields need not add up to 100 %.",
+                "Share of the variance of each merit that vanishes without the tolerance. For merits that are the "
+                "worst of several fields the shares need not add up to 100 %.",
             ),
-            (SvgFigure("shares", "Shares of variance", "", bars), _shares_table(run)),
+            (SvgFigure("shares", "Share of each tolerance", "", bars), _shares_table(run)),
             name="shares",
         ),
         Section(
             "Sensitivities",
             (
-                "Each tolerance alone at its limit, below and above, with all compensators adjusted anew, by exact "
-                "traces.",
+                "Merits with each tolerance alone at its lower and upper limit, after adjustment of all compensators, "
+                "by exact traces.",
             ),
             (_sensitivity_table(run),),
             name="sensitivities",
@@ -68,9 +71,9 @@ def tolerance_report(run: ToleranceRun) -> Report:
         Section(
             "Limits for a loss",
             (
-                "The limit at which a tolerance by itself spoils a merit by the loss in the head of its column, by "
-                f"exact traces of both signs. Empty where {FARTHEST:g} times the limit does not, and where the design "
-                "leaves nothing.",
+                "The limit at which a tolerance alone degrades a merit by the loss in the head of its column, by "
+                f"exact traces of both signs. Empty where {FARTHEST:g} times the limit does not cause the loss, and "
+                "where the design has no margin.",
             ),
             (_inverse_table(run),),
             name="inverse",
@@ -96,7 +99,7 @@ def tolerance_report(run: ToleranceRun) -> Report:
         ("seed", str(test.seed)),
     )
     title = f"Tolerances of {run.bench.camera}"
-    return Report(title, told, more, facts, _summary(run), sections, warnings=run.warnings)
+    return Report(title, verdict, more, facts, _summary(run), sections, warnings=run.warnings)
 
 
 def _light(run: ToleranceRun) -> str:
@@ -111,19 +114,19 @@ def _percent(share: float) -> str:
     return f"{100.0 * share:.1f} %"
 
 
-def _interval(one: Yield) -> str:
-    return f"{_percent(one.share)} ({100.0 * one.low:.1f} to {100.0 * one.high:.1f} %)"
+def _interval(passing: Yield) -> str:
+    return f"{_percent(passing.share)} ({100.0 * passing.low:.1f} to {100.0 * passing.high:.1f} %)"
 
 
 def _verdict(run: ToleranceRun) -> str:
-    judged = [(one.merit.name, one.passing.judged(one.merit.spec.probability)) for one in run.merits]
-    missed, undecided = ([name for name, how in judged if how == what] for what in ("missed", "open"))
+    judged = [(result.merit.name, result.passing.judged(result.merit.spec.probability)) for result in run.merits]
+    missed, undecided = ([name for name, how in judged if how == status] for status in ("missed", "open"))
     text = f"Yield: {_interval(run.passing)} of the cameras meet all requirements"
     if missed:
-        text += f"; too few meet {', '.join(missed)}"
+        text += f"; too few meet the requirement on {', '.join(missed)}"
     if undecided:
-        text += f"; more cameras have to be drawn to decide on {', '.join(undecided)}"
-    return text if missed or undecided else f"{text}, and enough meet each of them"
+        text += f"; more cameras are needed to decide on {', '.join(undecided)}"
+    return text if missed or undecided else f"{text}, and enough meet each single requirement"
 
 
 def _dear(run: ToleranceRun) -> str:
@@ -132,88 +135,88 @@ def _dear(run: ToleranceRun) -> str:
     order = sorted(worst, key=lambda name: -worst[name])
     dear = [f"{name} ({100.0 * worst[name]:.0f} %)" for name in order[:_FEW] if worst[name] > 0.0]
     loose = [name for name in order if worst[name] < _LITTLE][::-1]
-    text = f"Most of a merit's variance is due to {', '.join(dear)}" if dear else "No tolerance changes a merit"
+    text = f"Largest shares of a merit's variance: {', '.join(dear)}" if dear else "No tolerance changes a merit"
     if loose:
         named = ", ".join(loose[:_FEW]) + (f" and {len(loose) - _FEW} more" if len(loose) > _FEW else "")
-        text += f"; {named} could be loosened"
+        text += f"; {named} contribute little and could be loosened"
     return text
 
 
 def _importance(run: ToleranceRun) -> dict[str, float]:
     """Return each tolerance's largest share of the variance of a merit, over the merits that not every camera meets."""
-    tight = [one for one in run.merits if one.passing.share < 1.0] or list(run.merits)
-    return {name: max(one.shares[name] for one in tight) for name in run.bench.entries}
+    tight = [result for result in run.merits if result.passing.share < 1.0] or list(run.merits)
+    return {name: max(result.shares[name] for result in tight) for name in run.bench.entries}
 
 
 def _further(run: ToleranceRun) -> list[str]:
     out = []
-    found, judged = run.allocation, run.judged
-    if found is not None and judged is not None:
+    allocation, judged = run.allocation, run.judged
+    if allocation is not None and judged is not None:
         asked = run.setup.test.allocation
         assert asked is not None
-        if found.reached:
+        if allocation.reached:
             out.append(
-                f"Limits allocated for a yield of {_percent(asked.target)} give {_interval(judged)} at a cost of "
-                f"{found.cost[1]:.3g} against {found.cost[0]:.3g}"
+                f"Limits allocated for a yield of {_percent(asked.target)} give {_interval(judged)}, at a cost of "
+                f"{allocation.cost[1]:.3g} ({allocation.cost[0]:.3g} before)"
             )
         else:
-            which = (
-                "None of the graded limits that were found" if found.unrounded else "No allocation within the bounds"
-            )
+            subject = "None of the graded limits" if allocation.unrounded else "No allocation within the bounds"
             out.append(
-                f"{which} reaches a yield of {_percent(asked.target)}: those of the table give {_interval(judged)}"
+                f"{subject} reaches a yield of {_percent(asked.target)}: those of the table give {_interval(judged)}"
             )
     return out
 
 
-def _scaled(value: float, one: MeritResult, decimals: int | None = None) -> Cell:
+def _scaled(value: float, result: MeritResult, decimals: int | None = None) -> Cell:
     """Return a value in the merit's unit, with decimals according to its standard deviation."""
-    size = merit_unit(one.merit)[1]
+    size = merit_unit(result.merit)[1]
     if not np.isfinite(value):
         return None
-    places = decimals_for(one.deviation / size, 2, most=5) if decimals is None else decimals
-    return DecimalNumber(value / size, max(places, 1) if merit_unit(one.merit)[0] else max(places, 3))
+    digits = decimals_for(result.deviation / size, 2, most=5) if decimals is None else decimals
+    return DecimalNumber(value / size, max(digits, 1) if merit_unit(result.merit)[0] else max(digits, 3))
 
 
 def _summary(run: ToleranceRun) -> Table:
     rows: list[list[Cell]] = []
-    for one in run.merits:
-        spec = one.merit.spec
+    for result in run.merits:
+        spec = result.merit.spec
         sign = "at least" if spec.more_is_better else "at most"
         rows.append(
             [
-                merit_head(one.merit),
-                f"{sign} {plain(spec.requirement / merit_unit(one.merit)[1])} in {100 * spec.probability:.0f} %",
-                _scaled(one.nominal, one),
-                _scaled(one.mean, one),
-                _scaled(one.levels[1], one),
-                _scaled(one.quadratic[1], one),
-                _interval(one.passing),
-                one.passing.judged(spec.probability),
+                merit_head(result.merit),
+                f"{sign} {plain(spec.requirement / merit_unit(result.merit)[1])} in {100 * spec.probability:.0f} %",
+                _scaled(result.nominal, result),
+                _scaled(result.mean, result),
+                _scaled(result.levels[1], result),
+                _scaled(result.quadratic[1], result),
+                _interval(result.passing),
+                result.passing.judged(spec.probability),
             ]
         )
     caption = (
-        "Designed: adjusted, without any error. 90 %: the value that nine of ten cameras keep, by exact traces and by "
-        "derivatives of the second order. Yield: share that meets the requirement, with its interval at 95 %."
+        "Designed: nominal camera after adjustment. 90 %: the value that 90 % of the cameras meet, by exact traces and "
+        "by the second-order model. Yield: share of the cameras that meet the requirement, with its 95 % interval."
     )
-    heads = ("merit", "asked", "designed", "mean", "90 %", "90 % quadratic", "yield", "requirement")
+    heads = ("merit", "requirement", "designed", "mean", "90 %", "90 % quadratic", "yield", "result")
     return Table("merits", "Merits", caption, heads, rows)
 
 
 def _levels_table(run: ToleranceRun) -> Table:
     rows: list[list[Cell]] = []
-    for one in run.merits:
+    for result in run.merits:
         for k, share in enumerate(LEVELS):
-            values = (one.levels[k], one.quadratic[k], one.linear[k])
-            rows.append([merit_head(one.merit), f"{100 * share:.0f} %", *(_scaled(value, one) for value in values)])
+            values = (result.levels[k], result.quadratic[k], result.linear[k])
+            rows.append(
+                [merit_head(result.merit), f"{100 * share:.0f} %", *(_scaled(value, result) for value in values)]
+            )
         rows.append(
             [
-                merit_head(one.merit),
+                merit_head(result.merit),
                 "yield",
-                *(_percent(share) for share in (one.passing.share, *reversed(one.model_passing))),
+                *(_percent(share) for share in (result.passing.share, *reversed(result.model_passing))),
             ]
         )
-    caption = "Values that a share of the cameras keep, by exact traces of every camera and by models of all together."
+    caption = "Value of each merit that a share of the cameras meet, by exact traces of every camera and by the models."
     heads = ("merit", "share", "exact", "quadratic", "linear")
     return Table("levels", "Exact, quadratic and linear", caption, heads, rows)
 
@@ -221,17 +224,17 @@ def _levels_table(run: ToleranceRun) -> Table:
 def _shares_table(run: ToleranceRun) -> Table:
     worst = _importance(run)
     order = sorted(worst, key=lambda name: -worst[name])
-    rows: list[list[Cell]] = [[name, *(100.0 * one.shares[name] for one in run.merits)] for name in order]
-    heads = ("tolerance", *(f"{one.merit.name} [percent]" for one in run.merits))
-    return Table("variance", "Shares of variance", "Percent.", heads, rows, (None, *[1] * len(run.merits)))
+    rows: list[list[Cell]] = [[name, *(100.0 * result.shares[name] for result in run.merits)] for name in order]
+    heads = ("tolerance", *(f"{result.merit.name} [percent]" for result in run.merits))
+    return Table("variance", "Shares of variance", "In percent.", heads, rows, (None, *[1] * len(run.merits)))
 
 
 def _sensitivity_table(run: ToleranceRun) -> Table:
     adjusted = run.setup.test.compensators
     rows: list[list[Cell]] = []
     full: list[list[Cell]] = []
-    for e, (name, one) in enumerate(run.setup.test.tolerances.items()):
-        cells: list[Cell] = [name, one.words, str(one.limit)]
+    for e, (name, item) in enumerate(run.setup.test.tolerances.items()):
+        cells: list[Cell] = [name, item.words, str(item.limit)]
         for m, result in enumerate(run.merits):
             cells += [_scaled(float(run.found.values[e, end, m]), result) for end in (0, 1)]
         shares = [
@@ -240,25 +243,25 @@ def _sensitivity_table(run: ToleranceRun) -> Table:
             for end in (0, 1)
         ]
         ranges = [compensator.range for compensator in adjusted.values() for _ in (0, 1)]
-        both = list(zip(ranges, shares, strict=True))
-        rows.append([*cells, *(_scaled_limit(limit, x) if np.isfinite(x) else "" for limit, x in both)])
-        full.append([*cells, *(_number(limit)[0] * x if np.isfinite(x) else None for limit, x in both)])
+        limits_and_shares = list(zip(ranges, shares, strict=True))
+        rows.append([*cells, *(_scaled_limit(limit, x) if np.isfinite(x) else "" for limit, x in limits_and_shares)])
+        full.append([*cells, *(_number(limit)[0] * x if np.isfinite(x) else None for limit, x in limits_and_shares)])
     signs = ("\N{MINUS SIGN}", "+")
     moved = [f"move of {name} [{_number(c.range)[1]}]".replace(" []", "") for name, c in adjusted.items()]
-    groups = [*(merit_head(one.merit) for one in run.merits), *moved]
+    groups = [*(merit_head(item.merit) for item in run.merits), *moved]
     heads = ("tolerance", "motion", "limit", *(sign for _ in groups for sign in signs))
     over = (
         ("", 3),
         *((group, 2) for group in groups[: len(run.merits)]),
         *((f"move of {name}", 2) for name in adjusted),
     )
-    caption = "Merits with one tolerance at its limit. Of a figure error: what its terms come to on the average."
+    caption = "Merits with one tolerance at its limit, for a figure error the average over its random terms."
     if adjusted:
-        caption += " Then how far each compensator is moved for it; a figure error has no one answer."
-    told = Table(
+        caption += " Then the move of each compensator; it is not defined for a figure error."
+    full_table = Table(
         "sensitivities", "", "", (*heads[:3], *(f"{group} {sign}" for group in groups for sign in signs)), full
     )
-    return Table("sensitivities", "Each tolerance at its limits", caption, heads, rows, over=over, full=told)
+    return Table("sensitivities", "Each tolerance at its limits", caption, heads, rows, over=over, full=full_table)
 
 
 def _number(limit: str | float) -> tuple[float, str]:
@@ -269,11 +272,11 @@ def _number(limit: str | float) -> tuple[float, str]:
 
 def _inverse_table(run: ToleranceRun) -> Table:
     rows: list[list[Cell]] = []
-    for e, (name, one) in enumerate(run.setup.test.tolerances.items()):
-        cells: list[Cell] = [name, str(one.limit)]
+    for e, (name, tolerance) in enumerate(run.setup.test.tolerances.items()):
+        cells: list[Cell] = [name, str(tolerance.limit)]
         for m in range(len(run.merits)):
             share = float(run.inverse.shares[e, m])
-            cells.append(_scaled_limit(one.limit, share) if np.isfinite(share) else "")
+            cells.append(_scaled_limit(tolerance.limit, share) if np.isfinite(share) else "")
         rows.append(cells)
     heads = ["tolerance", "limit"]
     for m, result in enumerate(run.merits):
@@ -297,32 +300,32 @@ def _scaled_limit(limit: str | float, share: float) -> str:
 
 
 def _allocation_sections(run: ToleranceRun) -> tuple[Section, ...]:
-    found, judged = run.allocation, run.judged
-    if found is None or judged is None:
+    allocation, judged = run.allocation, run.judged
+    if allocation is None or judged is None:
         return ()
     rows: list[list[Cell]] = []
-    for e, (name, one) in enumerate(run.setup.test.tolerances.items()):
+    for e, (name, tolerance) in enumerate(run.setup.test.tolerances.items()):
         rows.append(
             [
                 name,
-                one.words,
-                str(one.limit),
-                _scaled_limit(one.limit, float(found.scales[e])),
-                str(found.limits[name]),
-                float(found.rounded[e]),
-                float(found.costs[0, e]),
-                float(found.costs[1, e]),
+                tolerance.words,
+                str(tolerance.limit),
+                _scaled_limit(tolerance.limit, float(allocation.scales[e])),
+                str(allocation.limits[name]),
+                float(allocation.rounded[e]),
+                float(allocation.costs[0, e]),
+                float(allocation.costs[1, e]),
             ]
         )
     heads = ("tolerance", "motion", "limit", "chosen", "rounded", "ratio", "cost", "new cost")
-    caption = "Limits as stated, as the least cost asks for, and rounded to the grades, with what they cost."
+    caption = "Limits as specified, at the least cost, and rounded to the grades, with their costs."
     table = Table(
         "allocation", "Limits before and after", caption, heads, rows, (None, None, None, None, None, 3, 2, 2)
     )
     text = (
-        f"Cost {found.cost[0]:.3g} before and {found.cost[1]:.3g} after. By the model the yield goes from "
-        f"{_percent(found.predicted[0])} to {_percent(found.predicted[1])}; other cameras, traced exactly, yield "
-        f"{_interval(judged)}.",
+        f"Cost {allocation.cost[0]:.3g} before and {allocation.cost[1]:.3g} after. By the model the yield changes from "
+        f"{_percent(allocation.predicted[0])} to {_percent(allocation.predicted[1])}; independent cameras, traced "
+        f"exactly, give {_interval(judged)}.",
     )
     return (Section("Allocation", text, (table, _tol_table(run)), name="allocation"),)
 
@@ -331,9 +334,9 @@ def _tol_table(run: ToleranceRun) -> Table:
     """Return the table of the limits for the workshop."""
     limits = run.allocation.limits if run.allocation is not None else {}
     rows: list[list[Cell]] = []
-    for name, one in run.setup.test.tolerances.items():
-        law = "measured" if one.measured is not None else "figure" if one.spectrum else one.law
-        rows.append([name, one.words, str(limits.get(name, one.limit)), law, " ".join(one.carrying)])
+    for name, tolerance in run.setup.test.tolerances.items():
+        law = "measured" if tolerance.measured is not None else "figure" if tolerance.spectrum else tolerance.law
+        rows.append([name, tolerance.words, str(limits.get(name, tolerance.limit)), law, " ".join(tolerance.carrying)])
     heads = ("tolerance", "motion", "limit (plus, minus)", "law", "carrying")
     return Table("tol", "Limits for the workshop", "As CSV in artefacts/tol.csv.", heads, rows)
 
@@ -350,13 +353,14 @@ def _figure_sections(run: ToleranceRun) -> tuple[Section, ...]:
         shape = type(outer).__name__.lower() + ", partly blocked" * any(edge.blocks for edge in element.edges)
         lengths = [1e3 * v for v in (disk.radius, *disk.centre, x1 - x0, y1 - y0)]
         rows.append([name, run.setup.test.tolerances[name].words, *lengths[:3], shape, *lengths[3:]])
-    sizes = ("circle's radius [mm]", "its x [mm]", "its y [mm]", "clear aperture", "width [mm]", "height [mm]")
+    sizes = ("circle radius [mm]", "circle x [mm]", "circle y [mm]", "clear aperture", "width [mm]", "height [mm]")
     table = Table(
         "figures", "Circles and clear apertures", "In the surface's own x and y.", ("tolerance", "motion", *sizes), rows
     )
-    text = "A Zernike term has its rms over the smallest circle round the clear aperture, a whole figure error its rms "
-    text += (
-        "over the clear aperture about its mean: a stated edge, the stop, or the beams of the field and edge_margin."
+    text = (
+        "The rms of a Zernike term is over the smallest circle round the clear aperture, that of a whole figure error "
+        "over the clear aperture about its mean. The clear aperture is a specified edge, the stop, or the beams of the "
+        "field with edge_margin."
     )
     return (Section("Figure errors", (text,), (table,), name="figures"),)
 
@@ -366,13 +370,14 @@ def _compensator_sections(run: ToleranceRun) -> tuple[Section, ...]:
         return () if run.allocation is not None else (Section("Limits", (), (_tol_table(run),), name="tol"),)
     moves = run.samples.moves
     rows: list[list[Cell]] = []
-    for c, (name, one) in enumerate(run.setup.test.compensators.items()):
-        own = moves[np.isfinite(moves[:, c]), c]
-        unit = one.range_si or 1.0
+    for c, (name, spec) in enumerate(run.setup.test.compensators.items()):
+        values = moves[np.isfinite(moves[:, c]), c]
+        unit = spec.range_si or 1.0
         size = [
-            _scaled_limit(one.range, float(part) / unit) for part in (np.std(own), np.max(np.abs(own), initial=0.0))
+            _scaled_limit(spec.range, float(part) / unit)
+            for part in (np.std(values), np.max(np.abs(values), initial=0.0))
         ]
-        rows.append([name, one.motion, str(one.range), str(one.step or ""), str(one.accuracy or ""), *size])
+        rows.append([name, spec.motion, str(spec.range), str(spec.step or ""), str(spec.accuracy or ""), *size])
     heads = ("compensator", "motion", "range", "step", "accuracy", "std of moves", "largest move")
     table = Table("compensators", "Adjustments", "Over all cameras.", heads, rows)
     tables = (table,) if run.allocation is not None else (table, _tol_table(run))
@@ -384,20 +389,27 @@ def _monitor_sections(run: ToleranceRun) -> tuple[Section, ...]:
         return ()
     stated = run.bench.monitor.stated.name
     rows: list[list[Cell]] = []
-    for one in run.merits:
-        if one.merit.name in run.missed:
-            spec = one.merit.spec
+    for result in run.merits:
+        if result.merit.name in run.missed:
+            spec = result.merit.spec
             readings = ", ".join(readings_of(spec, tuple(run.bench.instrument.cameras)))
             rows.append(
-                [merit_head(one.merit), readings, spec.estimator, _scaled(one.nominal, one), run.missed[one.merit.name]]
+                [
+                    merit_head(result.merit),
+                    readings,
+                    spec.estimator,
+                    _scaled(result.nominal, result),
+                    run.missed[result.merit.name],
+                ]
             )
     text = (
         f"Standard deviations of the monitor's readings under the disturbances {stated}, with the derivatives and the "
         "noise of each camera as it is built and adjusted; its area CCDs have been set to its spots. Derivatives are "
-        f"interpolated between those of the tolerances; in {EXACT} of the cameras they were traced as well.",
+        f"interpolated between those of the tolerances; in {EXACT} of the cameras they were also traced for "
+        "comparison.",
     )
     heads = ("merit", "reading", "estimator", "designed", "relative difference of traced derivatives")
-    table = Table("monitor", "What the monitor still knows", "", heads, rows, (None, None, None, None, 7))
+    table = Table("monitor", "Accuracy of the monitor's readings", "", heads, rows, (None, None, None, None, 7))
     return (Section("Monitor", text, (table,), name="monitor"),)
 
 
@@ -408,28 +420,28 @@ def _yield_figure(run: ToleranceRun) -> Figure:
     lines = -(-len(shown) // columns)
     figure = new_figure(2.6 * lines)
     axes = np.atleast_1d(figure.subplots(lines, columns, squeeze=False)).ravel()
-    for one, ax in zip(shown, axes, strict=False):
-        _curve(ax, run, one)
+    for result, ax in zip(shown, axes, strict=False):
+        _curve(ax, run, result)
     for ax in axes[len(shown) :]:
         ax.set_axis_off()
     shared_legend(figure, axes[0])
     return figure
 
 
-def _curve(ax: Axes, run: ToleranceRun, one: MeritResult) -> None:
-    size, m = merit_unit(one.merit)[1], run.bench.merits.index(one.merit)
+def _curve(ax: Axes, run: ToleranceRun, result: MeritResult) -> None:
+    size, m = merit_unit(result.merit)[1], run.bench.merits.index(result.merit)
     models = (run.found.model.quadratic, run.found.model.linear)
-    own = [run.samples.values[:, m], *(one.merit.values(part(run.samples.x)) for part in models)]
+    curves = [run.samples.values[:, m], *(result.merit.values(part(run.samples.x)) for part in models)]
     looks = ((BLUE, "-", 1.8, "exact"), (ORANGE, "--", 1.4, "quadratic"), (GREY, ":", 1.2, "linear"))
-    for values, (colour, style, width, label) in zip(own, looks, strict=True):
+    for values, (colour, style, width, label) in zip(curves, looks, strict=True):
         known = np.sort(values[np.isfinite(values)]) / size
         share = np.arange(1, len(known) + 1) / len(values)
-        if one.merit.spec.more_is_better:
+        if result.merit.spec.more_is_better:
             share = 1.0 - share + 1.0 / len(values)
         ax.plot(known, 100.0 * share, style, color=colour, lw=width, label=label)
-    ax.axvline(one.merit.spec.requirement / size, color=VERMILION, lw=1.0)
-    ax.axhline(100.0 * one.merit.spec.probability, color=INK, lw=0.5, alpha=0.5)
-    ax.set_xlabel(merit_head(one.merit))
+    ax.axvline(result.merit.spec.requirement / size, color=VERMILION, lw=1.0)
+    ax.axhline(100.0 * result.merit.spec.probability, color=INK, lw=0.5, alpha=0.5)
+    ax.set_xlabel(merit_head(result.merit))
     ax.set_ylabel("cameras [%]")
     ax.set_ylim(0.0, 102.0)
     plain_axes(ax)
@@ -444,9 +456,11 @@ def _share_figure(run: ToleranceRun) -> Figure:
     shown = run.merits[:_MOST_CURVES]
     colours = (BLUE, ORANGE, VERMILION, GREY, INK, "#009E73")
     step = 0.8 / max(1, len(shown))
-    for k, one in enumerate(shown):
+    for k, result in enumerate(shown):
         at = np.arange(len(order)) + 0.4 - (k + 0.5) * step
-        ax.barh(at, [100.0 * one.shares[name] for name in order], 0.9 * step, color=colours[k], label=one.merit.name)
+        ax.barh(
+            at, [100.0 * result.shares[name] for name in order], 0.9 * step, color=colours[k], label=result.merit.name
+        )
     ax.set_yticks(np.arange(len(order)), order)
     ax.set_xlabel("share of the variance [%]")
     shared_legend(figure, ax)

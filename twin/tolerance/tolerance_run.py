@@ -197,40 +197,44 @@ def run_tolerance(
         See ``draw_samples``.
     """
     test, force = setup.test, force or Workforce()
-    told: dict[str, None] = {}  # what is told twice, of the cameras and of those by which an allocation is judged
+    engine_warnings: dict[
+        str, None
+    ] = {}  # what is told twice, of the cameras and of those by which an allocation is judged
 
     def warn(text: str, further: Callable[[str], None] = force.warn) -> None:
-        told[text] = None
+        engine_warnings[text] = None
         further(text)
 
     force = replace(force, warn=warn)
     seed = test.seed if seed is None else seed
     _require_memory(test)
     bench = ToleranceBench(setup, backend)
-    given = given_warnings(setup, bench)
-    found = sensitivities(bench, advance)
-    _require_light(setup, found)
-    inverse = inverse_limits(bench, found, advance)
+    input_warnings = given_warnings(setup, bench)
+    sensitivity = sensitivities(bench, advance)
+    _require_light(setup, sensitivity)
+    inverse = inverse_limits(bench, sensitivity, advance)
     samples = draw_samples(setup, bench, backend, test.samples, seed, force, "cameras", advance)
     passing = bench.passing(samples.values)
-    models = Modelled.of(bench, found, samples)
-    merits = tuple(_merit_result(bench, found, samples, models, m, passing[:, m]) for m in range(len(bench.merits)))
+    models = Modelled.of(bench, sensitivity, samples)
+    merits = tuple(
+        _merit_result(bench, sensitivity, samples, models, m, passing[:, m]) for m in range(len(bench.merits))
+    )
     allocation, judged = None, None
     if test.allocation is not None:
-        allocation = allocate(setup, bench, found.model, samples, test.allocation, advance)
+        allocation = allocate(setup, bench, sensitivity.model, samples, test.allocation, advance)
         judged = _judged(setup, backend, allocation, seed, force, advance)
     missed = _missed(bench, samples)
     warnings = (
-        *given,
-        *told,
+        *input_warnings,
+        *engine_warnings,
         *beam_warnings(bench, _states(bench, samples, worst_of(bench, samples))),
-        *_warnings(bench, found, samples, merits, allocation, judged, test.allocation),
+        *_warnings(bench, sensitivity, samples, merits, allocation, judged, test.allocation),
         *missed_warnings(missed, EXACT),
     )
     return ToleranceRun(
         setup,
         bench,
-        found,
+        sensitivity,
         inverse,
         samples,
         merits,
@@ -243,14 +247,14 @@ def run_tolerance(
     )
 
 
-def _amounts(bench: ToleranceBench, samples: Samples, which: np.ndarray) -> np.ndarray:
+def _amounts(bench: ToleranceBench, samples: Samples, rows: np.ndarray) -> np.ndarray:
     """Return the amounts of the parameters and the compensators of selected cameras, SI, (W, K)."""
-    return np.concatenate([samples.x[which] * bench.sizes, np.nan_to_num(samples.moves[which])], axis=1)
+    return np.concatenate([samples.x[rows] * bench.sizes, np.nan_to_num(samples.moves[rows])], axis=1)
 
 
-def _states(bench: ToleranceBench, samples: Samples, which: np.ndarray) -> list[State]:
+def _states(bench: ToleranceBench, samples: Samples, rows: np.ndarray) -> list[State]:
     """Return the states of selected cameras with their adjustments."""
-    return states_of((*bench.numbers, *bench.compensators), _amounts(bench, samples, which))
+    return states_of((*bench.numbers, *bench.compensators), _amounts(bench, samples, rows))
 
 
 def worst_of(bench: ToleranceBench, samples: Samples) -> np.ndarray:
@@ -267,23 +271,23 @@ def _missed(bench: ToleranceBench, samples: Samples) -> dict[str, float]:
 
 
 def _require_memory(test: ToleranceBudgetSpec) -> None:
-    numbers = sum(max(1, len(one.spectrum)) for one in test.tolerances.values())
+    numbers = sum(max(1, len(tolerance.spectrum)) for tolerance in test.tolerances.values())
     merits = len(test.merits)
     camera = numbers * _DRAWN + (merits + len(test.compensators)) * _SHOWN + merits * _MODELLED
     pairs = numbers**2 * _PAIR
     require_memory(Lowered(test, ("samples",), test.samples, "samples", lambda count: pairs + count * camera, 20))
 
 
-def _require_light(setup: ToleranceSetup, found: Sensitivities) -> None:
-    if not np.all(np.isfinite(found.nominal)):
+def _require_light(setup: ToleranceSetup, sensitivity: Sensitivities) -> None:
+    if not np.all(np.isfinite(sensitivity.nominal)):
         raise setup.test.error("the designed camera has no light at these fields", ("merits",))
 
 
 def with_limits(setup: ToleranceSetup, limits: Mapping[str, str | float]) -> ToleranceSetup:
     """Return the budget with other limits."""
     entries = {
-        name: one.model_copy(update={"limit": limits.get(name, one.limit)})
-        for name, one in setup.test.tolerances.items()
+        name: tolerance.model_copy(update={"limit": limits.get(name, tolerance.limit)})
+        for name, tolerance in setup.test.tolerances.items()
     }
     return setup.model_copy(update={"test": setup.test.model_copy(update={"tolerances": FrozenMap(entries)})})
 
@@ -315,27 +319,27 @@ class Modelled:
     without: np.ndarray
 
     @classmethod
-    def of(cls, bench: ToleranceBench, found: Sensitivities, samples: Samples) -> Modelled:
+    def of(cls, bench: ToleranceBench, sensitivity: Sensitivities, samples: Samples) -> Modelled:
         """Evaluate the models at the draws of the cameras."""
-        scaled = ScaledModel.of(found.model, samples.x, list(bench.entries.values()))
-        every = np.eye(len(bench.entries))
+        scaled = ScaledModel.of(sensitivity.model, samples.x, list(bench.entries.values()))
+        identity = np.eye(len(bench.entries))
         return cls(
-            bench.values(found.model.linear(samples.x)),
-            bench.values(found.model.quadratic(samples.x)),
-            np.stack([bench.values(scaled.parts(1.0 - one)) for one in every]),
+            bench.values(sensitivity.model.linear(samples.x)),
+            bench.values(sensitivity.model.quadratic(samples.x)),
+            np.stack([bench.values(scaled.parts(1.0 - row)) for row in identity]),
         )
 
 
 def _merit_result(
-    bench: ToleranceBench, found: Sensitivities, samples: Samples, models: Modelled, m: int, passing: np.ndarray
+    bench: ToleranceBench, sensitivity: Sensitivities, samples: Samples, models: Modelled, m: int, passing: np.ndarray
 ) -> MeritResult:
     merit = bench.merits[m]
     values = samples.values[:, m]
     good = values[np.isfinite(values)]
     sign = -1.0 if merit.spec.more_is_better else 1.0
 
-    def levels(own: np.ndarray) -> tuple[float, ...]:
-        known = sign * own[np.isfinite(own)]
+    def levels(column: np.ndarray) -> tuple[float, ...]:
+        known = sign * column[np.isfinite(column)]
         return tuple(float(sign * np.quantile(known, share)) for share in LEVELS) if len(known) else (np.nan,) * 3
 
     without = np.var(models.without[:, :, m], axis=1)
@@ -344,7 +348,7 @@ def _merit_result(
     by_model = models.linear[:, m], models.quadratic[:, m]
     return MeritResult(
         merit,
-        float(found.nominal[m]),
+        float(sensitivity.nominal[m]),
         float(np.mean(good)) if len(good) else np.nan,
         float(np.std(good)) if len(good) else np.nan,
         levels(values),
@@ -358,7 +362,7 @@ def _merit_result(
 
 def _warnings(
     bench: ToleranceBench,
-    found: Sensitivities,
+    sensitivity: Sensitivities,
     samples: Samples,
     merits: tuple[MeritResult, ...],
     allocation: Allocation | None,
@@ -366,33 +370,36 @@ def _warnings(
     spec: AllocationSpec | None,
 ) -> list[str]:
     out = []
-    lost = [problem for problem in samples.problems if problem]
-    if lost:
-        out.append(f"{len(lost)} of {len(samples.problems)} cameras have no light and count as failed: {lost[0]}")
-    for name, problem in zip(bench.entries, found.problems, strict=True):
+    reasons = [problem for problem in samples.problems if problem]
+    if reasons:
+        out.append(f"{len(reasons)} of {len(samples.problems)} cameras have no light and count as failed: {reasons[0]}")
+    for name, problem in zip(bench.entries, sensitivity.problems, strict=True):
         if problem:
-            out.append(f"tolerance {name}: no light at its limit ({problem}), so that the models know nothing of it")
+            out.append(f"tolerance {name}: no light at its limit ({problem}), so the models do not include it")
     unsettled = int(np.sum(samples.settled > SETTLED))
     if unsettled:
-        out.append(f"the adjustments of {unsettled} cameras have not settled: their merits may be better than told")
-    if not found.model.paired:
-        out.append(f"{len(bench.numbers)} numbers vary: the second order has no products of two of them")
-    for one in merits:
-        level = one.levels[1]
-        for what, own in (("first", one.linear[1]), ("second", one.quadratic[1])):
-            away = abs(own - level) / max(abs(level), 1e-30)
-            if away > NEAR_MODEL:
-                kind = "linear" if what == "first" else "quadratic"
+        out.append(
+            f"the adjustments of {unsettled} cameras have not converged: their merits may be better than reported"
+        )
+    if not sensitivity.model.paired:
+        out.append(f"{len(bench.numbers)} parameters vary: the second order omits their mixed terms")
+    for result in merits:
+        level = result.levels[1]
+        for order, modelled in (("first", result.linear[1]), ("second", result.quadratic[1])):
+            difference = abs(modelled - level) / max(abs(level), 1e-30)
+            if difference > NEAR_MODEL:
+                kind = "linear" if order == "first" else "quadratic"
                 out.append(
-                    f"{one.merit.name}: the {kind} model's value for {100 * LEVELS[1]:.0f} % of the cameras differs by "
-                    f"{100 * away:.0f} % from the exact one; do not use derivatives of the {what} order for it"
+                    f"{result.merit.name}: the {100 * LEVELS[1]:.0f} % quantile of the {kind} model differs by "
+                    f"{100 * difference:.0f} % from that of the exact traces; do not use {order}-order derivatives for "
+                    "it"
                 )
     stuck = bench.ranges > 0.0
     at_end = np.abs(samples.moves) >= 0.999 * bench.ranges
     for c in np.flatnonzero(stuck & np.any(at_end, axis=0)):
         share = float(np.mean(at_end[:, c]))
         out.append(
-            f"compensator {bench.compensators[c].name} stands at the end of its range in {100 * share:.1f} % of all"
+            f"compensator {bench.compensators[c].name} is at the end of its range in {100 * share:.1f} % of the cameras"
         )
     if allocation is not None and judged is not None and spec is not None:
         out += _allocation_warnings(allocation, judged, spec)
@@ -404,18 +411,18 @@ def _allocation_warnings(allocation: Allocation, judged: Yield, spec: Allocation
     out = []
     if not allocation.reached and allocation.unrounded:
         out.append(
-            f"limits rounded to the grades do not reach a yield of {100 * spec.target:.0f} %, by the model "
-            f"{100 * allocation.predicted[1]:.1f} %, though those before rounding do: use more grades"
+            f"the limits rounded to the grades do not reach a yield of {100 * spec.target:.0f} % (by the model "
+            f"{100 * allocation.predicted[1]:.1f} %), but those before rounding do: use more grades"
         )
     elif not allocation.reached:
         out.append(
-            f"no limits that were found, up to {spec.tightest:g} times tighter, reach a yield of "
+            f"no limits up to {spec.tightest:g} times tighter reach a yield of "
             f"{100 * spec.target:.0f} %: those of the table have {100 * allocation.predicted[1]:.1f} % by the model"
         )
     if not judged.low <= allocation.predicted[1] <= judged.high:
         out.append(
-            f"the allocated limits yield {100 * judged.share:.1f} % of cameras of their own, and the model "
-            f"{100 * allocation.predicted[1]:.1f} %: trust the cameras"
+            f"with the allocated limits {100 * judged.share:.1f} % of independent cameras pass, against "
+            f"{100 * allocation.predicted[1]:.1f} % by the model: trust the exact traces"
         )
     return out
 
@@ -428,7 +435,7 @@ def worst_jobs(setup: ToleranceSetup, bench: ToleranceBench, samples: Samples) -
         perturb = {path: _perturb(motion) for path, motion in state.items()}
         data: dict[str, Any] = {
             "instrument": _reference(setup),
-            "perturb": {path: what for path, what in perturb.items() if what},
+            "perturb": {path: perturbation for path, perturbation in perturb.items() if perturbation},
         }
         data |= {key: _short(value) for key, value in setup.test.plain().items() if key == "disturbances"}
         number = f"worst_{rank + 1:02d}"
@@ -438,15 +445,15 @@ def worst_jobs(setup: ToleranceSetup, bench: ToleranceBench, samples: Samples) -
 
 def _short(disturbances: dict[str, Any]) -> Any:
     """Return disturbances in the form of a file: the name alone if nothing of that file is changed."""
-    said = {key: value for key, value in disturbances.items() if value}
-    return said["file"] if said.keys() == {"file"} else said
+    changed = {key: value for key, value in disturbances.items() if value}
+    return changed["file"] if changed.keys() == {"file"} else changed
 
 
 def _reference(setup: ToleranceSetup) -> str:
     """Return the instrument as a job in another folder refers to it: by name or by its absolute path."""
     named = setup.test.instrument
-    place = (Path(setup.test.source.file).parent / named).resolve()
-    return str(place) if is_path(named) and place.is_file() else named
+    path = (Path(setup.test.source.file).parent / named).resolve()
+    return str(path) if is_path(named) and path.is_file() else named
 
 
 def _perturb(motion: Any) -> dict[str, Any]:
@@ -468,19 +475,18 @@ def _job_text(data: dict[str, Any], number: int, setup: ToleranceSetup) -> str:
     try:
         JobSpec.model_validate(data)
     except (InputError, ValueError) as error:  # a motion larger than a job may say
-        return (
-            f"# Camera {number} of the tolerance budget cannot be said as a job: {' '.join(str(error).split())[:200]}\n"
-        )
+        reason = " ".join(str(error).split())[:200]
+        return f"# Camera {number} of the tolerance budget cannot be written as a job: {reason}\n"
     head = f"# Camera {number} of the tolerance budget of {setup.test.instrument}, with its adjustments\n"
     return head + dump_yaml(data)
 
 
-def _yield_plain(one: Yield) -> dict[str, Any]:
-    return {"share": one.share, "passed": one.passed, "of": one.of, "interval": [one.low, one.high]}
+def _yield_plain(passing: Yield) -> dict[str, Any]:
+    return {"share": passing.share, "passed": passing.passed, "of": passing.of, "interval": [passing.low, passing.high]}
 
 
-def _merit_plain(one: MeritResult, missed: float | None = None) -> dict[str, Any]:
-    merit = one.merit
+def _merit_plain(result: MeritResult, missed: float | None = None) -> dict[str, Any]:
+    merit = result.merit
 
     def row(values: tuple[float, ...]) -> dict[str, float | None]:
         return {f"p{100 * share:.0f}": shown_merit(value, merit) for share, value in zip(LEVELS, values, strict=True)}
@@ -490,17 +496,17 @@ def _merit_plain(one: MeritResult, missed: float | None = None) -> dict[str, Any
         "unit": merit_unit(merit)[0],
         "requirement": shown_merit(merit.spec.requirement, merit),
         "probability": merit.spec.probability,
-        "nominal": shown_merit(one.nominal, merit),
-        "mean": shown_merit(one.mean, merit),
-        "std": shown_merit(one.deviation, merit),
-        "monte_carlo": row(one.levels),
-        "linear": row(one.linear),
-        "quadratic": row(one.quadratic),
-        "yield": _yield_plain(one.passing),
-        "yield_linear": one.model_passing[0],
-        "yield_quadratic": one.model_passing[1],
-        "judged": one.passing.judged(merit.spec.probability),
-        "variance_shares": dict(one.shares),
+        "nominal": shown_merit(result.nominal, merit),
+        "mean": shown_merit(result.mean, merit),
+        "std": shown_merit(result.deviation, merit),
+        "monte_carlo": row(result.levels),
+        "linear": row(result.linear),
+        "quadratic": row(result.quadratic),
+        "yield": _yield_plain(result.passing),
+        "yield_linear": result.model_passing[0],
+        "yield_quadratic": result.model_passing[1],
+        "judged": result.passing.judged(merit.spec.probability),
+        "variance_shares": dict(result.shares),
         **({} if missed is None else {"interpolation_error": missed}),
     }
 
@@ -508,15 +514,15 @@ def _merit_plain(one: MeritResult, missed: float | None = None) -> dict[str, Any
 def _tolerance_plain(run: ToleranceRun) -> dict[str, Any]:
     out = {}
     bench = run.bench
-    for e, (name, one) in enumerate(run.setup.test.tolerances.items()):
+    for e, (name, tolerance) in enumerate(run.setup.test.tolerances.items()):
         below, above = (
             {m.name: shown_merit(float(run.found.values[e, end, k]), m) for k, m in enumerate(bench.merits)}
             for end in (0, 1)
         )
         share = run.inverse.shares[e]
         out[name] = {
-            "motion": one.words,
-            "limit": one.limit,
+            "motion": tolerance.words,
+            "limit": tolerance.limit,
             "at_minus": below,
             "at_plus": above,
             "moves_at_minus": _moves_at(run, e, 0),
@@ -534,34 +540,34 @@ def _moves_at(run: ToleranceRun, entry: int, end: int) -> dict[str, str | float 
     """Return each compensator's move with a tolerance at an end of its limit; None for a figure error."""
     moves = run.found.moves[entry, end].tolist()
     return {
-        one.name: amount_text(move, one.kind) if np.isfinite(move) else None
-        for one, move in zip(run.bench.compensators, moves, strict=True)
+        compensator.name: amount_text(move, compensator.kind) if np.isfinite(move) else None
+        for compensator, move in zip(run.bench.compensators, moves, strict=True)
     }
 
 
 def _allocation_plain(run: ToleranceRun) -> dict[str, Any] | None:
-    found = run.allocation
-    if found is None or run.judged is None:
+    allocation = run.allocation
+    if allocation is None or run.judged is None:
         return None
     return {
-        "reached": found.reached,
-        "reached_unrounded": found.unrounded,
-        "cost_before": found.cost[0],
-        "cost_after": found.cost[1],
-        "yield_predicted_before": found.predicted[0],
-        "yield_predicted": found.predicted[1],
+        "reached": allocation.reached,
+        "reached_unrounded": allocation.unrounded,
+        "cost_before": allocation.cost[0],
+        "cost_after": allocation.cost[1],
+        "yield_predicted_before": allocation.predicted[0],
+        "yield_predicted": allocation.predicted[1],
         "yield": _yield_plain(run.judged),
-        "limits": dict(found.limits),
+        "limits": dict(allocation.limits),
     }
 
 
 def _moves_plain(run: ToleranceRun) -> dict[str, Any]:
     out = {}
     for c, number in enumerate(run.bench.compensators):
-        own = run.samples.moves[:, c]
-        own = own[np.isfinite(own)]
-        spread = float(np.std(own)) if len(own) else 0.0
-        largest = float(np.max(np.abs(own))) if len(own) else 0.0
+        moves = run.samples.moves[:, c]
+        moves = moves[np.isfinite(moves)]
+        spread = float(np.std(moves)) if len(moves) else 0.0
+        largest = float(np.max(np.abs(moves))) if len(moves) else 0.0
         out[number.name] = {
             "motion": run.setup.test.compensators[number.name].motion,
             "std": amount_text(spread, number.kind),
@@ -573,10 +579,10 @@ def _moves_plain(run: ToleranceRun) -> dict[str, Any]:
 TOLERANCE: Record[ToleranceRun] = Record(
     "tolerance.json: a tolerance budget.",
     Quantity("instrument", lambda run: run.setup.test.instrument),
-    Quantity("camera", lambda run: run.bench.camera, "the camera that is judged"),
-    Quantity("wavelengths_nm", lambda run: run.bench.colours, "of the light of wavefronts and MTFs"),
-    Quantity("weights", lambda run: run.bench.shares, "share of the light at each of these wavelengths"),
-    Quantity("samples", lambda run: len(run.samples.problems), "cameras that were drawn"),
+    Quantity("camera", lambda run: run.bench.camera, "camera that is evaluated"),
+    Quantity("wavelengths_nm", lambda run: run.bench.colours, "wavelengths of wavefronts and MTFs"),
+    Quantity("weights", lambda run: run.bench.shares, "weight of each of these wavelengths"),
+    Quantity("samples", lambda run: len(run.samples.problems), "number of Monte Carlo cameras"),
     Quantity("lost", lambda run: sum(map(bool, run.samples.problems)), "cameras without light, which count as failed"),
     Quantity("yield", lambda run: _yield_plain(run.passing), "share of cameras that meet all requirements"),
     Quantity(
@@ -584,13 +590,21 @@ TOLERANCE: Record[ToleranceRun] = Record(
         lambda run: {one.merit.name: _merit_plain(one, run.missed.get(one.merit.name)) for one in run.merits},
         "each in its unit; p90 is the value that 90 % of the cameras keep",
     ),
-    Quantity("tolerances", _tolerance_plain, "each at its limits, and the share of its limit that costs the loss"),
-    Quantity("compensators", _moves_plain, "how far they are moved"),
+    Quantity(
+        "tolerances",
+        _tolerance_plain,
+        "merits with each at its limits, and the ratio to its limit that causes the loss",
+    ),
+    Quantity("compensators", _moves_plain, "standard deviation and largest of their moves"),
     Quantity(
         "losses",
         lambda run: {m.name: shown_merit(float(run.inverse.losses[k]), m) for k, m in enumerate(run.bench.merits)},
-        "of the inverse limits",
+        "loss of each merit for the inverse limits",
     ),
-    Quantity("allocation", _allocation_plain, "limits chosen anew", where_known=True),
-    Quantity("unsettled_waves", lambda run: float(np.nanmax(run.samples.settled)), "largest change of a further step"),
+    Quantity("allocation", _allocation_plain, "allocated limits", where_known=True),
+    Quantity(
+        "unsettled_waves",
+        lambda run: float(np.nanmax(run.samples.settled)),
+        "largest change of the rms wavefront error by a further step of the adjustments",
+    ),
 )

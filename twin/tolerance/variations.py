@@ -95,8 +95,8 @@ def tolerance_numbers(setup: ToleranceSetup, instrument: Instrument, thermal: Th
     """
     maker = _Maker(setup.test, instrument, thermal)
     out: list[VariedNumber] = []
-    for name, one in setup.test.tolerances.items():
-        out += maker.tolerance(name, one)
+    for name, tolerance in setup.test.tolerances.items():
+        out += maker.tolerance(name, tolerance)
     return tuple(out)
 
 
@@ -105,15 +105,15 @@ def compensator_numbers(
 ) -> tuple[VariedNumber, ...]:
     """Return one parameter for each compensator; see ``tolerance_numbers``."""
     maker = _Maker(setup.test, instrument, thermal)
-    return tuple(maker.compensator(name, one) for name, one in setup.test.compensators.items())
+    return tuple(maker.compensator(name, compensator) for name, compensator in setup.test.compensators.items())
 
 
 def actuator_number(
-    test: Spec, instrument: Instrument, thermal: ThermalModel, name: str, one: CompensatorSpec
+    test: Spec, instrument: Instrument, thermal: ThermalModel, name: str, actuator: CompensatorSpec
 ) -> VariedNumber:
     """Return the parameter of an actuator under ``actuators`` of a test; see ``tolerance_numbers``."""
-    moves = _Maker(test, instrument, thermal)._moves(one, ("actuators", name), one.range_si or 1.0)
-    return VariedNumber(name, name, one.parts[1], 1.0, moves)
+    moves = _Maker(test, instrument, thermal)._moves(actuator, ("actuators", name), actuator.range_si or 1.0)
+    return VariedNumber(name, name, actuator.parts[1], 1.0, moves)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,31 +124,31 @@ class _Maker:
     instrument: Instrument
     thermal: ThermalModel
 
-    def tolerance(self, name: str, one: ToleranceSpec) -> list[VariedNumber]:
+    def tolerance(self, name: str, spec: ToleranceSpec) -> list[VariedNumber]:
         key: KeyPath = ("tolerances", name)
-        kind = one.parts[1]
-        if not one.spectrum:
-            return [VariedNumber(name, name, kind, one.limit_si, self._moves(one, key, one.limit_si))]
-        body = self._node(one, one.parts[0], key)
-        sizes = one.limit_si * spectrum_over(self.instrument.assembly.face(body), one.spectrum, one.power)
+        kind = spec.parts[1]
+        if not spec.spectrum:
+            return [VariedNumber(name, name, kind, spec.limit_si, self._moves(spec, key, spec.limit_si))]
+        body = self._node(spec, spec.parts[0], key)
+        sizes = spec.limit_si * spectrum_over(self.instrument.assembly.face(body), spec.spectrum, spec.power)
         return [
             VariedNumber(
                 f"{name} Z{j}", name, kind, float(size), FrozenMap({body: BodyMove(figure=FrozenMap({j: 1.0}))})
             )
-            for j, size in zip(one.spectrum, sizes, strict=True)
+            for j, size in zip(spec.spectrum, sizes, strict=True)
         ]
 
-    def compensator(self, name: str, one: CompensatorSpec) -> VariedNumber:
-        moves = self._moves(one, ("compensators", name), one.range_si or 1.0)
-        return VariedNumber(name, name, one.parts[1], 1.0, moves)
+    def compensator(self, name: str, spec: CompensatorSpec) -> VariedNumber:
+        moves = self._moves(spec, ("compensators", name), spec.range_si or 1.0)
+        return VariedNumber(name, name, spec.parts[1], 1.0, moves)
 
-    def _node(self, one: Varied, name: str, key: KeyPath) -> str:
+    def _node(self, spec: Varied, name: str, key: KeyPath) -> str:
         """Return the path of a body that allows the motion; raise InputError if there is none."""
         try:
             body = find_node(name, self.instrument.nodes)
         except Problem as problem:
-            raise self.test.error(problem, (*key, "motion" if name == one.parts[0] else "carrying")) from None
-        _, kind, axis, _, pivot = one.parts
+            raise self.test.error(problem, (*key, "motion" if name == spec.parts[0] else "carrying")) from None
+        _, kind, axis, _, pivot = spec.parts
         does: dict[str, Any] = {} if kind in HEAT else {kind: 1.0}
         if kind in ("shift", "rotate"):
             does = {kind: tuple(float(k == AXES[axis]) for k in range(3))}
@@ -156,17 +156,17 @@ class _Maker:
             does = {kind: FrozenMap({axis: 1.0})}
         if pivot:
             does["pivot"] = pivot
-        what = PlainPerturbationSpec.model_construct(**does)
-        issues = perturbation_issues(self.test, self.instrument.nodes, body, what, key)
+        perturbation = PlainPerturbationSpec.model_construct(**does)
+        issues = perturbation_issues(self.test, self.instrument.nodes, body, perturbation, key)
         if issues:
             raise InputError(*issues)
         if kind in HEAT and "temperature" not in self.instrument.nodes[body].allows:
-            raise self.test.error("this node does not allow temperature", (*key, "motion"), found=one.motion)
+            raise self.test.error("this node does not allow temperature", (*key, "motion"), found=spec.motion)
         return body
 
-    def _moves(self, one: Varied, key: KeyPath, limit: float) -> FrozenMap[str, BodyMove]:
-        name, kind, axis, _, pivot = one.parts
-        body = self._node(one, name, key)
+    def _moves(self, spec: Varied, key: KeyPath, limit: float) -> FrozenMap[str, BodyMove]:
+        name, kind, axis, _, pivot = spec.parts
+        body = self._node(spec, name, key)
         if kind in HEAT:
             return self._heat(body, kind, axis, key, limit)
         if kind == "figure":
@@ -175,17 +175,17 @@ class _Maker:
             about = np.array(self._body(body).pivots[pivot or "origin"])
             shift = -about if kind == "scale" else np.zeros(3)
             return FrozenMap({body: BodyMove(shift=shift, shape=FrozenMap({kind: 1.0}))})
-        bodies = [body, *(self._node(one, other, key) for other in one.carrying)]
+        bodies = [body, *(self._node(spec, other, key) for other in spec.carrying)]
         for other in bodies:
             above = next((path for path in bodies if other.startswith(f"{path}/")), None)
             if above is not None or bodies.count(other) > 1:
                 problem = f"{other} is carried already" if above is None else f"{other} moves with {above} already"
-                raise self.test.error(problem, (*key, "carrying"), found=shown(list(one.carrying)))
+                raise self.test.error(problem, (*key, "carrying"), found=shown(list(spec.carrying)))
         first = self.instrument.assembly.nominal_pose(body)
-        way = first.rotation[:, AXES[axis]]
+        direction = first.rotation[:, AXES[axis]]
         point = first.apply(np.array(self._body(body).pivots[pivot or "origin"]))
         return FrozenMap(
-            {path: _rigid(self.instrument.assembly.nominal_pose(path), kind, way, point) for path in bodies}
+            {path: _rigid(self.instrument.assembly.nominal_pose(path), kind, direction, point) for path in bodies}
         )
 
     def _body(self, path: str) -> Body:
@@ -247,9 +247,9 @@ def heat_moves(
 
 def _per_unit(body: Body, motion: Motion, amount: float) -> BodyMove:
     about = np.array(body.pivots[motion.pivot])
-    growth = (1.0 + motion.scale) * (1.0 + motion.expansion) - 1.0
-    turned = rotation_matrix(np.array(motion.rotate))
-    shift = about + np.array(motion.shift) - (1.0 + growth) * turned @ about
+    scale = (1.0 + motion.scale) * (1.0 + motion.expansion) - 1.0
+    rotation = rotation_matrix(np.array(motion.rotate))
+    shift = about + np.array(motion.shift) - (1.0 + scale) * rotation @ about
     return BodyMove(
         rotate=np.array(motion.rotate) / amount,
         shift=shift / amount,
@@ -258,12 +258,12 @@ def _per_unit(body: Body, motion: Motion, amount: float) -> BodyMove:
     )
 
 
-def _rigid(pose: Pose, kind: str, way: np.ndarray, point: np.ndarray) -> BodyMove:
+def _rigid(pose: Pose, kind: str, direction: np.ndarray, point: np.ndarray) -> BodyMove:
     """Return a motion along or about a world direction (3,), about a world point (3,), in a body's own frame."""
-    own = pose.rotation.T @ way
+    axis = pose.rotation.T @ direction
     if kind == "shift":
-        return BodyMove(shift=own)
-    return BodyMove(rotate=own, pivot=pose.inverse().apply(point))
+        return BodyMove(shift=axis)
+    return BodyMove(rotate=axis, pivot=pose.inverse().apply(point))
 
 
 def spectrum_shares(terms: Sequence[int], power: float) -> np.ndarray:
@@ -331,33 +331,33 @@ def states_of(numbers: Sequence[VariedNumber], amounts: np.ndarray) -> list[Stat
     """
     count = len(amounts)
     bodies = tuple(dict.fromkeys(path for number in numbers for path in number.moves))
-    made: dict[str, list[Motion]] = {}
+    motions_by_body: dict[str, list[Motion]] = {}
     for path in bodies:
         rotate, offset = np.zeros((count, 3)), np.zeros((count, 3))
-        turns: dict[tuple[float, float, float], np.ndarray] = {}
+        rotations: dict[tuple[float, float, float], np.ndarray] = {}
         figure: dict[int, np.ndarray] = {}
         shape: dict[str, np.ndarray] = {}
         for k, number in enumerate(numbers):
             move = number.moves.get(path)
             if move is None:
                 continue
-            own = amounts[:, k]
-            offset += np.outer(own, move.shift)
+            amount = amounts[:, k]
+            offset += np.outer(amount, move.shift)
             if np.any(move.rotate):
-                turn = np.outer(own, move.rotate)
-                rotate += turn
+                rotation = np.outer(amount, move.rotate)
+                rotate += rotation
                 about = triple(move.pivot)
-                turns[about] = turns.get(about, 0.0) + turn
+                rotations[about] = rotations.get(about, 0.0) + rotation
             for j, per in move.figure.items():
-                figure[j] = figure.get(j, 0.0) + per * own
+                figure[j] = figure.get(j, 0.0) + per * amount
             for name, per in move.shape.items():
-                shape[name] = shape.get(name, 0.0) + per * own
-        for about, turn in turns.items():
+                shape[name] = shape.get(name, 0.0) + per * amount
+        for about, rotation in rotations.items():
             point = np.array(about)
             if np.any(point):
-                offset += point - np.einsum("sij,j->si", rotation_matrix(turn), point)
-        made[path] = _motions(count, rotate, offset, figure, shape)
-    return [FrozenMap({path: motions[s] for path, motions in made.items()}) for s in range(count)]
+                offset += point - np.einsum("sij,j->si", rotation_matrix(rotation), point)
+        motions_by_body[path] = _motions(count, rotate, offset, figure, shape)
+    return [FrozenMap({path: motions[s] for path, motions in motions_by_body.items()}) for s in range(count)]
 
 
 def _motions(

@@ -28,20 +28,20 @@ from twin.study.report.study_statistics import typeset
 from twin.study.runs.setup import PROGRAM, StudySetup, base_of, resolve_study
 
 DOUBTFUL_TEXT = (
-    "Differences that are not good to 1% of the response's largest change (their step crosses a bend, or the job "
+    "Finite differences not accurate to 1% of the response's largest change (their step crosses a bend, or the job "
     "is noisy)"
 )
 """Beginning of the warning about inaccurate finite differences."""
 
 
-def _write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warnings: Sequence[str] = ()) -> None:
+def _write_report(setup: StudySetup, gradient: Gradient, folder: RunFolder, warnings: Sequence[str] = ()) -> None:
     """Write report.html, its figures and tables into an open run folder.
 
     Parameters
     ----------
     setup : StudySetup
         The study.
-    found : Gradient
+    gradient : Gradient
         Jacobian of the study.
     folder : RunFolder
         Folder of the study.
@@ -52,35 +52,37 @@ def _write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warning
         figures = (
             SvgFigure(
                 "heat-map",
-                "Which factor moves which response",
+                "Sensitivity of each response to each factor",
                 "Change of each response per spread of each factor, as a share of the response's largest one; the "
                 "scale is logarithmic above 0.001.",
-                svg.to_svg(_heat_map(found)),
+                svg.to_svg(_heat_map(gradient)),
             ),
             SvgFigure(
                 "tornado",
                 "Largest changes",
                 "Change of each response when a factor rises by its spread, the largest first; in brackets the root of "
                 "the sum of squares over all factors.",
-                svg.to_svg(_tornado(found)),
+                svg.to_svg(_tornado(gradient)),
             ),
         )
     study = setup.study
     about = (
-        f"Derivatives of {len(found.responses)} responses by {len(found.factors)} factors of {study.base.command}, at "
-        "the base's own values; the design plays no part.",
-        f"{int((found.method == AD).sum())} of {found.method.size} entries are by automatic differentiation through "
-        f"the trace.{_agreement(found)} All other entries are differences. Spots are the means of their rays, as the "
-        "energy centroid has them; estimators are applied to these.",
+        f"Derivatives of {len(gradient.responses)} responses by {len(gradient.factors)} factors of "
+        f"{study.base.command}, at "
+        "the base's values; the design is not used.",
+        f"{int((gradient.method == AD).sum())} of {gradient.method.size} entries are by automatic differentiation "
+        "through "
+        f"the trace.{_agreement(gradient)} All other entries are differences. Spots are means of rays, which are the "
+        "energy centroids; estimators are applied to them.",
     )
-    said, more = verdict(found)
+    head, more = verdict(gradient)
     report = Report(
         f"{study.name}: gradient",
-        said,
+        head,
         (*more, *([study.description] if study.description else ()), *about),
         (),
-        _response_table(found),
-        (Section("Sensitivity", (), figures), Section("Factors", (), (_factor_rows(found),))),
+        _response_table(gradient),
+        (Section("Sensitivity", (), figures), Section("Factors", (), (_factor_rows(gradient),))),
         warnings=tuple(warnings),
     )
     page.write_artefacts(report.artefacts, folder)
@@ -90,26 +92,26 @@ def _write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warning
     )
 
 
-def _agreement(found: Gradient) -> str:
-    if found.worst is None:
+def _agreement(gradient: Gradient) -> str:
+    if gradient.worst is None:
         return ""
     return (
-        f" They and central differences through perturbed traces agree to {significant(found.worst, 3, floor=0.0)}: "
+        f" They and central differences through perturbed traces agree to {significant(gradient.worst, 3, floor=0.0)}: "
         "relative to the entry, but for entries below 0.001 of their response's largest one relative to that; and for "
         "a response that is a difference of two numbers, relative to these."
     )
 
 
-def verdict(found: Gradient) -> tuple[str, tuple[str, ...]]:
+def verdict(gradient: Gradient) -> tuple[str, tuple[str, ...]]:
     """Return the verdict on which factors dominate and how accurate that is, and the sentences that follow it."""
-    moved = [i for i in range(len(found.responses)) if np.any(found.change[i])]
-    strongest = Counter(found.factors[int(np.argmax(np.abs(found.change[i])))].name for i in moved)
-    total = len(found.responses)
-    first = [f"the factor {name} moves {count} of {total} responses most" for name, count in strongest.most_common(2)]
+    moved = [i for i in range(len(gradient.responses)) if np.any(gradient.change[i])]
+    strongest = Counter(gradient.factors[int(np.argmax(np.abs(gradient.change[i])))].name for i in moved)
+    total = len(gradient.responses)
+    first = [f"the factor {name} dominates {count} of {total} responses" for name, count in strongest.most_common(2)]
     still = total - len(moved)
     sure = ""
-    if found.worst is not None:
-        sure = f"automatic differentiation and differences agree to {significant(found.worst, 2, floor=0.0)}"
+    if gradient.worst is not None:
+        sure = f"automatic differentiation and differences agree to {significant(gradient.worst, 2, floor=0.0)}"
     return answer(
         ", ".join(first) or "No factor moves any response",
         sure,
@@ -118,28 +120,28 @@ def verdict(found: Gradient) -> tuple[str, tuple[str, ...]]:
     )
 
 
-def _response_table(found: Gradient) -> Table:
+def _response_table(gradient: Gradient) -> Table:
     """Return the dominant factor of each response, its derivative, and the agreement of AD with finite differences."""
     rows: list[list[Cell]] = []
-    change, relative = found.change, found.relative
-    for i, response in enumerate(found.responses):
+    change, relative = gradient.change, gradient.relative
+    for i, response in enumerate(gradient.responses):
         k = int(np.argmax(np.abs(change[i])))
-        factor = found.factors[k]
+        factor = gradient.factors[k]
         known = ~np.isnan(relative[i])
         worst = float(np.max(relative[i, known])) if np.any(known) else None
-        exact = int(np.sum(found.method[i] == AD))
+        exact = int(np.sum(gradient.method[i] == AD))
         total = float(np.linalg.norm(change[i]))
         none = total == 0.0
         rows.append(
             [
                 response,
                 "none" if none else factor.name,
-                "" if none else significant(float(found.best[i, k]), 6, floor=0.0),
-                "" if none else _unit_text(typeset(found.units[i]), typeset(factor.unit)),
+                "" if none else significant(float(gradient.best[i, k]), 6, floor=0.0),
+                "" if none else _unit_text(typeset(gradient.units[i]), typeset(factor.unit)),
                 "" if none else significant(float(change[i, k]), 3, floor=0.0),
                 significant(total, 3, floor=0.0),
-                typeset(found.units[i]),
-                f"{exact} of {len(found.factors)}",
+                typeset(gradient.units[i]),
+                f"{exact} of {len(gradient.factors)}",
                 significant(worst, 3, floor=0.0) if worst is not None else "\N{EM DASH}",
             ]
         )
@@ -162,14 +164,14 @@ def _response_table(found: Gradient) -> Table:
     return Table("responses", "Responses", caption, heads, rows)
 
 
-def _factor_rows(found: Gradient) -> Table:
+def _factor_rows(gradient: Gradient) -> Table:
     """Return the table of the factors."""
     rows: list[list[Cell]] = []
-    for k, factor in enumerate(found.factors):
+    for k, factor in enumerate(gradient.factors):
         keys = [*factor.spec.places, *(scale.key for scale in factor.spec.scales)]
         where = key_text(keys[0]) + (f" and {len(keys) - 1} more" if len(keys) > 1 else "")
-        exact = bool(np.any(found.method[:, k] == AD))
-        steps = sorted({significant(float(step), 3, floor=0.0) for step in found.step[:, k]})
+        exact = bool(np.any(gradient.method[:, k] == AD))
+        steps = sorted({significant(float(step), 3, floor=0.0) for step in gradient.step[:, k]})
         kind = "AD and differences" if exact else "differences"
         spread = f"{plain(factor.spread)} ({factor.spread_of})"
         value = plain(factor.value, 6)
@@ -187,23 +189,23 @@ NEGLIGIBLE = 1e-3
 """Share of a response's largest change below which no bar is drawn."""
 
 
-def _normalised(found: Gradient) -> np.ndarray:
+def _normalised(gradient: Gradient) -> np.ndarray:
     """Return the changes per spread (R, F) relative to each response's largest; zero where no factor moves it."""
-    change = found.change
+    change = gradient.change
     largest = np.max(np.abs(change), axis=1, initial=0.0, keepdims=True)
     return np.asarray(np.where(largest > 0.0, change / np.where(largest > 0.0, largest, 1.0), 0.0))
 
 
-def _heat_map(found: Gradient) -> Figure:
+def _heat_map(gradient: Gradient) -> Figure:
     """Plot the normalised changes as colours, responses along x, factors down."""
-    shares = _normalised(found).T
+    shares = _normalised(gradient).T
     rows, columns = shares.shape
     figure = svg.new_figure(2.1 + 0.21 * max(rows, 4))
     axes = figure.subplots()
     norm = SymLogNorm(LINEAR, vmin=-1.0, vmax=1.0)
     picture = axes.imshow(shares, cmap="RdBu", norm=norm, aspect="auto", interpolation="nearest")
-    axes.set_xticks(np.arange(columns), list(found.responses), rotation=45, ha="right", rotation_mode="anchor")
-    axes.set_yticks(np.arange(rows), [factor.name for factor in found.factors])
+    axes.set_xticks(np.arange(columns), list(gradient.responses), rotation=45, ha="right", rotation_mode="anchor")
+    axes.set_yticks(np.arange(rows), [factor.name for factor in gradient.factors])
     axes.set_xticks(np.arange(columns + 1) - 0.5, minor=True)
     axes.set_yticks(np.arange(rows + 1) - 0.5, minor=True)
     axes.grid(which="minor", color=svg.LIGHT, lw=0.5)
@@ -218,13 +220,13 @@ def _heat_map(found: Gradient) -> Figure:
     return figure
 
 
-def _tornado(found: Gradient) -> Figure:
+def _tornado(gradient: Gradient) -> Figure:
     """Plot for each response the largest changes per spread."""
-    moved = [i for i in range(len(found.responses)) if np.any(found.change[i])]
-    largest = [_largest(found.change[i]) for i in moved]
-    figure, grid = svg.panels([0.85 + 0.2 * len(one) for one in largest] or [1.5], 2)
+    moved = [i for i in range(len(gradient.responses)) if np.any(gradient.change[i])]
+    largest = [_largest(gradient.change[i]) for i in moved]
+    figure, grid = svg.panels([0.85 + 0.2 * len(indices) for indices in largest] or [1.5], 2)
     for axes, i, order in zip(grid, moved, largest, strict=False):
-        _bars(axes, found, i, order)
+        _bars(axes, gradient, i, order)
     return figure
 
 
@@ -233,15 +235,15 @@ def _largest(change: np.ndarray) -> np.ndarray:
     return np.asarray(order[np.abs(change[order]) > NEGLIGIBLE * np.abs(change).max()])
 
 
-def _bars(axes: Axes, found: Gradient, i: int, order: np.ndarray) -> None:
-    values = found.change[i, order][::-1]
+def _bars(axes: Axes, gradient: Gradient, i: int, order: np.ndarray) -> None:
+    values = gradient.change[i, order][::-1]
     y = np.arange(len(order))
     axes.barh(y, values, 0.66, color=[svg.BLUE if value >= 0 else svg.VERMILION for value in values])
     axes.axvline(0.0, color=svg.INK, lw=0.8)
-    axes.set_yticks(y, [found.factors[k].name for k in order[::-1]])
-    unit = f", {typeset(found.units[i])}" if found.units[i] else ""
-    rss = significant(float(np.linalg.norm(found.change[i])), 3, floor=0.0)
-    axes.set_xlabel(f"{found.responses[i]}{unit} (all: {rss})")
+    axes.set_yticks(y, [gradient.factors[k].name for k in order[::-1]])
+    unit = f", {typeset(gradient.units[i])}" if gradient.units[i] else ""
+    rss = significant(float(np.linalg.norm(gradient.change[i])), 3, floor=0.0)
+    axes.set_xlabel(f"{gradient.responses[i]}{unit} (all: {rss})")
     axes.set_ylim(-0.7, max(len(order), 2) - 0.3)
     finish(axes, 5, None)
     axes.grid(False, axis="y")
@@ -263,8 +265,8 @@ def _unit_text(response: str, factor: str) -> str:
 def _entries(of: Callable[[Gradient], np.ndarray]) -> Callable[[Gradient], list[list[float | None]]]:
     """Return a function that gives a table of the Jacobian as lists, None for NaN."""
 
-    def rows(found: Gradient) -> list[list[float | None]]:
-        return [[None if np.isnan(value) else float(value) + 0.0 for value in row] for row in of(found)]
+    def rows(gradient: Gradient) -> list[list[float | None]]:
+        return [[None if np.isnan(value) else float(value) + 0.0 for value in row] for row in of(gradient)]
 
     return rows
 
@@ -288,33 +290,33 @@ GRADIENT: Record[Gradient] = Record(
     Quantity("relative", _entries(lambda g: g.relative), "differences against AD, relative", "relative deviation"),
     Quantity("worst_relative", lambda g: g.worst, "largest relative deviation, None without AD"),
     Quantity("change", _entries(lambda g: g.change), "change per spread of the factor", "change per spread"),
-    Quantity("method", lambda g: g.method.tolist(), "how the best value of an entry was found", "method"),
+    Quantity("method", lambda g: g.method.tolist(), "method of the best value of an entry", "method"),
 )
 
 
-def _whole_table(found: Gradient) -> Table:
+def _whole_table(gradient: Gradient) -> Table:
     """Return every entry of the Jacobian, one row each."""
-    told = GRADIENT(found)
+    values = GRADIENT(gradient)
     keys = ("units", "method", "ad", "differences", "relative", "difference_error", "step", "change")
     rows = [
-        [response, factor, *(told[key][i][k] for key in keys)]
-        for i, response in enumerate(told["responses"])
-        for k, factor in enumerate(told["factors"])
+        [response, factor, *(values[key][i][k] for key in keys)]
+        for i, response in enumerate(values["responses"])
+        for k, factor in enumerate(values["factors"])
     ]
     heads = ("response", "factor", *(GRADIENT[key].head for key in keys))
     return Table("gradient", "Jacobian", "All entries.", heads, rows)
 
 
-def _doubtful(found: Gradient) -> list[str]:
+def _doubtful(gradient: Gradient) -> list[str]:
     """Return the responses whose finite differences are not accurate to 1 %.
 
     Causes are noise, or a kink or bend within the step.
     """
-    spread = np.array([factor.spread for factor in found.factors])
-    largest = np.max(np.abs(found.change), axis=1, initial=0.0, keepdims=True)
-    bad = (found.method != AD) & (found.error * spread > DOUBTFUL * largest)
+    spread = np.array([factor.spread for factor in gradient.factors])
+    largest = np.max(np.abs(gradient.change), axis=1, initial=0.0, keepdims=True)
+    bad = (gradient.method != AD) & (gradient.error * spread > DOUBTFUL * largest)
     return [
-        f"{found.responses[i]}: by {', '.join(found.factors[k].name for k in np.flatnonzero(bad[i]))}"
+        f"{gradient.responses[i]}: by {', '.join(gradient.factors[k].name for k in np.flatnonzero(bad[i]))}"
         for i in np.flatnonzero(bad.any(axis=1))
     ]
 
@@ -338,34 +340,34 @@ def run_gradient(file: Path, options: cli.Options) -> None:
 
 
 def _work(setup: StudySetup, session: procedure.Session) -> command.Result:
-    found = study_gradient(setup, session.backend, session.advance)
+    gradient = study_gradient(setup, session.backend, session.advance)
     session.advance(procedure.WRITE, 0, 1)
     folder = session.folder
     base = base_of(setup)
-    bad = _doubtful(found)
-    told = [f"{DOUBTFUL_TEXT}: {'; '.join(bad)}"] if bad else []
-    warnings = (*blur_warnings(base, session.backend), *coarse_warnings(base), *told)
-    said = {"verdict": verdict(found)[0], "warnings": list(warnings)}
-    numbers = reference_frames.described("gradient", {**GRADIENT(found), **said})
+    bad = _doubtful(gradient)
+    notes = [f"{DOUBTFUL_TEXT}: {'; '.join(bad)}"] if bad else []
+    warnings = (*blur_warnings(base, session.backend), *coarse_warnings(base), *notes)
+    summary = {"verdict": verdict(gradient)[0], "warnings": list(warnings)}
+    numbers = reference_frames.described("gradient", {**GRADIENT(gradient), **summary})
     folder.write_text("config.yaml", setup.to_yaml())
     folder.write_json("gradient.json", numbers)
-    folder.write_bytes("gradient.csv", _whole_table(found).content())
-    _write_report(setup, found, folder, warnings)
-    entries: dict[str, Any] = {"gradient": True, "backend": session.backend.name, "worst_relative": found.worst}
+    folder.write_bytes("gradient.csv", _whole_table(gradient).content())
+    _write_report(setup, gradient, folder, warnings)
+    entries: dict[str, Any] = {"gradient": True, "backend": session.backend.name, "worst_relative": gradient.worst}
     entries["again"] = [PROGRAM, "config.yaml", "--gradient", "--backend", session.backend.name]
     entries["inputs"] = provenance.inputs_in(setup.tree)
     run_folder.write_manifest(folder, PROGRAM, session.started, session.seconds, warnings=list(warnings), **entries)
-    return command.Result(numbers, lambda console: _print_result(found, warnings, console))
+    return command.Result(numbers, lambda console: _print_result(gradient, warnings, console))
 
 
-def _print_result(found: Gradient, warnings: Sequence[str], console: Console) -> None:
-    cli.print_verdict(console, verdict(found)[0])
-    table = cli.result_table(f"{len(found.responses)} responses by {len(found.factors)} factors")
+def _print_result(gradient: Gradient, warnings: Sequence[str], console: Console) -> None:
+    cli.print_verdict(console, verdict(gradient)[0])
+    table = cli.result_table(f"{len(gradient.responses)} responses by {len(gradient.factors)} factors")
     picked = [0, 1, 2, 3, 4, 5, 8]
     heads = ("response", "strongest factor", "derivative", "unit", "per spread", "all, rss", "AD-diff.")
     for head, k in zip(heads, picked, strict=True):
         table.add_column(head, justify="left" if k in (0, 1, 3) else "right", no_wrap=True)
-    for row in _response_table(found).rows:
+    for row in _response_table(gradient).rows:
         table.add_row(*(str(row[k]) for k in picked))
     cli.print_whole(console, table)
     command.print_warnings(console, warnings)

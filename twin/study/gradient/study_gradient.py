@@ -71,15 +71,15 @@ def motion_slopes(about: State, state: Callable[[float], State], step: float) ->
     """
     at = [state(share * step) for share in SHARES]
     slopes: dict[ElementaryMotion, float] = {}
-    for path in {path for one in at for path in one}:
+    for path in {path for moved in at for path in moved}:
         base = about.get(path, Motion())
-        several = [one.get(path, base) for one in at]
-        if any(_rest(motion) != _rest(base) for motion in several):
+        motions = [moved.get(path, base) for moved in at]
+        if any(_rest(motion) != _rest(base) for motion in motions):
             return None
-        terms = sorted({j for motion in several for j in motion.figure})
+        terms = sorted({j for motion in motions for j in motion.figure})
         kinds = [(kind, axis) for kind in ("rotate", "shift") for axis in range(3)]
         for kind, axis in (*kinds, ("scale", 0), *(("figure", j) for j in terms)):
-            a, b, c, d = (motion.component(kind, axis) for motion in several)
+            a, b, c, d = (motion.component(kind, axis) for motion in motions)
             wide, narrow = (a - b) / (2.0 * step), (c - d) / step
             slope = narrow + (narrow - wide) / 3.0
             if abs(slope * step) > ROUNDING * max(abs(base.component(kind, axis)), CAP[kind] * ROUNDING):
@@ -162,15 +162,15 @@ class Chain:
 
         Without a monitor there is ``truth`` alone.
         """
-        truth = self.experiment.sight.told_by(sight[:, None])
+        truth = self.experiment.sight.truth_of(sight[:, None])
         if not self.experiment.monitored:
             return run_results(self.resolved, self.experiment, state, truth)
         start, end = self.nominal, spots[None]
         cameras = self.experiment.cameras
         joint = np.zeros((1, 2 * end.shape[1], 2 * end.shape[1]))
-        found = estimates(start, end, joint, cameras, self.experiment.disturbances, self.experiment.ground)
+        estimated = estimates(start, end, joint, cameras, self.experiment.disturbances, self.experiment.ground)
         none = np.zeros_like(end)
-        recovery = Recovery(start, end, none, none, joint, found.parameters, found.angle, found.ground)
+        recovery = Recovery(start, end, none, none, joint, estimated.parameters, estimated.angle, estimated.ground)
         return run_results(self.resolved, self.experiment, state, truth, recovery)
 
     def moved(
@@ -183,9 +183,9 @@ class Chain:
         """
         largest = max(np.abs(spots).max(initial=0.0) / SPOT_REACH, np.abs(sight).max() / self.reach)
         step = 1.0 / float(largest) if largest > 0.0 else 1.0
-        place, line = at
+        positions, line = at
         return [
-            self.outcome(state, place + share * step * spots, line + share * step * sight) for share in SHARES
+            self.outcome(state, positions + share * step * spots, line + share * step * sight) for share in SHARES
         ], step
 
 
@@ -245,16 +245,16 @@ def sight_gradient(
     axes, slope = hit_slopes(backend, stop, position, direction)
 
     moved = np.concatenate([line_in_world(instrument, name, stepped).imag for name in names]) / COMPLEX_STEP
-    place, heading = np.repeat(position, m, axis=0), np.repeat(direction, m, axis=0)
+    positions, heading = np.repeat(position, m, axis=0), np.repeat(direction, m, axis=0)
 
     def systems(sequence: str) -> SystemBatch:
         return assemble(assembly, [f"{name}/{sequence}" for name in names], states, steps, stepped)
 
-    drift = jvp(backend, systems("image_to_stop"), place, heading, moved, 0.0).position[..., :2]
-    turn = -matvec(np.repeat(inverse(slope), m, axis=0), drift)
+    drift = jvp(backend, systems("image_to_stop"), positions, heading, moved, 0.0).position[..., :2]
+    rotation = -matvec(np.repeat(inverse(slope), m, axis=0), drift)
     to_object = systems("image_to_object")
-    heading_step = np.einsum("bnk,bnkx->bnx", turn, np.repeat(axes, m, axis=0))
-    pushed = jvp(backend, to_object, place, heading, moved, heading_step)
+    heading_step = np.einsum("bnk,bnkx->bnx", rotation, np.repeat(axes, m, axis=0))
+    pushed = jvp(backend, to_object, positions, heading, moved, heading_step)
     local = pushed.traced.numpy()[1]
     # from the frame of the last element, which moves too, to the world
     assert to_object.world_tangents is not None
@@ -309,8 +309,8 @@ class GradientFactor:
         factor = setup.study.factors[name]
         numbers = factor.numbers()
         if not numbers.numeric:
-            found = shown(list(factor.scalars()))
-            problem = Problem("there is no derivative by what is not a number", found, "numbers or quantities")
+            listed = shown(list(factor.scalars()))
+            problem = Problem("a factor that is not a number has no derivative", listed, "numbers or quantities")
             raise setup.error(problem, ("factors", name, factor.kind))
         unit = numbers.unit or ""
         values = numbers.values
@@ -342,8 +342,10 @@ class GradientFactor:
         if self.spec.scales:
             tree = self.setup.base
             try:
-                found = ratios(self.spec, tree, np.array([value]), self.unit)
-                out.update({place: scaled(number_of(leaf(tree, place)), float(r[0])) for place, r in found.items()})
+                multipliers = ratios(self.spec, tree, np.array([value]), self.unit)
+                out.update(
+                    {place: scaled(number_of(leaf(tree, place)), float(r[0])) for place, r in multipliers.items()}
+                )
             except Problem as problem:
                 raise self.setup.error(problem, ("factors", self.name)) from None
         return tuple(out.items())
@@ -357,7 +359,7 @@ def _in_base(setup: StudySetup, name: str, factor: FactorSpec, unit: str) -> flo
             numbers.append(number_at(setup.base, place, unit))
             # values that are written in several units agree to rounding
             if abs(numbers[k] - numbers[0]) > 1e-12 * abs(numbers[0]):
-                text = "the places of the factor have different values in the base, so that it has none"
+                text = "the places of the factor have different values in the base"
                 raise Problem(text, shown(leaf(setup.base, place)), shown(leaf(setup.base, factor.places[0])))
         except Problem as problem:
             raise setup.error(problem, ("factors", name, *factor.key_of(k))) from None
@@ -429,7 +431,7 @@ class Gradient:
     def unknown(cls, factors: tuple[GradientFactor, ...], asked: Sequence[_Asked]) -> Gradient:
         """Return a Jacobian whose entries are not filled in yet."""
         shape = (len(asked), len(factors))
-        names, units = tuple(one.name for one in asked), tuple(one.spec.units for one in asked)
+        names, units = tuple(response.name for response in asked), tuple(response.spec.units for response in asked)
         ad, differences, error, scale, step = (np.full(shape, np.nan) for _ in range(5))
         return cls(factors, names, units, ad, differences, error, scale, step, np.full(shape, WHOLE, object))
 
@@ -493,13 +495,13 @@ class _Asked:
                 out.append(0.0)
                 continue
             try:
-                found = leaf(outcome, key)
+                value = leaf(outcome, key)
             except Problem as problem:
                 raise setup.error(problem, ("responses", self.name, where)) from None
-            if isinstance(found, bool) or not isinstance(found, int | float):
+            if isinstance(value, bool) or not isinstance(value, int | float):
                 text = "the response is not a number in the base, so that it has no derivative"
                 raise setup.error(text, ("responses", self.name, where), allowed="a key that leads to a number")
-            out.append(float(found))
+            out.append(float(value))
         return out[0], out[1]
 
     @property
@@ -542,7 +544,7 @@ def study_gradient(setup: StudySetup, backend: Backend, advance: Advance = silen
         asked = [*_spot_responses(maker.base), *asked]
     table = Gradient.unknown(factors, asked)
     known = {"truth", "recovered", "quality"} if maker is not None else set()
-    traced = [i for i, one in enumerate(asked) if one.roots <= known]
+    traced = [i for i, response in enumerate(asked) if response.roots <= known]
     if maker is not None and traced:
         _Traced(setup, maker, backend, factors, asked, traced, advance).fill(table)
     rest = [i for i in range(len(asked)) if i not in traced]
@@ -608,14 +610,14 @@ class _Traced:
         moving = list(self.slopes)
         done: dict[int, np.ndarray] = {}
         for start in range(0, len(moving), TOGETHER):
-            some = moving[start : start + TOGETHER]
+            batch = moving[start : start + TOGETHER]
             self.advance(TRACED, start, len(moving))
-            jobs = [self._job(self.factors[k], share * steps[k]) for k in some for share in SHARES]
+            jobs = [self._job(self.factors[k], share * steps[k]) for k in batch for share in SHARES]
             try:
                 outcomes = self._outcomes(chain, jobs, rows)
             except (AimError, BeamMissedError, ValueError):
                 continue  # they are tried one by one, to name the one
-            for i, k in enumerate(some):
+            for i, k in enumerate(batch):
                 done[k] = self._numbers(outcomes[i * len(SHARES) : (i + 1) * len(SHARES)], rows)
         for k, factor in enumerate(self.factors):
             if k not in done:
@@ -625,7 +627,7 @@ class _Traced:
         self.advance(TRACED, len(self.factors), len(self.factors))
 
     def _numbers(self, outcomes: Sequence[Any], rows: Sequence[int]) -> np.ndarray:
-        return np.array([[self.asked[i].value(one, self.setup) for i in rows] for one in outcomes])
+        return np.array([[self.asked[i].value(outcome, self.setup) for i in rows] for outcome in outcomes])
 
     def _state(self, chain: Chain, factor: GradientFactor, change: float) -> State:
         job = self._job(factor, change)
@@ -657,15 +659,15 @@ class _Traced:
         sizes = {}
         for k, slopes in self.slopes.items():
             weight = np.array([slopes.get(motion, 0.0) for motion in motions])
-            moved, turned = spots @ weight, sight @ weight
-            outcomes, step = chain.moved(about, at, moved, turned)
-            numbers = [[self.asked[i].terms(one, self.setup) for i in self.exact] for one in outcomes]
+            moved, rotated = spots @ weight, sight @ weight
+            outcomes, step = chain.moved(about, at, moved, rotated)
+            numbers = [[self.asked[i].terms(outcome, self.setup) for i in self.exact] for outcome in outcomes]
             terms = extrapolated(np.array(numbers).reshape(len(SHARES), -1, 2), step)[0]
             table.ad[self.exact, k] = terms[:, 0] - terms[:, 1]
             table.scale[self.exact, k] = np.abs(terms).max(axis=1)
             limits = [CAP[motion.kind] / abs(slope) for motion, slope in slopes.items()]
             if slopes:
-                size = np.abs(moved).max() / MOVE if chain.experiment.monitored else np.abs(turned).max() / TURN
+                size = np.abs(moved).max() / MOVE if chain.experiment.monitored else np.abs(rotated).max() / TURN
                 sizes[k] = float(min([1.0 / max(size, 1e-300), *limits]))
         self.advance(AD_PART, 1, 1)
         return sizes
@@ -694,8 +696,8 @@ class _Traced:
         spots, sight = chain.spots(states), chain.sight(states)
         out = [chain.outcome(state, spots[s], sight[s]) for s, state in enumerate(states)]
         if rows is self.quality:
-            found = quality_dicts(chain.experiment.instrument, self.backend, states, jobs[0].job.render.obstructed)
-            out = [{**one, "quality": quality} for one, quality in zip(out, found, strict=True)]
+            qualities = quality_dicts(chain.experiment.instrument, self.backend, states, jobs[0].job.render.obstructed)
+            out = [{**outcome, "quality": quality} for outcome, quality in zip(out, qualities, strict=True)]
         return out
 
 
@@ -723,7 +725,7 @@ def _whole(
             if isinstance(outcome, Failure):
                 text = f"the factor cannot be varied by {step:g} {factor.unit} about the base: {outcome.message}"
                 raise setup.error(text, ("factors", factor.name))
-        values = np.array([[one.value(outcome, setup) for one in asked] for outcome in outcomes])
+        values = np.array([[response.value(outcome, setup) for response in asked] for outcome in outcomes])
         table.put(list(rows), k, values, step, WHOLE)
     advance(WHOLE, len(factors), len(factors))
 
@@ -731,6 +733,6 @@ def _whole(
 def _refused(setup: StudySetup, factor: GradientFactor, step: float, error: InputError) -> InputError:
     issue = error.issues[0]
     at = f"{factor.value:g} ± {abs(step):g} {factor.unit}".strip()
-    text = f"the base does not allow values beside its own, {at}, where differences are taken: {issue.problem}"
+    text = f"the base does not allow values beside its own, {at}, which finite differences need: {issue.problem}"
     problem = Problem(text, issue.found, issue.allowed, issue.suggestion)
     return setup.error(problem, ("factors", factor.name, factor.spec.kind))

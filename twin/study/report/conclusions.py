@@ -21,35 +21,37 @@ def design_title(kind: str) -> str:
     return "complete grid" if kind == GRID else SAMPLERS[kind].title
 
 
-def warnings(found: StudyAnalysis) -> list[str]:
+def warnings(analysis: StudyAnalysis) -> list[str]:
     """Return the warnings, which precede everything else in the report."""
-    runs = found.runs
+    runs = analysis.runs
     failed = int(runs.failed.sum())
     out = []
     if failed:
         common = [f"{text} ({plural(n, 'run')})" for text, n in Counter(t for t in runs.messages if t).most_common(3)]
         why = f" Most often: {'; '.join(common)}." if common else ""
-        out.append(f"{failed} of {plural(runs.count, 'run')} failed and are in no statistic.{why}")
+        out.append(f"{failed} of {plural(runs.count, 'run')} failed and are excluded from all statistics.{why}")
         if failed > MANY_FAILED * runs.count and failed < runs.count:
             out.append(
-                "So many failed that the others no longer follow the design; statistics are those of what can be done."
+                "So many runs failed that the others no longer represent the design; the statistics hold only for "
+                "feasible runs."
             )
     wrong = impossible(runs)
     out += [str(issue) for issue in wrong.issues] if wrong is not None else []
-    for name, part in found.indices.items():
-        apart = [one for one in part.axes if one.agrees is False] if isinstance(part, Indices) else []
-        if apart:
+    for name, part in analysis.indices.items():
+        disagreeing = [index for index in part.axes if index.agrees is False] if isinstance(part, Indices) else []
+        if disagreeing:
             out.append(
-                f"{name}: the Sobol indices of {listed([one.name for one in apart])} by polynomial chaos and by "
-                "RBD-FAST do not agree, so that neither holds; more runs will tell."
+                f"{name}: the Sobol indices of {listed([index.name for index in disagreeing])} by polynomial chaos and "
+                "by "
+                "RBD-FAST do not agree, so that neither is reliable: use more runs."
             )
     doubts = [text for text in runs.doubts if text]
     if doubts:
         # the same words about other numbers are one reason
         common = [f"{text} ({plural(n, 'run')})" for text, n in Counter(map(_reason, doubts)).most_common(3)]
         out.append(
-            f"σ does not hold in {len(doubts)} of {plural(runs.count, 'run')}, whose readings are in all statistics as "
-            f"they are: {'; '.join(common)}. Which, the column doubt says."
+            f"σ does not hold in {len(doubts)} of {plural(runs.count, 'run')}; their readings are included in all "
+            f"statistics: {'; '.join(common)}. The column doubt lists these runs."
         )
     for r in runs.responses:
         missing = int((~r.good & ~runs.failed).sum())
@@ -57,8 +59,8 @@ def warnings(found: StudyAnalysis) -> list[str]:
             out.append(f"{r.name} has no finite number in {plural(missing, 'run')} that did not fail.")
     if runs.sampled and failed < runs.count < LEAST:
         out.append(
-            f"{plural(runs.count, 'run')} are few: distributions, upper quantiles and sensitivity indices cannot be "
-            f"told from fewer than {LEAST}, and intervals are wide."
+            f"{plural(runs.count, 'run')} are few: distributions, upper quantiles and sensitivity indices need at "
+            f"least {LEAST}, and intervals are wide."
         )
     return out
 
@@ -71,24 +73,24 @@ def _reason(doubt: str) -> str:
     return head.removeprefix("σ does not hold: ").partition(" (")[0]
 
 
-def indices_texts(found: StudyAnalysis) -> list[str]:
+def indices_texts(analysis: StudyAnalysis) -> list[str]:
     """Return sentences on how the sensitivity indices were computed, and how accurate they are."""
-    if found.runs.sampled:
+    if analysis.runs.sampled:
         out = [
-            f"From the given runs ({design_title(found.runs.kind)}) by polynomial chaos, with intervals from "
-            f"{RESAMPLES} resamples of the runs. What happens in less than "
-            f"{percent(3.7 / max(found.runs.count, 4), 1)} of the "
-            "factors' distribution may have been met by no run and is in no interval."
+            f"From the runs ({design_title(analysis.runs.kind)}) by polynomial chaos, with intervals from {RESAMPLES} "
+            "bootstrap resamples. Events in less than "
+            f"{percent(3.7 / max(analysis.runs.count, 4), 1)} of the "
+            "factors' distribution may be missed by all runs, and no interval covers them."
         ]
     else:
-        out = ["The variance of the complete grid is taken apart exactly, all combinations being equally likely."]
-    for name, part in found.indices.items():
+        out = ["The variance of the complete grid is decomposed exactly, with all combinations equally likely."]
+    for name, part in analysis.indices.items():
         if isinstance(part, NoIndices):
             out.append(f"{name}: {part.reason}.")
         elif part.method == "chaos":
             out.append(_model_text(name, part))
         elif part.noise is not None and part.noise > 0.01:
-            out.append(f"{name}: the runs state {percent(part.noise)} of the variance as their noise.")
+            out.append(f"{name}: the runs report {percent(part.noise)} of the variance as noise.")
     return out
 
 
@@ -99,26 +101,26 @@ def _model_text(name: str, part: Indices) -> str:
         f"{percent(part.rest)} of the variance not explained"
     ).replace("-", "\N{MINUS SIGN}" if part.held_out < 0 else "-")
     if part.noise is not None:
-        text += f" (noise as the runs state it: {percent(part.noise)})"
+        text += f" (reported noise: {percent(part.noise)})"
     explained = part.rest - (part.noise or 0.0) < 0.05
     if part.held_out < BAD_MODEL and not explained:
-        text += "; so poor a model tells orders of importance at best"
+        text += "; such a poor model gives at best the order of importance"
     return f"{text}."
 
 
-def convergence_texts(found: StudyAnalysis, names: list[str]) -> list[str]:
+def convergence_texts(analysis: StudyAnalysis, names: list[str]) -> list[str]:
     """Return sentences on whether there are enough runs."""
     goals = (
         f"A statistic counts as known when half its 95% interval is below {GOALS['mean']:g}σ (mean, standard "
         f"deviation) or {GOALS['p95']:g}σ (quantiles)."
     )
     out = [goals]
-    if found.runs.kind != GRID and SAMPLERS[found.runs.kind].even:
+    if analysis.runs.kind != GRID and SAMPLERS[analysis.runs.kind].even:
         out.append(
-            "The intervals are those of independent runs; this design is spread more evenly, and knows the mean better."
+            "The intervals are those of independent runs; this design is more uniform and determines the mean better."
         )
     for name in names:
-        convergences = found.convergences[name]
+        convergences = analysis.convergences[name]
         good = [c.name for c in convergences if c.enough]
         bad = [f"{c.name}{_needed(c)}" for c in convergences if not c.enough]
         n = int(convergences[0].counts[-1])
@@ -149,40 +151,44 @@ LINEAR = 0.5
 """Share of the variance below which a linear model describes a response poorly."""
 
 
-def conclusions(found: StudyAnalysis) -> list[str]:
+def conclusions(analysis: StudyAnalysis) -> list[str]:
     """Return the sentences at the top of the report, the requirements first."""
-    out = [_requirement_text(found)] if found.requirements else []
-    out += [_knee(found, k) for k in range(len(found.fronts))]
-    out += [_contributors(found, response) for response in found.runs.responses]
+    out = [_requirement_text(analysis)] if analysis.requirements else []
+    out += [_knee(analysis, k) for k in range(len(analysis.fronts))]
+    out += [_contributors(analysis, response) for response in analysis.runs.responses]
     # a stated sigma is a response of its own where it is all a grid is about; among drawn runs it hardly changes
-    if not found.runs.sampled:
-        out += [_contributors(found, sigma) for sigma in found.runs.sigmas]
+    if not analysis.runs.sampled:
+        out += [_contributors(analysis, sigma) for sigma in analysis.runs.sigmas]
     return [text for text in out if text]
 
 
-def verdict(found: StudyAnalysis) -> tuple[str, tuple[str, ...]]:
+def verdict(analysis: StudyAnalysis) -> tuple[str, tuple[str, ...]]:
     """Return a study's verdict of two sentences, and the sentences that follow it.
 
     The verdict says how the requirements are met, or else which factors move the first response, and whether the runs
     suffice.
     """
-    runs = found.runs
+    runs = analysis.runs
     failed = int(runs.failed.sum())
     first = [f"{plural(runs.count, 'run')}, {failed} failed" if failed else plural(runs.count, "run")]
-    known = [r for r in found.requirements if r.share is not None]
+    known = [r for r in analysis.requirements if r.share is not None]
     if known:
         # the last of several is all together
         worst = min(known, key=lambda r: (r.share, r.name))
         name = f"the requirement {worst.name} ({worst.text})" if worst.name else "all requirements together"
-        least = ", met least," if len(known) > 1 else ""
+        least = ", the lowest share," if len(known) > 1 else ""
         are = "is" if worst.name else "are"
         whatever = _whatever(worst)
         first.append(
-            f"{name}{least} {are} met by {worst.met} of {plural(worst.count, 'run')} with a finite value{whatever}"
+            f"{name} {are} met by {worst.met} of {plural(worst.count, 'run')} with a finite value{least}{whatever}"
         )
     elif runs.responses:
-        first.append(f"Response {_contributors(found, runs.responses[0])}")
-    short = [name for name, statistics in found.convergences.items() if not all(one.enough for one in statistics)]
+        first.append(f"Response {_contributors(analysis, runs.responses[0])}")
+    short = [
+        name
+        for name, statistics in analysis.convergences.items()
+        if not all(convergence.enough for convergence in statistics)
+    ]
     if short:
         first.append(
             f"the runs are too few for some statistics of {plural(len(short), 'response')}: see the convergence"
@@ -190,9 +196,9 @@ def verdict(found: StudyAnalysis) -> tuple[str, tuple[str, ...]]:
     return answer(*(part for text in first for part in text.split(". ")))
 
 
-def _requirement_text(found: StudyAnalysis) -> str:
+def _requirement_text(analysis: StudyAnalysis) -> str:
     texts = []
-    for r in found.requirements:
+    for r in analysis.requirements:
         name = f"{r.name} ({r.text})" if r.name else "All requirements together"
         if r.share is None:
             texts.append(f"{name}: the value is NaN in all runs.")
@@ -208,11 +214,11 @@ def _whatever(r: Requirement) -> str:
     if r.bounds is None:
         return ""
     interval = f" (95% interval {span(r.bounds_interval)})" if r.bounds_interval is not None else ""
-    return f", and by {r.met} to {r.most} of all {r.runs} runs, for any values of the others{interval}"
+    return f", or by {r.met} to {r.most} of all {r.runs} runs, whatever the others would have given{interval}"
 
 
-def _contributors(found: StudyAnalysis, response: Response) -> str:
-    about = found.descriptions[response.name]
+def _contributors(analysis: StudyAnalysis, response: Response) -> str:
+    about = analysis.descriptions[response.name]
     name = response.name
     if about.count == 0:
         return f"{name}: the value is NaN in all runs."
@@ -222,32 +228,32 @@ def _contributors(found: StudyAnalysis, response: Response) -> str:
     assert about.std is not None
     mean = with_unit(about.mean.value, response.unit)
     std = with_unit(about.std.value, response.unit)
-    where = "" if found.runs.sampled else " over the grid"
+    where = "" if analysis.runs.sampled else " over the grid"
     text = f"{name}: mean {mean}, standard deviation {std}{where}."
-    indices = found.indices.get(name)
+    indices = analysis.indices.get(name)
     if isinstance(indices, Indices):
         big = [index for index in indices.axes if index.total.value >= WORTH][:3]
         parts = [f"{index.name} {percent(index.total.value, 0)}" for index in big]
         if parts:
             together = sum(index.first.value for index in indices.axes) < 0.5 and indices.rest < 0.5
-            text += f" Total shares of its variance: {listed(parts)}{', mostly together' if together else ''}."
-        left = indices.rest
-        if indices.method == "chaos" and left > 0.05:
-            text += f" {percent(left, 0)} are explained by no factor ({_rest_reason(indices)})."
+            text += f" Total Sobol indices: {listed(parts)}{', mostly by interaction' if together else ''}."
+        rest = indices.rest
+        if indices.method == "chaos" and rest > 0.05:
+            text += f" {percent(rest, 0)} of the variance is not explained by the factors ({_rest_reason(indices)})."
         return text
-    if found.effects[name]:
+    if analysis.effects[name]:
         unit = typeset(response.unit)
-        parts = [f"{e.factor} {number(e.swing, 3)}" for e in found.effects[name][:3] if e.swing > 0.0]
+        parts = [f"{e.factor} {number(e.swing, 3)}" for e in analysis.effects[name][:3] if e.swing > 0.0]
         if parts:
             text += f" Largest main effects: {listed(parts)}{' ' + unit if unit else ''}."
         return text
-    model = found.linear[name]
+    model = analysis.linear[name]
     if model is None:
         return f"{text} {plural(about.count, 'run')} are too few to find its main factors."
     sure = [e for e in model.effects if _sure(e.swing.interval)]
     share = max(model.adjusted, 0.0)
     if share < LINEAR and about.count >= LEAST:
-        return f"{text} Hardly linear in the factors ({percent(share, 0)} of its variance): see its curves."
+        return f"{text} It is hardly linear in the factors (R² {percent(share, 0)}): see its response curves."
     if not sure:
         text += " No linear effect of a factor exceeds the scatter."
     else:
@@ -255,7 +261,7 @@ def _contributors(found: StudyAnalysis, response: Response) -> str:
         text += f" Largest changes over the middle 90% of a factor: {listed(parts)}."
     text += f" All factors together explain {percent(share, 0)} of its variance linearly."
     if about.count < LEAST:
-        text += f" With {about.count} runs this is a first look only."
+        text += f" With {about.count} runs this is only a first indication."
     return text
 
 
@@ -266,26 +272,26 @@ def _sure(interval: tuple[float | None, float | None]) -> bool:
 
 def _rest_reason(indices: Indices) -> str:
     if indices.noise is None:
-        return "noise, or a shape that the model does not follow"
+        return "noise, or a shape that the model does not fit"
     if indices.noise > 0.7 * indices.rest:
-        return f"noise: the runs state {percent(indices.noise, 0)}"
-    return f"the runs state only {percent(indices.noise, 0)} as noise; the model does not follow the rest"
+        return f"noise: the runs report {percent(indices.noise, 0)}"
+    return f"the runs report only {percent(indices.noise, 0)} as noise; the model does not fit the rest"
 
 
-def _knee(found: StudyAnalysis, k: int) -> str:
-    front = found.fronts[k]
-    x, y = found.runs.find(front.spec.x), found.runs.find(front.spec.y)
+def _knee(analysis: StudyAnalysis, k: int) -> str:
+    front = analysis.fronts[k]
+    x, y = analysis.runs.find(front.spec.x), analysis.runs.find(front.spec.y)
     pair = f"{x.name} against {y.name}"
     if len(front.runs) == 0:
-        return f"{pair}: no run has both numbers."
+        return f"{pair}: no run has both values."
     if front.knee is None:
         if len(front.runs) == 1:
             return f"{pair}: run {front.runs[0]} is best in both; they do not compete."
-        return f"{pair}: {len(front.runs)} runs are best compromises; the front has no knee."
+        return f"{pair}: the Pareto front has {len(front.runs)} runs and no knee."
     run = int(front.runs[front.knee])
     x_text = with_unit(float(front.x[front.knee]), x.unit)
-    places = f"{x.name} {x_text}, {y.name} {with_unit(float(front.y[front.knee]), y.unit)}"
-    return f"{pair}: of {len(front.runs)} best compromises run {run} is the knee ({places})."
+    position = f"{x.name} {x_text}, {y.name} {with_unit(float(front.y[front.knee]), y.unit)}"
+    return f"{pair}: of {len(front.runs)} runs on the Pareto front run {run} is the knee ({position})."
 
 
 DASH = "\N{EN DASH}"
@@ -309,9 +315,9 @@ def limits(interval: Interval) -> str:
     if low is None and high is None:
         return ""
     if low is not None and high is not None:
-        places = decimals_for(0.5 * abs(high - low))
-        if places < 7 and max(abs(low), abs(high)) < 1e6:
-            return f"{fixed(low, places)} … {fixed(high, places)}"
+        decimals = decimals_for(0.5 * abs(high - low))
+        if decimals < 7 and max(abs(low), abs(high)) < 1e6:
+            return f"{fixed(low, decimals)} … {fixed(high, decimals)}"
     return f"{'?' if low is None else number(low, 4)} … {'?' if high is None else number(high, 4)}"
 
 
@@ -326,9 +332,9 @@ def with_limits(value: Estimate | None) -> str:
     if half == 0.0:
         return number(value.value)
     if half is not None:
-        places = decimals_for(half)
-        if places < 7 and abs(value.value) < 1e6:
-            return f"{fixed(value.value, places)} ({limits(value.interval)})"
+        decimals = decimals_for(half)
+        if decimals < 7 and abs(value.value) < 1e6:
+            return f"{fixed(value.value, decimals)} ({limits(value.interval)})"
     text = limits(value.interval)
     return f"{number(value.value)} ({text})" if text else number(value.value)
 
@@ -377,10 +383,10 @@ def normality_text(response: Response, about: Description) -> str | None:
     p = "below 0.0001" if test.p < 1e-4 else number(test.p, 2)
     shape = f"skewness {fixed(test.skewness, 2, sign=True)}, excess kurtosis {fixed(test.kurtosis, 2, sign=True)}"
     if test.normal:
-        return f"{response.name}: nothing speaks against a normal distribution ({shape}, p = {p})."
+        return f"{response.name}: normality is not rejected ({shape}, p = {p})."
     text = f"{response.name} is not normal ({shape}, p {'= ' if test.p >= 1e-4 else ''}{p})"
     if about.tails is None:
-        return f"{text}; where 0.135% and 99.865% of the runs lie, {about.count} runs cannot tell (741 are needed)."
+        return f"{text}; the 0.135% and 99.865% quantiles need 741 runs, and there are {about.count}."
     low, high = ((tail - about.mean.value) / about.std.value for tail in about.tails)
     return (
         f"{text}: 99.73% of the runs lie from {fixed(low, 2, sign=True)}σ to {fixed(high, 2, sign=True)}σ of the mean, "

@@ -65,9 +65,9 @@ def _text_weights(axis: tuple[Factor, ...], levels: np.ndarray, counts: np.ndarr
     if len(axis) == 1:
         listed = [_text(value) for value in axis[0].spec.scalars()]
         names = [str(value) for value in np.unique(axis[0].values)[levels[:, 0]]]
-        found = np.array([listed.count(name) for name in names], np.float64)
-        if np.all(found > 0):
-            return np.asarray(found / found.sum())
+        frequencies = np.array([listed.count(name) for name in names], np.float64)
+        if np.all(frequencies > 0):
+            return np.asarray(frequencies / frequencies.sum())
     return np.asarray(counts / counts.sum())
 
 
@@ -91,13 +91,13 @@ def _of_number(factor: Factor, values: np.ndarray, degree: int) -> tuple[np.ndar
         mean, sigma, low, high = numbers
         # further out the density is below exp(-50) of its largest within the limits, which may lie far from the mean
         nearest = (min(max(mean, low), high) - mean) / sigma
-        reach = sigma * math.sqrt(nearest**2 + 100.0)
-        low, high = max(low, mean - reach), min(high, mean + reach)
+        half_range = sigma * math.sqrt(nearest**2 + 100.0)
+        low, high = max(low, mean - half_range), min(high, mean + half_range)
         nodes, weights = roots_legendre(200)
-        places = 0.5 * (low + high) + 0.5 * (high - low) * nodes
-        z = (places - mean) / sigma
+        points = 0.5 * (low + high) + 0.5 * (high - low) * nodes
+        z = (points - mean) / sigma
         weights = weights * np.exp(-0.5 * (z**2 - np.min(z**2)))
-        return _by_recurrence(places, weights / weights.sum(), values, degree)
+        return _by_recurrence(points, weights / weights.sum(), values, degree)
     if kind not in ("values", "table"):
         raise KeyError(f"there are no polynomials for a factor of kind {kind!r}")
     listed = np.array(numbers, np.float64)
@@ -105,13 +105,13 @@ def _of_number(factor: Factor, values: np.ndarray, degree: int) -> tuple[np.ndar
 
 
 def _by_recurrence(
-    places: np.ndarray, weights: np.ndarray, values: np.ndarray, degree: int
+    points: np.ndarray, weights: np.ndarray, values: np.ndarray, degree: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the orthonormal polynomials of a discrete measure at ``values``, by Stieltjes' recurrence."""
-    middle, reach = 0.5 * (places.max() + places.min()), 0.5 * np.ptp(places)
-    if reach == 0.0:
+    middle, half_range = 0.5 * (points.max() + points.min()), 0.5 * np.ptp(points)
+    if half_range == 0.0:
         return np.empty((len(values), 0)), np.empty(0, int)
-    nodes, x = (places - middle) / reach, (values - middle) / reach
+    nodes, x = (points - middle) / half_range, (values - middle) / half_range
     most = min(degree, len(np.unique(nodes)) - 1)
     before, now = np.zeros(len(nodes)), np.ones(len(nodes))
     before_x, now_x = np.zeros(len(x)), np.ones(len(x))
@@ -130,27 +130,27 @@ def _by_recurrence(
 
 def _of_table(table: np.ndarray, values: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the polynomials of several columns that belong together, orthonormal over the rows of the table."""
-    middle, reach = table.mean(axis=0), np.maximum(np.ptp(table, axis=0), np.finfo(float).tiny)
-    nodes, x = (table - middle) / reach, (values - middle) / reach
+    middle, scale = table.mean(axis=0), np.maximum(np.ptp(table, axis=0), np.finfo(float).tiny)
+    nodes, x = (table - middle) / scale, (values - middle) / scale
     powers = [p for p in np.ndindex(*[degree + 1] * table.shape[1]) if 0 < sum(p) <= degree]
     powers.sort(key=sum)
-    kept, degrees = [np.ones(len(nodes))], [0]
-    kept_x = [np.ones(len(x))]
+    basis, degrees = [np.ones(len(nodes))], [0]
+    basis_x = [np.ones(len(x))]
     for power in powers:
-        if len(kept) >= min(len(np.unique(nodes, axis=0)), 40):
+        if len(basis) >= min(len(np.unique(nodes, axis=0)), 40):
             break
         f, f_x = np.prod(nodes**power, axis=1), np.prod(x**power, axis=1)
         size = math.sqrt(np.mean(f**2))
         for _ in range(2):  # twice is enough for orthogonality to rounding
-            for g, g_x in zip(kept, kept_x, strict=True):
+            for g, g_x in zip(basis, basis_x, strict=True):
                 part = np.mean(f * g)
                 f, f_x = f - part * g, f_x - part * g_x
         norm = math.sqrt(np.mean(f**2))
         if norm > 1e-8 * size:
-            kept.append(f / norm)
-            kept_x.append(f_x / norm)
+            basis.append(f / norm)
+            basis_x.append(f_x / norm)
             degrees.append(sum(power))
-    return np.stack(kept_x, axis=1)[:, 1:], np.array(degrees[1:], int)
+    return np.stack(basis_x, axis=1)[:, 1:], np.array(degrees[1:], int)
 
 
 def _orthonormal(columns: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -283,7 +283,7 @@ def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | NoIndi
     noise = None if stated is None else stated.share
     if not runs.sampled:
         if not np.all(response.good):
-            return NoIndices("runs of the grid are missing, and its variance cannot be taken apart")
+            return NoIndices("runs of the grid are missing, and its variance cannot be decomposed")
         return Indices("grid", _of_grid(axes, response.values), 0, 0, None, 0.0, noise)
     n = len(response.known)
     if n < LEAST:
@@ -298,9 +298,9 @@ def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | NoIndi
         return NoIndices(str(error))
     if chaos is None:
         return NoIndices(f"{n} runs are too few for {len(axes)} factors")
-    own = 0.0 if noise is None else noise * float(np.var(response.known, ddof=1))
-    found = chaos.indices(own, runs.study.design.seed, ~response.good)
-    return Indices("chaos", found, chaos.degree, len(chaos.coefficients), chaos.held_out, chaos.rest, noise)
+    noise_variance = 0.0 if noise is None else noise * float(np.var(response.known, ddof=1))
+    indices = chaos.indices(noise_variance, runs.study.design.seed, ~response.good)
+    return Indices("chaos", indices, chaos.degree, len(chaos.coefficients), chaos.held_out, chaos.rest, noise)
 
 
 def _of_grid(axes: Sequence[tuple[Factor, ...]], values: np.ndarray) -> tuple[Index, ...]:
@@ -308,12 +308,12 @@ def _of_grid(axes: Sequence[tuple[Factor, ...]], values: np.ndarray) -> tuple[In
     total = float(np.var(values))
     out = []
     for k, axis in enumerate(axes):
-        own = _cells([axis])
+        cells = _cells([axis])
         others = _cells([a for j, a in enumerate(axes) if j != k])
         out.append(
             Index(
                 tuple(factor.name for factor in axis),
-                Estimate(_between(own, values) / total),
+                Estimate(_between(cells, values) / total),
                 Estimate(max(1.0 - _between(others, values) / total, 0.0) if len(axes) > 1 else 1.0),
             )
         )
@@ -370,22 +370,22 @@ class _Chaos:
     @classmethod
     def fitted(cls, axes: Sequence[tuple[Factor, ...]], good: np.ndarray, y: np.ndarray) -> _Chaos | None:
         best: _Chaos | None = None
-        every = [axis_functions(axis, good, HIGHEST_DEGREE) for axis in axes]
+        all_functions = [axis_functions(axis, good, HIGHEST_DEGREE) for axis in axes]
         few = min(len(y), RUNS_TO_CHOOSE)
-        functions = [(values[:few], degrees) for values, degrees in every]
-        seen: set[bytes] = set()
+        functions = [(values[:few], degrees) for values, degrees in all_functions]
+        tried: set[bytes] = set()
         for degree, norm in itertools.product(range(1, HIGHEST_DEGREE + 1), (0.5, 0.75, 1.0)):
             terms = _terms([degrees for _, degrees in functions], degree, norm, few)
-            if terms is None or terms.tobytes() in seen:
+            if terms is None or terms.tobytes() in tried:
                 continue
-            seen.add(terms.tobytes())
-            found = cls._fit(axes, functions, terms, degree, y[:few], good)
+            tried.add(terms.tobytes())
+            model = cls._fit(axes, functions, terms, degree, y[:few], good)
             # a little better is not better: more terms only where they pay
-            if found is not None and (best is None or 1.0 - found.held_out < 0.98 * (1.0 - best.held_out)):
-                best = found
+            if model is not None and (best is None or 1.0 - model.held_out < 0.98 * (1.0 - best.held_out)):
+                best = model
         if best is None or few == len(y):
             return best
-        return cls._fit(axes, every, best.terms, best.degree, y, good)
+        return cls._fit(axes, all_functions, best.terms, best.degree, y, good)
 
     @classmethod
     def _fit(
@@ -405,11 +405,11 @@ class _Chaos:
             return None
         middle = y.mean()
         coefficients = np.linalg.solve(r, q.T @ (y - middle))
-        left = y - middle - columns @ coefficients
-        out = left / np.maximum(1.0 - np.sum(q**2, axis=1), 1e-9)
+        residuals = y - middle - columns @ coefficients
+        out = residuals / np.maximum(1.0 - np.sum(q**2, axis=1), 1e-9)
         spread = float(np.var(y))
         held_out = 1.0 - float(np.mean(out**2)) / spread
-        rest = float(np.sum(left**2)) / (n - m - 1)
+        rest = float(np.sum(residuals**2)) / (n - m - 1)
         total = float(np.sum(coefficients[1:] ** 2)) + rest
         return cls(axes, terms, coefficients[1:], y, q, r, degree, held_out, rest / total, good)
 
@@ -427,8 +427,8 @@ class _Chaos:
         """
         shares = self._shares()
         ends = [
-            np.quantile(some, share, axis=0)
-            for some, share in zip(
+            np.quantile(samples, share, axis=0)
+            for samples, share in zip(
                 self._resampled(noise, seed), (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE), strict=True
             )
         ]
@@ -438,8 +438,8 @@ class _Chaos:
         out = []
         for k, axis in enumerate(self.axes):
             alone, whole = (Estimate(float(shares[i, k]), (float(low[i, k]), float(high[i, k]))) for i in (0, 1))
-            check, reach = _rbd_fast(axis, self.good, self.y), DISAGREE / math.sqrt(len(self.y))
-            agrees = None if check is None else bool(low[0, k] - reach <= check <= high[0, k] + reach)
+            check, tolerance = _rbd_fast(axis, self.good, self.y), DISAGREE / math.sqrt(len(self.y))
+            agrees = None if check is None else bool(low[0, k] - tolerance <= check <= high[0, k] + tolerance)
             out.append(Index(tuple(f.name for f in axis), alone, whole, check, agrees))
         return tuple(sorted(out, key=lambda index: -index.total.value))
 
@@ -452,8 +452,8 @@ class _Chaos:
         functions = [axis_functions(axis, missing, HIGHEST_DEGREE)[0] for axis in self.axes]
         terms = _columns(functions, self.terms)[:, 1:] * self.coefficients
         constant = float(np.mean(self.y - (self.q @ self.r)[:, 1:] @ self.coefficients))
-        away = constant + terms.sum(axis=1)
-        off = np.maximum(self.y.max() - away, away - self.y.min())
+        predicted = constant + terms.sum(axis=1)
+        off = np.maximum(self.y.max() - predicted, predicted - self.y.min())
         used = self.terms > 0
         parts = np.stack([terms @ (used & (used.sum(axis=1) == 1)[:, None]), terms @ used])
         variance, runs = float(np.var(self.y)), len(missing)
@@ -477,11 +477,11 @@ class _Chaos:
     def _fit_rest(self) -> tuple[np.ndarray, float]:
         """Leave-one-out residuals of the runs, (n,), and the residual variance."""
         centred = self.y - self.y.mean()
-        left = centred - self.q @ (self.q.T @ centred)
-        rest = float(np.sum(left**2)) / (len(self.y) - len(self.terms) - 1)
+        residuals = centred - self.q @ (self.q.T @ centred)
+        rest = float(np.sum(residuals**2)) / (len(self.y) - len(self.terms) - 1)
         # rounding of a perfect fit
         rest = rest if rest >= 1e-20 * np.var(self.y) else 0.0
-        return left / np.maximum(1.0 - np.sum(self.q**2, axis=1), 1e-9), rest
+        return residuals / np.maximum(1.0 - np.sum(self.q**2, axis=1), 1e-9), rest
 
     @cached_property
     def _squares(self) -> np.ndarray:
@@ -507,8 +507,8 @@ class _Chaos:
         held_out = float(np.mean(out**2)) if rest > 0.0 else 0.0
         # few runs know their own scatter badly: as Student's distribution is wider than the normal one
         wide = float(stats.t.ppf(0.975, n - m - 1) / stats.norm.ppf(0.975))
-        each = wide * (np.linalg.solve(self.r, self.q.T)[1:] * out).T
-        spread = np.sum(each**2, axis=0)
+        influence = wide * (np.linalg.solve(self.r, self.q.T)[1:] * out).T
+        spread = np.sum(influence**2, axis=0)
         generator = np.random.default_rng(np.random.SeedSequence(seed))
         # where few runs carry what is left (a narrow peak), chance decides how many do, as in Poisson's distribution;
         # the number that carry it equally, and the upper limit of what may be expected where so many were met
@@ -516,7 +516,7 @@ class _Chaos:
         lows, highs = [], []
         for _ in range(RESAMPLES // 100):
             more = generator.poisson(1.0, (100, n)) - 1.0
-            moved = self.coefficients + more @ each
+            moved = self.coefficients + more @ influence
             # about the estimate: the squares of what is added are taken off
             squares = moved**2 - self.coefficients**2 - spread + self._squares
             unexplained = held_out * generator.gamma(events + 1.0, 1.0 / events, 100)
@@ -539,22 +539,22 @@ def _columns(functions: Sequence[np.ndarray], terms: np.ndarray) -> np.ndarray:
 def _terms(degrees: Sequence[np.ndarray], degree: int, norm: float, runs: int) -> np.ndarray | None:
     """Return products of functions with degrees (sum d^norm)^(1/norm) <= degree; None if there are too many."""
     most = min(MOST_TERMS, int(runs / RUNS_PER_TERM))
-    found = []
+    terms = []
     for term in _products(degrees, 0, degree**norm + 1e-9, norm):
-        found.append(term)
-        if len(found) > most + 1:
+        terms.append(term)
+        if len(terms) > most + 1:
             return None
-    return np.array(found[1:], int)
+    return np.array(terms[1:], int)
 
 
-def _products(degrees: Sequence[np.ndarray], axis: int, left: float, norm: float) -> Iterator[tuple[int, ...]]:
+def _products(degrees: Sequence[np.ndarray], axis: int, remaining: float, norm: float) -> Iterator[tuple[int, ...]]:
     if axis == len(degrees):
         yield ()
         return
     for k in range(len(degrees[axis]) + 1):
         spent = float(degrees[axis][k - 1]) ** norm if k else 0.0
-        if spent <= left:
-            for others in _products(degrees, axis + 1, left - spent, norm):
+        if spent <= remaining:
+            for others in _products(degrees, axis + 1, remaining - spent, norm):
                 yield (k, *others)
 
 
@@ -571,6 +571,6 @@ def _rbd_fast(axis: tuple[Factor, ...], good: np.ndarray, y: np.ndarray) -> floa
     # only studies that ask for indices need it
     from SALib.analyze import rbd_fast as method
 
-    found = method.compute_first_order(method.permute_outputs(factor.values[good], y), HARMONICS)
-    value = float(method.unskew_S1(found, HARMONICS, len(y)))
+    index = method.compute_first_order(method.permute_outputs(factor.values[good], y), HARMONICS)
+    value = float(method.unskew_S1(index, HARMONICS, len(y)))
     return min(max(value, 0.0), 1.0) if math.isfinite(value) else None

@@ -220,10 +220,10 @@ def _counted(
 
 
 def _text(spec: ThresholdSpec) -> str:
-    what = f"|{spec.response}|" if spec.magnitude else spec.response
+    name = f"|{spec.response}|" if spec.magnitude else spec.response
     low = f"{spec.at_least:g} ≤ " if spec.at_least is not None else ""
     high = f" ≤ {spec.at_most:g}" if spec.at_most is not None else ""
-    return f"{low}{what}{high}"
+    return f"{low}{name}{high}"
 
 
 QUANTILES = {"p95": 0.95, "p99.7": 0.997}
@@ -346,7 +346,7 @@ class StudyAnalysis:
         fronts, wrong = [], []
         for spec in runs.study.report.pareto:
             x, y = runs.find(spec.x), runs.find(spec.y)
-            if any(not thing.numeric for thing in (x, y)):
+            if any(not series.numeric for series in (x, y)):
                 wrong.append(f"{spec.x} and {spec.y}")
             else:
                 # a run without a response is no compromise
@@ -376,11 +376,11 @@ class StudyAnalysis:
         It is the total index if there is one, else the squared standardised coefficient or the share of the main
         effect.
         """
-        found = self.indices.get(response)
+        indices = self.indices.get(response)
         out = {factor.name: 0.0 for factor in self.runs.factors}
         std = self.descriptions[response].std
-        if isinstance(found, Indices):
-            out.update({name: index.total.value for index in found.axes for name in index.factors})
+        if isinstance(indices, Indices):
+            out.update({name: index.total.value for index in indices.axes for name in index.factors})
         elif self.effects[response] and std is not None and std.value > 0.0:
             out.update({effect.factor: float(np.var(effect.means)) / std.value**2 for effect in self.effects[response]})
         else:
@@ -401,12 +401,12 @@ def _finite(value: float | None) -> float | None:
 
 
 ESTIMATE: Record[Estimate] = Record(
-    "A number with its 95% interval; null where the runs cannot tell it.",
+    "A number with its 95% interval; null where the runs do not determine it.",
     Quantity("value", lambda one: _finite(one.value), "the number"),
     Quantity("interval", lambda one: [_finite(end) for end in one.interval], "lower and upper end"),
 )
 EFFECT: Record[statistics.Effect] = Record(
-    "What a factor does to a response, by the linear model and by ranks.",
+    "Effect of a factor on a response, by the linear model and by ranks.",
     Quantity("swing", lambda e: e.swing, "change from the factor's 5% to its 95% quantile", record=ESTIMATE),
     Quantity("standardised_coefficient", lambda e: e.coefficient, "sigmas per sigma of the factor", record=ESTIMATE),
     Quantity("rank_correlation", lambda e: e.rank, "Spearman's", record=ESTIMATE),
@@ -428,9 +428,9 @@ MAIN_EFFECT: Record[statistics.MainEffect] = Record(
 INDEX: Record[Index] = Record(
     "Sensitivity to a factor, or to factors that vary together.",
     Quantity("first", lambda index: index.first, "share of the variance that it explains alone", record=ESTIMATE),
-    Quantity("total", lambda index: index.total, "share that is gone when it is fixed", record=ESTIMATE),
+    Quantity("total", lambda index: index.total, "share that vanishes when it is fixed", record=ESTIMATE),
     Quantity("first_rbd_fast", lambda index: index.check, "first order by RBD-FAST, which needs no model"),
-    Quantity("rbd_fast_agrees", lambda index: index.agrees, "whether that is in the interval, but for its noise"),
+    Quantity("rbd_fast_agrees", lambda index: index.agrees, "true if that is in the interval, apart from its noise"),
 )
 INDICES: Record[Indices] = Record(
     "Sobol indices of a response.",
@@ -439,13 +439,13 @@ INDICES: Record[Indices] = Record(
     Quantity("terms", lambda found: found.terms, "number of polynomials, 0 for a grid"),
     Quantity("held_out_r2", lambda found: found.held_out, "of runs that the model was not fitted to"),
     Quantity("unexplained_share", lambda found: found.rest, "share of the variance that the model does not explain"),
-    Quantity("noise_share", lambda found: found.noise, "share of the variance that the runs state as noise"),
+    Quantity("noise_share", lambda found: found.noise, "share of the variance that the runs report as noise"),
     Quantity("factors", lambda found: {index.name: index for index in found.axes}, "by factor", record=INDEX),
 )
 CONVERGENCE: Record[Convergence] = Record(
-    "How well the runs know a statistic.",
+    "Accuracy of a statistic of the runs.",
     Quantity("relative_half_width", lambda one: one.relative, "half the interval over sigma of the response"),
-    Quantity("enough_runs", lambda one: one.enough, "whether that is below the goal"),
+    Quantity("enough_runs", lambda one: one.enough, "true if that is below the goal"),
     Quantity("runs_needed", lambda one: one.needed, "about how many runs would reach it"),
 )
 
@@ -466,16 +466,16 @@ class _About:
         return self.found.noise.get(self.of.name)
 
     def sobol(self) -> dict[str, Any] | None:
-        found = self.found.indices.get(self.of.name)
-        if isinstance(found, NoIndices):
-            return {"method": None, "reason": found.reason}
-        return None if found is None else INDICES(found)
+        indices = self.found.indices.get(self.of.name)
+        if isinstance(indices, NoIndices):
+            return {"method": None, "reason": indices.reason}
+        return None if indices is None else INDICES(indices)
 
 
 RESPONSE: Record[_About] = Record(
     "Statistics of a response over the runs that have a number, in its unit.",
     Quantity("unit", lambda a: a.of.unit, "of its numbers, empty for pure ones"),
-    Quantity("sigma_of", lambda a: a.of.of or None, "response whose stated sigma this is", where_known=True),
+    Quantity("sigma_of", lambda a: a.of.of or None, "response whose reported sigma this is", where_known=True),
     Quantity("count", lambda a: a.numbers.count, "runs that have a number"),
     Quantity("mean", lambda a: a.numbers.mean, "mean", record=ESTIMATE),
     Quantity("std", lambda a: a.numbers.std, "standard deviation, n - 1", record=ESTIMATE),
@@ -491,20 +491,30 @@ RESPONSE: Record[_About] = Record(
     ),
     Quantity("p0135", lambda a: a.numbers.tails and a.numbers.tails[0], "0.135% of the runs lie below"),
     Quantity("p99865", lambda a: a.numbers.tails and a.numbers.tails[1], "99.865% of the runs lie below"),
-    Quantity("noise_share", lambda a: a.noise and a.noise.share, "of the variance, as stated", where_known=True),
-    Quantity("noise_share_possible", lambda a: a.noise and a.noise.possible, "whether that can be", where_known=True),
+    Quantity(
+        "noise_share",
+        lambda a: a.noise and a.noise.share,
+        "share of the variance that the runs report as noise",
+        where_known=True,
+    ),
+    Quantity(
+        "noise_share_possible",
+        lambda a: a.noise and a.noise.possible,
+        "true if that is compatible with the variance of the runs",
+        where_known=True,
+    ),
     Quantity("linear_model", lambda a: a.found.linear[a.of.name], "null where none can be fitted", record=LINEAR),
     Quantity("main_effects", lambda a: a.found.effects[a.of.name], "of a grid", record=MAIN_EFFECT),
     Quantity("sobol", _About.sobol, "sensitivity indices, where the study asks for them", where_known=True),
     Quantity(
         "convergence",
         lambda a: {one.name: one for one in a.found.convergences.get(a.of.name, ())},
-        "how the statistics settle",
+        "convergence of the statistics",
         record=CONVERGENCE,
     ),
 )
 REQUIREMENT: Record[Requirement] = Record(
-    "What became of a requirement.",
+    "Result of a requirement.",
     Quantity("name", lambda r: r.name or "all", "its name; all for all of them together"),
     Quantity("text", lambda r: r.text, "in words"),
     Quantity("met", lambda r: r.met, "runs that meet it"),
@@ -515,16 +525,16 @@ REQUIREMENT: Record[Requirement] = Record(
     Quantity("bounds_interval", lambda r: r.bounds_interval, "from the lower end for none to the upper end for all"),
 )
 FRONT: Record[ParetoFront] = Record(
-    "Best compromises of a pair.",
+    "Pareto front of a pair.",
     Quantity("x", lambda front: front.spec.x, "name of a factor or response"),
     Quantity("y", lambda front: front.spec.y, "name of a factor or response"),
     Quantity("best_x", lambda front: front.spec.best_x, "min or max"),
     Quantity("best_y", lambda front: front.spec.best_y, "min or max"),
     Quantity("runs", lambda front: front.runs, "runs on the front, from the best x to the best y"),
-    Quantity("knee_run", lambda f: None if f.knee is None else f.runs[f.knee], "run at the strongest bulge"),
+    Quantity("knee_run", lambda f: None if f.knee is None else f.runs[f.knee], "run at the knee"),
 )
 STATISTICS: Record[StudyAnalysis] = Record(
-    "statistics.json: what the report says of a study; null where the runs cannot tell a number.",
+    "statistics.json: numbers of a study's report; null where the runs do not determine a number.",
     Quantity("name", lambda found: found.runs.study.name, "of the study"),
     Quantity("design", lambda found: found.runs.kind, "kind of the design"),
     Quantity("runs", lambda found: found.runs.count, "number of runs"),
@@ -533,7 +543,7 @@ STATISTICS: Record[StudyAnalysis] = Record(
     Quantity(
         "responses",
         lambda found: {one.name: _About(found, one) for one in found.runs.everything},
-        "responses, and the sigmas that the runs state for them",
+        "responses, and the sigmas that the runs report for them",
         record=RESPONSE,
     ),
     Quantity("requirements", lambda found: found.requirements, "in the study's order, then all", record=REQUIREMENT),

@@ -39,11 +39,11 @@ def finish(axes: Axes, x_ticks: int | None = 6, y_ticks: int | None = 5) -> None
         _plain_numbers(axes, "y")
 
 
-def _plain_numbers(axes: Axes, which: str) -> None:
+def _plain_numbers(axes: Axes, axis: str) -> None:
     """Show full numbers at the ticks instead of an offset, as long as they are short."""
-    low, high = axes.get_xlim() if which == "x" else axes.get_ylim()
+    low, high = axes.get_xlim() if axis == "x" else axes.get_ylim()
     short = abs(high - low) > 1e-4 * max(abs(low), abs(high))
-    axes.ticklabel_format(axis=which, style="sci", scilimits=(-3, 5), useOffset=not short)  # type: ignore[arg-type]
+    axes.ticklabel_format(axis=axis, style="sci", scilimits=(-3, 5), useOffset=not short)  # type: ignore[arg-type]
 
 
 def short(text: str) -> str:
@@ -51,38 +51,38 @@ def short(text: str) -> str:
     return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
 
 
-def positions(thing: Series) -> np.ndarray:
+def positions(series: Series) -> np.ndarray:
     """Return the positions (runs,) of values on an axis: numbers themselves, texts at 0, 1, ..."""
-    if not thing.numeric:
-        return np.array([np.flatnonzero(thing.levels == value)[0] for value in thing.values], np.float64)
-    return thing.values
+    if not series.numeric:
+        return np.array([np.flatnonzero(series.levels == value)[0] for value in series.values], np.float64)
+    return series.values
 
 
-def name_texts(axes: Axes, thing: Series, which: str) -> None:
+def name_texts(axes: Axes, series: Series, axis: str) -> None:
     """Label an axis of ``positions`` with the texts; do nothing for numbers."""
-    if thing.numeric:
+    if series.numeric:
         return
-    places, names = np.arange(len(thing.levels)), [short(str(level)) for level in thing.levels]
-    if which == "x":
-        turned = sum(len(name) for name in names) > 34
-        axes.set_xticks(places, names, rotation=30 if turned else 0, ha="right" if turned else "center")
+    ticks, names = np.arange(len(series.levels)), [short(str(level)) for level in series.levels]
+    if axis == "x":
+        rotated = sum(len(name) for name in names) > 34
+        axes.set_xticks(ticks, names, rotation=30 if rotated else 0, ha="right" if rotated else "center")
         axes.set_xlim(-0.6, len(names) - 0.4)
     else:
-        axes.set_yticks(places, names)
+        axes.set_yticks(ticks, names)
         axes.set_ylim(-0.6, len(names) - 0.4)
 
 
 def some(good: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
     """Return the indices of up to ``most`` runs of (n,) ``good``, evenly spaced through the study."""
-    found = np.flatnonzero(good)
-    return found if len(found) <= most else found[np.linspace(0, len(found) - 1, most).astype(int)]
+    indices = np.flatnonzero(good)
+    return indices if len(indices) <= most else indices[np.linspace(0, len(indices) - 1, most).astype(int)]
 
 
-def jitter(thing: Series, seed: int) -> np.ndarray:
+def jitter(series: Series, seed: int) -> np.ndarray:
     """Return random offsets (runs,) to ``positions`` that keep points of one text from hiding each other."""
-    if not thing.numeric:
-        return np.random.default_rng(np.random.SeedSequence(seed)).uniform(-0.2, 0.2, len(thing.values))
-    return np.zeros(len(thing.values))
+    if not series.numeric:
+        return np.random.default_rng(np.random.SeedSequence(seed)).uniform(-0.2, 0.2, len(series.values))
+    return np.zeros(len(series.values))
 
 
 def bins(factor: Factor, good: np.ndarray) -> Iterator[np.ndarray]:
@@ -97,12 +97,12 @@ def bins(factor: Factor, good: np.ndarray) -> Iterator[np.ndarray]:
     yield from np.array_split(order, count)
 
 
-def histogram_figure(found: StudyAnalysis, names: Sequence[str]) -> Figure:
+def histogram_figure(analysis: StudyAnalysis, names: Sequence[str]) -> Figure:
     """Plot the histograms of the named responses."""
-    things = [r for r in found.runs.responses if r.name in names]
-    figure, grid = svg.panels([3.0] * len(things), min(len(things), 2))
-    for axes, response in zip(grid, things, strict=True):
-        _histogram(axes, response, found.descriptions[response.name], found.runs.sampled)
+    responses = [r for r in analysis.runs.responses if r.name in names]
+    figure, grid = svg.panels([3.0] * len(responses), min(len(responses), 2))
+    for axes, response in zip(grid, responses, strict=True):
+        _histogram(axes, response, analysis.descriptions[response.name], analysis.runs.sampled)
     return figure
 
 
@@ -110,7 +110,7 @@ def _histogram(axes: Axes, response: Response, about: Description, sampled: bool
     values = response.known
     axes.set(xlabel=response.label, ylabel="runs")
     if response.constant or about.mean is None or about.std is None:
-        text = "no run has a number" if len(values) == 0 else f"all {len(values)} runs: {values[0]:.6g}"
+        text = "no run has a value" if len(values) == 0 else f"all {len(values)} runs: {values[0]:.6g}"
         axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center")
         finish(axes, None, None)
         axes.set_xticks([])
@@ -121,12 +121,12 @@ def _histogram(axes: Axes, response: Response, about: Description, sampled: bool
     mean, std = about.mean.value, about.std.value
     axes.axvline(mean, color=INK, lw=1.3, label="mean")
     if sampled:
-        for k, place in enumerate((mean - 3.0 * std, mean + 3.0 * std)):
-            axes.axvline(place, color=VERMILION, lw=1.2, ls="--", label="mean ± 3σ" if k == 0 else None)
+        for k, position in enumerate((mean - 3.0 * std, mean + 3.0 * std)):
+            axes.axvline(position, color=VERMILION, lw=1.2, ls="--", label="mean ± 3σ" if k == 0 else None)
         normal = about.normality is None or about.normality.normal
         if not normal and about.tails is not None:
-            for k, place in enumerate(about.tails):
-                axes.axvline(place, color=GREEN, lw=1.4, ls=":", label="0.135% and 99.865%" if k == 0 else None)
+            for k, position in enumerate(about.tails):
+                axes.axvline(position, color=GREEN, lw=1.4, ls=":", label="0.135% and 99.865%" if k == 0 else None)
         if normal and about.normality is not None:
             x = np.linspace(mean - 3.5 * std, mean + 3.5 * std, 200)
             bell = np.exp(-0.5 * ((x - mean) / std) ** 2) / (np.sqrt(2.0 * np.pi) * std)
@@ -145,17 +145,19 @@ def _bin_count(values: np.ndarray) -> int:
 _TITLES = {"mean": "mean", "sigma": "standard deviation", "p95": "95% quantile", "p99.7": "99.7% quantile"}
 
 
-def convergence_figure(found: StudyAnalysis, response: Response) -> Figure:
+def convergence_figure(analysis: StudyAnalysis, response: Response) -> Figure:
     """Plot mean, sigma and the upper quantiles of the first n runs, each with its interval."""
-    convergences = found.convergences[response.name]
+    convergences = analysis.convergences[response.name]
     figure, grid = svg.panels([2.8] * len(convergences), len(convergences))
     for axes, convergence in zip(grid, convergences, strict=True):
-        both = np.isfinite(convergence.low) & np.isfinite(convergence.high)
-        axes.fill_between(convergence.counts, convergence.low, convergence.high, where=both, color=SKY, alpha=0.4, lw=0)
+        finite = np.isfinite(convergence.low) & np.isfinite(convergence.high)
+        axes.fill_between(
+            convergence.counts, convergence.low, convergence.high, where=finite, color=SKY, alpha=0.4, lw=0
+        )
         axes.plot(convergence.counts, convergence.values, color=BLUE, lw=1.3)
         axes.set_xscale("log")
         axes.set(title=f"{_TITLES[convergence.name]} of {response.name}", xlabel="runs")
-        if not both.any():
+        if not finite.any():
             axes.text(
                 0.03, 0.04, f"no upper limit below {convergence.needed} runs", transform=axes.transAxes, fontsize=7.5
             )
@@ -170,20 +172,20 @@ MOST_PANELS = 6
 """Largest number of factors for which a response curve is drawn."""
 
 
-def curve_figure(found: StudyAnalysis, response: Response) -> Figure:
+def curve_figure(analysis: StudyAnalysis, response: Response) -> Figure:
     """Plot a response against each of the most important factors, up to six."""
-    order = list(found.influence(response.name))
-    factors = sorted(found.runs.factors, key=lambda factor: order.index(factor.name))
+    order = list(analysis.influence(response.name))
+    factors = sorted(analysis.runs.factors, key=lambda factor: order.index(factor.name))
     factors = [factor for factor in factors if len(factor.levels) > 1][:MOST_PANELS]
     if not factors:
-        factors = list(found.runs.factors[:1])
+        factors = list(analysis.runs.factors[:1])
     wide = min(len(factors), 3)
     figure, grid = svg.panels([3.5 if wide < 3 else 3.0] * len(factors), wide)
     for k, (axes, factor) in enumerate(zip(grid, factors, strict=True)):
-        other = _partner(factor, factors) if not found.runs.sampled else None
+        other = _partner(factor, factors) if not analysis.runs.sampled else None
         if not factor.numeric:
             _bars(axes, factor, other, response)
-        elif found.runs.sampled:
+        elif analysis.runs.sampled:
             _binned(axes, factor, response)
         else:
             _lines(axes, factor, other, response)
@@ -193,7 +195,7 @@ def curve_figure(found: StudyAnalysis, response: Response) -> Figure:
         finish(axes, 5 if factor.numeric else None)
         name_texts(axes, factor, "x")
         # all panels of a drawn design have the same lines
-        if axes.get_legend_handles_labels()[0] and (k == 0 or not found.runs.sampled):
+        if axes.get_legend_handles_labels()[0] and (k == 0 or not analysis.runs.sampled):
             axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.04), fontsize=7.5, ncols=3, columnspacing=0.9)
     return figure
 
@@ -248,9 +250,9 @@ def _bars(axes: Axes, factor: Factor, other: Factor | None, response: Response) 
     groups = _groups(other, response)
     width = 0.8 / len(groups)
     means = [[response.values[runs & (factor.values == level)] for level in factor.levels] for _, runs in groups]
-    every = np.array([part.mean() for row in means for part in row if len(part)])
+    all_means = np.array([part.mean() for row in means for part in row if len(part)])
     spread = float(np.std(response.known)) if len(response.known) else 0.0
-    from_zero = len(every) > 0 and np.max(np.abs(every)) < 8.0 * max(spread, np.ptp(every))
+    from_zero = len(all_means) > 0 and np.max(np.abs(all_means)) < 8.0 * max(spread, np.ptp(all_means))
     for k, ((label, _), row) in enumerate(zip(groups, means, strict=True)):
         x = np.array([j for j, part in enumerate(row) if len(part)], np.float64)
         x += (k - 0.5 * (len(groups) - 1)) * width
@@ -265,13 +267,13 @@ def _bars(axes: Axes, factor: Factor, other: Factor | None, response: Response) 
             axes.errorbar(x, y, whisker, fmt=MARKS[k % len(MARKS)], color=colour, ms=5, **style)  # type: ignore[arg-type]
 
 
-def scatter_figure(found: StudyAnalysis, pairs: Sequence[tuple[str, str]]) -> Figure:
+def scatter_figure(analysis: StudyAnalysis, pairs: Sequence[tuple[str, str]]) -> Figure:
     """Plot the pairs that the study requests."""
     wide = min(len(pairs), 3)
     figure, grid = svg.panels([3.5] * len(pairs), wide)
     for axes, (x_name, y_name) in zip(grid, pairs, strict=True):
-        x, y = found.runs.find(x_name), found.runs.find(y_name)
-        _points(axes, x, y, found.runs.study.design.seed)
+        x, y = analysis.runs.find(x_name), analysis.runs.find(y_name)
+        _points(axes, x, y, analysis.runs.study.design.seed)
         axes.set(xlabel=x.label, ylabel=y.label)
         finish(axes, 5, 5)
         name_texts(axes, x, "x")
@@ -280,19 +282,19 @@ def scatter_figure(found: StudyAnalysis, pairs: Sequence[tuple[str, str]]) -> Fi
 
 
 def _points(axes: Axes, x: Series, y: Series, seed: int, size: float = 3.0) -> None:
-    places, heights = positions(x) + jitter(x, seed), positions(y) + jitter(y, seed + 1)
-    shown = some(np.isfinite(places) & np.isfinite(heights))
-    axes.plot(places[shown], heights[shown], ".", color=BLUE, ms=size, alpha=0.6)
+    x_positions, y_positions = positions(x) + jitter(x, seed), positions(y) + jitter(y, seed + 1)
+    shown = some(np.isfinite(x_positions) & np.isfinite(y_positions))
+    axes.plot(x_positions[shown], y_positions[shown], ".", color=BLUE, ms=size, alpha=0.6)
 
 
 _WAYS = {"min": "small is good", "max": "large is good"}
 
 
-def pareto_figure(found: StudyAnalysis) -> Figure:
+def pareto_figure(analysis: StudyAnalysis) -> Figure:
     """Plot for each pair all runs, the front and its knee."""
-    figure, grid = svg.panels([3.9] * len(found.fronts), min(len(found.fronts), 2))
-    for axes, front in zip(grid, found.fronts, strict=True):
-        x, y = found.runs.find(front.spec.x), found.runs.find(front.spec.y)
+    figure, grid = svg.panels([3.9] * len(analysis.fronts), min(len(analysis.fronts), 2))
+    for axes, front in zip(grid, analysis.fronts, strict=True):
+        x, y = analysis.runs.find(front.spec.x), analysis.runs.find(front.spec.y)
         shown = some(front.ranks > 0, 1000)
         axes.plot(x.values[shown], y.values[shown], ".", color=GREY, ms=3.5, alpha=0.6, label="dominated runs")
         if len(front.runs):
@@ -300,9 +302,9 @@ def pareto_figure(found: StudyAnalysis) -> Figure:
             axes.step(front.x, front.y, where="post", color=BLUE, lw=1.0)
             axes.plot(front.x, front.y, "o", color=BLUE, ms=5, label=f"front, {len(front.runs)} runs")
         if front.knee is not None:
-            place = (front.x[front.knee], front.y[front.knee])
+            point = (front.x[front.knee], front.y[front.knee])
             label = f"knee, run {front.runs[front.knee]}"
-            axes.plot(*place, "D", color=VERMILION, ms=8, mfc="none", mew=1.6, label=label)
+            axes.plot(*point, "D", color=VERMILION, ms=8, mfc="none", mew=1.6, label=label)
         axes.set_xlabel(f"{x.label} ({_WAYS[front.spec.best_x]})")
         axes.set_ylabel(f"{y.label} ({_WAYS[front.spec.best_y]})")
         finish(axes)
@@ -320,31 +322,31 @@ def _bar_panels(rows: Sequence[int]) -> tuple[Figure, list[Axes]]:
     return svg.panels([0.95 + 0.3 * max(row, 2) for row in rows], min(2, len(rows)))
 
 
-def with_tornado(found: StudyAnalysis) -> list[Response]:
+def with_tornado(analysis: StudyAnalysis) -> list[Response]:
     """Return the responses and sigmas with effects to draw."""
-    return [r for r in found.runs.everything if found.effects[r.name] or found.linear[r.name] is not None]
+    return [r for r in analysis.runs.everything if analysis.effects[r.name] or analysis.linear[r.name] is not None]
 
 
-def tornado_figure(found: StudyAnalysis) -> Figure:
+def tornado_figure(analysis: StudyAnalysis) -> Figure:
     """Plot the swing of each response over each factor, the largest first."""
-    things = with_tornado(found)
-    rows = [min(len(found.effects[r.name]) or _effects(found, r.name), MOST_BARS) for r in things]
+    responses = with_tornado(analysis)
+    rows = [min(len(analysis.effects[r.name]) or _effects(analysis, r.name), MOST_BARS) for r in responses]
     figure, grid = _bar_panels(rows)
-    for axes, response in zip(grid, things, strict=True):
-        if found.runs.sampled:
-            _swings(axes, found, response)
+    for axes, response in zip(grid, responses, strict=True):
+        if analysis.runs.sampled:
+            _swings(axes, analysis, response)
         else:
-            _main_effects(axes, found, response)
+            _main_effects(axes, analysis, response)
     return figure
 
 
-def _effects(found: StudyAnalysis, name: str) -> int:
-    model = found.linear[name]
+def _effects(analysis: StudyAnalysis, name: str) -> int:
+    model = analysis.linear[name]
     return len(model.effects) if model is not None else 0
 
 
-def _swings(axes: Axes, found: StudyAnalysis, response: Response) -> None:
-    model = found.linear[response.name]
+def _swings(axes: Axes, analysis: StudyAnalysis, response: Response) -> None:
+    model = analysis.linear[response.name]
     assert model is not None
     shown = model.effects[:MOST_BARS][::-1]
     y = np.arange(len(shown))
@@ -357,17 +359,17 @@ def _swings(axes: Axes, found: StudyAnalysis, response: Response) -> None:
     _name_bars(axes, [e.factor for e in shown], f"change of {response.label}")
 
 
-def _main_effects(axes: Axes, found: StudyAnalysis, response: Response) -> None:
+def _main_effects(axes: Axes, analysis: StudyAnalysis, response: Response) -> None:
     """Plot bars from the smallest to the largest mean of a factor's values, relative to the mean of all runs."""
-    shown = found.effects[response.name][:MOST_BARS][::-1]
+    shown = analysis.effects[response.name][:MOST_BARS][::-1]
     mean = float(np.mean(response.known))
     y = np.arange(len(shown))
-    for place, effect in zip(y, shown, strict=True):
+    for position, effect in zip(y, shown, strict=True):
         low, high = float(effect.means.min()) - mean, float(effect.means.max()) - mean
         rising = effect.means[-1] >= effect.means[0]
         numeric = effect.levels.dtype.kind == "f"
         colour = GREY if not numeric else BLUE if rising else VERMILION
-        axes.barh(place, high - low, 0.66, left=low, color=colour)
+        axes.barh(position, high - low, 0.66, left=low, color=colour)
     of = f", {typeset(response.unit)}" if response.unit else ""
     _name_bars(axes, [e.factor for e in shown], f"mean of {response.name} − mean of all{of}")
 
@@ -382,18 +384,18 @@ def _name_bars(axes: Axes, names: Sequence[str], label: str) -> None:
     axes.grid(False, axis="y")
 
 
-def with_indices(found: StudyAnalysis) -> list[Response]:
+def with_indices(analysis: StudyAnalysis) -> list[Response]:
     """Return the responses and sigmas that have sensitivity indices."""
-    return [r for r in found.runs.everything if isinstance(found.indices.get(r.name), Indices)]
+    return [r for r in analysis.runs.everything if isinstance(analysis.indices.get(r.name), Indices)]
 
 
-def indices_figure(found: StudyAnalysis) -> Figure:
+def indices_figure(analysis: StudyAnalysis) -> Figure:
     """Plot first-order and total index of each factor."""
-    things = with_indices(found)
-    parts = [found.indices[r.name] for r in things]
+    responses = with_indices(analysis)
+    parts = [analysis.indices[r.name] for r in responses]
     rows = [min(2 * len(part.axes), 2 * MOST_BARS) for part in parts if isinstance(part, Indices)]
     figure, grid = _bar_panels([int(0.7 * row) + 1 for row in rows])
-    for axes, response, part in zip(grid, things, parts, strict=True):
+    for axes, response, part in zip(grid, responses, parts, strict=True):
         assert isinstance(part, Indices)
         shown = part.axes[:MOST_BARS][::-1]
         y = np.arange(len(shown))
@@ -415,28 +417,28 @@ def indices_figure(found: StudyAnalysis) -> Figure:
 MOST_RESPONSES, MOST = 3, 6
 
 
-def chosen(found: StudyAnalysis) -> list[Series]:
+def chosen(analysis: StudyAnalysis) -> list[Series]:
     """Return the first three responses that vary, and the most influential factors, as many as fit."""
-    responses = [r for r in found.runs.responses if not r.constant][:MOST_RESPONSES]
-    weight = {factor.name: 0.0 for factor in found.runs.factors}
+    responses = [r for r in analysis.runs.responses if not r.constant][:MOST_RESPONSES]
+    weight = {factor.name: 0.0 for factor in analysis.runs.factors}
     for response in responses:
-        influence = found.influence(response.name)
+        influence = analysis.influence(response.name)
         for name, value in influence.items():
             weight[name] = max(weight[name], value)
-    factors = [factor for factor in found.runs.factors if len(factor.levels) > 1]
+    factors = [factor for factor in analysis.runs.factors if len(factor.levels) > 1]
     best = sorted(factors, key=lambda factor: -weight[factor.name])[: MOST - len(responses)]
-    return [*(factor for factor in found.runs.factors if factor in best), *responses]
+    return [*(factor for factor in analysis.runs.factors if factor in best), *responses]
 
 
-def matrix_figure(found: StudyAnalysis) -> Figure:
+def matrix_figure(analysis: StudyAnalysis) -> Figure:
     """Plot a matrix of points below the diagonal, rank correlations above it, and distributions on it."""
-    things = chosen(found)
-    n = len(things)
+    variables = chosen(analysis)
+    n = len(variables)
     figure = svg.new_figure(min(1.65 * n + 0.6, 10.2), {"h_pad": 0.03, "w_pad": 0.03, "hspace": 0.02, "wspace": 0.02})
     grid = figure.subplots(n, n, squeeze=False)
-    seed = found.runs.study.design.seed
-    for i, row in enumerate(things):
-        for j, column in enumerate(things):
+    seed = analysis.runs.study.design.seed
+    for i, row in enumerate(variables):
+        for j, column in enumerate(variables):
             axes = grid[i, j]
             if j > i:
                 _correlation(axes, column, row)
@@ -461,8 +463,8 @@ def matrix_figure(found: StudyAnalysis) -> Figure:
             if j > 0:
                 axes.tick_params(labelleft=False)
                 axes.yaxis.offsetText.set_visible(False)
-    for k, thing in enumerate(things):
-        label = thing.label.replace(", ", ",\n")
+    for k, variable in enumerate(variables):
+        label = variable.label.replace(", ", ",\n")
         grid[n - 1, k].set_xlabel(label)
         grid[k, 0].set_ylabel(label)
     return figure
@@ -472,7 +474,7 @@ def _correlation(axes: Axes, x: Series, y: Series) -> None:
     axes.set_xticks([])
     axes.set_yticks([])
     axes.spines[:].set_color(LIGHT)
-    if any(not thing.numeric for thing in (x, y)):
+    if any(not series.numeric for series in (x, y)):
         axes.set_axis_off()
         return
     good = np.isfinite(x.values) & np.isfinite(y.values)

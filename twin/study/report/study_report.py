@@ -51,7 +51,7 @@ class StudyReport:
 
 
 def write_report(
-    data: xr.Dataset, plan: Plan, folder: RunFolder, files: Sequence[str], given: Sequence[str] = ()
+    data: xr.Dataset, plan: Plan, folder: RunFolder, files: Sequence[str], input_warnings: Sequence[str] = ()
 ) -> StudyReport:
     """Write ``report.html``, ``statistics.json`` and the folder ``artefacts`` into the study's folder.
 
@@ -65,7 +65,7 @@ def write_report(
         Folder of the study, complete but for the manifest, which is written afterwards.
     files : sequence of str
         Names of the data files in that folder.
-    given : sequence of str
+    input_warnings : sequence of str
         Warnings about the inputs, which precede all others.
 
     Returns
@@ -73,38 +73,41 @@ def write_report(
     StudyReport
         The report that was written.
     """
-    made = report_files(data, plan.setup.study, files, given)
-    for name, content in made.contents.items():
+    report = report_files(data, plan.setup.study, files, input_warnings)
+    for name, content in report.contents.items():
         folder.write_bytes(name, content)
-    return made
+    return report
 
 
 def report_files(
-    data: xr.Dataset, study: StudySpec, files: Sequence[str] = ("study.nc", "study.csv"), given: Sequence[str] = ()
+    data: xr.Dataset,
+    study: StudySpec,
+    files: Sequence[str] = ("study.nc", "study.csv"),
+    input_warnings: Sequence[str] = (),
 ) -> StudyReport:
     """Return the report with the contents of all its files; arguments as in ``write_report``."""
-    found = StudyAnalysis.of(StudyRuns.of(data, study))
-    (said, more), runs = words.verdict(found), found.runs
+    analysis = StudyAnalysis.of(StudyRuns.of(data, study))
+    (head, more), runs = words.verdict(analysis), analysis.runs
     about = (
         f"{words.plural(runs.count, 'run')} of {study.base.command}, {int(runs.failed.sum())} of them failed; "
         f"{words.design_title(runs.kind)}, seed {study.design.seed}."
     )
     report = Report(
         study.name,
-        said,
+        head,
         (*more, *([study.description] if study.description else ()), about),
         (),
-        _response_table(found),
-        (Section("Factors", (), (_factor_table(runs),)), *sections(found)),
-        conclusions=tuple(words.conclusions(found)),
+        _response_table(analysis),
+        (Section("Factors", (), (_factor_table(runs),)), *sections(analysis)),
+        conclusions=tuple(words.conclusions(analysis)),
     )
     undrawn = tuple(artefact.note for artefact in report.artefacts if isinstance(artefact, Undrawn))
-    report = replace(report, warnings=(*given, *undrawn, *words.warnings(found)))
+    report = replace(report, warnings=(*input_warnings, *undrawn, *words.warnings(analysis)))
     contents = {artefact.file: artefact.content() for artefact in report.artefacts if artefact.within is None}
-    contents[STATISTICS] = run_folder.json_text(report.with_verdict(study_analysis.STATISTICS(found))).encode()
+    contents[STATISTICS] = run_folder.json_text(report.with_verdict(study_analysis.STATISTICS(analysis))).encode()
     numbers = page.links((*files, "study.json", STATISTICS, "config.yaml"))
     contents["report.html"] = page.report_page(report, (PROGRAM, "config.yaml"), [("Numbers", numbers)]).encode()
-    return StudyReport(said, contents, undrawn, report.warnings)
+    return StudyReport(head, contents, undrawn, report.warnings)
 
 
 MOST_NAMED = 6
@@ -117,11 +120,11 @@ def _factor_table(runs: StudyRuns) -> Table:
     """Return the table of factors: name, position in the base, distribution and values run."""
     rows: list[list[Cell]] = []
     for factor in runs.factors:
-        places = [key_text(place) for place in factor.spec.places]
-        places += [f"{key_text(scale.key)} (power {scale.power:g})" for scale in factor.spec.scales]
-        rows.append([factor.name, typeset(factor.unit), "; ".join(places), _source(factor.spec), _values(factor)])
+        positions = [key_text(key) for key in factor.spec.places]
+        positions += [f"{key_text(scale.key)} (power {scale.power:g})" for scale in factor.spec.scales]
+        rows.append([factor.name, typeset(factor.unit), "; ".join(positions), _source(factor.spec), _values(factor)])
     heads = ("factor", "unit", "in the base", "distribution", "values run")
-    return Table("factors", "", "What was varied.", heads, rows, within="config.yaml")
+    return Table("factors", "", "Varied factors.", heads, rows, within="config.yaml")
 
 
 def _source(spec: FactorSpec) -> str:
@@ -156,40 +159,38 @@ MOST_FRONT = 50
 """Largest number of rows of a Pareto front in the report; its CSV file has all."""
 
 
-def sections(found: StudyAnalysis) -> list[Section]:
+def sections(analysis: StudyAnalysis) -> list[Section]:
     """Return all sections that have contents, in the order of the page."""
-    made = (
-        _requirements(found),
-        _distributions(found),
-        _influences(found),
-        _indices(found),
-        _curves(found),
-        _pairs(found),
-        _fronts(found),
-        _convergence(found),
+    candidates = (
+        _requirements(analysis),
+        _distributions(analysis),
+        _influences(analysis),
+        _indices(analysis),
+        _curves(analysis),
+        _pairs(analysis),
+        _fronts(analysis),
+        _convergence(analysis),
     )
-    return [section for section in made if section is not None]
+    return [section for section in candidates if section is not None]
 
 
-def _response_table(found: StudyAnalysis) -> Table:
+def _response_table(analysis: StudyAnalysis) -> Table:
     """Return the statistics of the responses and of their reported sigmas."""
     heads = ("response", "unit", "runs", "mean", "std", "median", "95%", "99.7%", "min", "max")
     rows: list[list[Cell]] = []
-    for r in found.runs.everything:
-        d = found.descriptions[r.name]
+    for r in analysis.runs.everything:
+        d = analysis.descriptions[r.name]
         estimates = [words.with_limits(e) for e in (d.mean, d.std, d.median, d.p95, d.p997)]
         rows.append([r.name, typeset(r.unit), d.count, *estimates, words.number(d.low), words.number(d.high)])
-    if found.runs.sampled:
+    if analysis.runs.sampled:
         how = (
             "In brackets 95% confidence intervals: Student's for the mean, from the kurtosis for the standard "
-            "deviation, order statistics for the quantiles; a question mark stands for an end that so few runs cannot "
-            "tell, > for a quantile of which they tell nothing else."
+            "deviation, order statistics for the quantiles; a question mark is an end that needs more runs, > a "
+            "quantile with a lower limit alone."
         )
     else:
-        how = (
-            "Over the combinations of the grid, all counted alike; they are no sample, so that there are no intervals."
-        )
-    caption = f"Over the runs that have a number; 95% and 99.7% of the runs lie below those columns. {how}"
+        how = "Over all combinations of the grid with equal weights; a grid is not a sample, so there are no intervals."
+    caption = f"Over the runs with a finite value; the columns 95% and 99.7% are quantiles. {how}"
     return Table("responses", "Responses", caption, heads, rows, within=STATISTICS)
 
 
@@ -206,11 +207,11 @@ def _figure(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> 
         return Undrawn(name, title, caption, one_line(error))
 
 
-def _requirements(found: StudyAnalysis) -> Section | None:
-    if not found.requirements:
+def _requirements(analysis: StudyAnalysis) -> Section | None:
+    if not analysis.requirements:
         return None
-    failed = int(found.runs.failed.sum())
-    lacking = any(r.bounds is not None for r in found.requirements)
+    failed = int(analysis.runs.failed.sum())
+    lacking = any(r.bounds is not None for r in analysis.requirements)
     rows: list[list[Cell]] = [
         [
             r.name or "all",
@@ -223,15 +224,19 @@ def _requirements(found: StudyAnalysis) -> Section | None:
             *((words.DASH if r.bounds is None else f"{r.met} … {r.most} of {r.runs}",) if lacking else ()),
             *((words.span(r.bounds_interval),) if lacking else ()),
             *(
-                words.number(one.value if one else None)
-                for one in (r.judged and r.judged.p95, r.judged and r.judged.p997)
+                words.number(estimate.value if estimate else None)
+                for estimate in (r.judged and r.judged.p95, r.judged and r.judged.p997)
             ),
         ]
-        for r in found.requirements
+        for r in analysis.requirements
     ]
-    how = "The interval is Clopper and Pearson's, 95%." if found.runs.sampled else "A grid is no sample: no interval."
-    lost = f" {failed} failed runs are not counted." if failed else ""
-    more = ("all runs, if none … all without a number meet it", "interval of all runs") if lacking else ()
+    how = (
+        "The interval is Clopper and Pearson's, 95%."
+        if analysis.runs.sampled
+        else "A grid is not a sample: no interval."
+    )
+    failed_text = f" {failed} failed runs are not counted." if failed else ""
+    more = ("all runs, if none … all without a value meet it", "interval of all runs") if lacking else ()
     return Section(
         "Requirements",
         (),
@@ -239,7 +244,8 @@ def _requirements(found: StudyAnalysis) -> Section | None:
             Table(
                 "requirements",
                 "Share of the runs that meet them",
-                f"Of the runs that have a number.{lost} {how} The last columns are quantiles of what is judged.",
+                f"Over the runs with a finite value.{failed_text} {how} The last columns are quantiles of the response "
+                "or its absolute value.",
                 ("requirement", "", "unit", "met", "of", "share", "interval", *more, "95%", "99.7%"),
                 rows,
                 within=STATISTICS,
@@ -248,45 +254,45 @@ def _requirements(found: StudyAnalysis) -> Section | None:
     )
 
 
-def _distributions(found: StudyAnalysis) -> Section | None:
-    asked = found.runs.study.report.histograms
-    names = [r.name for r in found.runs.responses if asked is None or r.name in asked][:MOST_FIGURES]
-    names = [name for name in names if found.descriptions[name].count > 0]
+def _distributions(analysis: StudyAnalysis) -> Section | None:
+    asked = analysis.runs.study.report.histograms
+    names = [r.name for r in analysis.runs.responses if asked is None or r.name in asked][:MOST_FIGURES]
+    names = [name for name in names if analysis.descriptions[name].count > 0]
     if not names:
         return None
-    texts = [words.normality_text(r, found.descriptions[r.name]) for r in found.runs.responses if r.name in names]
+    texts = [words.normality_text(r, analysis.descriptions[r.name]) for r in analysis.runs.responses if r.name in names]
     remarks = tuple(text for text in texts if text is not None)
     caption = "Number of runs by value."
-    if found.runs.sampled:
-        caption += (
-            " Dashed: three standard deviations from the mean. Where the distribution is not normal, dotted: what "
-        )
-        caption += "0.135% and 99.865% of the runs lie below, from 741 runs on."
-    figure = _figure("histograms", "Histograms", caption, lambda: plots.histogram_figure(found, names))
+    if analysis.runs.sampled:
+        caption += " Dashed: three standard deviations from the mean. Dotted, if the distribution is not normal: the "
+        caption += "0.135% and 99.865% quantiles, from 741 runs on."
+    figure = _figure("histograms", "Histograms", caption, lambda: plots.histogram_figure(analysis, names))
     return Section("Distributions", remarks, (figure,))
 
 
-def _influences(found: StudyAnalysis) -> Section | None:
-    things = plots.with_tornado(found)
-    if not things:
+def _influences(analysis: StudyAnalysis) -> Section | None:
+    responses = plots.with_tornado(analysis)
+    if not responses:
         return None
-    sampled = found.runs.sampled
+    sampled = analysis.runs.sampled
     if sampled:
         caption = (
             "Change of the response from a factor's 5% to its 95% quantile by the linear model, the others unchanged, "
-            "with 95% intervals (HC3). Blue: rises with the factor; red: falls; grey: of a text, between the values "
+            "with 95% intervals (HC3). Blue: rises with the factor; red: falls; grey: a text, between the values "
             "with the smallest and the largest mean."
         )
     else:
         caption = (
-            "From the smallest to the largest of the means that belong to a factor's values. Blue: the mean at the "
-            "last value is the larger one; red: the first; grey: texts."
+            "From the smallest to the largest mean over a factor's values. Blue: the last value has the larger mean; "
+            "red: the first; grey: texts."
         )
-    figure = _figure("tornado", "Swings" if sampled else "Main effects", caption, lambda: plots.tornado_figure(found))
+    figure = _figure(
+        "tornado", "Swings" if sampled else "Main effects", caption, lambda: plots.tornado_figure(analysis)
+    )
     rows: list[list[Cell]] = []
     texts = []
-    for r in things:
-        model = found.linear[r.name]
+    for r in responses:
+        model = analysis.linear[r.name]
         if model is None:
             continue
         texts.append(f"{r.name} {words.percent(model.r2)}")
@@ -308,16 +314,16 @@ def _influences(found: StudyAnalysis) -> Section | None:
         "Linear model and rank correlations",
         "Swing between the factor's 5% and 95% quantiles (second column), standardised regression coefficient (sigmas "
         "of the response per sigma of the factor) and Spearman's rank correlation"
-        + (", with 95% intervals. Where the last two differ much, the response is curved." if sampled else "."),
+        + (", with 95% intervals. Where the last two differ much, the response is nonlinear." if sampled else "."),
         ("response", "factor", "from … to", "swing", "unit", "standardised", "rank correlation"),
         rows,
         within=STATISTICS,
     )
-    cannot = sorted({name for r in things for m in [found.linear[r.name]] if m is not None for name in m.cannot})
-    remarks = [f"The linear model explains of the variance (R²): {', '.join(texts)}."] if texts else []
+    cannot = sorted({name for r in responses for m in [analysis.linear[r.name]] if m is not None for name in m.cannot})
+    remarks = [f"R² of the linear model: {', '.join(texts)}."] if texts else []
     if cannot:
-        remarks.append(f"Not separable from the other factors, and left out of the model: {', '.join(cannot)}.")
-    return Section("What the factors do", tuple(remarks), (figure, table) if rows else (figure,))
+        remarks.append(f"Not separable from the other factors and excluded from the model: {', '.join(cannot)}.")
+    return Section("Effects of the factors", tuple(remarks), (figure, table) if rows else (figure,))
 
 
 def _maybe(estimate: Estimate | None, sampled: bool) -> str:
@@ -326,17 +332,17 @@ def _maybe(estimate: Estimate | None, sampled: bool) -> str:
     return words.with_limits(estimate) if sampled else words.number(estimate.value, 3)
 
 
-def _indices(found: StudyAnalysis) -> Section | None:
-    if not found.runs.study.report.sobol:
+def _indices(analysis: StudyAnalysis) -> Section | None:
+    if not analysis.runs.study.report.sobol:
         return None
-    remarks = words.indices_texts(found)
-    things = plots.with_indices(found)
-    if not things:
+    remarks = words.indices_texts(analysis)
+    responses = plots.with_indices(analysis)
+    if not responses:
         return Section("Sobol indices", tuple(remarks))
-    chaos = found.runs.sampled
+    chaos = analysis.runs.sampled
     rows: list[list[Cell]] = []
-    for r in things:
-        part = found.indices[r.name]
+    for r in responses:
+        part = analysis.indices[r.name]
         assert isinstance(part, Indices)
         for index in part.axes:
             check = words.DASH if index.check is None else fixed(index.check, 2)
@@ -350,67 +356,69 @@ def _indices(found: StudyAnalysis) -> Section | None:
     table = Table("sobol", "Indices", caption, heads, rows, within=STATISTICS)
     intervals = "with 95% intervals" if chaos else "exact for the grid"
     figure = _figure("sobol-indices", "First order and total", f"Shares of the variance, {intervals}.",
-                     lambda: plots.indices_figure(found))  # fmt: skip
+                     lambda: plots.indices_figure(analysis))  # fmt: skip
     return Section("Sobol indices", tuple(remarks), (figure, table))
 
 
-def _curves(found: StudyAnalysis) -> Section | None:
+def _curves(analysis: StudyAnalysis) -> Section | None:
     figures = []
-    if found.runs.sampled:
+    if analysis.runs.sampled:
         caption = (
             "Points: runs. Line: means of neighbouring runs with 95% intervals. Band: the middle 68% of these runs."
         )
     else:
-        caption = "Means over all other factors; of a text with one standard deviation of the runs as whisker."
-        if len([f for f in found.runs.factors if len(f.levels) > 1]) > 1:
-            caption += " A line or group for each value of the other factor that matters most."
-    for k, response in enumerate(found.runs.everything[:MOST_FIGURES]):
-        if found.descriptions[response.name].count == 0 or response.constant:
+        caption = "Means over all other factors; for a text with one standard deviation of the runs as whisker."
+        if len([f for f in analysis.runs.factors if len(f.levels) > 1]) > 1:
+            caption += " A line or group for each value of the most important other factor."
+    for k, response in enumerate(analysis.runs.everything[:MOST_FIGURES]):
+        if analysis.descriptions[response.name].count == 0 or response.constant:
             continue
         figures.append(
-            _figure(f"curves-{k + 1}", response.label, caption, partial(plots.curve_figure, found, response))
+            _figure(f"curves-{k + 1}", response.label, caption, partial(plots.curve_figure, analysis, response))
         )
         caption = "As above."
     if not figures:
         return None
-    more = len(found.runs.factors) - plots.MOST_PANELS
-    remarks = (f"The {plots.MOST_PANELS} factors that matter most of {len(found.runs.factors)}.",) if more > 0 else ()
+    more = len(analysis.runs.factors) - plots.MOST_PANELS
+    remarks = (f"The {plots.MOST_PANELS} most important of {len(analysis.runs.factors)} factors.",) if more > 0 else ()
     return Section("Response curves", remarks, tuple(figures))
 
 
-def _pairs(found: StudyAnalysis) -> Section | None:
+def _pairs(analysis: StudyAnalysis) -> Section | None:
     figures = []
-    pairs = found.runs.study.report.scatter
+    pairs = analysis.runs.study.report.scatter
     if pairs:
-        draw = partial(plots.scatter_figure, found, pairs)
-        figures.append(_figure("scatter", "Pairs that were asked for", "Every point is a run.", draw))
-    things = plots.chosen(found)
-    if len(things) > 2:
-        factors = sum(isinstance(thing, Factor) for thing in things)
+        draw = partial(plots.scatter_figure, analysis, pairs)
+        figures.append(_figure("scatter", "Requested pairs", "Every point is a run.", draw))
+    variables = plots.chosen(analysis)
+    if len(variables) > 2:
+        factors = sum(isinstance(variable, Factor) for variable in variables)
         caption = (
-            f"The {factors} factors that matter most and {len(things) - factors} responses. Below the diagonal up to "
+            f"The {factors} most important factors and {len(variables) - factors} responses. Below the diagonal up to "
             "300 runs, above it Spearman's rank correlation, large and framed (green +, red −) beyond 0.3."
         )
-        figures.append(_figure("matrix", "Scatter matrix", caption, lambda: plots.matrix_figure(found)))
+        figures.append(_figure("matrix", "Scatter matrix", caption, lambda: plots.matrix_figure(analysis)))
     return Section("Pairs", (), tuple(figures)) if figures else None
 
 
-def _fronts(found: StudyAnalysis) -> Section | None:
-    remarks = tuple(f"{pair}: texts have no order, so that there is no front." for pair in found.not_numbers)
-    if not found.fronts:
+def _fronts(analysis: StudyAnalysis) -> Section | None:
+    remarks = tuple(f"{pair}: texts have no order, so that there is no front." for pair in analysis.not_numbers)
+    if not analysis.fronts:
         return Section("Best compromises", remarks) if remarks else None
-    caption = "Blue: runs that no other run beats in both; the stairs bound what is known to be possible. "
-    caption += "Knee: where the front, scaled to its range, bulges farthest from the line through its ends."
+    caption = (
+        "Blue: runs on the Pareto front, which no other run beats in both; the steps bound the known feasible region. "
+    )
+    caption += "Knee: point of the front, scaled to its range, farthest from the line through its ends."
     parts: list[SvgFigure | Undrawn | Table] = [
-        _figure("pareto", "Pareto fronts", caption, lambda: plots.pareto_figure(found))
+        _figure("pareto", "Pareto fronts", caption, lambda: plots.pareto_figure(analysis))
     ]
-    for k, front in enumerate(found.fronts):
-        x, y = found.runs.find(front.spec.x), found.runs.find(front.spec.y)
-        others = [f for f in found.runs.factors if f not in (x, y) and len(f.levels) > 1]
+    for k, front in enumerate(analysis.fronts):
+        x, y = analysis.runs.find(front.spec.x), analysis.runs.find(front.spec.y)
+        others = [f for f in analysis.runs.factors if f not in (x, y) and len(f.levels) > 1]
         rows: list[list[Cell]] = []
         for j, run in enumerate(front.runs.tolist()):
-            own: list[Cell] = [_cell(f, run) for f in others]
-            rows.append([run, float(front.x[j]), float(front.y[j]), *own, "knee" if j == front.knee else ""])
+            values: list[Cell] = [_cell(f, run) for f in others]
+            rows.append([run, float(front.x[j]), float(front.y[j]), *values, "knee" if j == front.knee else ""])
         shown = [rows[i] for i in np.linspace(0, len(rows) - 1, min(len(rows), MOST_FRONT)).round().astype(int)]
         thin = f" {MOST_FRONT} of {len(rows)}, evenly through the front; study.csv holds all runs."
         note = f"From the best {x.name} on.{thin if len(shown) < len(rows) else ''}"
@@ -426,14 +434,16 @@ def _cell(factor: Factor, run: int) -> Cell:
     return int(value) if whole and isinstance(value, float) else value
 
 
-def _convergence(found: StudyAnalysis) -> Section | None:
-    names = [name for name, convergences in found.convergences.items() if convergences][:MOST_FIGURES]
+def _convergence(analysis: StudyAnalysis) -> Section | None:
+    names = [name for name, convergences in analysis.convergences.items() if convergences][:MOST_FIGURES]
     if not names:
         return None
-    caption = "Of the first n runs, with the 95% interval where both its ends can be told."
+    caption = "Statistic of the first n runs, with its 95% interval where both ends exist."
     figures = []
-    things = [r for r in found.runs.responses if r.name in names]
-    for k, r in enumerate(things):
-        figures.append(_figure(f"convergence-{k + 1}", r.label, caption, partial(plots.convergence_figure, found, r)))
+    responses = [r for r in analysis.runs.responses if r.name in names]
+    for k, r in enumerate(responses):
+        figures.append(
+            _figure(f"convergence-{k + 1}", r.label, caption, partial(plots.convergence_figure, analysis, r))
+        )
         caption = "As above."
-    return Section("Enough runs?", tuple(words.convergence_texts(found, names)), tuple(figures))
+    return Section("Convergence", tuple(words.convergence_texts(analysis, names)), tuple(figures))

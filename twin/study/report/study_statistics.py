@@ -55,11 +55,11 @@ class Series:
     @cached_property
     def levels(self) -> np.ndarray:
         """Distinct values, numbers in ascending order, texts in the order of the study."""
-        found = np.unique(self.values)
+        distinct = np.unique(self.values)
         if self.numeric:
-            return found
-        first = [int(np.argmax(self.values == value)) for value in found]
-        return np.asarray(found[np.argsort(first, kind="stable")])
+            return distinct
+        first = [int(np.argmax(self.values == value)) for value in distinct]
+        return np.asarray(distinct[np.argsort(first, kind="stable")])
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,8 +155,8 @@ class StudyRuns:
             unit = str(data[name].attrs.get("units", ""))
             stated = {ending: data[f"{name}{ending}"].values.astype(np.float64) for ending in response.sigma_keys}
             responses.append(Response(name, unit, data[name].values.astype(np.float64), stated.get(NOISE)))
-            own = [Response(f"{name}{ending}", unit, sigma, None, name) for ending, sigma in stated.items()]
-            sigmas += [one for one in own if not one.constant]
+            reported = [Response(f"{name}{ending}", unit, sigma, None, name) for ending, sigma in stated.items()]
+            sigmas += [series for series in reported if not series.constant]
         messages = tuple(str(m) for m in data["message"].values.tolist()) if "message" in data else ()
         doubts = tuple(str(m) for m in data["doubt"].values.tolist()) if "doubt" in data else ()
         failed = data["failed"].values.astype(bool)
@@ -190,8 +190,8 @@ class StudyRuns:
 
     def find(self, name: str) -> Series:
         """Return a factor or response by its name."""
-        things: Sequence[Series] = (*self.factors, *self.responses, *self.sigmas)
-        return next(thing for thing in things if thing.name == name)
+        series: Sequence[Series] = (*self.factors, *self.responses, *self.sigmas)
+        return next(item for item in series if item.name == name)
 
 
 def _factor_values(values: np.ndarray) -> np.ndarray:
@@ -308,7 +308,7 @@ def describe(values: np.ndarray, sampled: bool) -> Description:
     std = None
     if n > 1:
         std = Estimate(float(np.std(good, ddof=1)), std_interval(good) if sampled else (None, None))
-    reach = n * TAILS[0] >= 1.0
+    enough = n * TAILS[0] >= 1.0
     return Description(
         count=n,
         mean=Estimate(float(np.mean(good)), mean_interval(good) if sampled else (None, None)),
@@ -319,7 +319,7 @@ def describe(values: np.ndarray, sampled: bool) -> Description:
         low=float(ordered[0]),
         high=float(ordered[-1]),
         normality=normality(good) if sampled else None,
-        tails=(float(np.quantile(ordered, TAILS[0])), float(np.quantile(ordered, TAILS[1]))) if reach else None,
+        tails=(float(np.quantile(ordered, TAILS[0])), float(np.quantile(ordered, TAILS[1]))) if enough else None,
     )
 
 
@@ -363,9 +363,9 @@ def quantile_interval(values: np.ndarray, q: float) -> Interval:
     q : float
         Probability of the quantile.
     """
-    found = stats.quantile_test(values, p=q).confidence_interval(CONFIDENCE)
-    return (None if math.isnan(found.low) else float(found.low)), (
-        None if math.isnan(found.high) else float(found.high)
+    interval = stats.quantile_test(values, p=q).confidence_interval(CONFIDENCE)
+    return (None if math.isnan(interval.low) else float(interval.low)), (
+        None if math.isnan(interval.high) else float(interval.high)
     )
 
 
@@ -444,16 +444,18 @@ def impossible(runs: StudyRuns) -> InputError | None:
     study = runs.study
     issues: list[Issue] = []
     for response in runs.responses:
-        one = noise_share(response, study)
-        if one is None or one.possible:
+        share = noise_share(response, study)
+        if share is None or share.possible:
             continue
-        key = study.responses[one.response].noise
+        key = study.responses[share.response].noise
         assert key is not None
-        times = significant(one.share, 3)
-        text = f"states a variance of noise {times} times that of all runs: not the noise of {one.response}"
+        times = significant(share.share, 3)
+        text = (
+            f"the reported noise variance is {times} times the variance of all runs: not the noise of {share.response}"
+        )
         remedy = "the standard deviation by noise alone, for readings the key that ends in _sigma_noise"
-        found = study.error(text, ("responses", one.response, "noise"), found=key_text(key), allowed=remedy)
-        issues += found.issues
+        error = study.error(text, ("responses", share.response, "noise"), found=key_text(key), allowed=remedy)
+        issues += error.issues
     return InputError(*issues) if issues else None
 
 
@@ -530,25 +532,25 @@ def linear_model(factors: Sequence[Factor], response: Response) -> LinearModel |
         return None
     blocks: list[tuple[Factor, np.ndarray]] = []
     cannot = []
-    seen = np.ones((n, 1))
+    design = np.ones((n, 1))
     for factor in factors:
         columns = _columns(factor, good)
         if columns.shape[1] == 0:
             continue
-        joined = np.concatenate([seen, columns], axis=1)
+        joined = np.concatenate([design, columns], axis=1)
         if np.linalg.matrix_rank(joined / np.linalg.norm(joined, axis=0)) < joined.shape[1]:
             cannot.append(factor.name)
             continue
-        seen = joined
+        design = joined
         blocks.append((factor, columns))
-    terms = seen.shape[1]
+    terms = design.shape[1]
     if not blocks or n < terms + 2:
         return None
-    q, r = np.linalg.qr(seen)
+    q, r = np.linalg.qr(design)
     coefficients = np.linalg.solve(r, q.T @ y)
     # rounding is no effect
     coefficients = np.where(np.abs(coefficients) < 1e-12 * np.std(y), 0.0, coefficients)
-    rest = y - seen @ coefficients
+    rest = y - design @ coefficients
     leverage = np.minimum(np.sum(q**2, axis=1), 1.0 - 1e-9)
     bread = np.linalg.solve(r, q.T) * (rest / (1.0 - leverage))
     # rounding of a perfect fit
@@ -559,9 +561,9 @@ def linear_model(factors: Sequence[Factor], response: Response) -> LinearModel |
     effects = []
     first = 1
     for factor, columns in blocks:
-        own = slice(first, first + columns.shape[1])
+        rows = slice(first, first + columns.shape[1])
         first += columns.shape[1]
-        effects.append(_effect(factor, good, y, coefficients[own], bread[own], t))
+        effects.append(_effect(factor, good, y, coefficients[rows], bread[rows], t))
     effects.sort(key=lambda effect: -abs(effect.swing.value))
     adjusted = 1.0 - (1.0 - r2) * (n - 1) / (n - terms)
     return LinearModel(r2, adjusted, terms, tuple(effects), tuple(cannot))
@@ -593,15 +595,15 @@ def _effect(
         ends = (str(levels[first]), str(levels[last]))
         return Effect(factor.name, _largest_difference(means, moved, t), None, None, ends)
     low, high = _span(factor, values)
-    b, own = float(coefficient[0]), moved[0]
+    b, influence = float(coefficient[0]), moved[0]
     spread = float(np.std(y))
     # a standardised coefficient moves with the sigmas of the runs, too, which belong to the same runs
     widths = 0.5 * (((values - values.mean()) / values.std()) ** 2 - ((y - y.mean()) / spread) ** 2) / len(y)
     rank = float(stats.spearmanr(values, y).statistic)
     return Effect(
         factor.name,
-        _estimate(b, own, (high - low) / float(values.std()), t),
-        _estimate(b, own + b * widths, 1.0 / spread, t),
+        _estimate(b, influence, (high - low) / float(values.std()), t),
+        _estimate(b, influence + b * widths, 1.0 / spread, t),
         Estimate(rank, _rank_interval(rank, len(y))),
         (low, high),
     )

@@ -225,12 +225,14 @@ def _entry(node: Tree, model: type[Spec], key: KeyPath, k: int, last: bool) -> A
     # a mapping with free keys may get another entry, one with fields only those that it may have
     known = tuple(dict.fromkeys((*node, *fields)))
     free = typing.get_origin(annotation) is not None and not fields
-    made = _default(annotation_at(model, key[: k + 1])) if isinstance(part, str) and (free or part in fields) else None
-    if made is None and not (last and isinstance(part, str) and (free or part in fields)):
+    default = (
+        _default(annotation_at(model, key[: k + 1])) if isinstance(part, str) and (free or part in fields) else None
+    )
+    if default is None and not (last and isinstance(part, str) and (free or part in fields)):
         suggestion = nearest(str(part), [str(name) for name in known])
         raise Problem("no such key", shown(part), names_text(known), suggestion, within=(k,))
-    node[str(part)] = made
-    return made
+    node[str(part)] = default
+    return default
 
 
 def _fields(annotation: Any) -> tuple[str, ...]:
@@ -262,14 +264,14 @@ def with_values(tree: Tree, values: Iterable[tuple[KeyPath, Any]]) -> Tree:
         Place and value of everything that changes.
     """
     out = dict(tree)
-    own = {id(out)}
+    copied = {id(out)}
     for key, value in values:
         node: Any = out
         for part in key[:-1]:
             below = node[part]
-            if id(below) not in own:
+            if id(below) not in copied:
                 below = below.copy()
-                own.add(id(below))
+                copied.add(id(below))
                 node[part] = below
             node = below
         node[key[-1]] = value
@@ -335,11 +337,11 @@ class BlockResult:
     def fits(self, shape: tuple[int, int]) -> bool:
         """Return True if these are results of the given numbers of runs and responses; a file may hold anything."""
         arrays = all(
-            isinstance(one, np.ndarray) and one.shape == shape and one.dtype == float
-            for one in (self.values, self.sigmas, self.noises)
+            isinstance(item, np.ndarray) and item.shape == shape and item.dtype == float
+            for item in (self.values, self.sigmas, self.noises)
         )
         texts = (self.messages, self.doubts)
-        return arrays and all(len(one) == shape[0] and all(isinstance(m, str) for m in one) for one in texts)
+        return arrays and all(len(item) == shape[0] and all(isinstance(m, str) for m in item) for item in texts)
 
     @property
     def failed(self) -> np.ndarray:
@@ -389,7 +391,7 @@ class BlockResult:
         )
 
 
-CONTRADICTED = "the shifts of the spots contradict the stated disturbances"
+CONTRADICTED = "the shifts of the spots contradict the prior on disturbances"
 """Reason why sigma does not hold although the fits of the spots are good."""
 
 

@@ -205,15 +205,15 @@ class Engine:
 
     def __post_init__(self) -> None:
         """Warn about corrupt lines of the journal."""
-        if lost := self.journal.damaged:
-            lines = "1 line of it is" if lost == 1 else f"{lost} lines of it are"
+        if damaged := self.journal.damaged:
+            lines = "1 line of it is" if damaged == 1 else f"{damaged} lines of it are"
             self.warn(f"{self.journal.file}: {lines} corrupt; what it held is computed again")
 
     def _known(self, block: int) -> BlockResult | None:
         """Return the results of a block if they are in the journal."""
-        found = self.journal.known.get(str(block))
+        result = self.journal.known.get(str(block))
         shape = len(self.plan.block(block)), len(self.plan.setup.study.responses)
-        return found if isinstance(found, BlockResult) and found.fits(shape) else None
+        return result if isinstance(result, BlockResult) and result.fits(shape) else None
 
     @property
     def missing(self) -> list[int]:
@@ -222,7 +222,7 @@ class Engine:
 
     def result(self) -> BlockResult:
         """Return the results of all runs, in order; no block may be missing."""
-        return BlockResult.joined([found for block in range(self.plan.blocks) if (found := self._known(block))])
+        return BlockResult.joined([known for block in range(self.plan.blocks) if (known := self._known(block))])
 
     def run(self, workers: cluster.Workers, own_memory: float = 0.0) -> None:
         """Compute all missing blocks.
@@ -266,7 +266,7 @@ class Engine:
     def _estimate(self, first: Pilot, missing: Sequence[int], there: int, workers: int, own_memory: float) -> None:
         """Report the estimated time and memory of the study, from its first block."""
         runs = self._runs(missing)
-        each = first.result.seconds / len(first.result.messages)
+        seconds_per_run = first.result.seconds / len(first.result.messages)
         seconds = -(-(len(missing) - 1) // workers) * first.result.seconds + first.start_seconds * (workers > 1)
         memory, limit = own_memory + workers * first.memory, self.plan.setup.study.limits
         if memory > limit.bytes:
@@ -275,9 +275,9 @@ class Engine:
                 "--workers"
             )
         self.say(
-            f"{runs} runs{f' ({there} are there already)' if there else ''} in {len(missing)} blocks on {workers} "
+            f"{runs} runs{f' ({there} already done)' if there else ''} in {len(missing)} blocks on {workers} "
             f"worker{'s' if workers > 1 else ''}; about {time_text(seconds)}, {1e-9 * memory:.1f} GB; "
-            f"{1e3 * each:.3g} ms a run"
+            f"{1e3 * seconds_per_run:.3g} ms a run"
         )
 
     def _first(self, workers: cluster.Workers, block: int) -> Pilot:
@@ -300,7 +300,7 @@ class Engine:
 
     def _all(self, workers: cluster.Workers, blocks: Sequence[int], there: int) -> list[int]:
         """Compute blocks and return those in which workers died."""
-        lost = []
+        failed = []
         for finished in workers.each(evaluate, map(self.task, blocks)):
             self._keep({blocks[k]: future.result() for k, future in finished if future.status == "finished"})
             self.advance(there + self.computed, self.plan.runs)
@@ -308,8 +308,8 @@ class Engine:
                 if future.status != "finished":
                     if not cluster.killed(future.exception()):
                         raise _fault(future)
-                    lost.append(blocks[k])
-        return lost
+                    failed.append(blocks[k])
+        return failed
 
     def _keep(self, results: Mapping[int, BlockResult]) -> None:
         self.journal.keep({str(block): result for block, result in results.items()})
@@ -371,14 +371,14 @@ def _check_noise(setup: StudySetup, sample: Any, name: str, path: KeyPath) -> No
     InputError
         The key is that of a total standard deviation.
     """
-    place = max((k for k, part in enumerate(path) if isinstance(part, str)), default=0)
-    named = str(path[place])
-    own = (*path[:place], f"{named.removesuffix(TOTAL)}{NOISE}", *path[place + 1 :])
+    index = max((k for k, part in enumerate(path) if isinstance(part, str)), default=0)
+    named = str(path[index])
+    noise_path = (*path[:index], f"{named.removesuffix(TOTAL)}{NOISE}", *path[index + 1 :])
     if named.endswith(NOISE):
         return
     try:
-        base_job.leaf(sample, own)
+        base_job.leaf(sample, noise_path)
     except Problem:
         return
-    text = "not the noise alone, which stands beside it"
-    raise setup.error(Problem(text, key_text(path), key_text(own)), ("responses", name, "noise"))
+    text = "not the standard deviation by noise alone, which is beside it"
+    raise setup.error(Problem(text, key_text(path), key_text(noise_path)), ("responses", name, "noise"))

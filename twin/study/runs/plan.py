@@ -203,11 +203,11 @@ def ratios(factor: FactorSpec, tree: Tree, values: np.ndarray, unit: str) -> dic
     out = {}
     for k, scale in enumerate(factor.scales):
         with np.errstate(all="ignore"):
-            found = np.power(np.asarray(values, np.float64) / _nominal(factor, tree, unit), scale.power)
-        if not np.all(np.isfinite(found)):
-            shortage = f"power {scale.power:g} of a ratio of {values[np.argmin(np.isfinite(found))]:g}"
+            multipliers = np.power(np.asarray(values, np.float64) / _nominal(factor, tree, unit), scale.power)
+        if not np.all(np.isfinite(multipliers)):
+            shortage = f"power {scale.power:g} of a ratio of {values[np.argmin(np.isfinite(multipliers))]:g}"
             raise Problem("no such number", shortage, "values greater than zero", within=("scales", k, "power"))
-        out[scale.key] = found
+        out[scale.key] = multipliers
     return out
 
 
@@ -217,7 +217,7 @@ def _nominal(factor: FactorSpec, tree: Tree, unit: str) -> float:
         return 1.0
     number = number_at(tree, factor.places[0], unit)
     if number == 0.0:
-        raise Problem("nothing to compare it with", "zero in the base", "scales in a factor without a key")
+        raise Problem("a ratio to zero is not defined", "zero in the base", "scales in a factor without a key")
     return number
 
 
@@ -244,9 +244,9 @@ def number_at(base: Tree, place: KeyPath, unit: str) -> float:
         value = None
     number = None if value is None else number_in(value, unit)
     if number is None:
-        found = "nothing" if value is None else f"{shown(value)} in the base"
+        shown_value = "nothing" if value is None else f"{shown(value)} in the base"
         allowed = "a number like the factor's, which the base's file states"
-        raise Problem("the base has no number here to start from", found, allowed)
+        raise Problem("the base has no number here to start from", shown_value, allowed)
     return number
 
 
@@ -373,8 +373,8 @@ class Plan:
                     base[scale.key] = number_of(leaf(self.setup.tree, scale.key))
                 except Problem as problem:
                     raise self.setup.error(problem, ("factors", column.name, "scales", k, "key")) from None
-            for place, found in self._ratios(column, column.values).items():
-                ratio[place] = ratio[place] * found if place in ratio else found
+            for place, multipliers in self._ratios(column, column.values).items():
+                ratio[place] = ratio[place] * multipliers if place in ratio else multipliers
         return Scaling(base, ratio)
 
     def _ratios(self, column: Column, values: np.ndarray) -> dict[KeyPath, np.ndarray]:
@@ -415,8 +415,10 @@ class Plan:
             factor = self.setup.study.factors[column.name]
             for value in _telling(column, extremes(factor)):
                 cell = with_unit(value, column.unit) if column.unit else value
-                found = self._ratios(column, np.array([value]))
-                follow = [(place, scaled(self.scaling.base[place], float(ratio[0]))) for place, ratio in found.items()]
+                multipliers = self._ratios(column, np.array([value]))
+                follow = [
+                    (place, scaled(self.scaling.base[place], float(ratio[0]))) for place, ratio in multipliers.items()
+                ]
                 self._check_value(column.name, [*((place, cell) for place in factor.places), *follow])
 
     def _check_value(self, name: str, values: list[tuple[Any, Any]]) -> None:
@@ -443,7 +445,7 @@ def _column(setup: StudySetup, name: str, sampled: np.ndarray) -> Column:
     if all(isinstance(value, bool) for value in scalars):
         return Column(name, "", np.array(scalars, bool)[sampled])
     if not all(isinstance(value, str) for value in scalars):
-        problem = Problem("values of different sorts", None, "all numbers, all quantities, or all texts")
+        problem = Problem("values of different types", None, "all numbers, all quantities, or all texts")
         raise setup.error(problem, ("factors", name, factor.kind))
     return Column(name, "", np.array(scalars, np.str_)[sampled])
 
@@ -487,7 +489,7 @@ def study_bytes(setup: StudySetup, runs: int) -> float:
         Number of runs.
     """
     responses = setup.study.responses.values()
-    columns = _KEPT + len(setup.study.factors) + sum(1 + len(one.sigma_keys) for one in responses)
+    columns = _KEPT + len(setup.study.factors) + sum(1 + len(response.sigma_keys) for response in responses)
     return STARTED + CELL * columns * runs
 
 

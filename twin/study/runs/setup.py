@@ -70,7 +70,9 @@ class StudySetup:
         study["base"] = {"command": self.study.base.command}
         # in their order: what is drawn for a factor, and the column of a response, go by their numbers
         study["factors"] = list(study["factors"].items())
-        study["responses"] = [{k: v for k, v in one.items() if k != "unit"} for one in study["responses"].values()]
+        study["responses"] = [
+            {k: v for k, v in response.items() if k != "unit"} for response in study["responses"].values()
+        ]
         content = json.dumps([study, self.base, self.job.block], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()
 
@@ -83,8 +85,8 @@ class StudySetup:
         """Return an error at ``key`` of the study."""
         if isinstance(problem, str):
             return self.study.error(problem, key, allowed=allowed)
-        told = Issue(problem.problem, "", None, (), problem.found, problem.allowed, problem.suggestion)
-        return InputError(self._placed(told, (*key, *problem.within)))
+        issue = Issue(problem.problem, "", None, (), problem.found, problem.allowed, problem.suggestion)
+        return InputError(self._placed(issue, (*key, *problem.within)))
 
     def _placed(self, issue: Issue, key: KeyPath) -> Issue:
         """Return the issue placed at ``key`` of the study."""
@@ -95,9 +97,9 @@ class StudySetup:
         """Return name and key of the factor that changes ``place`` of the base, or something above or below it."""
         for name, factor in self.study.factors.items():
             scaled = [(scale.key, ("scales", k)) for k, scale in enumerate(factor.scales)]
-            for own, where in (*((p, factor.key_of(k)) for k, p in enumerate(factor.places)), *scaled):
-                n = min(len(own), len(place))
-                if own[:n] == tuple(place)[:n]:
+            for changed, where in (*((p, factor.key_of(k)) for k, p in enumerate(factor.places)), *scaled):
+                n = min(len(changed), len(place))
+                if changed[:n] == tuple(place)[:n]:
                     return name, ("factors", name, *where)
         return None
 
@@ -105,10 +107,10 @@ class StudySetup:
         """Return an error in the base's tree placed at the factor that caused it; other errors unchanged."""
         issues = []
         for issue in error.issues:
-            found = self.factor_at((*prefix, *issue.key))
-            if found is not None:
+            factor = self.factor_at((*prefix, *issue.key))
+            if factor is not None:
                 text = f"{issue.problem} (at {key_text(issue.key)} of the base)"
-                issue = self._placed(replace(issue, problem=text), found[1])
+                issue = self._placed(replace(issue, problem=text), factor[1])
             issues.append(issue)
         return InputError(*issues)
 
@@ -220,7 +222,7 @@ def _inherited(base: Tree, place: KeyPath) -> bool:
     if place[:2] != ("job", "perturb") or place[3:4] != ("temperature",):
         return False
     perturb, node = base["job"].get("perturb", {}), str(place[2])
-    warmed = {path for path, what in perturb.items() if "temperature" in what}
+    warmed = {path for path, perturbation in perturb.items() if "temperature" in perturbation}
     warmed |= set(base["job"].get("course", {}).get("temperature", {}))
     return node not in warmed and any(node.startswith(f"{path}/") for path in warmed)
 
@@ -228,7 +230,7 @@ def _inherited(base: Tree, place: KeyPath) -> bool:
 def _refuse_names(study: StudySpec, place: KeyPath) -> None:
     """Raise Problem for a factor that would change the name of a file that has already been read."""
     if study.base.command == "render" and place[:1] == ("job",) and place[1:2] and place[1] in BY_NAME:
-        text = "the file that stands here has been read, its contents are what can be varied"
+        text = "this file has already been read, vary its contents instead"
         raise Problem(text, key_text(place), f"a key that begins with {place[1]}, without job", within=(0,))
     if "deformation" in place:
         text = "a table of displaced nodes is part of the base, and a study does not vary it"
