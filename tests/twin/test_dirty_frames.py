@@ -133,7 +133,7 @@ def test_too_little_of_a_spot_is_refused(bench, monkeypatch):
     template, detector, noise = bench
     drawn = draw(template, detector, (), 5)
     drawn.after[drawn.after > 0.03 * detector.max_dn] = detector.max_dn
-    monkeypatch.setattr(channel_measurement, "_DEAREST", 1.0)
+    monkeypatch.setattr(channel_measurement, "_MOST_GROWTH", 1.0)
     with one_blas_thread():
         work = measurement(drawn, template, noise)
         assert work.search() == []
@@ -323,7 +323,11 @@ def test_four_times_the_noise_is_noise(bench, learnt):
                 # of all noise, of which that of the light and the converter is as stated
                 assert 3.4 < spot.noise_ratio < 4.0
                 assert spot.fits
-                assert not {finding.kind for finding in spot.findings} & {"cosmic rays", "corrupted frames", "bad pixels"}
+                assert not {finding.kind for finding in spot.findings} & {
+                    "cosmic rays",
+                    "corrupted frames",
+                    "bad pixels",
+                }
             error = (work.positions[1].position - work.positions[0].position)[0] - drawn.shift
             total += float(error @ np.linalg.solve(work.shift_covariance(1)[0], error))
             widened.append(work.shift_covariance(1)[0, 0, 0])

@@ -36,7 +36,7 @@ from twin.path_tracing.stray_light import monitor_families, pinhole, trace_stray
 from twin.path_tracing.tracer import (
     BALANCED,
     FAINT,
-    LEAST_ALONG,
+    LEAST_NOMINAL,
     VARIANTS,
     PathTracer,
     Sampling,
@@ -131,7 +131,7 @@ def test_impossible_sampling_sources_and_scenes_are_refused(backend) -> None:
         (lambda: PathTracer(backend, alone).run(rays, 3), "a list of rays is traced as a whole"),
         (lambda: PathTracer(backend, Scenery((*glass[:3], surface, *glass[3:]), (grid,))), "do not follow each other"),
         (lambda: PathTracer(backend, Scenery((wavy, surface), (grid,))), "takes 3 aspheric terms, found 4"),
-        (lambda: Scenery((surface, surface), (grid,)), "surfaces of the same name: "),
+        (lambda: Scenery((surface, surface), (grid,)), "several surfaces have the same name: "),
         (lambda: Scenery((surface,), ()), "unknown detectors: far"),
         (lambda: PathTracer(backend, alone, {"near": ()}), "unknown detectors: near; detectors of the scene: far"),
         (lambda: PathTracer(backend, Scenery(*zip(*many, strict=True))), "256 detectors: at most 255 of each"),
@@ -264,7 +264,7 @@ def test_a_second_grid_on_other_samples_is_refused() -> None:
 # --- paths along nominal light, surface by surface --------------------------------------------------------------------
 
 
-PATHS, FEW = LEAST_ALONG, 20_000
+PATHS, FEW = LEAST_NOMINAL, 20_000
 ALL = replace(FAINT, first=0.0)
 """Every path that turns away is followed."""
 MOVED = {

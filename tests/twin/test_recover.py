@@ -125,7 +125,7 @@ def test_frames_of_different_sizes_say_where_they_begin(run, images, backend, tm
         return f"{HEAD}frames:\n  {channel.key}: {{before: {before}, after: {files}{more}}}\n{others}"
 
     for more in ("", ", offset: [0, 0]"):
-        with pytest.raises(InputError, match="nothing says where they begin"):
+        with pytest.raises(InputError, match="their offset is not specified"):
             measured(tmp_path, text(more), backend, run)
     found = measured(tmp_path, text(", offset_after: [8, 8]"), backend, run)
     np.testing.assert_allclose(found.last.recovery.after, run.recovery.after, atol=0.01)
@@ -230,11 +230,11 @@ def burnt(frames):
     quick(
         9,
         [
-            (no_spot, "no spot", "the right file, with the light on"),
-            (at_the_edge, "too near the edge", "10 pixels or more inside"),
+            (no_spot, "no spot", "the correct file, with the light on"),
+            (at_the_edge, "too near the edge", "at least 10 pixels from the edge"),
             (half_dark, "6 of 9 frames contain less than half of the light", "with the light on"),
             (burnt, "too much of the spot is missing (saturation", "less light"),
-            (lambda f: f[:, :20], "frames of 20 x 96 pixels", "24 rows and columns or more"),
+            (lambda f: f[:, :20], "frames of 20 x 96 pixels", "at least 24 rows and columns"),
             (
                 lambda f: np.pad(f, ((0, 0), (0, 9), (0, 0))),
                 "do not lie on the CCD of 96 x 96 pixels",
@@ -246,7 +246,7 @@ def burnt(frames):
                 "offset_after: [ROW, COLUMN]",
             ),
             (lambda f: f * 4, "all multiples of 4; the converter of monitor_ccd", "divided by 4"),
-            (lambda f: np.where(f == f.max(), 16384, f), "grey values up to 16384", "the right `detector`"),
+            (lambda f: np.where(f == f.max(), 16384, f), "grey values up to 16384", "the correct `detector`"),
             (lambda f: np.stack([f, f, f], -1), "colours", "raw frames of a CCD"),
             (lambda f: np.where(f == f.max(), 1e30, f), "grey values up to 1e+30", "at most 4.29497e+09"),
         ],
@@ -409,7 +409,7 @@ def test_files_that_are_no_raw_frames_are_refused(tmp_path):
     test = SimpleNamespace(error=lambda text, key, allowed=None: InputError(Issue(text, allowed=allowed)))
     for names, told in (
         (("a.tif", "b.tif"), "have frames of different sizes, 30 x 30 and 32 x 30"),
-        (("turned.tif",), "is stored turned or mirrored"),
+        (("turned.tif",), "is stored rotated or mirrored"),
         (("none.tif",), "there is no image"),
         (("coded.png",), "it is marked as sRGB, which is not linear in light"),
     ):
@@ -444,7 +444,7 @@ def test_a_file_that_the_disk_does_not_give_is_told(tmp_path, monkeypatch):
     test = SimpleNamespace(error=lambda text, key, allowed=None: InputError(Issue(text, allowed=allowed)))
     measured_frames._stacked(test, (str(tmp_path / "a.tif"),), ("frames",))
     monkeypatch.setattr(measured_frames.ImageFile, "pages", broken)
-    with pytest.raises(InputError, match=r"a\.tif: Input/output error; allowed: a file that can be read"):
+    with pytest.raises(InputError, match=r"a\.tif: Input/output error; allowed: a readable file"):
         measured_frames._stacked(test, (str(tmp_path / "a.tif"),), ("frames",))
 
 

@@ -32,7 +32,7 @@ from twin.main_job.render_folder import (
     IRRADIANCE,
     SCENE,
     SUMMARY,
-    _tried,
+    _attempt,
     drawings,
     instrument_drawings,
     limits_drawing,
@@ -101,8 +101,8 @@ def no_font(*_):
 
 
 def test_a_drawing_that_fails_is_a_note_and_a_file_that_fails_is_left_out():
-    made = {"motions": "<svg>1</svg>", "side": _tried("side", no_font), SUMMARY: _tried(SUMMARY, no_font)}
-    drawn, missing = without_failed(made | {SCENE: _tried(SCENE, bytes)})
+    made = {"motions": "<svg>1</svg>", "side": _attempt("side", no_font), SUMMARY: _attempt(SUMMARY, no_font)}
+    drawn, missing = without_failed(made | {SCENE: _attempt(SCENE, bytes)})
     assert missing == tuple(
         f"{what} could not be drawn: RuntimeError: no such font <x>"
         for what in ("the figure 'side'", "the file summary.png")
@@ -125,7 +125,7 @@ def test_all_that_is_drawn_can_be_sent_to_the_second_process(computed):
 @pytest.mark.second
 def test_what_cannot_be_drawn_costs_nothing_else(ready, tmp_path, monkeypatch):
     """A file that cannot be drawn is not there; all else is, and exit code and manifest say so."""
-    monkeypatch.setattr(twin.main_job.render_folder, "drawings", lambda _: {SUMMARY: partial(_tried, SUMMARY, no_font)})
+    monkeypatch.setattr(twin.main_job.render_folder, "drawings", lambda _: {SUMMARY: partial(_attempt, SUMMARY, no_font)})
     done = run(EXAMPLE, "--out", tmp_path / "run", "--frames", FRAMES, "--quiet")
     told = "the file summary.png could not be drawn: RuntimeError: no such font <x>"
     assert (done.exit_code, told in " ".join(done.stderr.split())) == (1, True)

@@ -90,7 +90,7 @@ def test_crosstalk_explains_the_systematic_residuals(run):
     *_, moved = residual_section(run, {"residuals": "<svg></svg>"}).artefacts
     assert isinstance(moved, Text)
     forward, backward = moved.points
-    assert forward.startswith("forward: moved outside the family: ")
+    assert forward.startswith("forward: motions outside the family: ")
     assert "M2 along Z, 3 µm" in forward
     assert "tilt" in backward
     assert "in no row of the table" not in forward

@@ -16,7 +16,7 @@ from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.spot_positions import difference_covariance
 from scenes.models.disturbances import state_of
 from twin.main_job import systematics
-from twin.main_job.systematics import BLIND
+from twin.main_job.systematics import UNNOTICED_SIGMAS
 from twin.main_job.verdict import recovered_numbers
 from twin.monitor.image_sampling import WRONG
 from twin.monitor.observation import StateReader
@@ -236,7 +236,7 @@ def test_no_false_alarm_in_200_clean_runs(orbit) -> None:
                 sigma = posterior_sigma(rows, known, own_noise)
                 for own in bodies:
                     wrong = (amounts / stated.sigma)[:, own] @ error[:, own].T
-                    bad |= np.any(np.abs(wrong) > BLIND * sigma, axis=1)
+                    bad |= np.any(np.abs(wrong) > UNNOTICED_SIGMAS * sigma, axis=1)
             alarms += int(np.count_nonzero(bad))
             runs += each
     assert runs == 200

@@ -299,5 +299,5 @@ def test_disturbances_that_change_no_camera_leave_nothing_to_measure(monkeypatch
     monkeypatch.setattr(coverage, "MonitorExperiment", lambda *given: experiment)
     monkeypatch.setattr(coverage, "expected_covariance", lambda *given: None)
     monkeypatch.setattr(coverage, "find_limits", lambda *given, **more: None)
-    with pytest.raises(InputError, match="nothing that is stated to move changes a camera"):
+    with pytest.raises(InputError, match="no disturbance of the prior changes a camera"):
         coverage.run_uncertainty(experiment.resolved, load_backend())

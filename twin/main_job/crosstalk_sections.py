@@ -73,16 +73,18 @@ def _pretty(parts: list[str], labels: set[str], keep: bool = False) -> str:
 def _motions(run: RenderRun) -> Table:
     """Return the table with spot shifts, true change and reading of every estimator per unit of each motion."""
     pitch = 1e6 * run.experiment.path.pitch
-    places = list(dict.fromkeys(place for table in run.crosstalk.values() for place in table.coordinates))
-    heads = ["camera", "motion", "body", "per", *(f"{place} [µm]" for place in places)]
+    coordinates = list(
+        dict.fromkeys(coordinate for table in run.crosstalk.values() for coordinate in table.coordinates)
+    )
+    heads = ["camera", "motion", "body", "per", *(f"{coordinate} [µm]" for coordinate in coordinates)]
     readers = ("true", *(estimator.title for estimator in run.estimators.values()))
     heads += [f"{p.label} {reader}" for reader in readers for p in parameters.CAMERA_PARAMETERS.values()]
     rows: list[list[Cell]] = []
     for name, table in run.crosstalk.items():
         for k, motion in enumerate(table.motions):
             row: list[Cell] = [name, motion.label, motion.body, unit_for_reports(motion.unit)]
-            moved = dict(zip(table.coordinates, table.spot_shift[:, k], strict=True))
-            row += [float(moved[place]) * pitch if place in moved else None for place in places]
+            shifts = dict(zip(table.coordinates, table.spot_shift[:, k], strict=True))
+            row += [float(shifts[coordinate]) * pitch if coordinate in shifts else None for coordinate in coordinates]
             row += [float(true) for true in table.true[:, k]]
             for estimator in run.estimators:
                 row += [float(reading) for reading in table.readings[estimator][:, k]]
@@ -166,19 +168,22 @@ def formula_section(run: RenderRun) -> Section:
         "Each printed formula is evaluated with the traced spot shifts of the motion for which it was derived. A "
         "factor of 1 means that the formula is correct."
     )
-    every = {name: table.factors for name, table in run.crosstalk.items()}
+    factors_by_camera = {name: table.factors for name, table in run.crosstalk.items()}
     symbols = {p.key: p.symbol for p in parameters.CAMERA_PARAMETERS.values()}
     rows: list[list[Cell]] = []
-    for same in zip(*every.values(), strict=True):
-        row: list[Cell] = [f"{symbols[same[0].parameter]}, {same[0].formula}", same[0].motion]
-        for name, f in zip(every, same, strict=True):
+    for factors_of_formula in zip(*factors_by_camera.values(), strict=True):
+        row: list[Cell] = [
+            f"{symbols[factors_of_formula[0].parameter]}, {factors_of_formula[0].formula}",
+            factors_of_formula[0].motion,
+        ]
+        for name, f in zip(factors_by_camera, factors_of_formula, strict=True):
             for which in ("by_model", "by_truth"):
                 key = f"factor.{name}.{f.estimator}.{f.parameter}.{which}"
                 row.append(Marked(fixed(float(getattr(f, which)), 4), "", "number", key))
         rows.append(row)
     full: list[list[Cell]] = [
         [name, f.formula, f.parameter, f.motion, float(f.by_model), float(f.by_truth)]
-        for name, factors in every.items()
+        for name, factors in factors_by_camera.items()
         for f in factors
     ]
     heads = ["camera", "formula", "parameter", "motion", "of the paper's model", "of the real camera"]
@@ -186,14 +191,14 @@ def formula_section(run: RenderRun) -> Section:
         "factors",
         "Reading divided by the change",
         "",
-        ("Formula", "Motion", *("of the paper's model", "of the real camera") * len(every)),
+        ("Formula", "Motion", *("of the paper's model", "of the real camera") * len(factors_by_camera)),
         rows,
-        over=(("", 2), *((name, 2) for name in every)),
+        over=(("", 2), *((name, 2) for name in factors_by_camera)),
         within=IN_PAGE,
         full=Table("factors", "Factors", "", heads, full),
     )
     texts: dict[str, list[str]] = {}
-    for name in every:
+    for name in factors_by_camera:
         texts.setdefault(_factor_text(run, name), []).append(name)
     points = (
         "The factor of the paper's model divides by the change of a thin lens (shift/f, the rotation, scale × f). That "
@@ -211,7 +216,7 @@ def _factor_text(run: RenderRun, name: str) -> str:
     """Return a sentence with the numbers that explain a camera's factors."""
     geometry, factors = run.experiment.geometry(name), run.crosstalk[name].factors
     f, f_x = geometry.principal_distance_m, geometry.principal_distance_across_m or geometry.principal_distance_m
-    by_model = {(one.estimator, one.parameter): float(one.by_model) for one in factors}
+    by_model = {(factor.estimator, factor.parameter): float(factor.by_model) for factor in factors}
     beta, alpha = geometry.field_beta_rad, geometry.field_alpha_rad
     return (
         f"the printed Δγ, eq. (5), reads {fixed(by_model['paper_single', 'd_gamma_arcsec'], 3)} times the rotation "

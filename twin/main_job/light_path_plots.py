@@ -75,8 +75,8 @@ def _colours(instrument: Instrument) -> dict[str, str]:
 
 def _seen(instrument: Instrument, camera: str) -> list[Channel]:
     """Return the channels that the side view shows: those at +Y, which hide those at -Y, or all if none is at +Y."""
-    own = [c for c in instrument.channels if c.camera == camera]
-    return [c for c in own if c.ccd[1] > 0.0] or own
+    channels = [c for c in instrument.channels if c.camera == camera]
+    return [c for c in channels if c.ccd[1] > 0.0] or channels
 
 
 def _camera_side(axes: Axes, instrument: Instrument, paths: LightPaths, camera: str) -> None:
@@ -132,22 +132,22 @@ def _prisms(axes: Axes, instrument: Instrument, paths: LightPaths) -> None:
         outline = _outline(solid, paths)
         axes.add_patch(Polygon(outline, closed=True, fc=_fill(solid), ec="none", zorder=1.6))
         axes.add_patch(Polygon(outline, closed=True, fill=False, ec=svg.INK, lw=0.8, zorder=3))
-        what = "prism" if solid.transparent else "mirrors"
+        kind = "prism" if solid.transparent else "mirrors"
         if solid.path == CENTRAL_PRISM:
             middle = 0.5 * (outline[:, 0].min() + outline[:, 0].max())
             _label(axes, "central prism", np.array([middle, outline[:, 1].min()]), (0, -4), "top")
         elif prism_of(solid.path) == PRISM_0:
-            small.append((outline, what))
+            small.append((outline, kind))
         elif solid.path in labelled:
-            large.setdefault(labelled[solid.path], []).append((outline[np.argmax(outline[:, 1])], what))
-    for found in large.values():
-        what = "prisms" if {what for _, what in found} == {"prism"} and len(found) > 1 else found[0][1]
-        _label(axes, f"180° {what}", max((top for top, _ in found), key=lambda top: float(top[1])), (0, 5), "bottom")
+            large.setdefault(labelled[solid.path], []).append((outline[np.argmax(outline[:, 1])], kind))
+    for tops in large.values():
+        kind = "prisms" if {kind for _, kind in tops} == {"prism"} and len(tops) > 1 else tops[0][1]
+        _label(axes, f"180° {kind}", max((top for top, _ in tops), key=lambda top: float(top[1])), (0, 5), "bottom")
     if not small:
         return
     corners = np.concatenate([outline for outline, _ in small])
     among = np.array([np.mean([outline[:, 0].mean() for outline, _ in small]), corners[:, 1].max()])
-    names = {"prisms" if what == "prism" else what for _, what in small}
+    names = {"prisms" if kind == "prism" else kind for _, kind in small}
     _label(axes, f"0° {' and '.join(sorted(names))}", among, (0, 6), "bottom")
 
 
@@ -217,13 +217,13 @@ MOST_COLUMNS = 5
 def footprints_svg(instrument: Instrument, paths: LightPaths) -> str:
     """Draw the footprints of the beams on each mirror, in millimetres of its frame, one or more rows per camera."""
     with svg.look("footprints"):
-        shown = [
+        mirrors = [
             (camera, name)
             for camera, model in instrument.cameras.items()
             for name, mirror in model.spec.mirrors.items()
             if mirror.light != "passes"
         ]
-        counts = [sum(one == camera for one, _ in shown) for camera in instrument.cameras]
+        counts = [sum(camera_name == camera for camera_name, _ in mirrors) for camera in instrument.cameras]
         columns = min(max(counts), MOST_COLUMNS)
         lines = [-(-count // columns) for count in counts]
         figure = svg.new_figure(0.7 + 3.0 * sum(lines))
@@ -231,7 +231,7 @@ def footprints_svg(instrument: Instrument, paths: LightPaths) -> str:
         for axes in grid.flat:
             axes.set_axis_off()
         for first, camera in zip(np.cumsum([0, *lines[:-1]]), instrument.cameras, strict=True):
-            for k, mirror in enumerate(name for one, name in shown if one == camera):
+            for k, mirror in enumerate(name for camera_name, name in mirrors if camera_name == camera):
                 axes = grid[first + k // columns, k % columns]
                 axes.set_axis_on()
                 _footprints(axes, instrument, paths, camera, mirror)

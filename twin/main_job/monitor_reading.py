@@ -24,7 +24,7 @@ from twin.framework.provenance import SelfCheck
 from twin.monitor.crosstalk import CameraCrosstalk, estimator_gains
 from twin.monitor.reading_table import ReadingTable, reading_table
 from twin.monitor.truth import Truth
-from twin.uncertainty.monitor_limits import short_text, unseen_texts
+from twin.uncertainty.monitor_limits import short_text, unobserved_texts
 
 
 @shows("cameras", "frames", "centroid", "recovery")
@@ -67,7 +67,7 @@ class MonitorReading:
     crosstalk: Mapping[str, CameraCrosstalk]
     frames: int
     centroid: str
-    found_wrong: tuple[str, ...] = ()
+    earlier_doubts: tuple[str, ...] = ()
     truth: Truth | None = None
     together: int = 1
 
@@ -98,18 +98,19 @@ class MonitorReading:
         They are spots that differ from their calibration, readings that are not linear and cannot be relinearised, and
         shifts that contradict the prior.
         """
-        out = list(self.found_wrong)
+        texts = list(self.earlier_doubts)
         evidence = self.recovery.evidence
-        told = None if evidence is None else evidence.doubt(0, ["/".join(channel) for channel in self.channels])
-        if told is not None and not out:
-            out.append(told.text)
-        for name, found in self.recovery.curvature.items():
-            if not found.holds[0]:
-                out.append(
+        doubt = None if evidence is None else evidence.doubt(0, ["/".join(channel) for channel in self.channels])
+        if doubt is not None and not texts:
+            texts.append(doubt.text)
+        for name, curvature in self.recovery.curvature.items():
+            if not curvature.holds[0]:
+                texts.append(
                     f"σ does not hold: the motions read by the {self.estimators[name].title} are too large for a "
-                    f"linear estimate, and the estimated state cannot be retraced ({self._off(name)}); readings are linear"
+                    f"linear estimate, and the estimated state cannot be retraced ({self._error_text(name)}); "
+                    "readings are linear"
                 )
-        return (*out, *self.contradiction)
+        return (*texts, *self.contradiction)
 
     @property
     def contradiction(self) -> tuple[str, ...]:
@@ -121,20 +122,20 @@ class MonitorReading:
         """Readings that were relinearised because they are not linear, as sentences without full stops."""
         return tuple(
             f"the motions read by the {self.estimators[name].title} are too large for a linear estimate "
-            f"({self._off(name)} against the retraced state): its readings are iterated by the Gauss-Newton method"
-            for name, found in self.recovery.curvature.items()
-            if found.beyond[0] and found.holds[0]
+            f"({self._error_text(name)} against the retraced state): its readings are Gauss-Newton iterates"
+            for name, curvature in self.recovery.curvature.items()
+            if curvature.beyond[0] and curvature.holds[0]
         )
 
     @cached_property
     def unseen(self) -> tuple[str, ...]:
         """Warnings of bodies whose motions hardly move the spots but contribute to sigma, without full stops."""
-        stated, noise = self.disturbances, self.recovery.shift_covariance[0]
-        if stated is None or not np.any(noise):
+        prior, noise = self.disturbances, self.recovery.shift_covariance[0]
+        if prior is None or not np.any(noise):
             return ()
-        return unseen_texts(stated, noise, self._quantities, self.gains[self.judged])
+        return unobserved_texts(prior, noise, self._quantities, self.gains[self.judged])
 
-    def _off(self, name: str) -> str:
+    def _error_text(self, name: str) -> str:
         """Return the quantity whose linear reading departs most from the retraced state, and by how much, as text."""
         worst, size = self.recovery.curvature[name].worst()
         if not math.isfinite(size):
@@ -156,16 +157,16 @@ class MonitorReading:
 
         None for a quantity that no motion of the prior changes. Empty without a prior and without noise.
         """
-        stated, noise = self.disturbances, self.recovery.shift_covariance[0]
-        if stated is None or not np.any(noise):
+        prior, noise = self.disturbances, self.recovery.shift_covariance[0]
+        if prior is None or not np.any(noise):
             return {}
         rows = np.stack([quantity.row for quantity in self._quantities])
-        left, unseen = (posterior_sigma(rows, stated, spread) for spread in (noise, 0.0 * noise))
+        with_noise, without_noise = (posterior_sigma(rows, prior, spread) for spread in (noise, 0.0 * noise))
         out: dict[str, dict[str, float | None]] = {}
-        without = unchanged_quantities(stated, self.cameras, self.ground)
-        for quantity, sigma, alone in zip(self._quantities, left, unseen, strict=True):
-            share = round(min(float(alone / sigma) ** 2, 1.0) if sigma > 0.0 else 0.0, SHARE)
-            missing = (quantity.group, quantity.key) in without
+        unchanged = unchanged_quantities(prior, self.cameras, self.ground)
+        for quantity, sigma, noise_free in zip(self._quantities, with_noise, without_noise, strict=True):
+            share = round(min(float(noise_free / sigma) ** 2, 1.0) if sigma > 0.0 else 0.0, SHARE_DECIMALS)
+            missing = (quantity.group, quantity.key) in unchanged
             out.setdefault(quantity.group, {})[quantity.key] = None if missing else share
         return out
 
@@ -178,11 +179,11 @@ class MonitorReading:
         """
         if self.disturbances is None or not np.any(self.recovery.shift_covariance):
             return None
-        found, others = self.recovery, self.any_motions(self.disturbances)
+        recovery, candidates = self.recovery, self.any_motions(self.disturbances)
         rate = FALSE_ALARM / self.together
-        return consistency(found.shift[0], found.shift_covariance[0], self.disturbances, others, rate)
+        return consistency(recovery.shift[0], recovery.shift_covariance[0], self.disturbances, candidates, rate)
 
-    def any_motions(self, stated: Disturbances) -> dict[str, np.ndarray]:
+    def any_motions(self, prior: Disturbances) -> dict[str, np.ndarray]:
         """Return the response of all spots to the motions of each body, in the prior or not.
 
         Parameters
@@ -197,11 +198,11 @@ class MonitorReading:
         """
         columns: dict[tuple[str, str, int], np.ndarray] = {}
         for name, table in self.crosstalk.items():
-            own = [2 * i + axis for i, (camera, _) in enumerate(self.channels) if camera == name for axis in (0, 1)]
-            for motion, moved in zip(table.motions, table.spot_shift.T, strict=True):
+            rows = [2 * i + axis for i, (camera, _) in enumerate(self.channels) if camera == name for axis in (0, 1)]
+            for motion, shifts in zip(table.motions, table.spot_shift.T, strict=True):
                 # a body that both cameras see is in both tables
                 key = (motion.body, motion.kind, motion.axis)
-                columns.setdefault(key, np.zeros(len(stated.spots)))[own] = moved
+                columns.setdefault(key, np.zeros(len(prior.spots)))[rows] = shifts
         bodies = dict.fromkeys(body for body, _, _ in columns)
         return {b: np.stack([c for (body, _, _), c in columns.items() if body == b], axis=1) for b in bodies}
 
@@ -217,12 +218,12 @@ class MonitorReading:
         covariance : (T, 2 C, 2 C) ndarray
             Covariance of the shifts, in px^2.
         """
-        stated, false_alarm = self.disturbances, FALSE_ALARM / len(shifts)
-        if stated is None:
+        prior, false_alarm = self.disturbances, FALSE_ALARM / len(shifts)
+        if prior is None:
             return None
-        worst = int(np.argmax(chi_squares(shifts, covariance, stated)))
-        others = self.any_motions(stated)
-        return worst, consistency(shifts[worst], covariance[worst], stated, others, false_alarm=false_alarm)
+        worst = int(np.argmax(chi_squares(shifts, covariance, prior)))
+        candidates = self.any_motions(prior)
+        return worst, consistency(shifts[worst], covariance[worst], prior, candidates, false_alarm=false_alarm)
 
     @property
     def checks(self) -> Iterator[SelfCheck]:
@@ -232,17 +233,19 @@ class MonitorReading:
             yield from _fits("spots before", evidence.before)
             yield from _fits("spots after", evidence.after)
         if self.consistency is not None:
-            yield stated_check("shifts against the prior on disturbances", self.consistency)
-        for name, found in self.recovery.curvature.items():
-            size = found.worst()[1]
+            yield prior_check("shifts against the prior on disturbances", self.consistency)
+        for name, curvature in self.recovery.curvature.items():
+            size = curvature.worst()[1]
             if math.isfinite(size):
-                done = "relinearised" if found.beyond[0] and found.holds[0] else "linear"
-                says = f"readings are {done}; above {NONLINEAR_SIGMAS:g} sigma relinearised, else sigma does not hold"
-                yield SelfCheck(f"linear readings of {name} against the retraced state", size, None, "sigma", says)
+                state = "relinearised" if curvature.beyond[0] and curvature.holds[0] else "linear"
+                meaning = (
+                    f"readings are {state}; above {NONLINEAR_SIGMAS:g} sigma relinearised, else sigma does not hold"
+                )
+                yield SelfCheck(f"linear readings of {name} against the retraced state", size, None, "sigma", meaning)
 
     def recovered_dict(self) -> dict[str, Any]:
         """Return the contents of recovered.json."""
-        read = self.table.groups()
+        groups = self.table.groups()
         spots: dict[str, Any] = {}
         r = self.recovery
         fits = (None, None) if r.evidence is None else (r.evidence.before, r.evidence.after)
@@ -253,7 +256,12 @@ class MonitorReading:
             }
         share, retraced = self.from_statement, {name: self._retraced(name) for name in r.curvature}
         return {
-            **{"cameras": read.pop("cameras"), "spots": spots, **read, "disturbances": self._stated(self.consistency)},
+            **{
+                "cameras": groups.pop("cameras"),
+                "spots": spots,
+                **groups,
+                "disturbances": self._stated(self.consistency),
+            },
             **({"from_statement": share} if share else {}),
             **({"retraced": retraced} if retraced else {}),
             **{"sigma_holds": self.sigma_holds, "doubts": list(self.doubts)},
@@ -262,29 +270,33 @@ class MonitorReading:
 
     def _retraced(self, name: str) -> dict[str, Any]:
         """Return the comparison of an estimator's readings with the trace of the state that they describe."""
-        found = self.recovery.curvature[name]
-        worst, size = found.worst()
+        curvature = self.recovery.curvature[name]
+        worst, size = curvature.worst()
         quantity = self._quantities[worst]
         return {
-            "off_in_sigma": round(size, OFF) if math.isfinite(size) else None,
+            "off_in_sigma": round(size, OFF_DECIMALS) if math.isfinite(size) else None,
             "of": quantity.name if size >= 1.0 else "",
-            "relinearised": bool(found.beyond[0] and found.holds[0]),
-            "holds": bool(found.holds[0]),
+            "relinearised": bool(curvature.beyond[0] and curvature.holds[0]),
+            "holds": bool(curvature.holds[0]),
         }
 
-    def _stated(self, found: Consistency | None) -> dict[str, Any]:
+    def _stated(self, test: Consistency | None) -> dict[str, Any]:
         """Return the prior's name and the test of the shifts against it; numbers are None without prior or noise."""
         name = None if self.disturbances is None else self.disturbances.name
-        numbers = {key: None if found is None else of(found) for key, of in _STATED.items()}
+        numbers = {key: None if test is None else number(test) for key, number in _TEST_KEYS.items()}
         suspects = [
-            {"body": one.body, "times_stated": _to_digits(one.times), "log_likelihood_gain": _to_digits(one.gain)}
-            for one in (found.suspects if found is not None else ())
+            {
+                "body": suspect.body,
+                "times_stated": _to_digits(suspect.times),
+                "log_likelihood_gain": _to_digits(suspect.gain),
+            }
+            for suspect in (test.suspects if test is not None else ())
         ]
         return {"name": name, **numbers, "suspects": suspects}
 
 
 def contradicted(
-    stated: Disturbances | None, found: Consistency | None, when: str = "", rate: str = f"{FALSE_ALARM:g}"
+    prior: Disturbances | None, test: Consistency | None, when: str = "", rate: str = f"{FALSE_ALARM:g}"
 ) -> tuple[str, ...]:
     """Return a warning if the shifts of a measurement contradict the prior.
 
@@ -299,21 +311,21 @@ def contradicted(
     rate : str
         False-alarm rate, as text.
     """
-    if stated is None or found is None or found.agrees:
+    if prior is None or test is None or test.agrees:
         return ()
     return (
-        f"the shifts of the spots contradict the prior {stated.name}{when}: chi-square "
-        f"{significant(found.chi_square)} for {found.degrees} degrees of freedom, limit {found.limit:.1f} at a "
-        f"false-alarm rate of {rate}{_suspected(found, stated.bodies)}; σ does not hold for this measurement",
+        f"the shifts of the spots contradict the prior {prior.name}{when}: chi-square "
+        f"{significant(test.chi_square)} for {test.degrees} degrees of freedom, limit {test.limit:.1f} at a "
+        f"false-alarm rate of {rate}{_suspect_text(test, prior.bodies)}; σ does not hold for this measurement",
     )
 
 
-def _suspected(found: Consistency, stated: Sequence[str]) -> str:
-    if not found.suspects:
+def _suspect_text(test: Consistency, prior_bodies: Sequence[str]) -> str:
+    if not test.suspects:
         return ""
-    first = found.suspects[0]
+    first = test.suspects[0]
     times = significant(first.times, 2)
-    if first.body in stated:
+    if first.body in prior_bodies:
         return (
             f"; motions of {first.body} would explain them best, with {times} times the standard deviations of the "
             "prior"
@@ -328,11 +340,13 @@ def _fits(what: str, fits: FitStates) -> Iterator[SelfCheck]:
     """Yield the check of the worst fit among some spots: its chi-square over its limit."""
     ratio = np.fmax(fits.whole / fits.whole_limit, fits.core / fits.core_limit)
     if np.any(np.isfinite(ratio) & (ratio > 0.0)):
-        says = f"reduced chi-square over its limit; false-alarm rate {SPOT_ALARM:g} per fit; above 1, sigma is widened"
-        yield SelfCheck(f"fit of the {what}", float(np.nanmax(ratio)), 1.0, "of the limit", says)
+        meaning = (
+            f"reduced chi-square over its limit; false-alarm rate {SPOT_ALARM:g} per fit; above 1, sigma is widened"
+        )
+        yield SelfCheck(f"fit of the {what}", float(np.nanmax(ratio)), 1.0, "of the limit", meaning)
 
 
-def stated_check(name: str, told: Consistency) -> SelfCheck:
+def prior_check(name: str, test: Consistency) -> SelfCheck:
     """Return the check of spot shifts against the prior on disturbances.
 
     Parameters
@@ -342,8 +356,10 @@ def stated_check(name: str, told: Consistency) -> SelfCheck:
     told : Consistency
         Test of the shifts against the prior.
     """
-    says = f"chi-square for {told.degrees} degrees of freedom; false-alarm rate {told.false_alarm:.2g}; else a warning"
-    return SelfCheck(name, told.chi_square, told.limit, "", says)
+    meaning = (
+        f"chi-square for {test.degrees} degrees of freedom; false-alarm rate {test.false_alarm:.2g}; else a warning"
+    )
+    return SelfCheck(name, test.chi_square, test.limit, "", meaning)
 
 
 def worst_checks(readings: Iterable[MonitorReading]) -> tuple[SelfCheck, ...]:
@@ -361,11 +377,11 @@ def worst_checks(readings: Iterable[MonitorReading]) -> tuple[SelfCheck, ...]:
     return tuple(out.values())
 
 
-SHARE, OFF = 3, 1
+SHARE_DECIMALS, OFF_DECIMALS = 3, 1
 """Decimals of shares, and of linearity errors in sigmas: rounding errors seldom change numbers rounded so."""
-STATED = 6
+READING_DECIMALS = 6
 """Decimals of a reading in files, counted in units of its sigma."""
-_STATED: Mapping[str, Callable[[Consistency], Any]] = {
+_TEST_KEYS: Mapping[str, Callable[[Consistency], Any]] = {
     "chi_square": lambda found: _to_digits(found.chi_square),
     "chi_square_sigma_noise": lambda found: found.sigma_noise,
     "degrees_of_freedom": lambda found: found.degrees,
@@ -376,14 +392,14 @@ _STATED: Mapping[str, Callable[[Consistency], Any]] = {
     "agrees": lambda found: found.agrees,
 }
 """Key in files -> number of the test against the prior."""
-_STATED_SIGMA = 8
+_SIGMA_DIGITS = 8
 """Significant digits of a sigma and of a chi-square in files."""
 _SIGMAS = ("_sigma", "_sigma_noise", "_rms_m")
 """Endings of the keys that hold sigmas."""
 
 
 def _to_digits(value: float) -> float:
-    return float(f"{value:.{_STATED_SIGMA - 1}e}")
+    return float(f"{value:.{_SIGMA_DIGITS - 1}e}")
 
 
 def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
@@ -407,7 +423,7 @@ def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
             out[key] = _to_digits(value)
         elif isinstance(value, float) and isinstance(sigma, float) and 0.0 < sigma < math.inf:
             # adding 0.0 turns a negative zero into a positive one
-            out[key] = round(value, STATED - math.floor(math.log10(sigma))) + 0.0
+            out[key] = round(value, READING_DECIMALS - math.floor(math.log10(sigma))) + 0.0
         else:
             out[key] = value
     return out
@@ -415,8 +431,10 @@ def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
 
 def _fit(fits: FitStates | None, spot: int) -> dict[str, float | None]:
     """Return the goodness of fit of a spot; its numbers are None where no shape was fitted or no fit was tested."""
-    known = fits is not None and math.isfinite(fits.whole[0, spot])
-    return {key: _to_digits(float(getattr(fits, of)[0, spot])) if known else None for key, of in _FIT.items()}
+    tested = fits is not None and math.isfinite(fits.whole[0, spot])
+    return {
+        key: _to_digits(float(getattr(fits, attribute)[0, spot])) if tested else None for key, attribute in _FIT.items()
+    }
 
 
 _FIT = {

@@ -22,7 +22,7 @@ from twin.framework.artefact import (
     significant,
 )
 from twin.framework.report import Section
-from twin.main_job.render_files import BENT, WARMED
+from twin.main_job.render_files import DEFORMATION, HEATED_BODY
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.result_sections import IN_PAGE, figure
 from twin.main_job.verdict import sharpness_lost
@@ -49,13 +49,15 @@ def quality_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
         bands[len(rows)] = f"Camera {name}, MTF with light of {light}, Nyquist {nyquist} cycles/mm"
         rows += _quality_rows(name, camera, quality)
     bodies = "; ".join(f"in {name} {', '.join(camera.bodies) or 'nothing'}" for name, camera in quality.cameras.items())
-    taken = f"The pupils include the obstruction by bodies in the beams: {bodies}." if quality.obstruction else ""
+    obstruction_text = (
+        f"The pupils include the obstruction by bodies in the beams: {bodies}." if quality.obstruction else ""
+    )
     caption = (
         "At fixed pixels of each line CCD, at its middle and at its left (+Y′) and right end. "
         f"Wavefront errors are rms over the pupil at {plain(1e9 * quality.wavelength)} nm, without piston and tilt. "
         "Best focus is counted along the light: + is behind the CCD. The MTF is that of the traced pupil over the "
         "named light, with the pixel and, where the camera describes them, charge diffusion and TDI. "
-        f"{taken or f'{FREE[0].upper()}{FREE[1:]}.'} Means and worst values: "
+        f"{obstruction_text or f'{FREE[0].upper()}{FREE[1:]}.'} Means and worst values: "
         f"`quality.json`. The CSV has all {len(quality.fields)} fields."
     )
     parts: list[Artefact] = [
@@ -78,21 +80,21 @@ def quality_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
         )
         parts.append(figure(drawn, "pupils", caption))
     share, where, change = sharpness_lost(quality)
-    lost = f"The MTF at Nyquist falls by at most {significant(100.0 * share, 2, floor=0.0)} %, {where}: {change}."
-    lost = lost if share > 0.0 else "The perturbation does not lower the MTF at Nyquist."
-    return Section("Image quality", (lost,), tuple(parts), name="quality")
+    loss_text = f"The MTF at Nyquist falls by at most {significant(100.0 * share, 2, floor=0.0)} %, {where}: {change}."
+    loss_text = loss_text if share > 0.0 else "The perturbation does not lower the MTF at Nyquist."
+    return Section("Image quality", (loss_text,), tuple(parts), name="quality")
 
 
 def _quality_rows(name: str, camera: CameraQuality, quality: ImageQuality) -> list[list[Cell]]:
     rows: list[list[Cell]] = []
-    for one in AT_FIELDS:
-        values = one.shown_value(one.value(camera))
-        row: list[Cell] = [one.shown_head]
+    for quantity in AT_FIELDS:
+        values = quantity.shown_value(quantity.value(camera))
+        row: list[Cell] = [quantity.shown_head]
         for place, field in PLACES.items():
             for s, when in enumerate(_WHEN):
                 value = float(values[s, quality.fields.index(field)])
-                text = fixed(value, one.decimals or 0, sign=one.key == "defocus_um")
-                row.append(Marked(text, "", "number", f"quality.{name}.{one.key}.{place}.{when}"))
+                text = fixed(value, quantity.decimals or 0, sign=quantity.key == "defocus_um")
+                row.append(Marked(text, "", "number", f"quality.{name}.{quantity.key}.{place}.{when}"))
         rows.append(row)
     return rows
 
@@ -102,11 +104,19 @@ def _every_field(quality: ImageQuality) -> Table:
     places = {quality.fields.index(field): place for place, field in PLACES.items()}
     rows: list[list[Cell]] = []
     for name, camera in quality.cameras.items():
-        values = [one.shown_value(one.value(camera)) for one in AT_FIELDS]
+        values = [quantity.shown_value(quantity.value(camera)) for quantity in AT_FIELDS]
         for s, when in enumerate(_WHEN):
             for k, field in enumerate(quality.fields):
-                rows.append([name, when, float(field), places.get(k, ""), *(float(found[s, k]) for found in values)])
-    heads = ["camera", "state", "field", "place", *(one.shown_head for one in AT_FIELDS)]
+                rows.append(
+                    [
+                        name,
+                        when,
+                        float(field),
+                        places.get(k, ""),
+                        *(float(quantity_values[s, k]) for quantity_values in values),
+                    ]
+                )
+    heads = ["camera", "state", "field", "place", *(quantity.shown_head for quantity in AT_FIELDS)]
     return Table("quality", "Image quality", "", heads, rows)
 
 
@@ -167,19 +177,19 @@ def _mtf_table(targets: TargetRun, kinds: list[str]) -> Table:
     for name, camera in targets.cameras.items():
         nyquist, pitch = plain(1e-3 * NYQUIST / camera.pitch, 4), plain(1e6 * camera.pitch)
         bands[len(rows)] = f"Camera {name}, band {camera.band}, Nyquist {nyquist} cycles/mm, {pitch} µm pixels"
-        for place, own in camera.places.items():
-            biases += [edge.nyquist_bias for shots in own.shots.values() for edge in shots.edges.values()]
+        for place, images in camera.places.items():
+            biases += [edge.nyquist_bias for shots in images.shots.values() for edge in shots.edges.values()]
             for direction in DIRECTIONS:
                 row: list[Cell] = [f"{place}, {DIRECTION_NAMES[direction]}"]
                 for kind in kinds:
-                    for when, shots in own.shots.items():
+                    for when, shots in images.shots.items():
                         reading = (shots.edges if kind == "edge" else shots.bars)[direction]
                         row += _mtf_cells(f"mtf.{name}.{place}.{direction}.{when}.{kind}", reading)
-                move = fixed(1e6 * float(own.shift[DIRECTIONS.index(direction)]), 2, sign=True)
+                move = fixed(1e6 * float(images.shift[DIRECTIONS.index(direction)]), 2, sign=True)
                 rows.append([*row, Marked(f"{move} {DIRECTION_NAMES[direction]}", "", "number")])
         full += _mtf_rows(name, camera)
-    known = [bias for bias in biases if bias is not None]
-    amount = f"at most {significant(max(known), 2, floor=0.0)}" if known else "an unknown amount"
+    known_biases = [bias for bias in biases if bias is not None]
+    amount = f"at most {significant(max(known_biases), 2, floor=0.0)}" if known_biases else "an unknown amount"
     caption = f"Below each value: (measured − true) in units of σ, ● within {FAR:g} σ, ▲ beyond."
     if "edge" in kinds:
         caption += f" At Nyquist, noise biases the knife edge's values by {amount} on average, which is not corrected."
@@ -221,10 +231,10 @@ def _mtf_rows(name: str, camera: CameraTargets) -> list[list[Cell]]:
 def _mtf_cells(key: str, reading: EdgeReading | BarReading) -> tuple[Marked, Marked]:
     """Return the cells of a measured MTF at Nyquist and of its true value."""
     true = Marked(fixed(reading.true_nyquist, _DECIMALS), "", "truth", f"{key}.true")
-    found = reading.nyquist
-    if found is None:
+    measured = reading.nyquist
+    if measured is None:
         return Marked("not measurable", "", "number", key), true
-    value, sigma = found
+    value, sigma = measured
     text = f"{fixed(value, _DECIMALS)} ± {fixed(sigma, _DECIMALS)}"
     return residual_cell(text, residual(value - reading.true_nyquist, sigma), key), true
 
@@ -244,17 +254,27 @@ def stray_section(run: RenderRun) -> Section | None:
     surfaces: list[list[Cell]] = []
     full: list[dict[str, Any]] = []
     for i, channel in enumerate(run.experiment.path.channels):
-        found = [one for one in after.traced.relative(channel.key) if one.family.detector == f"{channel.key}/area_ccd"]
-        by_kind = [sum(one.share for one in found if one.family.kind == kind) for kind in ("ghost", "stray")]
+        families_found = [
+            family
+            for family in after.traced.relative(channel.key)
+            if family.family.detector == f"{channel.key}/area_ccd"
+        ]
+        by_kind = [
+            sum(family.share for family in families_found if family.family.kind == kind) for kind in ("ghost", "stray")
+        ]
         amounts.append([channel.key, float(shares[i]), *by_kind, float(after.photons[i].max())])
-        told = [FAMILY(one) for one in found]
-        full += [{**one, "surfaces": " ".join(one["surfaces"])} for one in told]
-        for one in told[:_STRONGEST]:
-            size = f"{significant(one['relative_to_nominal'])} ± {significant(one['relative_to_nominal_sigma'], 1)}"
-            numbers = (Marked(text, "", "number") for text in (size, fixed(one["x_um"], 1), fixed(one["y_um"], 1)))
-            families.append([channel.key, one["kind"], one["name"], *numbers])
-            surfaces.append([channel.key, one["name"], _way(one["surfaces"]) or "not identified"])
-    keys = [*(one.key for one in FAMILY if one.key != "surfaces"), "surfaces"]
+        records = [FAMILY(family) for family in families_found]
+        full += [{**family, "surfaces": " ".join(family["surfaces"])} for family in records]
+        for family in records[:_STRONGEST]:
+            size = (
+                f"{significant(family['relative_to_nominal'])} ± {significant(family['relative_to_nominal_sigma'], 1)}"
+            )
+            numbers = (
+                Marked(text, "", "number") for text in (size, fixed(family["x_um"], 1), fixed(family["y_um"], 1))
+            )
+            families.append([channel.key, family["kind"], family["name"], *numbers])
+            surfaces.append([channel.key, family["name"], _surface_list(family["surfaces"]) or "not identified"])
+    keys = [*(family.key for family in FAMILY if family.key != "surfaces"), "surfaces"]
     parts: list[Artefact] = [
         Table(
             "stray-families",
@@ -286,11 +306,11 @@ def stray_section(run: RenderRun) -> Section | None:
             within=IN_PAGE,
         ),
     ]
-    taken: list[list[Cell]] = [[o.body, o.beam, 100.0 * o.share, 100.0 * o.used] for o in run.stray.obstructions]
-    if taken:
+    blocked: list[list[Cell]] = [[o.body, o.beam, 100.0 * o.share, 100.0 * o.used] for o in run.stray.obstructions]
+    if blocked:
         heads = ["prism", "beam", "blocked [%]", "of this used by its channel [%]"]
         title = "Prisms that block part of a beam's cross-section, nominal instrument"
-        parts.append(Table("stray_prisms", title, "", heads, taken, (None, None, 1, 1), within=IN_PAGE))
+        parts.append(Table("stray_prisms", title, "", heads, blocked, (None, None, 1, 1), within=IN_PAGE))
     paths = f"{after.paths:,}".replace(",", "\N{THIN SPACE}")
     about = (
         f"{paths} paths from every pinhole through the perturbed instrument, each identified by the surfaces that it "
@@ -300,11 +320,11 @@ def stray_section(run: RenderRun) -> Section | None:
     return Section("Ghosts and stray light", (about,), tuple(parts), len(parts) - 2, "stray")
 
 
-def _way(way: list[str]) -> str:
+def _surface_list(surfaces: list[str]) -> str:
     """Return surfaces in order, without the ``base/<camera>/monitor/<channel>/`` that all paths of prisms share."""
-    prisms = [step for step in way if "/monitor/" in step]
+    prisms = [step for step in surfaces if "/monitor/" in step]
     common = "/".join(prisms[0].split("/")[:4]) + "/" if prisms else ""
-    return " \N{RIGHTWARDS ARROW} ".join(step.removeprefix(common) for step in way)
+    return " \N{RIGHTWARDS ARROW} ".join(step.removeprefix(common) for step in surfaces)
 
 
 _SHOWN_ANGLES = np.arange(0.0, 90.0, 10.0)
@@ -321,10 +341,10 @@ def finish_section(run: RenderRun) -> Section | None:
         rows: list[tuple[Cell, ...]] = []
         for kind, scatter in measured.scatter.items():
             rms = scatter.table.reciprocity()
-            for angle, stated in zip(scatter.table.incidence, scatter.tis, strict=True):
+            for angle, specified in zip(scatter.table.incidence, scatter.tis, strict=True):
                 total = scatter.table.total(float(angle))
                 unequal: Cell = "" if np.isnan(rms) else 100.0 * rms
-                rows.append((kind, float(np.degrees(angle)), 100.0 * total, 100.0 * stated, unequal))
+                rows.append((kind, float(np.degrees(angle)), 100.0 * total, 100.0 * specified, unequal))
         heads = (
             "surfaces",
             "incidence [deg]",
@@ -335,16 +355,16 @@ def finish_section(run: RenderRun) -> Section | None:
         text = "Shares of the incident light. Total scatter is the integral of the table, which the paths use."
         tables.append(Table("finish_scatter", "Measured scattering", text, heads, rows, (), 4))
     if measured.coatings:
-        coats: list[tuple[Cell, ...]] = []
+        coating_rows: list[tuple[Cell, ...]] = []
         for kind, coating in measured.coatings.items():
             through = kind == "coated"
             for degrees in _SHOWN_ANGLES:
                 if degrees == 0.0 or np.radians(degrees) <= coating.angles[-1]:
                     reflected, passed = coating.at(float(np.radians(degrees)), through)
-                    coats.append((kind, float(degrees), 100.0 * reflected, 100.0 * passed if through else ""))
+                    coating_rows.append((kind, float(degrees), 100.0 * reflected, 100.0 * passed if through else ""))
         columns = ("surfaces", "incidence in air [deg]", "reflected [%]", "transmitted [%]")
         text = "At the monitor's wavelength, for unpolarised light."
-        tables.append(Table("finish_coatings", "Measured coatings", text, columns, coats, (), 4))
+        tables.append(Table("finish_coatings", "Measured coatings", text, columns, coating_rows, (), 4))
     about = "Surfaces with measured scatter or coatings; all others have built-in finishes."
     return Section("Measured finishes", (about,), tuple(tables), 1)
 
@@ -353,10 +373,10 @@ NAMED = 1e-10
 """Amplitude, in metres RMS, below which the report's table omits a Zernike term."""
 
 
-def _flat(told: Mapping[str, Any], *keys: str) -> list[Cell]:
+def _flat(numbers: Mapping[str, Any], *keys: str) -> list[Cell]:
     """Return the numbers under some keys as table cells; a vector gives one cell for each axis."""
-    found = [told[key] for key in keys]
-    return [number for one in found for number in (one if isinstance(one, list) else [one])]
+    values = [numbers[key] for key in keys]
+    return [number for value in values for number in (value if isinstance(value, list) else [value])]
 
 
 def deformation_section(run: JobRun) -> Section | None:
@@ -370,11 +390,11 @@ def deformation_section(run: JobRun) -> Section | None:
     heads += [*(f"shift {axis} [µm]" for axis in "xyz"), "scale [ppm]"]
     sizes = "change_rms_nm", "change_pv_nm", "residual_rms_nm", "residual_pv_nm", "not_carried_rms_nm"
     left = ["body", "change [nm rms]", "PV [nm]", "after Zernike [nm rms]", "PV [nm]", "after grid [nm rms]"]
-    found = {path: BENT(face) for path, face in run.deformed.items()}
+    records = {path: DEFORMATION(face) for path, face in run.deformed.items()}
     terms = [
         (path, term, size)
-        for path, told in found.items()
-        for term, size in told["figure_nm"].items()
+        for path, numbers in records.items()
+        for term, size in numbers["figure_nm"].items()
         if abs(size) >= 1e9 * NAMED
     ]
     parts = (
@@ -383,7 +403,7 @@ def deformation_section(run: JobRun) -> Section | None:
             "Rigid motion and scale",
             "In the body's nominal axes, about its origin. Nodes off the optical surface are not used.",
             heads,
-            [[path, *_flat(told, *motion)] for path, told in found.items()],
+            [[path, *_flat(numbers, *motion)] for path, numbers in records.items()],
             digits=5,
         ),
         Table(
@@ -391,7 +411,7 @@ def deformation_section(run: JobRun) -> Section | None:
             "Change of sag, and residuals of the fits",
             "Over the clear aperture.",
             [*left, "cross-validation [nm rms]"],
-            [[path, *_flat(told, *sizes, "between_nodes_rms_nm")] for path, told in found.items()],
+            [[path, *_flat(numbers, *sizes, "between_nodes_rms_nm")] for path, numbers in records.items()],
             digits=4,
         ),
         SvgFigure(
@@ -422,10 +442,10 @@ def heat_section(run: JobRun) -> Section | None:
     heads = ["body", "nodes", "spacing [mm]", "change [K]", *(f"gradient {axis} [K/m]" for axis in "xyz")]
     heads += ["not linear [K rms]", "largest [K]", "cross-validation [K rms]", "outside [%]", "farthest [mm]"]
     rows: list[list[Cell]] = []
-    for path, told in ((path, WARMED(body)) for path, body in run.heated.items()):
-        share = told["outside_share"]
-        outside: list[Cell] = ["", ""] if share is None else [100.0 * share, told["farthest_mm"]]
-        rows.append([path, *_flat(told, *keys), *outside])
+    for path, numbers in ((path, HEATED_BODY(body)) for path, body in run.heated.items()):
+        share = numbers["outside_share"]
+        outside: list[Cell] = ["", ""] if share is None else [100.0 * share, numbers["farthest_mm"]]
+        rows.append([path, *_flat(numbers, *keys), *outside])
     faces: list[list[Cell]] = [
         [
             *(face, change.motion.rotate[0] / ARCSEC, change.motion.rotate[1] / ARCSEC, 1e9 * change.motion.shift[2]),

@@ -78,22 +78,22 @@ def _numbers(run: JobRun) -> dict[str, Any]:
         parts["quality"] = QUALITY(run.quality)
     if run.targets is not None:
         parts["mtf"] = run.targets.to_dict()
-    told = judge(run)
-    said = {"verdict": told.verdict, "warnings": list(told.warnings)}
-    return {**{kind: described(kind, data) for kind, data in parts.items()}, **said}
+    judgement = judge(run)
+    texts = {"verdict": judgement.verdict, "warnings": list(judgement.warnings)}
+    return {**{kind: described(kind, data) for kind, data in parts.items()}, **texts}
 
 
 def _print_result(run: JobRun, console: Console) -> None:
     """Print the verdict, the result table, remarks and warnings."""
-    told = judge(run)
-    print_verdict(console, told.verdict)
-    after = list(told.more)
+    judgement = judge(run)
+    print_verdict(console, judgement.verdict)
+    remarks = list(judgement.more)
     if isinstance(run, RenderRun):
         print_whole(console, _table(run, console.width >= _WIDE))
-        after.append(f"{assumed(run.reading)}.")
+        remarks.append(f"{assumed(run.reading)}.")
     else:
         print_whole(console, _changes(run))
-    for line in after:
+    for line in remarks:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     if run.targets is not None:
         lines = _mtf_table(run.targets)
@@ -105,7 +105,7 @@ def _print_result(run: JobRun, console: Console) -> None:
             f"course: {count} times from {ends[0]} to {ends[1]} are in course.json, course.nc and the report.",
             highlight=False,
         )
-    print_warnings(console, told.warnings)
+    print_warnings(console, judgement.warnings)
 
 
 def _mtf_table(targets: TargetRun) -> Table | None:
@@ -177,16 +177,21 @@ def _table(run: RenderRun, wide: bool) -> Table:
         table.add_column(head, justify="right", no_wrap=True)
 
     group = ""
-    for same in run.reading.table.by_change():
-        own, p = next(row for row in same if row.estimator == judged), same[0].parameter
-        if own.where != group:
-            group = own.where
+    for rows in run.reading.table.by_change():
+        judged_row, p = next(row for row in rows if row.estimator == judged), rows[0].parameter
+        if judged_row.where != group:
+            group = judged_row.where
             table.add_row(f"[bold]{escape(group)}[/]")
-        values = [own.true, *(row.value for row in same), own.sigma, *([own.noise] if wide else [])]
+        values = [
+            judged_row.true,
+            *(row.value for row in rows),
+            judged_row.sigma,
+            *([judged_row.noise] if wide else []),
+        ]
         # adding 0.0 after rounding avoids a negative zero
         cells = [_DASH if math.isnan(value) else f"{round(value, p.decimals) + 0.0:.{p.decimals}f}" for value in values]
-        tail = [f"{own.error:+.{p.decimals}f}", f"{round(own.ratio, 1) + 0.0:+.1f}"]
-        if math.isnan(own.sigma):
-            tail = [_DASH, _DASH]
-        table.add_row(escape(own.parameter.label), *cells, *tail)
+        last_cells = [f"{judged_row.error:+.{p.decimals}f}", f"{round(judged_row.ratio, 1) + 0.0:+.1f}"]
+        if math.isnan(judged_row.sigma):
+            last_cells = [_DASH, _DASH]
+        table.add_row(escape(judged_row.parameter.label), *cells, *last_cells)
     return table

@@ -49,11 +49,11 @@ def write_results(run: JobRun, folder: RunFolder) -> None:
     # TIFF and netCDF are made in memory: on a full disk NumPy's writer gives no reason, and HDF5 crashes the process
     folder.write_text("config.yaml", config_text(run.resolved))
     for (path, kind), name in table_names(run.resolved.job).items():
-        given = getattr(run.resolved.job.perturb[path], kind)
-        folder.write_bytes(name, Path(given.table).read_bytes())
-    finishes = finish_tables(run.resolved.job)
+        table = getattr(run.resolved.job.perturb[path], kind)
+        folder.write_bytes(name, Path(table.table).read_bytes())
+    tables = finish_tables(run.resolved.job)
     for key, name in finish_names(run.resolved.job).items():
-        folder.write_bytes(name, Path(finishes[key].table).read_bytes())
+        folder.write_bytes(name, Path(tables[key].table).read_bytes())
     _write_numbers(folder, "truth", run.truth_dict())
     if isinstance(run, RenderRun):
         _write_monitor(run, folder)
@@ -197,19 +197,19 @@ def config_text(resolved: ResolvedJob) -> str:
         return resolved.to_yaml()
     perturb = dict(resolved.job.perturb)
     for (path, kind), name in names.items():
-        moved = getattr(perturb[path], kind).model_copy(update={"table": name})
-        perturb[path] = perturb[path].model_copy(update={kind: moved})
+        renamed = getattr(perturb[path], kind).model_copy(update={"table": name})
+        perturb[path] = perturb[path].model_copy(update={kind: renamed})
     render = resolved.job.render
     if finishes and render.stray is not None and render.stray.finishes is not None:
-        given = finish_tables(resolved.job)
-        tables = {key: given[key].model_copy(update={"table": name}) for key, name in finishes.items()}
+        tables_of_finishes = finish_tables(resolved.job)
+        tables = {key: tables_of_finishes[key].model_copy(update={"table": name}) for key, name in finishes.items()}
         stray = render.stray.model_copy(update={"finishes": render.stray.finishes.with_tables(tables)})
         render = render.model_copy(update={"stray": stray})
     job = resolved.job.model_copy(update={"perturb": FrozenMap(perturb), "render": render})
     return resolved.model_copy(update={"job": job}).to_yaml()
 
 
-BENT: Record[NodalDeformation] = Record(
+DEFORMATION: Record[NodalDeformation] = Record(
     "Deformation of an optical face by a table of displaced nodes.",
     Quantity("nodes", lambda face: len(face.weight), "nodes on the optical surface"),
     Quantity("nodes_not_used", lambda face: face.others, "nodes off the optical surface"),
@@ -237,7 +237,7 @@ _WARMED_FACE: Record[HeatedFace] = Record(
     Quantity("not_carried_rms_nm", lambda face: face.lost, "residual of the Zernike terms"),
     Quantity("coarser_elements_rms_nm", lambda face: face.unmeshed, "difference that coarser finite elements make"),
 )
-WARMED: Record[HeatedBody] = Record(
+HEATED_BODY: Record[HeatedBody] = Record(
     "Temperature field of a body by a table of nodes.",
     Quantity("nodes", lambda body: body.nodes, "nodes of the table"),
     Quantity("spacing_mm", lambda body: body.spacing, "distance of neighbouring nodes"),
@@ -264,13 +264,13 @@ WARMED: Record[HeatedBody] = Record(
 def table_numbers(run: JobRun) -> dict[str, dict[str, Any]]:
     """Return the contents of deformation.json and temperature.json, by kind, of a job that has such tables."""
     names = table_names(run.resolved.job)
-    found = {
-        "deformation": {path: BENT(face) for path, face in run.deformed.items()},
-        "temperature": {path: WARMED(body) for path, body in run.heated.items()},
+    numbers_by_kind = {
+        "deformation": {path: DEFORMATION(face) for path, face in run.deformed.items()},
+        "temperature": {path: HEATED_BODY(body) for path, body in run.heated.items()},
     }
     return {
         kind: {"bodies": {path: {"table": names[path, kind], **numbers} for path, numbers in bodies.items()}}
-        for kind, bodies in found.items()
+        for kind, bodies in numbers_by_kind.items()
         if bodies
     }
 
@@ -285,22 +285,24 @@ def deformation_warnings(faces: Mapping[str, NodalDeformation], planes: Collecti
     planes : Collection[str]
         Those of the bodies that are glass faces in a run with stray light, which treats them as planes.
     """
-    bent = {path: 1e9 * faces[path].rms(faces[path].change) for path in planes}
-    out = [
+    ignored = {path: 1e9 * faces[path].rms(faces[path].change) for path in planes}
+    warnings = [
         f"{path}: stray light treats faces of glass as planes, without the {size:.3g} nm rms of the face's table"
-        for path, size in bent.items()
+        for path, size in ignored.items()
     ]
     for path, face in faces.items():
-        rest, between, lost = (1e9 * value for value in (face.rms(face.residual), face.between, face.rms(face.lost)))
+        residual, between, lost = (
+            1e9 * value for value in (face.rms(face.residual), face.between, face.rms(face.lost))
+        )
         if face.printed_through:
-            out.append(
-                f"{path}: the mesh is too coarse for the residual of {rest:.3g} nm after Z{max(face.figure)}: it changes "
-                f"from node to node ({1e3 * face.spacing:.3g} mm), and nodes are interpolated from the others to "
-                f"{between:.3g} nm rms only; refine the mesh, or do not rely on the residual's effect on images"
+            warnings.append(
+                f"{path}: the mesh is too coarse for the residual of {residual:.3g} nm after Z{max(face.figure)}: it "
+                f"changes from node to node ({1e3 * face.spacing:.3g} mm), and nodes are interpolated from the others "
+                f"to {between:.3g} nm rms only; refine the mesh, or do not rely on the residual's effect on images"
             )
         if face.rms(face.lost) > max(SEEN, PRINTED * face.rms(face.residual)):
-            out.append(
+            warnings.append(
                 f"{path}: {lost:.3g} nm rms of the surface's change are finer than its grid and are not modelled; "
                 "give only the nodes of the clear aperture, or fewer nodes"
             )
-    return tuple(out)
+    return tuple(warnings)

@@ -99,9 +99,9 @@ def write_run(run: JobRun, session: Session, picture: bool = False, beside: Seco
     folder.write_text("report.html", render_report(run, sections, drawn.get(SCENE), pictures, drawn))
     warnings = [*judge(run).warnings, *missing]
     entries = {"backend": session.backend.name, "seed": run.seed, "frames": run.frames, "warnings": warnings}
-    again = list(_again_words(run, session.backend.name, picture))
+    command = list(_repeat_command(run, session.backend.name, picture))
     checks = [check.to_dict() for check in run.checks]
-    write_manifest(folder, PROGRAM, session.started, seconds, **entries, again=again, checks=checks)
+    write_manifest(folder, PROGRAM, session.started, seconds, **entries, again=command, checks=checks)
     return "; ".join(filter(None, problems))
 
 
@@ -156,35 +156,39 @@ def render_report(
     if drawn is None:
         pieces = instrument_drawings(experiment.instrument, experiment.backend, run.state) | drawings(run)
         drawn, _ = without_failed({name: draw() for name, draw in pieces.items() if name not in APART})
-    summary, *shown = result_tables(run)
-    done, told = done_table(run), judge(run)
-    moved = ", ".join(str(row[0]) for row in done.rows)
-    read = run if isinstance(run, RenderRun) else None
+    summary, *course_tables = result_tables(run)
+    perturbation, judgement = done_table(run), judge(run)
+    bodies = ", ".join(str(row[0]) for row in perturbation.rows)
+    monitored = run if isinstance(run, RenderRun) else None
     parts = (
-        *(course_sections(read, drawn, *shown) if shown and read else ()),
-        Section(f"What was done{shown_time(run)}", (), (done,), name="done") if done.rows else None,
+        *(course_sections(monitored, drawn, *course_tables) if course_tables and monitored else ()),
+        Section(f"What was done{shown_time(run)}", (), (perturbation,), name="done") if perturbation.rows else None,
         setup_section(run),
-        _instrument(drawn["side"], pictures, viewer_markup(moved) if scene else Markup(), read is not None),
-        *((spot_section(read, drawn), residual_section(read, drawn)) if read else ()),
+        _instrument(drawn["side"], pictures, viewer_markup(bodies) if scene else Markup(), monitored is not None),
+        *((spot_section(monitored, drawn), residual_section(monitored, drawn)) if monitored else ()),
         quality_section(run, drawn),
         target_section(run, drawn),
-        *((stray_section(read), motion_section(read, drawn), crosstalk_section(read)) if read else ()),
-        formula_section(read) if read else None,
-        _light(drawn, read is not None),
+        *(
+            (stray_section(monitored), motion_section(monitored, drawn), crosstalk_section(monitored))
+            if monitored
+            else ()
+        ),
+        formula_section(monitored) if monitored else None,
+        _light(drawn, monitored is not None),
         *sections,
     )
-    about = "readings of its monitor" if read else "changes of geometry and images"
+    about = "readings of its monitor" if monitored else "changes of geometry and images"
     return report_page(
         Report(
             f"{run.resolved.instrument.name}: {about}",
-            told.verdict,
-            told.more,
+            judgement.verdict,
+            judgement.more,
             facts(run),
             summary,
             tuple(section for section in parts if section is not None),
-            warnings=told.warnings,
+            warnings=judgement.warnings,
         ),
-        _again_words(run, backend, bool(pictures)),
+        _repeat_command(run, backend, bool(pictures)),
         [("Again", AGAIN), ("Backend", f"{backend}, float64")],
         config_text(run.resolved),
         viewer_programs() if scene else (),
@@ -228,7 +232,7 @@ def _light(drawn: Mapping[str, str], monitored: bool) -> Section:
     return Section("Light path and footprints", (), (footprints,), name="light", closed=True)
 
 
-def _again_words(run: JobRun, backend: str, pictures: bool) -> tuple[str, ...]:
+def _repeat_command(run: JobRun, backend: str, pictures: bool) -> tuple[str, ...]:
     """Return the words of the command that repeats a run from its folder."""
     options = ("--seed", str(run.seed), "--frames", str(run.frames), "--backend", backend)
     return (PROGRAM, "config.yaml", *options, *(("--picture",) if pictures else ()))
@@ -281,7 +285,7 @@ def instrument_drawings(instrument: Instrument, backend: Backend, state: State) 
     They give <svg> elements, and the bytes of scene.glb.
     """
     paths = trace_light_paths(instrument, backend, state)
-    return _tried_each(
+    return _attempts(
         {
             "footprints": _drawing("light_path_plots:footprints_svg", instrument, paths),
             "side": _drawing("light_path_plots:side_view_svg", instrument, paths),
@@ -301,18 +305,18 @@ def drawings(run: JobRun) -> dict[str, Callable[[], Any]]:
                 out[f"mtf {name}"] = _drawing("target_plots:curves_svg", name, camera)
     if run.quality is not None and run.quality.obstruction:
         out["pupils"] = _drawing("target_plots:pupils_svg", run.quality)
-    return _tried_each(out)
+    return _attempts(out)
 
 
 def limits_drawing(limits: MonitorLimits | None) -> dict[str, Callable[[], Any]]:
     """Return the drawing function of what limits the readings, by name; empty without a prior."""
     if limits is None:
         return {}
-    return _tried_each({LIMITS: _drawing("twin.uncertainty.uncertainty_report:limits_svg", limits)})
+    return _attempts({LIMITS: _drawing("twin.uncertainty.uncertainty_report:limits_svg", limits)})
 
 
-def _tried_each(drawing: Mapping[str, Callable[[], Any]]) -> dict[str, Callable[[], Any]]:
-    return {name: partial(_tried, name, draw) for name, draw in drawing.items()}
+def _attempts(drawing: Mapping[str, Callable[[], Any]]) -> dict[str, Callable[[], Any]]:
+    return {name: partial(_attempt, name, draw) for name, draw in drawing.items()}
 
 
 def _of_monitor(run: RenderRun) -> dict[str, Callable[[], Any]]:
@@ -336,7 +340,7 @@ def _drawing(function: str, *given: Any) -> Callable[[], Any]:
     return partial(Named(function if "." in function else f"{__package__}.{function}"), *given)
 
 
-def _tried(name: str, draw: Callable[[], Any]) -> Any:
+def _attempt(name: str, draw: Callable[[], Any]) -> Any:
     """Return a drawing, or Undrawn with the reason: a failed drawing must not cost the computed results."""
     try:
         return draw()
@@ -353,10 +357,10 @@ def without_failed(drawn: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str,
         The drawings, and a sentence for each that is missing.
     """
     out, missing = dict(drawn), []
-    for name, made in drawn.items():
-        if isinstance(made, Undrawn):
-            apart = f"the file {FILES[name]} could not be drawn: {made.why}" if name in APART else ""
-            missing.append(apart or made.note)
+    for name, drawing in drawn.items():
+        if isinstance(drawing, Undrawn):
+            apart = f"the file {FILES[name]} could not be drawn: {drawing.why}" if name in APART else ""
+            missing.append(apart or drawing.note)
             del out[name]
             if name not in APART:
                 out[name] = (

@@ -41,7 +41,7 @@ from twin.monitor.time_series import TimeSeries
 
 IN_PAGE = ""
 """File name of artefacts that appear in the page only."""
-_GROUND_TITLE = "Points on the ground, located as if the cameras had not changed: error"
+_GROUND_TITLE = "Errors of ground points if the changes of the cameras are ignored"
 _ANGLE_TITLE = "Angle between the cameras"
 
 
@@ -49,8 +49,8 @@ def figure(
     drawn: Mapping[str, str], name: str, caption: str, title: str = "", full: Table | None = None, count: int = 0
 ) -> SvgFigure:
     """Return a drawing of the run as a figure of the page, the ``count``-th of its kind."""
-    own = name.partition(" ")[0] + f"-{count}" * (" " in name)
-    return SvgFigure(own, title, caption, drawn[name], within=IN_PAGE, full=full)
+    file_name = name.partition(" ")[0] + f"-{count}" * (" " in name)
+    return SvgFigure(file_name, title, caption, drawn[name], within=IN_PAGE, full=full)
 
 
 def shown_time(run: JobRun) -> str:
@@ -77,18 +77,20 @@ def _change_table(run: JobRun) -> Table:
     """Return the table of true changes of the cameras, of the angle between two, and on the ground."""
     rows: list[list[Cell]] = []
     bands: dict[int, str] = {}
-    for group, one, value in run.true_changes():
+    for group, parameter, value in run.true_changes():
         title = {ANGLE_GROUP: _ANGLE_TITLE, GROUND_GROUP: _GROUND_TITLE}.get(group, f"Camera {group}")
         if title not in bands.values():
             bands[len(rows)] = title
-        key = f"{group}.{one.key}"
-        label = Marked(one.label, one.meaning, "text")
-        rows.append([label, Marked(fixed(value, one.decimals, sign=True), "", "truth", key)])
-    full: list[list[Cell]] = [[group, one.symbol, one.unit, value] for group, one, value in run.true_changes()]
+        key = f"{group}.{parameter.key}"
+        label = Marked(parameter.label, parameter.meaning, "text")
+        rows.append([label, Marked(fixed(value, parameter.decimals, sign=True), "", "truth", key)])
+    full: list[list[Cell]] = [
+        [group, parameter.symbol, parameter.unit, value] for group, parameter, value in run.true_changes()
+    ]
     return Table(
         "results",
-        "What changed, by exact chief rays",
-        "Perturbed minus nominal. Angles are right-handed about the camera's own axes; Δf is in pixels of its line.",
+        "Changes, by exact chief rays",
+        "Perturbed minus nominal. Angles are right-handed about the camera's axes; Δf refers to pixels of its line.",
         ("Parameter", "change"),
         rows,
         bands=bands,
@@ -113,55 +115,55 @@ def _label(reading: Reading) -> Marked:
     return Marked(reading.parameter.label, reading.parameter.meaning, "text")
 
 
-def _all_digits(run: RenderRun, name: str, found: ReadingTable, over: bool) -> Table:
+def _all_digits(run: RenderRun, name: str, table: ReadingTable, over: bool) -> Table:
     """Return a table of all changes: truth, and each estimator's value (or RMS error), sigma and noise sigma."""
     heads = ["camera", "parameter", "unit", "true rms" if over else "true"]
     heads += _value_and_sigma(run, " error rms" if over else "")
     rows: list[list[Cell]] = []
-    for same in found.by_change():
-        first = same[0]
+    for rows_of_change in table.by_change():
+        first = rows_of_change[0]
         row: list[Cell] = [first.where, first.parameter.symbol, first.parameter.unit, first.true]
-        for one in same:
-            row += [one.error if over else one.value, one.sigma, one.noise]
+        for reading in rows_of_change:
+            row += [reading.error if over else reading.value, reading.sigma, reading.noise]
         rows.append(row)
     return Table(name, name, "", heads, rows)
 
 
 def _value_and_sigma(run: RenderRun, label: str) -> list[str]:
     """Return column heads for value, total sigma and noise sigma of each estimator."""
-    said = (label, " sigma", " sigma noise")
-    return [f"{estimator.title}{what}" for estimator in run.estimators.values() for what in said]
+    labels = (label, " sigma", " sigma noise")
+    return [f"{estimator.title}{what}" for estimator in run.estimators.values() for what in labels]
 
 
 def _state_table(run: RenderRun, name: str, title: str) -> Table:
-    found = run.reading.table
+    table = run.reading.table
     rows: list[list[Cell]] = []
     bands: dict[int, str] = {}
     good = dict.fromkeys(run.estimators, 0)
     stated = run.experiment.stated is not None
-    for same in found.by_change():
-        first, p = same[0], same[0].parameter
+    for rows_of_change in table.by_change():
+        first, p = rows_of_change[0], rows_of_change[0].parameter
         heading = part_title(run, first)
         if heading not in bands.values():
             bands[len(rows)] = heading
         key = first.group if first.where == "both" else f"{first.group}.{p.key}"
-        finest = min((one.sigma for one in same if one.sigma > 0), default=0.0)
+        finest = min((reading.sigma for reading in rows_of_change if reading.sigma > 0), default=0.0)
         row: list[Cell] = [_label(first), Marked(fixed(first.true, decimals_for(finest)), "", "truth", f"{key}.true")]
-        for one in same:
-            ratio = residual(one.error, one.sigma)
-            good[one.estimator] += ratio is None or abs(ratio) <= FAR
-            hint = f"σ of noise alone: {fixed(one.noise, decimals_for(one.noise))} {p.unit}"
-            text = f"{one.shown(one.value)} ± {one.shown(one.sigma)}"
-            row.append(residual_cell(text, ratio, f"{key}.{one.estimator}", hint))
+        for reading in rows_of_change:
+            ratio = residual(reading.error, reading.sigma)
+            good[reading.estimator] += ratio is None or abs(ratio) <= FAR
+            hint = f"σ of noise alone: {fixed(reading.noise, decimals_for(reading.noise))} {p.unit}"
+            text = f"{reading.shown(reading.value)} ± {reading.shown(reading.sigma)}"
+            row.append(residual_cell(text, ratio, f"{key}.{reading.estimator}", hint))
         if stated:
-            noise = next(one.noise for one in same if one.estimator == run.judged)
+            noise = next(reading.noise for reading in rows_of_change if reading.estimator == run.judged)
             row.append(Marked(fixed(noise, decimals_for(noise)), "", "number", f"{key}.noise"))
         rows.append(row)
     heads = ["Parameter", "true", *(estimator.title for estimator in run.estimators.values())]
     within = ", ".join(f"{e.title} {good[name]} of {len(rows)}" for name, e in run.estimators.items())
     caption = (
         f"± is one standard deviation. {assumed(run.reading)}. "
-        + ("The noise's part of other estimators is shown by pointing at a value. " if stated else "")
+        + ("The noise part of other estimators is shown when pointing at a value. " if stated else "")
         + f"Below each value (recovered − true) in σ, ● within {FAR:g} σ, ▲ beyond. Within {FAR:g} σ: {within}."
     )
     return Table(
@@ -172,37 +174,39 @@ def _state_table(run: RenderRun, name: str, title: str) -> Table:
         rows,
         bands=bands,
         within=IN_PAGE,
-        full=_all_digits(run, name, found, False),
+        full=_all_digits(run, name, table, False),
     )
 
 
 def _course_table(run: RenderRun, series: TimeSeries) -> Table:
     rows: list[list[Cell]] = []
     bands: dict[int, str] = {}
-    found = series.readings.rms
-    for same in found.by_change():
-        first = same[0]
+    table = series.readings.rms
+    for rows_of_change in table.by_change():
+        first = rows_of_change[0]
         values = series.readings.row(first.group, first.parameter.key, first.estimator).true
         heading = part_title(run, first, nominal=False)
         if heading not in bands.values():
             bands[len(rows)] = heading
         key = f"course.{first.camera}.{first.parameter.key}" if first.camera else "course.angle"
-        finest = decimals_for(min(one.sigma for one in same))
+        finest = decimals_for(min(reading.sigma for reading in rows_of_change))
         row: list[Cell] = [_label(first), Marked(_range(values, finest), "", "truth", f"{key}.true")]
-        for one in same:
-            far = one.sigma > 0.0 and one.far
-            below = f"{'▲' if far else '●'} σ {one.shown(one.sigma)}"
-            row.append(Marked(one.shown(one.error), below, "far" if far else "near", f"{key}.{one.estimator}"))
+        for reading in rows_of_change:
+            far = reading.sigma > 0.0 and reading.far
+            below = f"{'▲' if far else '●'} σ {reading.shown(reading.sigma)}"
+            row.append(
+                Marked(reading.shown(reading.error), below, "far" if far else "near", f"{key}.{reading.estimator}")
+            )
         rows.append(row)
     return Table(
         "errors",
         "Errors over all times: root mean square of (recovered − true), and of σ",
-        f"● error within {FAR:g} σ, ▲ beyond: more than σ allows. {_worst(run, series)}",
+        f"● error within {FAR:g} σ, ▲ beyond. {_worst(run, series)}",
         ["Parameter", "true, range", *(estimator.title for estimator in run.estimators.values())],
         rows,
         bands=bands,
         within=IN_PAGE,
-        full=_all_digits(run, "results", found, True),
+        full=_all_digits(run, "results", table, True),
     )
 
 
@@ -214,14 +218,14 @@ def _range(values: np.ndarray, places: int) -> str:
 
 def _worst(run: RenderRun, series: TimeSeries) -> str:
     """Return a sentence with the largest error of the judged estimator in alpha: camera, size, time, true change."""
-    own = [row for row in series.readings.of(run.judged) if row.parameter.key == "d_alpha_arcsec"]
-    worst = max(own, key=lambda row: float(np.max(np.abs(row.error))))
+    candidates = [row for row in series.readings.of(run.judged) if row.parameter.key == "d_alpha_arcsec"]
+    worst = max(candidates, key=lambda row: float(np.max(np.abs(row.error))))
     k = int(np.argmax(np.abs(worst.error)))
     places = decimals_for(float(worst.sigma[k]))
     error, true = (fixed(float(number[k]), places, sign=True) for number in (worst.error, worst.true))
     return (
         f"The largest error of Δα by {run.estimators[run.judged].title} is {error} arcsec, camera {worst.camera} at "
-        f"{moment(float(series.times[k]))}, where it truly is {true} arcsec."
+        f"{moment(float(series.times[k]))}, where the true change is {true} arcsec."
     )
 
 
@@ -244,10 +248,10 @@ def course_sections(run: RenderRun, drawn: Mapping[str, str], shown: Table) -> t
         figure(
             drawn,
             "course",
-            f"True changes (line) and what every estimator reads in {run.frames} frames of each of {len(series.times)} "
-            "times (marks, side by side), with bars of one σ where they are larger than the marks. "
-            f"{assumed(run.reading)}. Where marks leave the line, the monitor takes something else for a change of the "
-            "camera.",
+            f"True changes (line) and readings of every estimator from {run.frames} frames at each of "
+            f"{len(series.times)} times (marks, side by side), with bars of one σ where they are larger than the "
+            f"marks. {assumed(run.reading)}. Where marks leave the line, the monitor misreads another motion as a "
+            "change of the camera.",
             full=_every_time(run),
         )
     ]
@@ -256,9 +260,9 @@ def course_sections(run: RenderRun, drawn: Mapping[str, str], shown: Table) -> t
             figure(
                 drawn,
                 "smoothed",
-                "Errors of the smoothed changes, with the total sigma that the smoother states: from all measurements "
-                f"together, by the disturbances {series.smoothed.name} and how they go on in time. Between the "
-                "measurements the band says how well the cameras are known there. "
+                "Errors of the smoothed changes, with the smoother's total sigma: from all measurements together, by "
+                f"the disturbances {series.smoothed.name} and their time laws. Between the measurements, the band "
+                "shows how well the cameras are known. "
                 f"{course_agrees(series.smoothed, series.times)}",
             )
         )
@@ -266,8 +270,8 @@ def course_sections(run: RenderRun, drawn: Mapping[str, str], shown: Table) -> t
         figure(
             drawn,
             "temperatures",
-            "Temperatures that were given, perturbation included: change at each body's origin and gradient along the "
-            "axes of its own frame. What a body carries inherits its field. Dotted: "
+            "Temperatures of the job, perturbation included: change at each body's origin and gradient along the "
+            "axes of its frame. Bodies that it carries inherit its field. Dotted: "
             f"{shown_time(run).removeprefix(', at ')}, the time that the other sections show. All numbers: "
             f"`course.json`. Expected images: `course.nc`. The first of the {run.frames} frames of every time, one "
             f"page each: {files}.",
@@ -284,12 +288,12 @@ def _every_time(run: RenderRun) -> Table:
     """Return the table of every reading at every time, with all digits."""
     assert run.series is not None
     rows: list[list[Cell]] = []
-    for same in run.series.readings.by_change():
-        first = same[0]
-        columns = [first.true, *(number for row in same for number in (row.value, row.sigma, row.noise))]
-        told = (first.camera, first.parameter.symbol, first.parameter.unit)
+    for rows_of_change in run.series.readings.by_change():
+        first = rows_of_change[0]
+        columns = [first.true, *(number for row in rows_of_change for number in (row.value, row.sigma, row.noise))]
+        labels = (first.camera, first.parameter.symbol, first.parameter.unit)
         times = zip(run.series.times, *columns, strict=True) if first.camera else ()
-        rows += [[float(time), *told, *map(float, numbers)] for time, *numbers in times]
+        rows += [[float(time), *labels, *map(float, numbers)] for time, *numbers in times]
     heads = ["time [s]", "camera", "parameter", "unit", "true", *_value_and_sigma(run, "")]
     return Table("course", "Course", "", heads, rows)
 
@@ -308,20 +312,20 @@ def spot_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
         figures.append(figure(drawn, f"spots {name}", caption, count=k))
     rows: list[list[Cell]] = []
     full: list[list[Cell]] = []
-    found, pitch = run.recovery, 1e6 * run.experiment.path.pitch
+    recovery, pitch = run.recovery, 1e6 * run.experiment.path.pitch
     for i, channel in enumerate(run.experiment.path.channels):
         for k, axis in enumerate(("row", "column")):
-            before, after = float(found.before[0, i, k]), float(found.after[0, i, k])
-            start, end = float(found.sigma_before[0, i, k]), float(found.sigma_after[0, i, k])
-            sigma = float(found.shift_covariance[0, 2 * i + k, 2 * i + k]) ** 0.5
+            before, after = float(recovery.before[0, i, k]), float(recovery.after[0, i, k])
+            start, end = float(recovery.sigma_before[0, i, k]), float(recovery.sigma_after[0, i, k])
+            sigma = float(recovery.shift_covariance[0, 2 * i + k, 2 * i + k]) ** 0.5
             shift = after - before
-            told = (
+            cells_by_key = (
                 ("before", _with_sigma(before, start)),
                 ("after", _with_sigma(after, end)),
                 ("shift_px", _with_sigma(shift, sigma, sign=True)),
                 ("shift_um", _with_sigma(shift * pitch, sigma * pitch, sign=True)),
             )
-            cells = [Marked(text, "", "number", f"{channel.key}.{axis}.{what}") for what, text in told]
+            cells = [Marked(text, "", "number", f"{channel.key}.{axis}.{what}") for what, text in cells_by_key]
             rows.append([f"{channel.camera} {channel.name}", axis, *cells])
             full.append([channel.key, axis, before, start, after, end, shift, sigma, shift * pitch, sigma * pitch])
     heads = ["channel", "axis", "before [px]", "sigma [px]", "after [px]", "sigma [px]", "shift [px]", "sigma [px]"]
@@ -331,7 +335,7 @@ def spot_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
         "Spot positions, pixel coordinates, and their shifts",
         f"{pitch:g} µm pixels, pixel (0, 0) at the upper left. A column is along the camera's X (flight direction), a "
         "row along its Y (the line CCD). Left is the +Y end of the line. Sigma of a shift: the noise of both "
-        "positions, without the pixel pattern that both share.",
+        "positions, without the pixel pattern that they have in common.",
         ("Channel", "Axis", "before [px]", "after [px]", "shift [px]", "shift [µm]"),
         rows,
         within=IN_PAGE,
@@ -367,76 +371,76 @@ def residual_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
             row: list[Cell] = [name, r.parameter.symbol, r.parameter.unit, r.error, r.sigma, r.noise]
             full.append([*row, bias, r.error - bias])
         outside, uncovered = joined(found.outside), joined(found.uncovered)
-        said = f"moved outside the family: {outside}." if outside else ""
-        said = "nothing moved outside the family." if not outside and not uncovered else said
+        said = f"motions outside the family: {outside}." if outside else ""
+        said = "no motions outside the family." if not outside and not uncovered else said
         if uncovered:
-            said += f" Moved but in no row of the table, so that its effect is left over: {uncovered}."
+            said += f" Perturbed but in no row of the table, so that the effect is unexplained: {uncovered}."
         notes.append(f"{name}: {said.strip()}")
     heads = ["camera", "parameter", "unit", f"{title} - true", "sigma", "sigma noise", "expected from the crosstalk"]
     stated = run.experiment.stated is not None
     far = (
-        "Far outside: more moved than is stated, or something else."
+        "Far outside: larger motions than the prior expects, or other ones."
         if stated
-        else "Inside the band: noise. Far outside: the formula has another factor, or something moved that the "
-        "estimators do not assume."
+        else "Inside the band: noise. Far outside: the formula has a wrong factor, or a body moved that the "
+        "estimators do not model."
     )
     caption = f"Recovered minus true in σ; shaded ±{FAR:g} σ. {assumed(run.reading)}. {far}"
     drawing = figure(drawn, "residuals", caption)
     table = Table(
         "explained",
-        f"Residuals of {title}, and how much of them the crosstalk table explains",
+        f"Residuals of {title}, and the part explained by the crosstalk table",
         "",
         (
-            *("Camera", "Parameter", f"{title} − true", "in σ", "expected from the crosstalk table", "left over"),
-            "of noise",
+            *("Camera", "Parameter", f"{title} − true", "in σ", "expected from the crosstalk table", "unexplained"),
+            "in σ of noise",
         ),
         rows,
         within=IN_PAGE,
-        full=Table("residuals", "Residuals", "", [*heads, "left over"], full),
+        full=Table("residuals", "Residuals", "", [*heads, "unexplained"], full),
     )
-    moved = Text("moved", "What moved beside what the estimators assume", "", notes, within=IN_PAGE)
+    moved = Text("moved", "Motions outside the model of the estimators", "", notes, within=IN_PAGE)
     return Section("Residuals", (), (drawing, table, moved), 2, "residuals")
 
 
 _PAPER = "Wang et al., Acta Photonica Sinica 47(10) 1012001 (2018), doi 10.3788/gxzb20184710.1012001"
-_BUILT = "The nominal state is the instrument as built: frames before, and changes, are those about it."
+_BUILT = "The nominal state is the instrument as built: the frames before are of this state, and changes refer to it."
 ZERO_CELSIUS = 273.15
 
 
 def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
     """Return the facts about set-up and assumptions, as pairs of title and text."""
     resolved, instrument = run.resolved, run.experiment.instrument
-    spec, stated = resolved.instrument, run.experiment.stated is not None
-    own = ("Instrument", f"{spec.name}: {spec.description}" if spec.description else spec.name)
-    built = () if not spec.as_built else (("As built", f"{perturbation_text(spec.as_built)}. {_BUILT}"),)
-    free = (
-        "Structures expand freely and carry the bodies on them, mirrors and prisms bend (finite elements), and glass "
+    spec, has_prior = resolved.instrument, run.experiment.stated is not None
+    instrument_fact = ("Instrument", f"{spec.name}: {spec.description}" if spec.description else spec.name)
+    as_built_fact = () if not spec.as_built else (("As built", f"{perturbation_text(spec.as_built)}. {_BUILT}"),)
+    expansion_text = (
+        "Structures expand freely and carry the bodies on them, mirrors and prisms bend (finite elements), and the "
     )
-    free += "changes its index."
+    expansion_text += "index of glass changes."
     if not isinstance(run, RenderRun):
-        without = "The instrument has no monitor: changes are those of the exact trace, and nothing is measured."
-        return ("Assumptions", f"{without} {free}"), own, *built
+        without = "The instrument has no monitor: changes are from the exact trace, and nothing is measured."
+        return ("Assumptions", f"{without} {expansion_text}"), instrument_fact, *as_built_fact
     monitor, ccd, bits = spec.autocollimator, spec.autocollimator.area_ccd, resolved.area_detector.bit_depth
-    fields = [float(np.degrees(one.field)) for name in spec.cameras for one in spec.channels_of(name).values()]
+    fields = [float(np.degrees(channel.field)) for name in spec.cameras for channel in spec.channels_of(name).values()]
     family = "; ".join(e.title for e in run.estimators.values() if not e.stated)
     judged = run.estimators[run.judged].title
     about = (
-        "These estimators assume shifts of the line CCD along X and Y, its turn about Z and a scale of the whole "
+        "These estimators assume shifts of the line CCD along X and Y, its rotation about Z and a scale of the whole "
         f"optics: {family}. They read any other motion as a mixture of these, an error that more frames do not reduce "
         "(Residuals, Crosstalk). "
         + (
             f"σ covers this error for motions of the prior. The {judged} weighs them against the noise. "
-            if stated
+            if has_prior
             else ""
         )
-        + free
+        + expansion_text
     )
     return (
         ("Assumptions", about),
         *((estimator.title, estimator.note) for estimator in run.estimators.values()),
         ("Paper", _PAPER),
-        own,
-        *built,
+        instrument_fact,
+        *as_built_fact,
         (
             "Monitor",
             f"{plain(1e9 * monitor.wavelength)} nm, pinhole {plain(1e6 * monitor.reticle.pinhole)} µm, return face "
@@ -469,7 +473,7 @@ def _fields(degrees: list[float]) -> str:
     for field in degrees:
         ends.setdefault(plain(abs(field)), set()).add(field > 0.0)
     signs = {frozenset((True, False)): "±", frozenset((True,)): "", frozenset((False,)): MINUS}
-    return ", ".join(signs[frozenset(own)] + size for size, own in ends.items())
+    return ", ".join(signs[frozenset(end)] + size for size, end in ends.items())
 
 
 def setup_section(run: JobRun) -> Section:
@@ -486,47 +490,51 @@ def setup_section(run: JobRun) -> Section:
     heads += ["pitch [µm]", "line [mm]", *(["distance of the area CCDs [mm]"] if instrument.channels else [])]
     decimals = (None, None, 2, 4, 1, None, None, 1, 2)[: len(heads)]
     cameras = Table("cameras", "Cameras", "", heads, rows, decimals, within=IN_PAGE)
-    stated = () if run.experiment.stated is None else (_stated(run),)
+    stated = () if run.experiment.stated is None else (_prior_table(run),)
     title = "Cameras, and the prior on disturbances" if stated else "Cameras"
     return Section(title, (), (*stated, cameras), closed=True)
 
 
-def _stated(run: JobRun) -> Table:
-    motions, spec = run.experiment.stated, run.resolved.disturbances
-    assert motions is not None
+def _prior_table(run: JobRun) -> Table:
+    prior, spec = run.experiment.stated, run.resolved.disturbances
+    assert prior is not None
     assert spec is not None
     rows: list[list[Cell]] = []
     full: list[list[Cell]] = []
 
     def listed(name: str, when: str, why: str) -> list[Component]:
         """Add the components of a cause to the table with all digits, and return them."""
-        own = [c for c in motions.components if c.cause == name]
-        full.extend([name, c.body, c.what, c.sigma / c.unit_size, unit_for_reports(c.unit), when, why] for c in own)
-        return own
+        components = [c for c in prior.components if c.cause == name]
+        full.extend(
+            [name, c.body, c.what, c.sigma / c.unit_size, unit_for_reports(c.unit), when, why] for c in components
+        )
+        return components
 
     for name, cause in spec.causes.items():
-        own = listed(name, cause.time.text, cause.reason)
-        bodies = list(dict.fromkeys(c.body for c in own))
+        components = listed(name, cause.time.text, cause.reason)
+        bodies = list(dict.fromkeys(c.body for c in components))
         sizes: dict[tuple[str, str], list[str]] = {}
-        for c in own:
+        for c in components:
             if c.body == bodies[0]:
                 size = f"{plain(c.sigma / c.unit_size)} {unit_for_reports(c.unit)}"
                 sizes.setdefault((c.kind, size), []).append(c.what.removeprefix(c.kind).strip())
         what = []
         for (kind, size), axes in sizes.items():
-            which = "" if axes in (["x", "y", "z"], [""]) else f" {', '.join(axes)}"
-            what.append(f"{kind.replace('_', ' ')}{which} {size}")
+            bodies_text = "" if axes in (["x", "y", "z"], [""]) else f" {', '.join(axes)}"
+            what.append(f"{kind.replace('_', ' ')}{bodies_text} {size}")
         if cause.together is not None:
             what.append(f"bodies together {plain(cause.together)}")
         if cause.correlations:
             what.append(f"{len(cause.correlations)} correlations")
-        which = f"{len(bodies)}: `{', '.join(cause.bodies)}`"
-        rows.append([name.replace("_", " "), which, "; ".join(what), cause.time.text, cause.reason])
+        bodies_text = f"{len(bodies)}: `{', '.join(cause.bodies)}`"
+        rows.append([name.replace("_", " "), bodies_text, "; ".join(what), cause.time.text, cause.reason])
     if (joint := spec.joint) is not None:
-        own = listed(JOINT, joint.time.text, joint.reason)
-        bodies = list(dict.fromkeys(c.body for c in own))
-        which = f"{len(bodies)}: `{', '.join(bodies[:3])}`" + (", ..." if len(bodies) > 3 else "")
-        rows.append([JOINT, which, f"{len(own)} components, one by one", joint.time.text, joint.reason])
+        components = listed(JOINT, joint.time.text, joint.reason)
+        bodies = list(dict.fromkeys(c.body for c in components))
+        bodies_text = f"{len(bodies)}: `{', '.join(bodies[:3])}`" + (", ..." if len(bodies) > 3 else "")
+        rows.append(
+            [JOINT, bodies_text, f"{len(components)} components, listed one by one", joint.time.text, joint.reason]
+        )
     heads = ["cause", "body", "motion", "sigma", "unit", "in time", "reason"]
     return Table(
         "disturbances",
@@ -546,22 +554,22 @@ def done_table(run: JobRun) -> Table:
     motions, fields = motions_of(job, shown), job.fields(shown)
     rows: list[list[Cell]] = []
     for path in dict.fromkeys((*motions, *fields)):
-        motion, given = motions.get(path, Motion()), job.perturb.get(path)
-        warm = given is not None and given.heat.table is not None
+        motion, perturbation = motions.get(path, Motion()), job.perturb.get(path)
+        has_table = perturbation is not None and perturbation.heat.table is not None
         parts = [_motion_text(motion)]
-        if path in fields and not (warm and fields[path] == Temperature()):
+        if path in fields and not (has_table and fields[path] == Temperature()):
             parts.append(_heat_text(fields[path]))
-        if given is not None and given.deformation is not None:
+        if perturbation is not None and perturbation.deformation is not None:
             parts.append("deformed by a table of nodes")
-        if warm:
-            parts.append("warmed by a table of nodes")
+        if has_table:
+            parts.append("temperatures by a table of nodes")
         rows.append([path, "; ".join(filter(None, parts)) or "nothing (all zero)", motion.pivot])
     heated, caption = _heated(run), "In each body's own frame: rotation vector about the pivot, then shift."
     if heated:
         caption += (
             f" A temperature is the change from {fixed(run.resolved.instrument.temperature - ZERO_CELSIUS, 2)} °C at "
-            "the body's origin plus gradient · r; what the body carries has the same field unless it stands here "
-            f"itself. {heated} bodies are at other temperatures than nominal."
+            "the body's origin plus gradient · r; bodies that it carries have the same field unless they are "
+            f"listed. {heated} bodies are at other temperatures than nominal."
         )
     return Table("perturbation", "", caption, ("body", "motion", "pivot"), rows, within=IN_PAGE)
 

@@ -74,14 +74,16 @@ def temperatures_svg(series: TimeSeries) -> str:
                 axes.plot(time, value, **looks[path])
         if series.motions:
             titles += ["rotation [arcsec]", "shift [µm]"]
-        for path, moves in series.motions.items():
-            turns = np.array([motion.rotate for motion in moves]) / ARCSEC
-            shifts = 1e6 * np.array([motion.shift for motion in moves])
-            for axes, values in zip(panels[-1], (turns, shifts), strict=True):
+        for path, motions in series.motions.items():
+            rotations = np.array([motion.rotate for motion in motions]) / ARCSEC
+            shifts = 1e6 * np.array([motion.shift for motion in motions])
+            for axes, values in zip(panels[-1], (rotations, shifts), strict=True):
                 for axis in np.flatnonzero(values.any(axis=0)):
                     axes.plot(time, values[:, axis], **looks[path])
-                    place = {"xytext": (3, 0), "textcoords": "offset points", "va": "center", "fontsize": 8.0}
-                    axes.annotate("XYZ"[axis], (time[-1], values[-1, axis]), color=looks[path]["color"], **place)
+                    text_position = {"xytext": (3, 0), "textcoords": "offset points", "va": "center", "fontsize": 8.0}
+                    axes.annotate(
+                        "XYZ"[axis], (time[-1], values[-1, axis]), color=looks[path]["color"], **text_position
+                    )
         for axes, title in zip(panels.flat, titles, strict=True):
             _frame(axes, series, time)
             axes.set_title(title, loc="left")
@@ -116,23 +118,23 @@ def smoothed_svg(series: TimeSeries) -> str:
     series : TimeSeries
         Course with smoothed changes.
     """
-    together = series.smoothed
-    assert together is not None
+    smoothed = series.smoothed
+    assert smoothed is not None
     size, _ = time_unit(series.times)
-    every = np.append(series.times, together.times)
-    order = np.argsort(every)
+    times = np.append(series.times, smoothed.times)
+    order = np.argsort(times)
 
-    def panel(axes: Axes, same: list[Reading]) -> None:
-        one = same[0]
+    def panel(axes: Axes, rows: list[Reading]) -> None:
+        reading = rows[0]
         at, between = (
-            part.row(one.group, one.parameter.key, "smoothed") for part in (together.changes, together.between)
+            part.row(reading.group, reading.parameter.key, "smoothed") for part in (smoothed.changes, smoothed.between)
         )
         sigma = np.append(at.sigma, between.sigma)[order]
-        time = every[order] / size
+        time = times[order] / size
         _frame(axes, series, series.times / size)
         axes.fill_between(time, -2.0 * sigma, 2.0 * sigma, color=svg.SKY, alpha=0.25, lw=0, label="2σ, smoothed")
         axes.fill_between(time, -sigma, sigma, color=svg.SKY, alpha=0.45, lw=0, label="σ, smoothed")
-        axes.plot(series.times / size, at.value - one.true, "o", color=svg.INK, ms=3.0, label="smoothed − true")
+        axes.plot(series.times / size, at.value - reading.true, "o", color=svg.INK, ms=3.0, label="smoothed − true")
 
     return _changes_svg(series, "smoothed", 1.3, panel, ground=True)
 
@@ -174,21 +176,21 @@ def _changes_svg(
         return svg.to_svg(figure)
 
 
-def _panel(axes: Axes, series: TimeSeries, time: np.ndarray, same: list[Reading], names: dict[str, str]) -> None:
+def _panel(axes: Axes, series: TimeSeries, time: np.ndarray, rows: list[Reading], names: dict[str, str]) -> None:
     _frame(axes, series, time)
-    # side by side, or the bars hide each other
+    # side by side, since overlapping bars would hide each other
     step = _BESIDE * float(np.min(np.diff(time), initial=np.inf)) if len(time) > 1 else 0.0
     for j, (estimator, (marker, colour)) in enumerate(marks(names).items()):
-        one = next(row for row in same if row.estimator == estimator)
-        place = time + (j - 0.5 * (len(names) - 1)) * step
+        reading = next(row for row in rows if row.estimator == estimator)
+        offset_time = time + (j - 0.5 * (len(names) - 1)) * step
         axes.errorbar(
-            place, one.value, one.sigma, fmt=marker, color=colour, ms=4.0, mec="white", mew=0.4, elinewidth=0.8,
-            label=names[estimator],
+            offset_time, reading.value, reading.sigma, fmt=marker, color=colour, ms=4.0, mec="white", mew=0.4,
+            elinewidth=0.8, label=names[estimator],
         )  # fmt: skip
-    axes.plot(time, same[0].true, color=svg.INK, lw=1.5, label="true", zorder=1.5)
+    axes.plot(time, rows[0].true, color=svg.INK, lw=1.5, label="true", zorder=1.5)
     low, high = axes.get_ylim()
-    # noise alone must not fill a panel
-    least = 6.0 * max(float(np.max(one.sigma)) for one in same)
+    # a panel must not be scaled to noise alone
+    least = 6.0 * max(float(np.max(reading.sigma)) for reading in rows)
     if high - low < least:
         middle = 0.5 * (low + high)
         axes.set_ylim(middle - 0.5 * least, middle + 0.5 * least)

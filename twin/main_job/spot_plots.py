@@ -137,9 +137,9 @@ def _dn_ticks(norm: Normalize) -> list[float]:
     """Return round numbers within the stretch, at most three per decade."""
     assert norm.vmin is not None
     assert norm.vmax is not None
-    found = [float(m * 10**k) for k in range(1, 8) for m in (1, 2, 5)]
+    candidates = [float(m * 10**k) for k in range(1, 8) for m in (1, 2, 5)]
     span = norm.vmax - norm.vmin
-    return [t for t in found if norm.vmin + 0.004 * span <= t <= norm.vmax]
+    return [t for t in candidates if norm.vmin + 0.004 * span <= t <= norm.vmax]
 
 
 _MARKS = (
@@ -156,8 +156,8 @@ def marks(names: Iterable[str]) -> dict[str, tuple[str, str]]:
     names : Iterable[str]
         Estimators in a figure; the mark of an estimator does not depend on the others.
     """
-    every = dict(zip(ESTIMATORS, cycle(_MARKS), strict=False))
-    return {name: every[name] for name in names}
+    all_marks = dict(zip(ESTIMATORS, cycle(_MARKS), strict=False))
+    return {name: all_marks[name] for name in names}
 
 
 def residuals_svg(run: RenderRun) -> str:
@@ -195,17 +195,17 @@ def residuals_svg(run: RenderRun) -> str:
 def _panel(axes: Axes, title: str, panel: dict[str, dict[str, float | None]], names: dict[str, str]) -> None:
     axes.axvspan(-FAR, FAR, color=svg.SHADE, lw=0)
     axes.axvline(0.0, color=svg.GREY, lw=0.8)
-    place = {label: k for k, label in enumerate(panel)}
-    found = marks(names)
-    for j, (estimator, (marker, colour)) in enumerate(found.items()):
-        points = [(r, place[label]) for label, row in panel.items() if (r := row.get(estimator)) is not None]
-        offset = (j - 0.5 * (len(found) - 1)) * min(0.19, 0.76 / len(found))
+    row_of = {label: k for k, label in enumerate(panel)}
+    marks_by_estimator = marks(names)
+    for j, (estimator, (marker, colour)) in enumerate(marks_by_estimator.items()):
+        points = [(r, row_of[label]) for label, row in panel.items() if (r := row.get(estimator)) is not None]
+        offset = (j - 0.5 * (len(marks_by_estimator) - 1)) * min(0.19, 0.76 / len(marks_by_estimator))
         x, y = [p[0] for p in points], [p[1] + offset for p in points]
         axes.plot(x, y, marker, color=colour, ms=5.5, mec="white", mew=0.5, ls="none", label=names[estimator])
-    axes.set_yticks(list(place.values()), list(place))
-    axes.set_ylim(len(place) - 0.5, -0.5)
+    axes.set_yticks(list(row_of.values()), list(row_of))
+    axes.set_ylim(len(row_of) - 0.5, -0.5)
     axes.set_title(title, loc="left", fontweight="bold")
-    for k in range(1, len(place)):
+    for k in range(1, len(row_of)):
         axes.axhline(k - 0.5, color=svg.LIGHT, lw=0.6)
     axes.tick_params(axis="y", length=0)
     svg.plain_axes(axes)
@@ -235,7 +235,7 @@ def motion_map_svg(run: RenderRun) -> str:
         for k, (axes, (name, table)) in enumerate(zip(panels, tables, strict=True)):
             _motion_panel(axes, pitch * table.spot_shift.T, table.coordinates, norm)
             axes.set_yticks(range(len(table.motions)), labels[k])
-            # told once where all cameras have the same motions
+            # labelled once where all cameras have the same motions
             axes.tick_params(labelleft=k == 0 or labels[k] != labels[0])
             axes.set_title(f"Camera {name}", fontweight="bold", pad=4)
         return svg.to_svg(figure)
@@ -248,16 +248,16 @@ def _labels(table: CameraCrosstalk) -> list[str]:
 def _motion_panel(axes: Axes, values: np.ndarray, names: Sequence[str], norm: SymLogNorm) -> None:
     axes.imshow(values, cmap=svg.DIVERGING, norm=norm, aspect="auto", interpolation="nearest")
     axes.xaxis.set_ticks_position("top")
-    # many are told below one another
-    turn = 90.0 if len(names) > _MOST_LEVEL else 0.0
-    axes.set_xticks(range(values.shape[1]), [f"{name} [µm]" for name in names], rotation=turn)
+    # many labels are written vertically
+    rotation = 90.0 if len(names) > _MOST_LEVEL else 0.0
+    axes.set_xticks(range(values.shape[1]), [f"{name} [µm]" for name in names], rotation=rotation)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
     deep = np.abs(np.asarray(norm(values)) - 0.5) * 2.0
     for (row, column), value in np.ndenumerate(values):
         colour = "white" if deep[row, column] > _STRONG else svg.INK
         text = significant(float(value), 2, floor=SAME)
-        # inside its panel, which is arranged without looking at it
+        # the text is inside its panel and must not affect the layout
         axes.text(column, row, text, ha="center", va="center", fontsize=7, color=colour, in_layout=False)
 
 
@@ -306,7 +306,7 @@ def _drawn_summary(run: RenderRun) -> Figure:
             if k:
                 _scale_bar(axes, run, column, row, half)
             else:
-                # many pictures are narrow
+                # with many pictures each is narrow
                 text = "{} camera, {} spot" if columns <= 4 else "{}, {}"
                 axes.set_title(text.format(channel.camera, channel.name), fontsize=13 if columns <= 4 else 10, pad=7)
     _table(figure, table, 1.0 - top - 0.1 / sum(heights), run, notes)
@@ -335,7 +335,7 @@ def _table(figure: Figure, table: Table, top: float, run: RenderRun, notes: Sequ
     count = 1 + len(table.bands) + len(table.rows)
     axes.set_ylim(count + 0.35 + NOTE * len(notes), 0.0)
     estimators = list(run.estimators.values())
-    # columns share the width that is left by the names and the truth
+    # columns divide the width beside the names and the true values
     step = (0.99 - FIRST) / len(estimators)
     edges = [FIRST, *(FIRST + step * (k + 1) for k in range(len(estimators)))]
     heads = ["true", *(estimator.title for estimator in estimators)]

@@ -72,7 +72,7 @@ def systematics(run: RenderRun, camera: str) -> Systematics:
     unit = rows_of(run.reading.cameras[camera])
     bias = {e: unit @ (gain[rows] @ moved) - true for e, gain in run.gains.items()}
     others = [i for i in range(_FAMILY, len(table.motions)) if abs(amounts[camera][i]) > SHOWN]
-    outside = tuple(_told(table.motions[i], amounts[camera][i]) for i in others)
+    outside = tuple(_motion_text(table.motions[i], amounts[camera][i]) for i in others)
     return Systematics(bias, outside, _parts(run, camera, amounts), _uncovered(run, camera, table))
 
 
@@ -82,27 +82,27 @@ def _parts(run: RenderRun, camera: str, amounts: dict[str, np.ndarray]) -> dict[
     k = names.index(camera)
     gain = rows_of(run.reading.cameras[camera]) @ run.gains[run.judged][4 * k : 4 * k + 4]
     # an estimator with a prior weighs all motions and reads none of them exactly
-    known = 0 if run.estimators[run.judged].stated else _FAMILY
+    modelled = 0 if run.estimators[run.judged].stated else _FAMILY
     out: dict[tuple[str, str, int], tuple[str, np.ndarray]] = {}
-    own = {name: run.experiment.instrument.coordinates_of(name) for name in names}
+    coordinates = {name: run.experiment.instrument.coordinates_of(name) for name in names}
     for name, table in run.crosstalk.items():
         for i, motion in enumerate(table.motions):
-            if i < known or abs(amounts[name][i]) <= SHOWN:
+            if i < modelled or abs(amounts[name][i]) <= SHOWN:
                 continue
-            read = gain[:, own[name]] @ table.spot_shift[:, i]
+            read = gain[:, coordinates[name]] @ table.spot_shift[:, i]
             part = (read - (table.true[:, i] if name == camera else 0.0)) * amounts[name][i]
             if not np.any(part):
                 continue
             # a body that both cameras see is in both tables
             key = (motion.body, motion.kind, motion.axis)
-            told = _told(motion, amounts[name][i])
-            told = told if name == camera or motion.body == CENTRAL_PRISM else f"{name}: {told}"
+            text = _motion_text(motion, amounts[name][i])
+            text = text if name == camera or motion.body == CENTRAL_PRISM else f"{name}: {text}"
             before = out.get(key)
-            out[key] = (told, part) if before is None else (before[0], before[1] + part)
+            out[key] = (text, part) if before is None else (before[0], before[1] + part)
     return dict(out.values())
 
 
-def _told(motion: ElementaryMotion, amount: float) -> str:
+def _motion_text(motion: ElementaryMotion, amount: float) -> str:
     return f"{motion.label}, {plain(float(amount), 4)} {unit_for_reports(motion.unit)}"
 
 
@@ -127,29 +127,31 @@ def _shift_at(run: RenderRun, body: str, motion: Motion, pivot: str) -> np.ndarr
 
 def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str, ...]:
     """Return the bodies that moved, affect this camera and have no row in the table."""
-    own = f"{BASE}/{camera}"
+    camera_body = f"{BASE}/{camera}"
     bodies = {motion.body for motion in table.motions}
-    out = []
-    given = run.resolved.job.perturb
+    uncovered = []
+    perturbations = run.resolved.job.perturb
     for path, motion in run.state.items():
-        if path not in (own, CENTRAL_PRISM) and not path.startswith((f"{own}/", f"{CENTRAL_PRISM}/{camera}_")):
+        if path not in (camera_body, CENTRAL_PRISM) and not path.startswith(
+            (f"{camera_body}/", f"{CENTRAL_PRISM}/{camera}_")
+        ):
             continue
-        deformed = path in given and given[path].deformation is not None
+        deformed = path in perturbations and perturbations[path].deformation is not None
         if (motion.expansion and not deformed) or motion.index or any(motion.index_gradient):
-            out.append(HEAT)
-        if path not in given:
+            uncovered.append(HEAT)
+        if path not in perturbations:
             continue
         if path not in bodies and (any(motion.rotate) or any(motion.shift) or motion.scale):
-            out.append(path)
-        if given[path].heat.table is not None:
+            uncovered.append(path)
+        if perturbations[path].heat.table is not None:
             continue
         covered = {m.axis for m in table.motions if m.body == path and m.kind == "figure"}
         missing = [f"Z{j}" for j, amplitude in motion.figure.items() if amplitude and j not in covered]
         if deformed:
             missing = ["of a table of nodes"]
         if missing:
-            out.append(f"{path} (figure {', '.join(missing)})")
-    return tuple(out)
+            uncovered.append(f"{path} (figure {', '.join(missing)})")
+    return tuple(uncovered)
 
 
 def joined(names: Sequence[str]) -> str:
@@ -157,14 +159,14 @@ def joined(names: Sequence[str]) -> str:
     return "; ".join(dict.fromkeys(names))
 
 
-BLIND = 4.0
+UNNOTICED_SIGMAS = 4.0
 """Error of a reading, in sigmas, from which a warning says that the spots do not show it.
 
 A motion drawn from the prior itself causes as much in one of 20 000 runs.
 """
 
 
-def perturbed_unseen(run: RenderRun) -> tuple[str, ...]:
+def unobserved_perturbations(run: RenderRun) -> tuple[str, ...]:
     """Return a warning for each perturbed body that falsifies readings without showing in the spots.
 
     The effect of that body's perturbation alone on spots and cameras is traced and compared with the reading of it.
@@ -182,41 +184,43 @@ def perturbed_unseen(run: RenderRun) -> tuple[str, ...]:
     if not moved:
         return ()
     try:
-        found = traced_states(run.experiment.path, run.experiment.sight, [{path: m} for path, m in moved.items()])
+        traced = traced_states(run.experiment.path, run.experiment.sight, [{path: m} for path, m in moved.items()])
     except LOST:
         # the body may keep its light together with others; moved alone, no statement is possible
         return ()
-    reading, stated = run.reading, run.reading.disturbances
+    reading, prior = run.reading, run.reading.disturbances
     gain = run.gains[run.judged]
-    every = quantities(reading.cameras, reading.ground)
-    rows = np.stack([quantity.row for quantity in every])
-    sigma = _sigmas(rows, stated, noise, gain)
-    spread = noise if stated is None else stated.spot_covariance + noise
+    all_quantities = quantities(reading.cameras, reading.ground)
+    rows = np.stack([quantity.row for quantity in all_quantities])
+    sigma = _sigmas(rows, prior, noise, gain)
+    covariance = noise if prior is None else prior.spot_covariance + noise
     limit = float(limit_of(FALSE_ALARM, len(noise))) - len(noise)
-    out = []
-    for path, shift, true in zip(moved, found.spots, found.parameters, strict=True):
-        wrong = rows @ (gain @ shift - true)
-        far = np.abs(wrong) / np.where(sigma > 0.0, sigma, np.inf)
-        worst = int(np.argmax(far))
-        still = float(np.max(np.abs(shift) / np.sqrt(np.diag(noise))))
-        told = float(shift @ np.linalg.solve(spread, shift))
-        if far[worst] < BLIND or (still > BLIND if stated is None else told > limit):
+    warnings = []
+    for path, shift, true in zip(moved, traced.spots, traced.parameters, strict=True):
+        errors = rows @ (gain @ shift - true)
+        sigmas_off = np.abs(errors) / np.where(sigma > 0.0, sigma, np.inf)
+        worst = int(np.argmax(sigmas_off))
+        largest_shift = float(np.max(np.abs(shift) / np.sqrt(np.diag(noise))))
+        chi_square = float(shift @ np.linalg.solve(covariance, shift))
+        if sigmas_off[worst] < UNNOTICED_SIGMAS or (
+            largest_shift > UNNOTICED_SIGMAS if prior is None else chi_square > limit
+        ):
             continue
-        how = "moves no spot beyond its noise" if still < 1.0 else "moves the spots as more probable motions do"
-        unit = unit_text(every[worst])
+        how = "moves no spot beyond its noise" if largest_shift < 1.0 else "moves the spots as more probable motions do"
+        unit = unit_text(all_quantities[worst])
         is_, read = (significant(float(rows[worst] @ value), 3) for value in (true, gain @ shift))
-        out.append(
-            f"{path}: its perturbation {how}; {short_text(every[worst])} changes by {is_} {unit} but is read as {read} "
-            f"{unit}, an error of {far[worst]:.1f} σ; neither σ nor the test of the shifts can show this: for this "
-            "body σ depends on the prior alone"
+        warnings.append(
+            f"{path}: its perturbation {how}; {short_text(all_quantities[worst])} changes by {is_} {unit} but is read "
+            f"as {read} {unit}, an error of {sigmas_off[worst]:.1f} σ; neither σ nor the test of the shifts can show "
+            "this: for this body σ depends on the prior alone"
         )
-    return tuple(out)
+    return tuple(warnings)
 
 
-def _sigmas(rows: np.ndarray, stated: Disturbances | None, noise: np.ndarray, gain: np.ndarray) -> np.ndarray:
+def _sigmas(rows: np.ndarray, prior: Disturbances | None, noise: np.ndarray, gain: np.ndarray) -> np.ndarray:
     """Return (Q,) sigmas of the readings by an estimator."""
-    if stated is not None:
-        return split(rows, stated, noise, gain).sigma
+    if prior is not None:
+        return split(rows, prior, noise, gain).sigma
     return np.sqrt(np.einsum("qd,de,qe->q", rows @ gain, noise, rows @ gain))
 
 
@@ -228,20 +232,20 @@ NOISE = "the noise of the images"
 
 def assumed(reading: MonitorReading) -> str:
     """Return the basis of the sigmas and whether the shifts agree with it, as a sentence without a full stop."""
-    stated, found = reading.disturbances, reading.consistency
-    if stated is None or found is None:
+    prior, test = reading.disturbances, reading.consistency
+    if prior is None or test is None:
         return _NOISE_ALONE
-    agree = "agree with it" if found.agrees else "contradict it"
+    agree = "agree with it" if test.agrees else "contradict it"
     return (
-        f"σ: noise and the prior {stated.name}; the shifts {agree} (chi-square "
-        f"{significant(found.chi_square)} for {found.degrees} degrees of freedom, limit {found.limit:.1f} at a "
-        f"false-alarm rate of {found.false_alarm:g}){_from_statement(reading)}"
+        f"σ: noise and the prior {prior.name}; the shifts {agree} (chi-square "
+        f"{significant(test.chi_square)} for {test.degrees} degrees of freedom, limit {test.limit:.1f} at a "
+        f"false-alarm rate of {test.false_alarm:g}){_prior_share_text(reading)}"
     )
 
 
-def _from_statement(reading: MonitorReading) -> str:
+def _prior_share_text(reading: MonitorReading) -> str:
     """Return how much of the posterior's variances rests on the prior, from the least to the largest share, as text."""
-    shares = [share for own in reading.from_statement.values() for share in own.values() if share is not None]
+    shares = [share for group in reading.from_statement.values() for share in group.values() if share is not None]
     if not shares:
         return ""
     ends = list(dict.fromkeys(plain(math.floor(1e3 * end) / 10.0, 4) for end in (min(shares), max(shares))))
@@ -255,9 +259,9 @@ def contradiction(run: RenderRun) -> tuple[str, ...]:
     """
     if run.worst_of_course is None or run.series is None:
         return ()
-    k, found = run.worst_of_course
+    k, test = run.worst_of_course
     when = f" at {moment(float(run.series.times[k]))}, the worst of {len(run.series.times)} times"
-    return contradicted(run.experiment.disturbances, found, when, f"{FALSE_ALARM:g} for the course")
+    return contradicted(run.experiment.disturbances, test, when, f"{FALSE_ALARM:g} for the course")
 
 
 def doubted(run: RenderRun) -> tuple[str, ...]:
@@ -277,10 +281,10 @@ def course_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
     times : (T,) ndarray
         Times of its measurements, in seconds.
     """
-    return " ".join((_series_agrees(together, times), *_jumps_told(together)))
+    return " ".join((_series_agrees(together, times), *_jump_sentences(together)))
 
 
-def _jumps_told(together: SmoothedCourse) -> tuple[str, ...]:
+def _jump_sentences(together: SmoothedCourse) -> tuple[str, ...]:
     """Return sentences on detected jumps, or that there are none; empty where the prior has no jumps."""
     if together.jumps is None:
         return ()
@@ -290,21 +294,22 @@ def _jumps_told(together: SmoothedCourse) -> tuple[str, ...]:
 
 
 def _series_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
-    found = together.consistency
-    what = f"Chi-square of all {len(times)} measurements is {found.chi_square:.4g}"
-    if found.chance > 1.0 - FALSE_ALARM:
+    test = together.consistency
+    what = f"Chi-square of all {len(times)} measurements is {test.chi_square:.4g}"
+    if test.chance > 1.0 - FALSE_ALARM:
         return (
-            f"{what} for {found.degrees} degrees of freedom: the motions are smaller than the prior expects, and the "
+            f"{what} for {test.degrees} degrees of freedom: the motions are smaller than the prior expects, and the "
             "sigmas are too large."
         )
-    if found.agrees:
-        limit = f"limit {found.limit:.4g} at a false-alarm rate of {FALSE_ALARM:g}"
-        return f"{what} for {found.degrees} degrees of freedom, in agreement with the prior ({limit})."
+    if test.agrees:
+        limit = f"limit {test.limit:.4g} at a false-alarm rate of {FALSE_ALARM:g}"
+        return f"{what} for {test.degrees} degrees of freedom, in agreement with the prior ({limit})."
     worst = int(np.argmax(together.innovations))
     return (
-        f"{what} for {found.degrees} degrees of freedom (limit {found.limit:.4g} at a false-alarm rate of "
-        f"{FALSE_ALARM:g}): the measurements contradict the prior, and the sigmas are not reliable. Look "
-        f"first at the measurement at {moment(float(times[worst]))}, which contributes {together.innovations[worst]:.3g} given those before it."
+        f"{what} for {test.degrees} degrees of freedom (limit {test.limit:.4g} at a false-alarm rate of "
+        f"{FALSE_ALARM:g}): the measurements contradict the prior, and the sigmas are not reliable. Look first at the "
+        f"measurement at {moment(float(times[worst]))}, which contributes {together.innovations[worst]:.3g} given "
+        "those before it."
     )
 
 
@@ -320,11 +325,11 @@ def combination(reading: MonitorReading, group: str, key: str) -> np.ndarray:
     key : str
         Key of the change.
     """
-    found = quantities(reading.cameras, reading.ground)
-    return next(quantity.row for quantity in found if (quantity.group, quantity.key) == (group, key))
+    all_quantities = quantities(reading.cameras, reading.ground)
+    return next(quantity.row for quantity in all_quantities if (quantity.group, quantity.key) == (group, key))
 
 
-def limits(reading: MonitorReading, one: Reading) -> tuple[str, float]:
+def limits(reading: MonitorReading, change: Reading) -> tuple[str, float]:
     """Return the largest source of a change's error variance (a body, or NOISE) and its share.
 
     Parameters
@@ -334,11 +339,11 @@ def limits(reading: MonitorReading, one: Reading) -> tuple[str, float]:
     one : Reading
         The change, as the judged estimator reads it.
     """
-    stated = reading.disturbances
-    assert stated is not None
-    row, noise = combination(reading, one.group, one.parameter.key)[None], reading.recovery.shift_covariance[0]
-    found = split(row, stated, noise, reading.gains[reading.judged])
-    variances = {NOISE: found.noise, **Split.by(found.after, stated.bodies)}
+    prior = reading.disturbances
+    assert prior is not None
+    row, noise = combination(reading, change.group, change.parameter.key)[None], reading.recovery.shift_covariance[0]
+    variance_split = split(row, prior, noise, reading.gains[reading.judged])
+    variances = {NOISE: variance_split.noise, **Split.by(variance_split.after, prior.bodies)}
     shares = {body: float(variance[0]) for body, variance in variances.items()}
     worst = max(shares, key=lambda body: shares[body])
     total = sum(shares.values())

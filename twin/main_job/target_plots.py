@@ -70,11 +70,11 @@ def curves_svg(name: str, camera: CameraTargets) -> str:
             for row, direction in enumerate(DIRECTIONS):
                 axes, below = panels[2 * row : 2 * row + 2, column]
                 nyquist = 1e-3 * NYQUIST / camera.pitch
-                for each in (axes, below):
-                    plain_axes(each)
-                    each.grid(color=LIGHT, lw=0.5)
-                    each.set_axisbelow(True)
-                    each.axvline(nyquist, color=GREY, lw=0.9, ls=(0, (1, 2)), zorder=0)
+                for panel in (axes, below):
+                    plain_axes(panel)
+                    panel.grid(color=LIGHT, lw=0.5)
+                    panel.set_axisbelow(True)
+                    panel.axvline(nyquist, color=GREY, lw=0.9, ls=(0, (1, 2)), zorder=0)
                 below.axhline(0.0, color=GREY, lw=0.8)
                 for when, shots in targets.shots.items():
                     _curve(axes, when, shots.edges[direction])
@@ -89,7 +89,7 @@ def curves_svg(name: str, camera: CameraTargets) -> str:
                 if row == len(DIRECTIONS) - 1:
                     below.set_xlabel("frequency [cycles/mm]")
         for below in panels[1::2, 0]:
-            # about zero, and noise alone does not fill a panel
+            # symmetric about zero, and not scaled to noise alone
             span = max(_LEAST_SPAN, *(abs(limit) for limit in below.get_ylim()))
             below.set_ylim(-span, span)
         handles, labels = panels[0, 0].get_legend_handles_labels()
@@ -102,28 +102,28 @@ def curves_svg(name: str, camera: CameraTargets) -> str:
 def _curve(axes: Axes, when: str, edge: EdgeReading) -> None:
     colour, frequency = COLOURS[when], 1e-3 * edge.frequency
     axes.plot(frequency, edge.true, color=colour, lw=1.3, label=f"true, {when}")
-    found = edge.measured
-    if found is None:
+    measured = edge.measured
+    if measured is None:
         return
     axes.plot(
-        frequency[::EVERY], found.mtf[::EVERY], MARKS[when], color=colour, ms=3.2, mec="white", mew=0.4,
+        frequency[::EVERY], measured.mtf[::EVERY], MARKS[when], color=colour, ms=3.2, mec="white", mew=0.4,
         label=f"measured, {when}",
     )  # fmt: skip
 
 
 def _difference(axes: Axes, when: str, edge: EdgeReading) -> None:
     """Draw measured minus true MTF, in thousandths."""
-    found = edge.measured
-    if found is None:
+    measured = edge.measured
+    if measured is None:
         return
-    frequency, error, sigma = 1e-3 * edge.frequency, 1e3 * (found.mtf - edge.true), 1e3 * found.sigma
+    frequency, error, sigma = 1e-3 * edge.frequency, 1e3 * (measured.mtf - edge.true), 1e3 * measured.sigma
     axes.fill_between(frequency, -BAND * sigma, BAND * sigma, color=COLOURS[when], alpha=0.18, lw=0.0)
     axes.plot(frequency, error, color=COLOURS[when], lw=1.1)
 
 
 def _bars(axes: Axes, when: str, bars: BarReading, pitch: float) -> None:
     if bars.measured is not None:
-        # bars of both states stand at one frequency
+        # bars of both states have the same frequency
         axes.plot(
             1e-3 * NYQUIST / pitch, bars.measured.mtf, "s", color="none", mec=COLOURS[when], mew=1.3, ms=6.5,
             label=f"bars, {when}",
@@ -214,25 +214,25 @@ def deformation_svg(faces: Mapping[str, NodalDeformation]) -> str:
 def _deformation(figure: Figure, axes: Any, path: str, face: NodalDeformation) -> None:
     """Draw the maps of one body; each node colours its cell of the aperture."""
     inside = face.weight > 0.0
-    places = face.places[inside]
-    low, high = places.min(axis=0), places.max(axis=0)
+    points = face.places[inside]
+    low, high = points.min(axis=0), points.max(axis=0)
     step = float(np.max(high - low)) / _PIXELS
     x, y = (np.arange(a, b + step, step) for a, b in zip(low, high, strict=True))
-    distance, nearest = cKDTree(places).query(np.stack(np.meshgrid(x, y), axis=-1))
+    distance, nearest = cKDTree(points).query(np.stack(np.meshgrid(x, y), axis=-1))
     ends = tuple(1e3 * float(v) for v in (low[0], high[0], low[1], high[1]))
-    for one, title, values in (
+    for panel, title, values in (
         (axes[0], f"{path}: change of sag", face.change),
         (axes[1], f"after Z{max(face.figure)}", face.residual),
         (axes[2], "after the grid", face.lost),
     ):
         shown = np.where(distance <= 2.0 * face.spacing, 1e9 * values[inside][nearest], np.nan)
         most = max(float(np.nanmax(np.abs(shown))), 1e-6)
-        picture = signed_map(one, shown, most, extent=ends, origin="lower", interpolation="nearest")
-        one.set_title(
+        picture = signed_map(panel, shown, most, extent=ends, origin="lower", interpolation="nearest")
+        panel.set_title(
             f"{title}\n{1e9 * face.rms(values):.3g} nm rms, {1e9 * face.range(values):.3g} nm PV", fontsize=8.5
         )
-        one.set_xlabel("x, mm")
-        one.tick_params(labelsize=7)
-        bar = figure.colorbar(picture, ax=one, shrink=0.8, pad=0.02)
+        panel.set_xlabel("x, mm")
+        panel.tick_params(labelsize=7)
+        bar = figure.colorbar(picture, ax=panel, shrink=0.8, pad=0.02)
         bar.ax.tick_params(labelsize=7)
     axes[0].set_ylabel("y, mm")

@@ -27,9 +27,9 @@ from twin.main_job.systematics import (
     doubted,
     joined,
     limits,
-    perturbed_unseen,
     share_text,
     systematics,
+    unobserved_perturbations,
 )
 from twin.monitor.image_quality import ImageQuality
 from twin.monitor.reading_table import Reading
@@ -65,23 +65,23 @@ def judge(run: JobRun) -> Judgement:
     """Judge a run by its readings, sigmas, truth and crosstalk; without a monitor by the truth and the images."""
     if not isinstance(run, RenderRun):
         return Judgement(*answer(*_changed(run)), run.warnings)
-    found = readings(run, run.judged)
-    off = [r for r in found if r.far]
+    rows = readings(run, run.judged)
+    wrong = [r for r in rows if r.far]
     if run.series is not None:
-        first, *others = _series_verdict(run, run.series, found, off)
+        first, *others = _series_verdict(run, run.series, rows, wrong)
     elif not any(map(_moves, run.state.values())):
-        first, *others = _nothing(run, found, off)
-    elif off:
-        first, *others = _misled(run, found, off)
+        first, *others = _nothing(run, rows, wrong)
+    elif wrong:
+        first, *others = _misled(run, rows, wrong)
     else:
-        first, *others = _recovered(run, found)
-    unseen = (*perturbed_unseen(run), *run.reading.unseen)
-    given = (*run.warnings, *doubted(run), *contradiction(run), *unseen)
-    warnings = (*given, *_unstated(run, found, unseen), *_misreadings(run))
+        first, *others = _recovered(run, rows)
+    unobserved = (*unobserved_perturbations(run), *run.reading.unseen)
+    computed = (*run.warnings, *doubted(run), *contradiction(run), *unobserved)
+    warnings = (*computed, *_beyond_prior(run, rows, unobserved), *_misreadings(run))
     doubt = "σ does not hold for this measurement: see the warnings" if not run.sigma_holds else ""
-    if contradicted := _series_contradicted(run):
+    if contradicted := _contradicted_course(run):
         first, doubt = contradicted, first
-    verdict, more = answer(first, doubt, *others, limited(run), _dimmed(run), _blurred(run))
+    verdict, more = answer(first, doubt, *others, limited(run), _lost_light(run), _blurred(run))
     return Judgement(verdict, more, warnings)
 
 
@@ -90,10 +90,10 @@ def _changed(run: JobRun) -> tuple[str, str]:
     moved = any(map(_moves, run.state.values()))
     cameras = len(run.truth.cameras) > 1
     parts = [
-        f"{one.symbol} {'of ' + group + ' ' if cameras and group in run.truth.cameras else ''}"
-        f"{significant(value, 3, sign=True)} {one.unit}"
-        for group, one, value in run.true_changes()
-        if group != GROUND_GROUP and abs(value) > 0.5 * 10.0**-one.decimals
+        f"{parameter.symbol} {'of ' + group + ' ' if cameras and group in run.truth.cameras else ''}"
+        f"{significant(value, 3, sign=True)} {parameter.unit}"
+        for group, parameter, value in run.true_changes()
+        if group != GROUND_GROUP and abs(value) > 0.5 * 10.0**-parameter.decimals
     ]
     text = f"The perturbation changes the geometry by {', '.join(parts)}"
     if not parts or not moved:
@@ -103,27 +103,27 @@ def _changed(run: JobRun) -> tuple[str, str]:
     worst: list[str] = []
     for name, camera in run.quality.cameras.items():
         before, after = (float(np.max(errors)) for errors in camera.wfe)
-        who = f" of {name}" if cameras else ""
+        camera_text = f" of {name}" if cameras else ""
         if not np.isfinite(before):
-            worst.append(f"the image quality{who} is not known: {camera.reasons[0]}")
+            worst.append(f"the image quality{camera_text} is not known: {camera.reasons[0]}")
         elif not np.isfinite(after):
-            worst.append(f"the image quality{who} after it is not known: {camera.reasons[1]}")
+            worst.append(f"the image quality{camera_text} after it is not known: {camera.reasons[1]}")
         elif moved:
             worst.append(
-                f"the worst wavefront error{who} goes from {significant(before, 3)} to {significant(after, 3)} "
+                f"the worst wavefront error{camera_text} goes from {significant(before, 3)} to {significant(after, 3)} "
                 "waves rms"
             )
         else:
-            worst.append(f"the worst wavefront error{who} is {significant(before, 3)} waves rms")
+            worst.append(f"the worst wavefront error{camera_text} is {significant(before, 3)} waves rms")
     share, _, change = sharpness_lost(run.quality)
-    told = f", the MTF at Nyquist at worst {change}" if moved and share > 0.0 else ""
-    return text, f"{', '.join(worst)}{told}"
+    mtf_text = f", the MTF at Nyquist at worst {change}" if moved and share > 0.0 else ""
+    return text, f"{', '.join(worst)}{mtf_text}"
 
 
 def recovered_numbers(run: RenderRun) -> dict[str, Any]:
     """Return the contents of recovered.json: readings, verdict and warnings."""
-    told = judge(run)
-    return {**stated(run.recovered_dict()), "verdict": told.verdict, "warnings": list(told.warnings)}
+    judgement = judge(run)
+    return {**stated(run.recovered_dict()), "verdict": judgement.verdict, "warnings": list(judgement.warnings)}
 
 
 def _moves(motion: Motion) -> bool:
@@ -131,40 +131,44 @@ def _moves(motion: Motion) -> bool:
     return any(moved) or any(motion.figure.values()) or motion.grid is not None
 
 
-def _hidden(run: RenderRun, found: tuple[Reading, ...]) -> str:
+def _undetectable(run: RenderRun, rows: tuple[Reading, ...]) -> str:
     """Return the smallest detectable changes of the cameras' parameters, as text."""
-    sigmas = {p: [r.sigma for r in found if r.parameter == p] for p in parameters.CAMERA_PARAMETERS.values()}
-    parts = [f"{p.symbol} {significant(FAR * max(own), 2, floor=0.0)} {p.unit}" for p, own in sigmas.items() if own]
-    who = (
+    sigmas = {p: [r.sigma for r in rows if r.parameter == p] for p in parameters.CAMERA_PARAMETERS.values()}
+    parts = [
+        f"{p.symbol} {significant(FAR * max(sigma_values), 2, floor=0.0)} {p.unit}"
+        for p, sigma_values in sigmas.items()
+        if sigma_values
+    ]
+    source = (
         f"with {run.frames} frames the noise of the images hides" if _noise_only(run) else "noise and disturbances hide"
     )
-    return f"{who} changes below {', '.join(parts)} ({FAR:g} σ)"
+    return f"{source} changes below {', '.join(parts)} ({FAR:g} σ)"
 
 
 def _noise_only(run: RenderRun) -> bool:
     return run.experiment.disturbances is None
 
 
-def _told(run: RenderRun) -> str:
+def _title(run: RenderRun) -> str:
     return run.estimators[run.judged].title
 
 
-def _within(run: RenderRun, found: tuple[Reading, ...], of: str, how: str = "") -> str:
+def _within(run: RenderRun, rows: tuple[Reading, ...], reference: str, prefix: str = "") -> str:
     """Return ``all 12 readings ... are within 3 σ of the truth``, with the basis of σ."""
-    stated = run.experiment.disturbances
-    basis = "noise alone" if stated is None else f"noise and disturbances {stated.name}"
-    return f"all {len(found)} readings of the {_told(run)} are within {FAR:g} σ of {of} ({how}σ: {basis})"
+    prior = run.experiment.disturbances
+    basis = "noise alone" if prior is None else f"noise and disturbances {prior.name}"
+    return f"all {len(rows)} readings of the {_title(run)} are within {FAR:g} σ of {reference} ({prefix}σ: {basis})"
 
 
-def _nothing(run: RenderRun, found: tuple[Reading, ...], off: list[Reading]) -> tuple[str, ...]:
-    if not off:
-        return f"Nothing was perturbed, and {_within(run, found, 'zero')}", _hidden(run, found)
-    worst = max(off, key=lambda r: abs(r.ratio))
-    chance = _chance(worst.ratio, len(found))
+def _nothing(run: RenderRun, rows: tuple[Reading, ...], wrong: list[Reading]) -> tuple[str, ...]:
+    if not wrong:
+        return f"Nothing was perturbed, and {_within(run, rows, 'zero')}", _undetectable(run, rows)
+    worst = max(wrong, key=lambda r: abs(r.ratio))
+    chance = _chance(worst.ratio, len(rows))
     why = "check the warnings and the spots" if chance < FALSE_ALARM else "this is consistent with chance"
     return (
-        f"Nothing was perturbed, but {len(off)} of {len(found)} readings of the {_told(run)} {_are(off)} beyond "
-        f"{FAR:g} σ",
+        f"Nothing was perturbed, but {len(wrong)} of {len(rows)} readings of the {_title(run)} "
+        f"{_are(wrong)} beyond {FAR:g} σ",
         f"the worst is {worst.name}, {worst.read}; chance alone causes such a reading in {100.0 * chance:.2g} % of "
         f"such runs: {why}",
     )
@@ -179,39 +183,39 @@ def _are(what: list[Reading]) -> str:
     return "is" if len(what) == 1 else "are"
 
 
-def _changes(found: tuple[Reading, ...]) -> list[Reading]:
+def _changes(rows: tuple[Reading, ...]) -> list[Reading]:
     """Return the readings without the errors on the ground, which follow from them."""
-    return [r for r in found if r.group != GROUND_GROUP]
+    return [r for r in rows if r.group != GROUND_GROUP]
 
 
-def _recovered(run: RenderRun, found: tuple[Reading, ...]) -> tuple[str, ...]:
-    seen = [r for r in found if abs(r.true) > FAR * r.sigma]
-    clear = _changes(found)
+def _recovered(run: RenderRun, rows: tuple[Reading, ...]) -> tuple[str, ...]:
+    clear_changes = [r for r in rows if abs(r.true) > FAR * r.sigma]
+    clear = _changes(rows)
     largest = max(clear, key=lambda r: abs(r.true) / r.sigma if r.sigma else abs(r.true))
-    if seen:
+    if clear_changes:
         return (
-            _within(run, found, "the truth"),
-            f"{len(seen)} of the changes exceed{'s' * (len(seen) == 1)} {FAR:g} σ; the clearest is {largest.name}, "
-            f"with a reading of {largest.read} and a true value of {largest.shown(largest.true)}",
-            f"{_hidden(run, found)}{_frames(run, found)}",
+            _within(run, rows, "the truth"),
+            f"{len(clear_changes)} of the changes exceed{'s' * (len(clear_changes) == 1)} {FAR:g} σ; the clearest "
+            f"is {largest.name}, with a reading of {largest.read} and a true value of {largest.shown(largest.true)}",
+            f"{_undetectable(run, rows)}{_frames(run, rows)}",
         )
-    if not any(abs(r.true) > SAME * r.sigma for r in found):
-        return f"The perturbation changes no camera, and {_within(run, found, 'zero')}", _hidden(run, found)
+    if not any(abs(r.true) > SAME * r.sigma for r in rows):
+        return f"The perturbation changes no camera, and {_within(run, rows, 'zero')}", _undetectable(run, rows)
     times = abs(largest.true) / largest.sigma if largest.sigma else 0.0
     size = f"{significant(abs(largest.true), 2)} {largest.parameter.unit}, {significant(times, 2)} σ"
     beneath = "the noise" if _noise_only(run) else "the effect of noise and disturbances"
     return (
         f"The perturbation is below {beneath}: no true change reaches {FAR:g} σ, and the clearest is that of "
         f"{largest.name} ({size})",
-        _within(run, found, "the truth"),
-        _hidden(run, found),
+        _within(run, rows, "the truth"),
+        _undetectable(run, rows),
         _needed(run, largest),
     )
 
 
-def _frames(run: RenderRun, found: tuple[Reading, ...]) -> str:
+def _frames(run: RenderRun, rows: tuple[Reading, ...]) -> str:
     """Return whether more frames help, as text; they lower only the noise."""
-    if any(r.noise**2 > 0.5 * r.sigma**2 for r in _changes(found)):
+    if any(r.noise**2 > 0.5 * r.sigma**2 for r in _changes(rows)):
         return "; more frames or more light would reveal smaller changes"
     return "; more frames do not lower this limit"
 
@@ -227,43 +231,43 @@ def limited(run: RenderRun) -> str:
     """Return the body that limits the angle of a pair, or else the worst reading; empty without a prior."""
     if _noise_only(run):
         return ""
-    found = readings(run, run.judged)
-    about = next((r for r in found if r.group == ANGLE_GROUP), max(found, key=lambda r: abs(r.ratio)))
-    body, share = limits(run.reading, about)
-    what = f"{body} causes" if body == NOISE else f"motions of {body} cause"
+    rows = readings(run, run.judged)
+    quantity = next((r for r in rows if r.group == ANGLE_GROUP), max(rows, key=lambda r: abs(r.ratio)))
+    body, share = limits(run.reading, quantity)
+    cause = f"{body} causes" if body == NOISE else f"motions of {body} cause"
     return (
-        f"{what} {share_text(share)} of the variance of {about.name} (σ {significant(about.sigma, 2)} "
-        f"{about.parameter.unit})"
+        f"{cause} {share_text(share)} of the variance of {quantity.name} (σ {significant(quantity.sigma, 2)} "
+        f"{quantity.parameter.unit})"
     )
 
 
-def _misled(run: RenderRun, found: tuple[Reading, ...], off: list[Reading]) -> tuple[str, ...]:
-    own = [r for r in off if r.camera] or _changes(tuple(off)) or off
-    worst = max(own, key=lambda r: abs(r.ratio))
+def _misled(run: RenderRun, rows: tuple[Reading, ...], wrong: list[Reading]) -> tuple[str, ...]:
+    candidates = [r for r in wrong if r.camera] or _changes(tuple(wrong)) or wrong
+    worst = max(candidates, key=lambda r: abs(r.ratio))
     share = ", larger than the change itself"
     if abs(worst.error) <= abs(worst.true):
         share = f" or {significant(100.0 * abs(worst.error / worst.true), 2, floor=0.0)} % of the change"
     return (
-        _score(found, off),
+        _score(rows, wrong),
         f"the worst is {worst.name}, with a reading of {worst.read} and a true value of {worst.shown(worst.true)}: an "
         f"error of {residual_text(abs(worst.ratio)).lstrip('+')} σ{share}",
-        _cause(run, worst, len(found)),
+        _cause(run, worst, len(rows)),
     )
 
 
-def _score(found: tuple[Reading, ...], off: list[Reading], how: str = "") -> str:
-    good = len(found) - len(off)
+def _score(rows: tuple[Reading, ...], wrong: list[Reading], suffix: str = "") -> str:
+    good = len(rows) - len(wrong)
     if not good:
-        return f"None of the {len(found)} changes is recovered within {FAR:g} σ{how}"
+        return f"None of the {len(rows)} changes is recovered within {FAR:g} σ{suffix}"
     are = "is" if good == 1 else "are"
-    return f"{good} of {len(found)} changes {are} recovered within {FAR:g} σ{how}, {len(off)} {_are(off)} not"
+    return f"{good} of {len(rows)} changes {are} recovered within {FAR:g} σ{suffix}, {len(wrong)} {_are(wrong)} not"
 
 
-def _unknown(run: RenderRun) -> str:
+def _misread_reason(run: RenderRun) -> str:
     """Return why an estimator misreads a motion, as text."""
     if run.estimators[run.judged].stated:
         return "larger than the prior expects"
-    return f"outside the family of the {_told(run)}"
+    return f"outside the family of the {_title(run)}"
 
 
 def _cause(run: RenderRun, worst: Reading, count: int) -> str:
@@ -272,18 +276,18 @@ def _cause(run: RenderRun, worst: Reading, count: int) -> str:
     ``count`` is the number of all readings.
     """
     cameras = list(run.crosstalk)
-    found = {name: systematics(run, name) for name in cameras}
+    biases = {name: systematics(run, name) for name in cameras}
     # a change of one camera, or what the angle and the ground are made of, per unit of the results
     weights = combination(run.reading, worst.group, worst.parameter.key).reshape(-1, 4) / PER_SI
     used = [name for name, weight in zip(cameras, weights, strict=True) if np.any(weight)]
-    bias = sum(float(w @ found[name].bias[run.judged][:4]) for name, w in zip(cameras, weights, strict=True))
+    bias = sum(float(w @ biases[name].bias[run.judged][:4]) for name, w in zip(cameras, weights, strict=True))
     chance = _chance(worst.ratio, count)
     if chance > FALSE_ALARM and abs(bias) < 0.5 * abs(worst.error):
         advice = "take more frames" if _noise_only(run) else "take more measurements"
         return f"chance alone causes such an error in {100.0 * chance:.2g} % of such runs: {advice} to decide"
     parts: dict[str, float] = {}
     for name in used:
-        for text, vector in found[name].parts.items():
+        for text, vector in biases[name].parts.items():
             parts[text] = parts.get(text, 0.0) + float(weights[cameras.index(name)] @ vector[:4])
     explained = worst.camera and abs(worst.error - bias) <= max(FAR * worst.noise, _EXPLAINED * abs(worst.error))
     if parts and explained:
@@ -292,20 +296,20 @@ def _cause(run: RenderRun, worst: Reading, count: int) -> str:
         if share > 0.5:
             most = "the cause is" if share > 1.0 - _EXPLAINED else "most of it is"
             return (
-                f"{most} a motion {_unknown(run)} ({text}), read as {worst.parameter.symbol} by "
+                f"{most} a motion {_misread_reason(run)} ({text}), read as {worst.parameter.symbol} by "
                 f"{worst.shown(part, sign=True)} {worst.parameter.unit}; more frames do not reduce it: see Crosstalk"
             )
-        return f"motions {_unknown(run)} cause it together ({_largest(parts)}): see Crosstalk"
-    uncovered = joined([name for camera in used for name in found[camera].uncovered])
+        return f"motions {_misread_reason(run)} cause it together ({_largest(parts)}): see Crosstalk"
+    uncovered = joined([name for camera in used for name in biases[camera].uncovered])
     if uncovered and run.estimators[run.judged].stated:
         return f"{uncovered} contribute, which the crosstalk table does not contain: see Residuals"
     if uncovered:
         return (
-            f"the {_told(run)} does not model {uncovered}, and the crosstalk table does not contain them; more frames "
-            "do not reduce the error: see Residuals"
+            f"the {_title(run)} does not model {uncovered}, and the crosstalk table does not contain them; "
+            "more frames do not reduce the error: see Residuals"
         )
     if parts:
-        return f"motions {_unknown(run)} contribute ({_largest(parts)}): see Crosstalk and Residuals"
+        return f"motions {_misread_reason(run)} contribute ({_largest(parts)}): see Crosstalk and Residuals"
     return "first-order crosstalk does not explain the error, motions may be too large for it: see Residuals"
 
 
@@ -319,27 +323,27 @@ def _largest(parts: Mapping[str, float]) -> str:
 
 
 def _series_verdict(
-    run: RenderRun, series: TimeSeries, found: tuple[Reading, ...], off: list[Reading]
+    run: RenderRun, series: TimeSeries, rows: tuple[Reading, ...], wrong: list[Reading]
 ) -> tuple[str, ...]:
     span = f"over {len(series.times)} times from {moment(float(series.times[0]))} to {moment(float(series.times[-1]))}"
-    if not off:
-        return f"{_within(run, found, 'the truth', 'RMS; ')}, {span}", _hidden(run, found)
-    worst = max([r for r in off if r.camera] or off, key=lambda r: abs(r.ratio))
+    if not wrong:
+        return f"{_within(run, rows, 'the truth', 'RMS; ')}, {span}", _undetectable(run, rows)
+    worst = max([r for r in wrong if r.camera] or wrong, key=lambda r: abs(r.ratio))
     unit = worst.parameter.unit
     uncovered = joined([name for camera in run.crosstalk for name in systematics(run, camera).uncovered])
-    why = f"motions {_unknown(run)} contribute"
+    cause = f"motions {_misread_reason(run)} contribute"
     if uncovered and not run.estimators[run.judged].stated:
-        why = f"the {_told(run)} does not model {uncovered}"
+        cause = f"the {_title(run)} does not model {uncovered}"
     size = "the noise is" if _noise_only(run) else "σ is"
     return (
-        f"{_score(found, off, ' (RMS)')}, {span}",
+        f"{_score(rows, wrong, ' (RMS)')}, {span}",
         f"the worst is {worst.name}, with an error of {worst.shown(worst.error)} {unit} RMS for a true change of "
         f"{worst.shown(worst.true)} {unit} RMS; {size} {worst.shown(worst.sigma)} {unit}",
-        f"{why}; more frames do not reduce the error: see Time course",
+        f"{cause}; more frames do not reduce the error: see Time course",
     )
 
 
-def _series_contradicted(run: RenderRun) -> str:
+def _contradicted_course(run: RenderRun) -> str:
     """Return the lead of the verdict for a course that contradicts its prior; empty where it does not.
 
     It has the largest error of the filtered and smoothed changes.
@@ -348,16 +352,16 @@ def _series_contradicted(run: RenderRun) -> str:
     if series is None or series.smoothed is None or series.smoothed.consistency.agrees:
         return ""
     true = {(row.group, row.parameter.key): row.true for row in series.readings}
-    found = [row for row in series.smoothed.changes if row.group != GROUND_GROUP]
-    worst = max(float(np.max(np.abs(r.value - true[r.group, r.parameter.key]) / r.sigma)) for r in found)
-    off = f": they are off by up to {significant(worst, 3)} σ" if worst > FAR else ""
+    changes = [row for row in series.smoothed.changes if row.group != GROUND_GROUP]
+    worst = max(float(np.max(np.abs(r.value - true[r.group, r.parameter.key]) / r.sigma)) for r in changes)
+    error_text = f": they are off by up to {significant(worst, 3)} σ" if worst > FAR else ""
     return (
         f"the course contradicts the prior {series.smoothed.name} or its time laws, and σ of filtered and smoothed "
-        f"changes does not hold{off}"
+        f"changes does not hold{error_text}"
     )
 
 
-def _dimmed(run: RenderRun) -> str:
+def _lost_light(run: RenderRun) -> str:
     """Return a sentence on spots that lost more than half of their light in the state shown."""
     share = run.photons_after.sum(axis=(1, 2)) / run.photons_before.sum(axis=(1, 2))
     lost = [(c.key, s) for c, s in zip(run.experiment.path.channels, share, strict=True) if s < _DIMMED]
@@ -369,16 +373,16 @@ def _dimmed(run: RenderRun) -> str:
 
 def sharpness_lost(quality: ImageQuality) -> tuple[float, str, str]:
     """Return the largest relative loss of MTF at Nyquist on the lines, its place, and the values before and after."""
-    lost = [
+    losses = [
         (1.0 - float(mtf[1, k] / mtf[0, k]), name, direction, field, float(mtf[0, k]), float(mtf[1, k]))
         for name, camera in quality.cameras.items()
         for direction, mtf in (("line", camera.mtf_along_line), ("track", camera.mtf_along_track))
         for k, field in enumerate(quality.fields)
         if mtf[0, k] > 0.0
     ]
-    if not lost:
+    if not losses:
         return 0.0, "", ""
-    share, name, direction, field, before, after = max(lost)
+    share, name, direction, field, before, after = max(losses)
     where = f"of {name} along the {direction}, at {plain(field)} of half the line"
     return share, where, f"from {before:.3f} to {after:.3f}"
 
@@ -396,25 +400,25 @@ def alarm_limit(count: int) -> float:
     return -float(ndtri(0.5 * FALSE_ALARM / count))
 
 
-def _unstated(run: RenderRun, found: tuple[Reading, ...], told: tuple[str, ...]) -> tuple[str, ...]:
+def _beyond_prior(run: RenderRun, rows: tuple[Reading, ...], warned: tuple[str, ...]) -> tuple[str, ...]:
     """Return a warning where readings are wrong beyond chance because the job moves more than its prior expects.
 
     In a real measurement this would go unnoticed. Bodies that have a warning already are omitted.
     """
-    limit = alarm_limit(len(found))
-    off = [r for r in found if abs(r.ratio) > limit]
-    if not off or run.series is not None:
+    limit = alarm_limit(len(rows))
+    wrong = [r for r in rows if abs(r.ratio) > limit]
+    if not wrong or run.series is not None:
         return ()
-    every = beyond_statement(run.resolved, run.experiment.stated)
-    beyond = [excess for excess in every if not any(text.startswith(f"{excess.body}:") for text in told)]
-    if not beyond:
+    excesses = beyond_statement(run.resolved, run.experiment.stated)
+    unwarned = [excess for excess in excesses if not any(text.startswith(f"{excess.body}:") for text in warned)]
+    if not unwarned:
         return ()
-    largest = joined([excess.text for excess in beyond[:NAMED]])
-    more = f" and {len(beyond) - NAMED} more" if len(beyond) > NAMED else ""
-    stated = run.experiment.stated
-    who = "there is no prior" if stated is None else f"the prior {stated.name} expects less"
+    largest = joined([excess.text for excess in unwarned[:NAMED]])
+    more = f" and {len(unwarned) - NAMED} more" if len(unwarned) > NAMED else ""
+    prior = run.experiment.stated
+    reason = "there is no prior" if prior is None else f"the prior {prior.name} expects less"
     return (
-        f"σ does not hold for {joined([r.name for r in off])}: the job moves {largest}{more}, but {who}; a real "
+        f"σ does not hold for {joined([r.name for r in wrong])}: the job moves {largest}{more}, but {reason}; a real "
         "measurement would not show this",
     )
 

@@ -342,7 +342,7 @@ class _NominalTracer:
         return (*new, reason, continues), pending
 
     def _meet(self, number: int, numbers: Any, p: Any, d: Any, on: Any) -> tuple[Intersection, Any]:
-        """Return the intersection of paths with a step's surface, and the mask of those that meet it as nominal light."""
+        """Return the intersection of paths with a step's surface, and the mask of those that follow nominal light."""
         import drjit as dr
 
         prepared, backend, step = self.prepared, self.prepared.backend, self.steps[number]

@@ -217,7 +217,7 @@ CHUNK = 1 << 19
 """Number of paths of one launch: about 200 MB of memory."""
 
 LEAST_CAPACITY = 1 << 14
-LEAST_ALONG = 1 << 16
+LEAST_NOMINAL = 1 << 16
 """Number of paths of a run from which they are traced surface by surface along the nominal path.
 
 So many save the time that recording its kernel takes, as measured. Fewer are traced by the loop alone; the paths are
@@ -363,7 +363,7 @@ class PathTracer:
         paths : int
             Number of paths of the run.
         """
-        line = self._clear.apertures(toward) if paths >= LEAST_ALONG else []
+        line = self._clear.apertures(toward) if paths >= LEAST_NOMINAL else []
         if not line or not isinstance(source, DiskSource):
             return ()
         segment = self._clear.from_source(source.patch, toward)

@@ -37,18 +37,18 @@ from scenes.yaml.errors import Issue
 from twin.framework.frame_store import mean_of, release_memory
 from twin.recover.measured_frames import ChannelFrames, StateFrames, cannot_measure
 
-_DEAREST = 4.0
+_MOST_GROWTH = 4.0
 """Factor by which missing pixels may increase sigma before a spot counts as lost."""
 _REMEDIES = (
     ("(saturation", "frames with less light or a shorter exposure"),
     (
         "too near the edge",
-        "frames in which the spot stands 10 pixels or more inside; another crop, or a shifted window",
+        "frames in which the spot is at least 10 pixels from the edge; another crop, or a shifted window",
     ),
     ("saturated", "frames with less light or a shorter exposure"),
-    ("no spot", "frames that hold the channel's spot: the right file, with the light on"),
-    ("range of the template", "a spot nearer to where the calibrated one stands"),
-    ("too narrow", "an instrument's model for the shape, `template: twin`, or a spot of 3 pixels at half of its peak"),
+    ("no spot", "frames that show the channel's spot: the correct file, with the light on"),
+    ("range of the template", "a spot closer to the calibrated position"),
+    ("too narrow", "a shape from a model of the instrument, `template: twin`, or a spot of at least 3 pixels FWHM"),
     ("mostly noise", "more frames of the state before, or frames with more light"),
     ("missing", "frames with less light, or with fewer bad pixels at the spot"),
 )
@@ -165,14 +165,14 @@ class ChannelMeasurement:
     def plain(self) -> bool:
         """True if the main job could measure these frames without any correction."""
         channel = self.channel
-        whole = all(state.shape == channel.ccd and not any(state.offset) for state in channel.states)
-        same = len({len(state.frames) for state in channel.after}) == 1
+        full_frames = all(state.shape == channel.ccd and not any(state.offset) for state in channel.states)
+        equal_counts = len({len(state.frames) for state in channel.after}) == 1
         integers = all(np.issubdtype(state.frames.dtype, np.integer) for state in channel.states)
-        known = channel.correction is None and channel.transfer is None
+        uncalibrated = channel.correction is None and channel.transfer is None
         untouched = all(screened.clean for screened in self._screened)
-        untouched &= all(one is None or one.clean for one in self._examined)
-        as_stated = known and not self._noisy and not self._level
-        return whole and same and integers and as_stated and untouched and self._test.vibration == "none"
+        untouched &= all(examined is None or examined.clean for examined in self._examined)
+        as_stated = uncalibrated and not self._noisy and not self._level
+        return full_frames and equal_counts and integers and as_stated and untouched and self._test.vibration == "none"
 
     def _template(self, state: StateFrames) -> SpotTemplate:
         assert self.shape is not None
@@ -190,10 +190,10 @@ class ChannelMeasurement:
             return [cannot_measure(self._test, self.channel.before, name, str(error), error.remedy)]
         self._show_noise()
         for number, state in enumerate(self.channel.states):
-            burnt = ""
+            saturation = ""
             try:
                 screened = self._screen(state)
-                burnt = "; ".join(found.text for found in screened.findings if found.kind == "saturation")
+                saturation = "; ".join(finding.text for finding in screened.findings if finding.kind == "saturation")
                 screened = replace(screened, findings=(*screened.findings, *self._level))
                 if self.shape is None:
                     screened, self._learnt_from = self._learn(screened)
@@ -203,7 +203,7 @@ class ChannelMeasurement:
             except FramesError as error:
                 issues.append(cannot_measure(self._test, state, self.channel.name, str(error), error.remedy))
             except SpotError as error:
-                issues.append(self._lost(state, error, burnt))
+                issues.append(self._lost(state, error, saturation))
             if issues and number == 0:
                 break
         return issues
@@ -219,8 +219,8 @@ class ChannelMeasurement:
             return
         if channel.correction is not None:
             raise FramesError(
-                f"beside the spot the frames are {below:.3g} DN darker than without light, as if a level had been "
-                "subtracted from them that the dark frames have",
+                f"beside the spot the frames are {below:.3g} DN darker than without light: a level seems to have been "
+                "subtracted from them, but not from the dark frames",
                 "frames and dark frames as they were recorded, or no dark frames",
             )
         low = replace(
@@ -229,29 +229,29 @@ class ChannelMeasurement:
             saturation_dn=channel.raw_noise.saturation_dn - below,
         )
         self.channel = replace(channel, raw_noise=low, noise=low)
-        text = f"{below:.4g} DN are missing below the spot; its noise is that of the light above what is left"
+        text = f"{below:.4g} DN were subtracted below the spot; its noise is computed from the light above this level"
         self._level = (Finding("subtracted level", text, corrects=False),)
 
     def _show_noise(self) -> None:
         """Set the detector's noise to that of its noisiest frames, where that exceeds the specified noise."""
         channel = self.channel
-        shown = []
+        dark_noises = []
         for state in channel.states:
             bad = state.bad_part(channel.bad)
             ratio = noise_ratio(state.frames, channel.raw_noise, bad, released=release_memory)
             self._noise_ratios.append(ratio)
-            shown.append(observed_noise(state.frames, channel.raw_noise, ratio, bad, release_memory).dark_noise_e)
-        most = max(shown)
+            dark_noises.append(observed_noise(state.frames, channel.raw_noise, ratio, bad, release_memory).dark_noise_e)
+        most = max(dark_noises)
         if most > channel.raw_noise.dark_noise_e:
-            raw, corrected = (replace(one, dark_noise_e=most) for one in (channel.raw_noise, channel.noise))
+            raw, corrected = (replace(model, dark_noise_e=most) for model in (channel.raw_noise, channel.noise))
             self.channel = replace(channel, raw_noise=raw, noise=corrected)
             self._noisy = True
 
-    def _lost(self, state: StateFrames, error: SpotError, burnt: str = "") -> Issue:
+    def _lost(self, state: StateFrames, error: SpotError, saturation: str = "") -> Issue:
         """Return the issue of a spot that cannot be measured; saturated pixels are named first."""
         reason = "; ".join(error.reasons.values())
-        if burnt:
-            reason = f"too much of the spot is missing (saturation: {burnt}): {reason}"
+        if saturation:
+            reason = f"too much of the spot is missing (saturation: {saturation}): {reason}"
         return cannot_measure(self._test, state, self.channel.name, reason, remedy(reason))
 
     def _screen(self, state: StateFrames) -> ScreenedFrames:
@@ -268,25 +268,31 @@ class ChannelMeasurement:
             screened = screen_frames(state.frames, channel.raw_noise, bad, release_memory)
         if channel.correction is None:
             return screened
-        known = channel.correction
-        dark, response, unusable = (state.of_ccd(one) for one in (known.dark, known.response, known.bad))
-        part = PixelCorrection(dark, response, unusable, known.noise)
-        told: tuple[Finding, ...] = (
-            Finding("dark frames" if self._test.flat is None else "dark and flat frames", "are taken off"),
+        correction = channel.correction
+        dark, response, unusable = (
+            state.of_ccd(pixel_map) for pixel_map in (correction.dark, correction.response, correction.bad)
         )
-        worse = np.count_nonzero(part.bad & screened.good)
-        if worse:
-            told += (Finding("bad pixels", f"{worse} found in dark and flat frames are excluded"),)
+        part = PixelCorrection(dark, response, unusable, correction.noise)
+        findings: tuple[Finding, ...] = (
+            Finding("dark frames" if self._test.flat is None else "dark and flat frames", "are corrected for"),
+        )
+        bad_count = np.count_nonzero(part.bad & screened.good)
+        if bad_count:
+            findings += (Finding("bad pixels", f"{bad_count} found in dark and flat frames are excluded"),)
         good = screened.good & ~part.bad
-        return replace(screened, mean=part.corrected(screened.mean), good=good, findings=(*screened.findings, *told))
+        return replace(
+            screened, mean=part.corrected(screened.mean), good=good, findings=(*screened.findings, *findings)
+        )
 
     def _learn(self, screened: ScreenedFrames) -> tuple[ScreenedFrames, LearntTemplate]:
         """Return frames without outlier pixels, and the shape of the spot that is learnt from them."""
         if self._searches:
-            lone = outlier_pixels(screened, self.channel.noise)
-            if np.any(lone):
-                told = Finding("bad pixels", f"{np.count_nonzero(lone)} hot, dead or otherwise deviating are excluded")
-                screened = replace(screened, good=screened.good & ~lone, findings=(*screened.findings, told))
+            outliers = outlier_pixels(screened, self.channel.noise)
+            if np.any(outliers):
+                finding = Finding(
+                    "bad pixels", f"{np.count_nonzero(outliers)} hot, dead or otherwise deviating pixels are excluded"
+                )
+                screened = replace(screened, good=screened.good & ~outliers, findings=(*screened.findings, finding))
             screened = without_slopes(screened, self.channel.noise)
         return screened, learn_template(screened, self.channel.noise)
 
@@ -296,9 +302,9 @@ class ChannelMeasurement:
         fitted = test.vibration == "fitted"
         if not self._searches and not fitted and np.all(screened.good):
             return None
-        own, learnt = self._learnt and number == 0, self._learnt and number > 0
+        template_source, learnt = self._learnt and number == 0, self._learnt and number > 0
         template, searched = self._template(state), self._searches
-        return examine(screened, self.channel.noise, template, fitted, own, searched, state.offset, learnt)
+        return examine(screened, self.channel.noise, template, fitted, template_source, searched, state.offset, learnt)
 
     def measure(self) -> list[Issue]:
         """Measure the spot in every state; return the issues of states in which it cannot be measured."""
@@ -321,17 +327,17 @@ class ChannelMeasurement:
     def _position(self, number: int, state: StateFrames, static: np.ndarray) -> SpotPositions:
         examined, screened = self._examined[number], self._screened[number]
         if examined is not None and np.any(static & examined.good):
-            more = np.count_nonzero(static & examined.good)
-            told = Finding("bad pixels", f"{more} pixels that are bad in another state are excluded here as well")
-            examined = refit(examined, static, self.channel.noise, self._template(state), (told,))
+            count = np.count_nonzero(static & examined.good)
+            finding = Finding("bad pixels", f"{count} pixels that are bad in another state are excluded here too")
+            examined = refit(examined, static, self.channel.noise, self._template(state), (finding,))
             self._examined[number] = examined
         if examined is None or examined.clean:
-            positions = self._as_ever(screened, state)
+            positions = self._direct_centroid(screened, state)
         else:
-            if examined.fit.missing > _DEAREST:
-                what = ", ".join(dict.fromkeys(f.kind for f in examined.findings if f.corrects))
-                grown = f"sigma would grow {1.0 + examined.fit.missing:.1f}-fold"
-                raise SpotError({0: f"too much of the spot is missing ({what}): {grown}"})
+            if examined.fit.missing > _MOST_GROWTH:
+                kinds = ", ".join(dict.fromkeys(f.kind for f in examined.findings if f.corrects))
+                growth = f"sigma would grow {1.0 + examined.fit.missing:.1f}-fold"
+                raise SpotError({0: f"too much of the spot is missing ({kinds}): {growth}"})
             positions, self._costs[number] = examined.fit.positions, examined.fit.cost
             if self._test.analysis.centroid != "ml":
                 positions, self._costs[number] = self._repaired(examined, state)
@@ -365,7 +371,7 @@ class ChannelMeasurement:
             Index of the state after, from 1.
         """
         if self._shifts:
-            # its noise is worked out with that of the learnt shape, and not from the positions
+            # its noise is computed together with that of the learnt shape, not from the positions
             return self._shifts[number - 1].covariance[None] * max(self._widened[0], self._widened[number]) ** 2
         spread = difference_covariance(self.positions[0], self.positions[number], self.channel.noise)
         return spread + self._doubt(number)
@@ -380,10 +386,10 @@ class ChannelMeasurement:
         first, second = self._examined[0], self._examined[number]
         if not self._learnt or first is None or second is None or not np.any(second.fit.others[:, 2] < 0.0):
             return np.zeros((2, 2))
-        own = (self.positions[number].position - self.positions[0].position)[0]
-        by_shape = (second.fit.positions.position - first.fit.positions.position)[0]
+        shift = (self.positions[number].position - self.positions[0].position)[0]
+        shape_shift = (second.fit.positions.position - first.fit.positions.position)[0]
         moved = np.subtract(self.channel.states[number].offset, self.channel.before.offset)
-        return np.outer(own - by_shape - moved, own - by_shape - moved)
+        return np.outer(shift - shape_shift - moved, shift - shape_shift - moved)
 
     def noise_parts(self, number: int) -> tuple[NoiseParts, NoiseParts]:
         """Return the noise of the spot before and after, for the covariance of a series of shifts.
@@ -400,7 +406,7 @@ class ChannelMeasurement:
         after = replace(after, temporal=after.temporal + self._doubt(number))
         return noise_parts(self.positions[0], noise), after
 
-    def _as_ever(self, screened: ScreenedFrames, state: StateFrames) -> SpotPositions:
+    def _direct_centroid(self, screened: ScreenedFrames, state: StateFrames) -> SpotPositions:
         return self._centroid(screened.mean[None], screened.frames, self.channel.noise, state)
 
     def _repaired(self, examined: Examined, state: StateFrames) -> tuple[SpotPositions, float]:
@@ -429,7 +435,7 @@ class ChannelMeasurement:
         row, column = positions.row + state.offset[0], positions.column + state.offset[1]
         return replace(positions, row=row, column=column, gain_maps=gain, light_dn=light)
 
-    def _noisier(self, number: int, fit: ScreenedFit) -> float:
+    def _core_excess(self, number: int, fit: ScreenedFit) -> float:
         """Return the factor by which the variance in a spot's core exceeds the specified one, where frames are noisier.
 
         It is taken from differences of frames in the core, but is at most that beside the spot: in the light, flicker
@@ -441,13 +447,13 @@ class ChannelMeasurement:
         frames = self.channel.states[number].frames
         light = fit.level - float(fit.level.min())
         core = light > CORE_SHARE * light.max()
-        found = noise_ratio(frames, self.channel.raw_noise, ~fit.used, core, release_memory)
-        return 1.0 if found is None else min(max(found, 1.0), ratio) ** 2
+        core_ratio = noise_ratio(frames, self.channel.raw_noise, ~fit.used, core, release_memory)
+        return 1.0 if core_ratio is None else min(max(core_ratio, 1.0), ratio) ** 2
 
     def result(self) -> ChannelResult:
         """Return the result of the channel."""
         spots = []
-        # of a learnt shape the frames before have been fitted, too, for they were searched
+        # with a learnt shape the frames before were fitted as well, during the search
         first = self._examined[0] if self._learnt else None
         learnt = None if first is None else first.fit
         for number, state in enumerate(self.channel.states):
@@ -465,7 +471,7 @@ class ChannelMeasurement:
                     core=None if fit is None else fit.core,
                     fits=fit is None
                     or (self._learnt and number == 0)
-                    or fit.core_fits(learnt, self._noisier(number, fit)),
+                    or fit.core_fits(learnt, self._core_excess(number, fit)),
                     noise_ratio=self._noise_ratios[number],
                 )
             )

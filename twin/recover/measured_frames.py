@@ -25,7 +25,7 @@ from scenes.yaml.spec import Spec
 from twin.framework.frame_store import IN_MEMORY, PART, allocate_frames, release_memory
 from twin.framework.memory import Lowered, require_memory
 
-_OTHER_FILES = "frames that were recorded one by one, each named once: the right files of before and after"
+_OTHER_FILES = "different frames, each named once: the correct files of before and after"
 NOMINAL, PERTURBED = "nominal", "perturbed"
 """Notes that the main job leaves in its frames."""
 _GREY, _MAPS = 2.0, 77.0
@@ -45,20 +45,20 @@ def repeated_frames(test: Spec, channels: Sequence[ChannelFrames]) -> list[Issue
     channels : Sequence[ChannelFrames]
         Frames as they were read.
     """
-    seen: dict[bytes, tuple[StateFrames, int]] = {}
-    told: set[tuple[int, int]] = set()
+    frames_by_digest: dict[bytes, tuple[StateFrames, int]] = {}
+    reported: set[tuple[int, int]] = set()
     out: list[Issue] = []
     for channel in channels:
         for state in channel.states:
             for number, digest in _digests(state):
-                first, before = seen.setdefault(digest, (state, number))
+                first, before = frames_by_digest.setdefault(digest, (state, number))
                 pair = (id(first), id(state))
-                if (first is state and before == number) or pair in told:
+                if (first is state and before == number) or pair in reported:
                     continue
-                told.add(pair)
+                reported.add(pair)
                 text = (
                     f"frame {number + 1} of {channel.name} in {_files(state)} is frame {before + 1} of {_files(first)},"
-                    " to the last pixel: a copy tells nothing of what has moved, and has no noise of its own"
+                    " to the last pixel: a copy has no information on motions, and no independent noise"
                 )
                 out.append(test.issue(text, state.key, allowed=_OTHER_FILES))
     return out
@@ -66,7 +66,7 @@ def repeated_frames(test: Spec, channels: Sequence[ChannelFrames]) -> list[Issue
 
 def _digests(state: StateFrames) -> Iterator[tuple[int, bytes]]:
     for number, frame in enumerate(state.frames):
-        # files of several types may hold the same grey values
+        # files of different types may have the same grey values
         values = np.ascontiguousarray(frame, dtype=np.float64)
         if values.min() < values.max():
             shape = f"{values.shape}".encode()
@@ -90,44 +90,44 @@ def order_warnings(channels: Sequence[ChannelFrames], times: Sequence[float] | N
     times : Sequence[float] or None
         Times of a series, in seconds; None for a single state after.
     """
-    out = []
+    warnings = []
     swapped = [channel.name for channel in channels if _swapped(channel)]
     if swapped:
-        out.append(
-            f"before and after seem to be exchanged ({', '.join(swapped)}): by their time stamps, the "
-            "frames after were recorded before those before; all changes then have the wrong sign"
+        warnings.append(
+            f"before and after seem to be exchanged ({', '.join(swapped)}): by their time stamps or notes, the "
+            "frames after were recorded first; all changes then have the wrong sign"
         )
     elif times is not None:
         mixed = {name: at for channel in channels for name, at in [(channel.name, _not_ascending(channel))] if at}
         if mixed:
             name, at = next(iter(mixed.items()))
-            out.append(
+            warnings.append(
                 f"{', '.join(mixed)}: by their time stamps, the frames of the series were recorded in an "
                 f"order that differs from `times`, first {name} at {moment(times[at])}"
             )
-    return tuple(out)
+    return tuple(warnings)
 
 
 def _recorded(state: StateFrames) -> tuple[datetime, ...]:
     """Return the recording times of all files; empty if one file has none."""
-    found = [time for time, _ in state.origin if time is not None]
-    return tuple(found) if found and len(found) == len(state.origin) else ()
+    times = [time for time, _ in state.origin if time is not None]
+    return tuple(times) if times and len(times) == len(state.origin) else ()
 
 
 def _swapped(channel: ChannelFrames) -> bool:
     notes = [{note for state in states for _, note in state.origin} for states in ((channel.before,), channel.after)]
     if notes == [{PERTURBED}, {NOMINAL}]:
         return True
-    every = [_recorded(state) for state in channel.states]
-    return all(every) and min(every[0]) > max(max(times) for times in every[1:])
+    times_by_state = [_recorded(state) for state in channel.states]
+    return all(times_by_state) and min(times_by_state[0]) > max(max(times) for times in times_by_state[1:])
 
 
 def _not_ascending(channel: ChannelFrames) -> int:
     """Return the index of the first time that was recorded before its predecessor; 0 if there is none."""
-    every = [_recorded(state) for state in channel.after]
-    if not all(every):
+    times_by_state = [_recorded(state) for state in channel.after]
+    if not all(times_by_state):
         return 0
-    return next((k for k, (one, two) in enumerate(pairwise(every), 1) if max(two) < min(one)), 0)
+    return next((k for k, (one, two) in enumerate(pairwise(times_by_state), 1) if max(two) < min(one)), 0)
 
 
 Shape = tuple[int, int]
@@ -283,10 +283,10 @@ def _channel(
     offset = files.offset if files.offset_after is None else files.offset_after
     after = tuple(_state(test, one, offset, (*key, AFTER)) for one in test.states(files))
     if ccd is None:
-        every = (before, *after)
+        times_by_state = (before, *after)
         ccd = (
-            max(state.offset[0] + state.shape[0] for state in every),
-            max(state.offset[1] + state.shape[1] for state in every),
+            max(state.offset[0] + state.shape[0] for state in times_by_state),
+            max(state.offset[1] + state.shape[1] for state in times_by_state),
         )
     for state in (before, *after):
         _check_place(test, state, ccd)
@@ -311,14 +311,14 @@ def _channel(
             correction = pixel_correction(raw, dark, flat)
     except FramesError as error:
         which = "flat" if "flat" in str(error) else "dark"
-        raise _told(test, (which,), str(error), error.remedy) from error
+        raise _input_error(test, (which,), str(error), error.remedy) from error
     if correction is not None and correction.dark.shape != ccd:
         correction = _placed(correction, ccd, before)
     corrected = raw if correction is None else correction.noise
     return ChannelFrames(name, ccd, before, after, bad, correction, transfer, corrected, raw)
 
 
-def _told(test: Spec, key: KeyPath, problem: str, remedy: str) -> InputError:
+def _input_error(test: Spec, key: KeyPath, problem: str, remedy: str) -> InputError:
     return test.error(problem, key, allowed=remedy)
 
 
@@ -326,37 +326,37 @@ def _state(test: Spec, files: tuple[str, ...], offset: Shape, key: KeyPath) -> S
     frames = _stacked(test, files, key)
     if min(frames.shape[1:]) < 24:
         text = f"{files[0]} has frames of {frames.shape[1]} x {frames.shape[2]} pixels"
-        raise _told(test, key, text, "24 rows and columns or more, to measure a spot in")
+        raise _input_error(test, key, text, "at least 24 rows and columns, which a spot measurement needs")
     return StateFrames(files, frames, offset, key, tuple(recording_origin(Path(file)) for file in files))
 
 
 def _stacked(test: Spec, files: tuple[str, ...], key: KeyPath) -> np.ndarray:
     """Return frames of all files in order, (N, H, W), in an unnamed temporary file where they are many."""
     images = [_opened(test, file, key) for file in files]
-    room: np.ndarray | None = None
-    count = held = 0
+    stack: np.ndarray | None = None
+    count = unreleased = 0
     for file, image in zip(files, images, strict=True):
         for page in _pages(test, file, image, key):
-            if room is None:
+            if stack is None:
                 shape, kind = page.shape, page.dtype
-                room = allocate_frames((sum(len(one.header.pages) for one in images), *shape), kind)
+                stack = allocate_frames((sum(len(one.header.pages) for one in images), *shape), kind)
             if page.shape != shape:
                 sizes = (" x ".join(map(str, size)) for size in (shape, page.shape))
                 text = f"{files[0]} and {file} have frames of different sizes, {' and '.join(sizes)}"
-                raise _told(test, key, text, "frames of one size in one state")
+                raise _input_error(test, key, text, "frames of one size in one state")
             if np.result_type(kind, page.dtype) != kind:
                 kind = np.result_type(kind, page.dtype)
-                wider = allocate_frames(room.shape, kind)
-                wider[:count] = room[:count]
-                room = wider
-            room[count] = page
-            count, held = count + 1, held + page.nbytes
-            if held > PART:
-                release_memory(room)
-                held = 0
-    assert room is not None  # a file without pages is none
-    release_memory(room)
-    return room
+                wider_stack = allocate_frames(stack.shape, kind)
+                wider_stack[:count] = stack[:count]
+                stack = wider_stack
+            stack[count] = page
+            count, unreleased = count + 1, unreleased + page.nbytes
+            if unreleased > PART:
+                release_memory(stack)
+                unreleased = 0
+    assert stack is not None  # a file without pages is none
+    release_memory(stack)
+    return stack
 
 
 def _opened(test: Spec, file: str, key: KeyPath) -> ImageFile:
@@ -364,9 +364,7 @@ def _opened(test: Spec, file: str, key: KeyPath) -> ImageFile:
     with _readable(test, file, key):
         image = ImageFile.open(Path(file), choose="")
         if image.header.orientation:
-            raise ImageError(
-                f"{file} is stored turned or mirrored ({image.header.orientation}): save it as it was read out"
-            )
+            raise ImageError(f"{file} is stored rotated or mirrored ({image.header.orientation}): save it as read out")
         if image.header.coded:
             raise ImageError(f"{file}: {image.header.coded}, which is not linear in light: give raw frames")
         return image
@@ -381,7 +379,7 @@ def _pages(test: Spec, file: str, image: ImageFile, key: KeyPath) -> Iterator[np
             yield page
     if largest > _MOST_GREY:
         text = f"{file} has grey values up to {largest:.3g}"
-        raise _told(test, key, text, f"grey values of a converter, at most {_MOST_GREY:g}")
+        raise _input_error(test, key, text, f"grey values of an analogue-to-digital converter, at most {_MOST_GREY:g}")
 
 
 @contextmanager
@@ -390,20 +388,20 @@ def _readable(test: Spec, file: str, key: KeyPath) -> Iterator[None]:
     try:
         yield
     except ImageError as error:
-        raise _told(test, key, str(error), "raw frames of a CCD: TIFF, FITS, 16-bit PNG") from error
+        raise _input_error(test, key, str(error), "raw frames of a CCD: TIFF, FITS, 16-bit PNG") from error
     except OSError as error:
-        raise _told(test, key, f"{file}: {error.strerror or error}", "a file that can be read") from error
+        raise _input_error(test, key, f"{file}: {error.strerror or error}", "a readable file") from error
 
 
 def _check_place(test: Spec, state: StateFrames, ccd: Shape) -> None:
     ends = [first + size for first, size in zip(state.offset, state.shape, strict=True)]
     if ends[0] > ccd[0] or ends[1] > ccd[1]:
         text = f"{state.files[0]}: frames of {state.shape[0]} x {state.shape[1]} pixels"
-        where = f" from row {state.offset[0]} and column {state.offset[1]} on" if any(state.offset) else ""
-        raise _told(
+        where = f" from row {state.offset[0]} and column {state.offset[1]}" if any(state.offset) else ""
+        raise _input_error(
             test, state.key, f"{text}{where} do not lie on the CCD of {ccd[0]} x {ccd[1]} pixels",
-            "frames of the instrument's area CCD or a part of it with its offset; or rows and columns of area_ccd in"
-            " the instrument that are those of the frames",
+            "frames of the instrument's area CCD or of a part of it with its offset; or the rows and columns of the"
+            " frames as area_ccd of the instrument",
         )  # fmt: skip
 
 
@@ -411,8 +409,8 @@ def _check_part(test: Spec, state: StateFrames, known: bool, others: str, key: s
     """Check that the part of the CCD that the frames of a state show is specified. Raises InputError."""
     if not known:
         text = f"{state.files[0]}: frames of {state.shape[0]} x {state.shape[1]} pixels are not of the size of {others}"
-        remedy = f"{key}: [ROW, COLUMN] of the CCD at which they begin, one size for all frames of a series"
-        raise _told(test, state.key, f"{text}, and nothing says where they begin", remedy)
+        remedy = f"{key}: [ROW, COLUMN] of the CCD at which they begin, and one size for all frames of a series"
+        raise _input_error(test, state.key, f"{text}, and their offset is not specified", remedy)
 
 
 def _check_values(test: Spec, state: StateFrames, detector: DetectorSpec) -> None:
@@ -431,8 +429,8 @@ def _check_values(test: Spec, state: StateFrames, detector: DetectorSpec) -> Non
             text = f"{state.files[0]} has grey values up to {largest}"
             text += f", all multiples of {step}" if step > 1 else ""
             text += f"; the converter of {detector.name} with {detector.bit_depth} bits gives 0 to {most} in steps of 1"
-            remedy = f"frames divided by {step}: they are aligned to the left" if step > 1 else "the right `detector`"
-            raise _told(test, state.key, text, remedy)
+            remedy = f"frames divided by {step}: they are left-aligned" if step > 1 else "the correct `detector`"
+            raise _input_error(test, state.key, text, remedy)
     release_memory(state.frames)
 
 
@@ -446,7 +444,9 @@ def _maps(test: MeasurementSpec, what: str, name: str, ccd: Shape, before: State
     stack = _stacked(test, files, key)
     if stack.shape[1:] not in (ccd, before.shape):
         text = f"{files[0]} has frames of {stack.shape[1]} x {stack.shape[2]} pixels"
-        raise _told(test, key, text, f"frames of the CCD, {ccd[0]} x {ccd[1]}, or of the same part as the others")
+        raise _input_error(
+            test, key, text, f"frames of the CCD, {ccd[0]} x {ccd[1]}, or of the same part as the others"
+        )
     return stack
 
 

@@ -73,9 +73,9 @@ def residuals_svg(run: RecoverRun, camera: str) -> str:
         shown = None
         for line, (channel, states) in enumerate(panels):
             for axes, (name, spot, _) in zip(grid[line], states, strict=True):
-                left = np.zeros_like(spot.mean) if spot.residual is None else spot.residual
+                residual = np.zeros_like(spot.mean) if spot.residual is None else spot.residual
                 shown = axes.imshow(
-                    left, cmap=svg.DIVERGING, vmin=-LIMIT, vmax=LIMIT, interpolation="none", extent=_extent(spot)
+                    residual, cmap=svg.DIVERGING, vmin=-LIMIT, vmax=LIMIT, interpolation="none", extent=_extent(spot)
                 )
                 _mark_unused(axes, spot)
                 _labels(axes, f"{channel}, {name}", line == len(panels) - 1)
@@ -136,13 +136,13 @@ def changes_svg(lines: Sequence[Line]) -> str:
     with svg.look("measured-series"):
         size, unit = time_unit(lines[0].marks[0])
         cameras = list(dict.fromkeys(line.camera for line in lines if line.camera))
-        own = {camera: [line for line in lines if line.camera == camera] for camera in cameras}
+        lines_of_camera = {camera: [line for line in lines if line.camera == camera] for camera in cameras}
         shared = [line for line in lines if not line.camera]
-        rows = max(map(len, own.values())) + len(shared)
+        rows = max(map(len, lines_of_camera.values())) + len(shared)
         figure = svg.new_figure(0.7 + 1.5 * rows)
         grid = figure.add_gridspec(rows, len(cameras))
         for column, camera in enumerate(cameras):
-            for row, line in enumerate(own[camera]):
+            for row, line in enumerate(lines_of_camera[camera]):
                 axes = figure.add_subplot(grid[row, column])
                 _change(axes, line, size)
                 axes.set_ylabel(line.name if column == 0 else "")
@@ -173,14 +173,6 @@ def _change(axes: Axes, line: Line, size: float) -> None:
         axes.plot(time / size, value, color=svg.BLUE, lw=1.0, label="smoothed")
     time, value, sigma = line.marks
     axes.errorbar(
-        time / size,
-        value,
-        sigma,
-        fmt="o",
-        color=svg.INK,
-        ms=3.0,
-        elinewidth=0.8,
-        capsize=2,
-        label="each time by itself",
+        time / size, value, sigma, fmt="o", color=svg.INK, ms=3.0, elinewidth=0.8, capsize=2, label="each time alone"
     )
     svg.gridded(axes, "y")

@@ -16,9 +16,9 @@ from twin.recover.channel_measurement import ChannelResult, SpotResult
 from twin.recover.recover_plots import Line, changes_svg, residuals_svg, spots_svg
 from twin.recover.recover_run import RecoverRun, state_name
 
-_IN_NO_SIGMA = (
-    "σ contains no charge that a CCD leaves behind when it is read out (tails away from the read-out), no reflection "
-    "so near the spot that it is not told from it, and no error of the stated geometry."
+_NOT_IN_SIGMA = (
+    "σ does not include charge transfer losses of the CCD (tails away from the read-out), reflections too close to the "
+    "spot to be separated from it, and errors of the specified geometry."
 )
 
 
@@ -28,16 +28,16 @@ def _name(run: RecoverRun) -> str:
 
 def _corrected(run: RecoverRun) -> tuple[int, int, SpotResult | None, str]:
     """Return the number of corrected sets of frames, the number of all, the most costly one and its name."""
-    every = [
+    all_frames = [
         (result.channel.name, state_name(run.times, k), spot)
         for result in run.channels
         for k, (_, spot) in enumerate(result.states())
     ]
-    corrected = [one for one in every if not one[2].clean]
+    corrected = [frames for frames in all_frames if not frames[2].clean]
     if not corrected:
-        return 0, len(every), None, ""
-    channel, name, worst = max(corrected, key=lambda one: one[2].cost)
-    return len(corrected), len(every), worst, f"{channel} {name}"
+        return 0, len(all_frames), None, ""
+    channel, name, worst = max(corrected, key=lambda frames: frames[2].cost)
+    return len(corrected), len(all_frames), worst, f"{channel} {name}"
 
 
 def _verdict(run: RecoverRun) -> tuple[str, tuple[str, ...]]:
@@ -73,7 +73,7 @@ def _verdict(run: RecoverRun) -> tuple[str, tuple[str, ...]]:
         if body == NOISE:
             limit = f"{what} causes {share_text(share)} of the variance of {about.name} (σ {size})"
     count, total, worst_spot, where = _corrected(run)
-    cleaned = "the frames were taken as they are" if run.setup.test.corrections == "none" else "the frames are clean"
+    cleaned = "the frames were used as they are" if run.setup.test.corrections == "none" else "the frames are clean"
     if worst_spot is not None:
         most = round(100.0 * worst_spot.cost, 1)
         cost = f"up to {plain(most, 3)} %" if most >= 0.1 else "less than 0.1 %"
@@ -128,11 +128,13 @@ def _summary(run: RecoverRun) -> Table:
     reading = run.last
     heads = ["camera", "change", *(one.title for one in reading.estimators.values()), "σ", "σ of noise", "in σ"]
     rows: list[list[Cell]] = []
-    for same in reading.table.by_change():
-        own = next(row for row in same if row.estimator == reading.judged)
-        values = [fixed(row.value, decimals_for(own.sigma, 3)) for row in same]
-        sigmas = [significant(own.sigma, 3, floor=0.0), significant(own.noise, 3, floor=0.0)]
-        rows.append([own.where, own.parameter.label, *values, *sigmas, fixed(own.size, 1, sign=True)])
+    for rows_of_change in reading.table.by_change():
+        judged_row = next(row for row in rows_of_change if row.estimator == reading.judged)
+        values = [fixed(row.value, decimals_for(judged_row.sigma, 3)) for row in rows_of_change]
+        sigmas = [significant(judged_row.sigma, 3, floor=0.0), significant(judged_row.noise, 3, floor=0.0)]
+        rows.append(
+            [judged_row.where, judged_row.parameter.label, *values, *sigmas, fixed(judged_row.size, 1, sign=True)]
+        )
     at = f" at {moment(run.times[-1])}" if run.times else ""
     title = f"{_name(run)}: recovered from measured frames{at}"
     caption = f"σ and the last column are those of the {reading.estimators[reading.judged].title}."
@@ -141,38 +143,38 @@ def _summary(run: RecoverRun) -> Table:
 
 def _spots(run: RecoverRun) -> Section:
     """Return the section with artefacts, spot positions and figures."""
-    heads = ["channel", "state", "frames", "row [px]", "column [px]", "σ [px]", "found and corrected", "cost in σ [%]"]
+    heads = ["channel", "state", "frames", "row [px]", "column [px]", "σ [px]", "artefacts", "increase of σ [%]"]
     rows: list[list[Cell]] = []
     for i, result in enumerate(run.channels):
         for k, (_, spot) in enumerate(result.states()):
             r = run.readings[max(k - 1, 0)].recovery
-            place, sigma = (r.before, r.sigma_before) if k == 0 else (r.after, r.sigma_after)
+            position, sigma = (r.before, r.sigma_before) if k == 0 else (r.after, r.sigma_after)
             digits = decimals_for(float(sigma[0, i].min()))
-            told = "; ".join(f"{finding.kind}: {finding.text}" for finding in spot.findings) or "nothing"
-            spread = float(np.sqrt(np.mean(np.square(sigma[0, i]))))
+            artefacts = "; ".join(f"{finding.kind}: {finding.text}" for finding in spot.findings) or "none"
+            rms_sigma = float(np.sqrt(np.mean(np.square(sigma[0, i]))))
             rows.append(
                 [
                     result.channel.name,
                     state_name(run.times, k),
                     len(spot.frames.frames),
-                    fixed(float(place[0, i, 0]), digits),
-                    fixed(float(place[0, i, 1]), digits),
-                    significant(spread, 2, floor=0.0),
-                    told,
+                    fixed(float(position[0, i, 0]), digits),
+                    fixed(float(position[0, i, 1]), digits),
+                    significant(rms_sigma, 2, floor=0.0),
+                    artefacts,
                     fixed(100.0 * spot.cost, 1),
                 ]
             )
     caption = (
-        "Rows and columns count on the whole CCD, from the centre of its first pixel. The cost is that of the place of "
-        "this spot: its sigma over what it would be with the same light and nothing left out or fitted beside it."
+        "Rows and columns count on the whole CCD, from the centre of its first pixel. The increase of σ is that of the "
+        "spot's position, relative to the same light without excluded pixels or fitted artefacts."
     )
     cameras = list(run.last.cameras)
     figures = [
         SvgFigure(
             f"spots-{name}",
             f"Spots of {name}",
-            "Mean frames, stretched to show what is faint, with the centres before and after; pixels that were left "
-            "out are marked.",
+            "Mean frames, stretched to show faint light, with the centres before and after; excluded pixels are "
+            "marked.",
             spots_svg(run, name),
         )
         for name in cameras
@@ -181,15 +183,17 @@ def _spots(run: RecoverRun) -> Section:
     figures += [
         SvgFigure(
             f"residuals-{name}",
-            f"What the fitted shape leaves over, {name}",
-            "Mean frame minus fitted spot and background in standard deviations of each pixel; pixels that were left "
-            "out are marked.",
+            f"Residuals of the fitted shape, {name}",
+            "Mean frame minus fitted spot and background in standard deviations of each pixel; excluded pixels are "
+            "marked.",
             residuals_svg(run, name),
         )
         for name in fitted
     ]
-    text = () if run.setup.test.corrections == "automatic" else ("The frames were not searched for defects.",)
-    return Section("Spots", text, (Table("spots", "What was found in the frames", caption, heads, rows), *figures))
+    text = () if run.setup.test.corrections == "automatic" else ("The frames were not searched for artefacts.",)
+    return Section(
+        "Spots", text, (Table("spots", "Spot positions and artefacts of the frames", caption, heads, rows), *figures)
+    )
 
 
 def _of(run: RecoverRun, camera: str) -> list[ChannelResult]:
@@ -210,12 +214,12 @@ def _estimators(run: RecoverRun) -> Section:
         rows.append(row)
     notes = [f"{one.title}: {one.note}." for one in reading.estimators.values()]
     table = Table("estimators", "All estimators", " ".join(notes), heads, rows, digits=5)
-    return Section("Estimators", (_IN_NO_SIGMA,), (table,), 1)
+    return Section("Estimators", (_NOT_IN_SIGMA,), (table,), 1)
 
 
 def _series(run: RecoverRun) -> Section:
     assert run.times is not None
-    together = run.smoothed
+    smoothed = run.smoothed
     heads = ["time [s]", "camera", "change", "unit", "value", "σ", "σ of noise"]
     rows: list[list[Cell]] = [
         [time, one.camera or "both", one.parameter.symbol, one.parameter.unit, one.value, one.sigma, one.noise]
@@ -223,43 +227,45 @@ def _series(run: RecoverRun) -> Section:
         for one in reading.table.of(reading.judged)
     ]
     judged = run.last.estimators[run.last.judged].title
-    caption = f"Value: as the {judged} reads each time by itself, against the same frames before."
-    legend = f"Marks: each time by itself as the {judged} reads it, with one total standard deviation."
+    caption = f"Value: reading of the {judged} at each time alone, relative to the same frames before."
+    legend = f"Marks: readings of the {judged} at each time alone, with one total standard deviation."
     text: tuple[str, ...] = ()
-    if together is not None:
+    if smoothed is not None:
         heads += ["filtered", "σ, filtered", "smoothed", "σ, smoothed"]
         reads = run.last.table.of(run.last.judged)
         for number, row in enumerate(rows):
             k, one = divmod(number, len(reads))
             for estimator in ("filtered", "smoothed"):
-                found = together.changes.row(reads[one].group, reads[one].parameter.key, estimator)
-                row += [float(found.value[k]), float(found.sigma[k])]
+                row_of_change = smoothed.changes.row(reads[one].group, reads[one].parameter.key, estimator)
+                row += [float(row_of_change.value[k]), float(row_of_change.sigma[k])]
         caption += " Filtered: from all times up to it; smoothed: from all times."
         legend += (
-            f" Line and bands: from all times together (smoothed), by how the disturbances {together.name} go on in "
-            "time, with one and two standard deviations, also between the times."
+            " Line and bands: from all times together (smoothed), by the time laws of the disturbances "
+            f"{smoothed.name}, with one and two standard deviations, also between the times."
         )
-        text = (course_agrees(together, np.array(run.times)),)
+        text = (course_agrees(smoothed, np.array(run.times)),)
     figure = SvgFigure("series", "Changes over time", legend, changes_svg(_drawn(run)))
-    return Section("Series", text, (figure, Table("times", "Every time", caption, heads, rows)), 1)
+    return Section("Series", text, (figure, Table("times", "All times", caption, heads, rows)), 1)
 
 
 def _drawn(run: RecoverRun) -> list[Line]:
     """Return the changes of the cameras and of their angle that the figure of a series shows."""
     assert run.times is not None
     out = []
-    every = [reading.table.of(reading.judged) for reading in run.readings]
-    for number, one in enumerate(every[-1]):
-        if one.group == GROUND_GROUP:
+    rows_by_time = [reading.table.of(reading.judged) for reading in run.readings]
+    for number, change in enumerate(rows_by_time[-1]):
+        if change.group == GROUND_GROUP:
             continue
-        values, sigmas = ([getattr(reads[number], name) for reads in every] for name in ("value", "sigma"))
+        values, sigmas = ([getattr(reads[number], name) for reads in rows_by_time] for name in ("value", "sigma"))
         band = None
         if run.smoothed is not None:
             parts = ((run.times, run.smoothed.changes), (run.smoothed.times, run.smoothed.between))
-            found = [(times, table.row(one.group, one.parameter.key, "smoothed")) for times, table in parts]
-            points = np.concatenate([np.stack([times, row.value, row.sigma], axis=1) for times, row in found])
+            parts_of_change = [
+                (times, table.row(change.group, change.parameter.key, "smoothed")) for times, table in parts
+            ]
+            points = np.concatenate([np.stack([times, row.value, row.sigma], axis=1) for times, row in parts_of_change])
             band = points[np.argsort(points[:, 0])].T
-        out.append(Line(one.camera, one.parameter.label, np.array([run.times, values, sigmas]), band))
+        out.append(Line(change.camera, change.parameter.label, np.array([run.times, values, sigmas]), band))
     return out
 
 
@@ -277,5 +283,5 @@ def _transfer(results: list[ChannelResult]) -> Section:
         )
         gain, noise, prnu, dsnu = (f"{fixed(v, decimals_for(s))} ± {fixed(s, decimals_for(s))}" for v, s in pairs)
         rows.append([result.channel.name, gain, noise, fixed(t.dark_level_dn, 2), prnu, dsnu])
-    caption = "By the variances of dark and flat frames, over the frames and over the pixels."
+    caption = "From the variances of dark and flat frames, over the frames and over the pixels."
     return Section("Photon transfer", (), (Table("photon_transfer", "Measured noise", caption, heads, rows),))

@@ -61,8 +61,8 @@ class _Limited:
     @property
     def followed(self) -> list[tuple[Elasticity, int]]:
         """Numbers of the prior with the largest elasticities, each with the quantity's index."""
-        found = sorted(self.limits.elasticities, key=lambda one: -float(one.elasticity[self.q]))[:LINES]
-        return [(one, self.q) for one in found]
+        largest = sorted(self.limits.elasticities, key=lambda elasticity: -float(elasticity.elasticity[self.q]))[:LINES]
+        return [(elasticity, self.q) for elasticity in largest]
 
 
 SHARE: Record[tuple[str, float]] = Record(
