@@ -1,4 +1,4 @@
-"""One check of a paper: its statement, what the simulation gives, and the verdict."""
+"""Check of a paper's statement: the statement, the value from the simulation, and the verdict."""
 
 from __future__ import annotations
 
@@ -20,29 +20,31 @@ from scenes.yaml.spec import Number, Spec, Text
 from twin.framework.artefact import plain, significant
 
 FARTHEST = 100.0
-"""Factor on an input up to which its limit is looked for."""
+"""Largest factor on an input within which its limit is searched."""
 _STEP = 1.1
+"""Factor between two trial values of an input in the search for its limit."""
 _HALVINGS = 20
+"""Number of bisections that locate a limit: 1.1 to 2^-20 of a step, far below the two digits shown."""
 
 
 @dataclass(frozen=True)
 class InputRange:
-    """A chosen input and where the row stays as it is, all other inputs being what they are.
+    """Chosen input, with the range over which the verdict stays the same while all other inputs are fixed.
 
     Attributes
     ----------
     name : str
-        What it is.
-    value : float | None
-        As chosen; None where it is no number.
+        Name of the input.
+    value : float or None
+        Chosen value; None if it is not a number.
     unit : str
-        Of the numbers; "1" for a factor.
-    low, high : float | None
-        Limits; None where there is none within a factor of `FARTHEST`, or the row does not agree.
+        Unit of the numbers; "1" for a factor.
+    low, high : float or None
+        Limits of the range; None if there is none within a factor of `FARTHEST`, or if the row does not agree.
     agrees : bool
-        Whether the row does.
+        True if the row agrees with the claim.
     said : str
-        Where else the row holds, where the input is no number.
+        Other choices for which the row agrees, if the input is not a number.
     """
 
     name: str
@@ -55,7 +57,7 @@ class InputRange:
 
     @property
     def text(self) -> str:
-        """For a reader: the value, and its limits to two digits."""
+        """Text for the report: the value, and its limits to two digits."""
         if self.value is None:
             return f"{self.name}, {self.said}"
         unit = "" if self.unit == "1" else f" {self.unit}"
@@ -71,24 +73,24 @@ class InputRange:
 
 
 def _two(value: float) -> str:
-    """Two digits; an exponent would be noise."""
+    """Return a number with two digits and without an exponent."""
     return significant(value, 2, floor=0.0)
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """An input that was chosen, and how the measured value goes with it.
+    """Input that was chosen, with the response of the measured value to it.
 
     Attributes
     ----------
     name : str
-        What it is, a phrase.
+        Name of the input, a phrase.
     value : float
-        As chosen, not zero.
+        Chosen value, not zero.
     unit : str
-        Of it.
-    response : Callable[[float], float]
-        What is measured, in the row's unit, when the input is so many times what it is.
+        Unit of the value.
+    response : callable
+        Function from a factor on the input to the measured value, in the unit of the row.
     """
 
     name: str
@@ -98,18 +100,18 @@ class Chosen:
 
     @classmethod
     def power(cls, name: str, value: float, unit: str, measured: float, exponent: float = 1.0) -> Chosen:
-        """An input that the measured value goes with as its power: 1 where it is proportional to it."""
+        """Return an input that the measured value follows as a power; exponent 1 if it is proportional."""
         return cls(name, value, unit, lambda factor: measured * factor**exponent)
 
     def range(self, holds: Callable[[float], bool], agrees: bool) -> InputRange:
-        """Where a row stays as it is.
+        """Return the range of the input over which a row agrees.
 
         Parameters
         ----------
-        holds : Callable[[float], bool]
-            Whether a measured value agrees.
+        holds : callable
+            Function that returns True if a measured value agrees.
         agrees : bool
-            Whether that of the row does; if not, no limits are looked for.
+            True if the measured value of the row agrees; otherwise no limits are searched.
         """
         low = high = None
         if agrees:
@@ -118,7 +120,7 @@ class Chosen:
         return InputRange(self.name, self.value, self.unit, low, high, agrees)
 
     def _limit(self, holds: Callable[[float], bool], step: float) -> float | None:
-        """Factor at which the row begins to fail, going by a step; None where it does not."""
+        """Return the factor at which the row begins to fail, searched with a step; None if it does not fail."""
         inside, outside = 1.0, step
         while holds(self.response(outside)):
             if not 1.0 / FARTHEST <= outside <= FARTHEST:
@@ -132,36 +134,36 @@ class Chosen:
 
 @dataclass(frozen=True)
 class Supposed:
-    """A choice that is no number.
+    """Choice that is not a number.
 
     Attributes
     ----------
     name : str
-        What it is, a phrase with the choice.
+        Name of the input with the choice, a phrase.
     said : str
-        Where else the row holds, found by trying.
+        Other choices for which the row agrees, determined by trying them.
     """
 
     name: str
     said: str
 
     def range(self, holds: Callable[[float], bool], agrees: bool) -> InputRange:
-        """Range of this choice. It has no limits, because the choice is not a number."""
+        """Return the range of this choice. It has no limits, because the choice is not a number."""
         return InputRange(self.name, None, "1", None, None, agrees, self.said)
 
 
 def mean_of(values: NDArray[Any]) -> tuple[float, float]:
-    """Mean of (n,) independent measurements, n > 1, and its standard deviation from their scatter."""
+    """Return the mean of (n,) independent measurements, n > 1, and its standard deviation from their scatter."""
     return float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(len(values)))
 
 
 def median_of(values: NDArray[Any]) -> tuple[float, float]:
-    """Median of (n,) independent measurements, n > 1, and its standard deviation from their scatter, were it normal."""
+    """Return the median of (n,) independent measurements, n > 1, and its standard deviation for a normal scatter."""
     return float(np.median(values)), float(np.sqrt(0.5 * np.pi / len(values)) * np.std(values, ddof=1))
 
 
 def rms(values: Any) -> float:
-    """Root mean square of all of an array's values."""
+    """Return the root mean square of all values of an array."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
@@ -176,10 +178,10 @@ _STATISTICS: Mapping[str, Callable[[Any], Any]] = {
 
 
 class _Sentences(Formatter):
-    """Formatter of texts with facts, see `sentence`."""
+    """Formatter of texts with facts; see `sentence`."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
-        """Apply the words before the digits, and name each value of a mapping."""
+        """Apply the words before the digits, and show each value of a mapping with its name."""
         *words, digits = format_spec.split(" ")
         for word in words:
             if isinstance(value, Mapping) and word in _UNITS:
@@ -195,16 +197,16 @@ class _Sentences(Formatter):
 
 
 def sentence(text: str, facts: Mapping[str, Any]) -> str:
-    """Return a text of ``printed.yaml`` with its facts.
+    """Return a text of ``printed.yaml`` with its facts inserted.
 
     Parameters
     ----------
     text : str
-        Facts stand in braces as for `str.format`. Before the digits may stand statistics and a unit, separated by
-        spaces: ``{error:abs max arcsec .3f}`` is the largest size of an SI array's values in arcseconds. Several values
-        are listed, those of a mapping with their names.
-    facts : Mapping[str, Any]
-        By name.
+        Text with facts in braces as for `str.format`. Statistics and a unit may precede the digits, separated by
+        spaces: ``{error:abs max arcsec .3f}`` is the largest absolute value of an SI array in arcseconds. Several
+        values are listed, those of a mapping with their names.
+    facts : mapping of str to object
+        Facts by name.
     """
     return _Sentences().vformat(text, (), facts)
 
@@ -236,10 +238,10 @@ VERDICTS: dict[Verdict, str] = {
     NOT_CHECKABLE: "The text does not print what a comparison needs; the reason stands beside it.",
     FAILED: "The check could not be computed; this says nothing about the paper.",
 }
-"""The verdicts and what they mean."""
+"""Meaning of each verdict."""
 
 SIGMAS = 3.0
-"""The noise allowance of a comparison, in standard deviations of the measured value."""
+"""Noise allowance of a comparison, in standard deviations of the measured value."""
 
 PAPERS = {
     "000": "Liu and Huang, Infrared and Laser Engineering 43(10) (2014)",
@@ -248,65 +250,67 @@ PAPERS = {
     "004": "Li et al., Infrared and Laser Engineering, doi 10.3788/IRLA20200143",
     "017": "Wang Renxiang, Acta Geodaetica et Cartographica Sinica 46(3) 332 (2017)",
 }
-"""The source papers by the number that the ids begin with."""
+"""Source papers by the number with which the ids begin."""
 
 Comparison = Literal["two-sided", "at most", "at least"]
 Basis = Literal["printed", "chosen", "theory"]
 AGREED: dict[Basis, Verdict] = {"printed": CONFIRMED, "chosen": REPRODUCED, "theory": CONSISTENT}
-"""What a row rests on -> its verdict where simulation and claim agree: a print that could have failed, a print with
-inputs chosen here, or a theory beside which nothing is printed.
+"""Verdict for agreement of simulation and claim, by the basis of the row.
+
+The basis is a printed value that could have failed, a printed value with inputs chosen here, or a theory where the
+paper prints nothing.
 """
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """What a check found; exactly these are the keys in JSON.
+    """Result of a check; its attributes are the keys in JSON.
 
     Attributes
     ----------
     id : str
-        Dotted, beginning with the paper's number.
-    also : tuple[str, ...]
+        Dotted id that begins with the paper's number.
+    also : tuple of str
         Further ids of the same row.
     paper : str
-        The paper's number.
+        Number of the paper.
     equation : str
-        Where it is printed: equation, table or section.
+        Equation, table or section where it is printed.
     statement : str
-        What the paper says, in one sentence.
-    printed : float | None
-        The paper's number; None where it prints none.
-    implied : float | None
-        What the statement implies, where no number is printed.
-    measured : float | None
-        The simulation's number; None when it failed or nothing can be compared.
-    sigma : float | None
-        Standard deviation of ``measured``; None where there is no noise.
+        Statement of the paper, in one sentence.
+    printed : float or None
+        Number that the paper prints; None if it prints none.
+    implied : float or None
+        Number that the statement implies, if none is printed.
+    measured : float or None
+        Number from the simulation; None if it failed or nothing can be compared.
+    sigma : float or None
+        Standard deviation of ``measured``; None if there is no noise.
     unit : str
-        Of all these numbers; "1" for a ratio.
+        Unit of all these numbers; "1" for a ratio.
     tolerance : float
-        How far apart claim and measurement may be, without the noise.
-    comparison : Comparison
-        Two-sided, at most or at least; a row with one side takes whatever lies on the other.
+        Largest difference of claim and measurement that agrees, without the noise.
+    comparison : {"two-sided", "at most", "at least"}
+        Sides that are tested; a one-sided row accepts any value on the other side.
     because : str
-        Why that tolerance, a phrase.
-    power : float | None
-        Tolerance + 3 sigma: the smallest error of the statement that the row would have found. An error just so large
-        is found half the time, one of 3 sigma more practically always. None where nothing is compared.
-    tells : float | None
-        How far away the other statement is that the row is to tell from the printed one.
+        Reason of the tolerance, a phrase.
+    power : float or None
+        Tolerance + 3 sigma: the smallest error of the statement that the row would have found. An error of this size is
+        found half the time, one that is 3 sigma larger practically always. None if nothing is compared.
+    tells : float or None
+        Distance of the alternative statement from which the row has to distinguish the printed one.
     against : str
-        That other statement, a phrase.
+        The alternative statement, a phrase.
     theory : str
-        With what it agrees, where nothing is printed; else empty.
-    inputs : tuple[InputRange, ...]
-        Chosen here, and how far each may move.
+        Theory that the value is compared with if nothing is printed; else empty.
+    inputs : tuple of InputRange
+        Inputs chosen here, with their admissible ranges.
     verdict : Verdict
         One of VERDICTS.
     how : str
-        Lines: how it was measured; the reason, unless it is confirmed; the comparison that makes the verdict.
+        Lines: the method; the reason, unless the row is confirmed; the comparison that gives the verdict.
     seconds : float
-        Computing time since the group's result before; the first one holds the work that all share.
+        Computing time since the previous result of the group; the first one includes the work that all share.
     """
 
     id: str
@@ -332,7 +336,7 @@ class CheckResult:
     seconds: float
 
     def __post_init__(self) -> None:
-        """Check that a reader, and JSON, can take it."""
+        """Check that the values can be shown and written to JSON."""
         if self.verdict not in VERDICTS:
             raise ValueError(f"{self.id}: no verdict {self.verdict!r}; there are {', '.join(VERDICTS)}")
         for name in ("printed", "implied", "measured", "sigma", "tolerance", "power", "tells", "seconds"):
@@ -352,23 +356,23 @@ class CheckResult:
 
     @property
     def claim(self) -> float | None:
-        """What was compared with: the printed or the implied number."""
+        """Number that was compared with: the printed or the implied one."""
         return self.implied if self.printed is None else self.printed
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for JSON."""
+        """Return plain data for JSON."""
         return asdict(self) | {"also": list(self.also), "inputs": [asdict(i) for i in self.inputs]}
 
 
 class Explanation(Spec):
-    """A known reason for a value other than the claimed one.
+    """Known reason of a value other than the claimed one.
 
     Attributes
     ----------
-    verdict : Literal['confirmed with correction', 'refuted']
+    verdict : {"confirmed with correction", "refuted"}
         CORRECTED if the reason is a fault, a gap or an ambiguity of the print, else REFUTED.
-    text : Text
-        The reason, with the facts that `Check.evaluate` is given, see `sentence`.
+    text : str
+        Reason, with the facts that `Check.evaluate` receives; see `sentence`.
     """
 
     verdict: Literal["confirmed with correction", "refuted"]
@@ -376,52 +380,53 @@ class Explanation(Spec):
 
 
 class Check(Spec):
-    """A row: what a paper states and prints, a tolerance with its reason, the alternative that it has to be told from,
-    and what agreement rests on. It stands in the paper's ``printed.yaml`` and is known before anything is computed, so
-    that no tolerance can follow a result; `evaluate` compares what was measured, with the inputs that were chosen for
-    it, and gives the result.
+    """Row of the validation: a paper's statement, its tolerance with the reason, and the alternative it is tested
+    against.
+
+    A row stands in the paper's ``printed.yaml`` and is known before anything is computed, so that no tolerance can
+    follow a result. `evaluate` compares the measured value, with the inputs that were chosen for it, and gives the
+    result.
 
     Attributes
     ----------
-    id : Text
-        Dotted, beginning with the paper's number, for instance ``001.table3.centroid``.
-    equation : Text
-        Where it is printed, for instance ``eq. (5)``.
-    statement : Text
-        What the paper says, in one sentence.
-    unit : Text
-        Of printed, measured and tolerance; "1" for a ratio.
-    printed : Number | None
-        The paper's number; None where it prints none.
-    tolerance : Number
-        How far apart printed and measured may be and still agree, without the noise.
-    because : Text
-        Why that tolerance.
-    comparison : Comparison
-        ``two-sided``: off to either side counts; or what the paper claims of the measured value: ``at most`` or ``at
-        least`` the printed, so that whatever lies on the other side agrees, however far away.
+    id : str
+        Dotted id that begins with the paper's number, for instance ``001.table3.centroid``.
+    equation : str
+        Place where it is printed, for instance ``eq. (5)``.
+    statement : str
+        Statement of the paper, in one sentence.
+    unit : str
+        Unit of printed value, measured value and tolerance; "1" for a ratio.
+    printed : float or None
+        Number that the paper prints; None if it prints none.
+    tolerance : float
+        Largest difference of printed and measured value that agrees, without the noise.
+    because : str
+        Reason of the tolerance.
+    comparison : {"two-sided", "at most", "at least"}
+        ``two-sided`` if a difference to either side counts; ``at most`` or ``at least`` if the paper claims a limit,
+        so that any value on the other side agrees.
     expected : Verdict
-        The verdict that is known from earlier work; any other one is reported and fails the command. By default that of
-        agreement.
-    tells : Number | None
-        How far away the nearest other statement is that the row is to tell from this one, in its unit; with a tolerance
-        plus noise above that it confirms nothing. None only where nothing can be compared.
-    against : Text
-        That other statement, a phrase that goes on "told from".
-    basis : Basis
-        What agreement rests on, see AGREED; the inputs of ``chosen`` are given to `evaluate`.
-    theory : Text
-        Which theory agreement rests on, a phrase; the basis is then ``theory``.
-    also : tuple[Text, ...]
-        Further ids of the same row, where one comparison is of two equations.
-    not_checkable : Text
-        Why nothing can be compared; empty where something can.
-    explanations : tuple[Explanation, ...]
-        Known reasons for other values, the likeliest first; `evaluate` is given the values.
-    otherwise : Text
-        What can be said where neither claim nor explanation agrees.
-    how : Text
-        How the number is measured and what else is found, with facts like the explanations.
+        Verdict known from earlier work; any other one is reported and fails the command. Agreement by default.
+    tells : float or None
+        Distance of the nearest alternative statement from this one, in the unit of the row; if tolerance plus noise
+        exceed it, the row confirms nothing. None only if nothing can be compared.
+    against : str
+        The alternative statement, a phrase that continues "told from".
+    basis : {"printed", "chosen", "theory"}
+        Basis of agreement, see AGREED; for ``chosen`` the inputs are passed to `evaluate`.
+    theory : str
+        Theory that agreement rests on, a phrase; the basis is then ``theory``.
+    also : tuple of str
+        Further ids of the same row, if one comparison tests two equations.
+    not_checkable : str
+        Reason why nothing can be compared; empty if something can.
+    explanations : tuple of Explanation
+        Known reasons for other values, the likeliest first; `evaluate` receives the values.
+    otherwise : str
+        Conclusion if neither the claim nor an explanation agrees.
+    how : str
+        Method of measurement and further findings, with facts like the explanations.
     """
 
     id: Text
@@ -446,7 +451,7 @@ class Check(Spec):
     @model_validator(mode="before")
     @classmethod
     def _follow(cls, row: Any) -> Any:
-        """What follows from other keys: a basis from a theory, the expected verdict from the basis."""
+        """Fill in keys that follow from others: the basis from a theory, the expected verdict from the basis."""
         if not isinstance(row, dict):
             return row
         basis = row.get("basis", "theory" if row.get("theory") else "printed")
@@ -455,7 +460,7 @@ class Check(Spec):
 
     @model_validator(mode="after")
     def _can_tell(self) -> Check:
-        """Refuse ids that nobody can select and rows that cannot tell what they are for."""
+        """Refuse ids that cannot be selected, and rows that cannot distinguish what they test."""
         for name in self.names:
             parts = name.split(".")
             if parts[0] not in PAPERS or len(parts) < 2 or not all(p and p.replace("_", "").isalnum() for p in parts):
@@ -481,17 +486,17 @@ class Check(Spec):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All ids of the row, its own first."""
+        """All ids of the row, the main one first."""
         return (self.id, *self.also)
 
     @property
     def agreed(self) -> Verdict:
-        """The verdict where simulation and claim agree."""
+        """Verdict for agreement of simulation and claim."""
         return AGREED[self.basis]
 
     @property
     def paper(self) -> str:
-        """The paper's number."""
+        """Number of the paper."""
         return self.id.partition(".")[0]
 
     def evaluate(
@@ -504,33 +509,38 @@ class Check(Spec):
         inputs: Sequence[Chosen | Supposed] = (),
         facts: Mapping[str, Any] = FrozenMap(),
     ) -> CheckResult:
-        """The result, with the verdict that the numbers give.
+        """Return the result of the row, with the verdict that the numbers give.
 
-        It agrees if ``measured`` is the claimed value within ``tolerance`` + 3 ``sigma``; else the first explanation
-        whose value it is within the same limit gives verdict and reason; else it is refuted. A limit above
-        ``tells`` makes of either agreement ``undecided``.
+        The row agrees if ``measured`` is within ``tolerance`` + 3 ``sigma`` of the claimed value. Otherwise the first
+        explanation whose value is within the same limit gives verdict and reason; if there is none, the row is refuted.
+        A limit above ``tells`` turns either agreement into ``undecided``.
 
         Parameters
         ----------
         measured : float
-            The simulation's number.
-        sigma : float | None
-            Its standard deviation, None without noise.
+            Number from the simulation.
+        sigma : float or None
+            Its standard deviation; None without noise.
         how : str
-            What stands after the row's own ``how``.
-        implied : float | None
-            What the paper's statement implies, where it prints no number.
-        explained : Sequence[float | None]
-            Values that the row's explanations would give, in their order; None where one is no reason here.
-        inputs : Sequence[Chosen | Supposed]
-            Chosen here; needed where the row's basis is ``chosen``.
-        facts : Mapping[str, Any]
-            What the row's texts name in braces, beside ``measured``.
+            Text appended to the row's own ``how``.
+        implied : float or None
+            Number that the paper's statement implies, if it prints none.
+        explained : sequence of float or None
+            Values that the row's explanations would give, in their order; None for one that does not apply.
+        inputs : sequence of Chosen or Supposed
+            Inputs chosen here; required if the row's basis is ``chosen``.
+        facts : mapping of str to object
+            Facts that the row's texts name in braces, in addition to ``measured``.
+
+        Returns
+        -------
+        CheckResult
+            Result with its verdict.
 
         Raises
         ------
         ValueError
-            a number is not finite, there is nothing to compare with, or inputs are missing.
+            A number is not finite, there is nothing to compare with, or inputs are missing.
         """
         measured, noise = float(measured), SIGMAS * float(sigma or 0.0)
         goal = self.printed if self.printed is not None else implied

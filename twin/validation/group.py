@@ -1,5 +1,4 @@
-"""Groups of rows that share work, what they are given to work with, and the YAML files in which the rows stand beside
-what the papers print.
+"""Groups of rows that share work, their context, and the YAML files with the rows and the printed values.
 
 Keys of numbers end in the unit in which the paper prints them, so that they are read as printed and converted where
 they are used. Below ``groups`` stand the rows by group and id, with the keys of `Check`; a row's ``printed`` is a
@@ -31,7 +30,7 @@ from twin.validation.row_names import FILE, FOLDER, matches
 
 
 class ArtefactText(Spec):
-    """What is said of a figure or a table, with facts in braces, see `sentence`; attributes as of `Table`."""
+    """Texts of a figure or a table, with facts in braces, see `sentence`; attributes as of `Table`."""
 
     title: Text
     caption: Text = ""
@@ -41,30 +40,30 @@ class ArtefactText(Spec):
 
 @dataclass(eq=False)
 class Context:
-    """What the function of a group may use.
+    """Context in which the function of a group computes.
 
     Attributes
     ----------
     backend : Backend
-        Where to trace.
+        Backend of the ray trace.
     seed : int
-        Of all noise; the same seed must give the same results.
+        Seed of all noise; the same seed gives the same results.
     fast : bool
-        Whether fewer trials have to do; the verdicts must not depend on it.
-    selected : frozenset[str]
-        Ids that are wanted; others need no work, and their results are not kept.
-    checks : Mapping[str, Check]
-        Id -> check, of the whole group.
-    report_progress : Callable[[float, str], None]
-        Takes the fraction of the group's work that is done, and what is being done.
-    folder : Path | None
-        Where the group may put files of its own, which the report lists; None when nothing is written.
-    experiments : dict[str, MonitorExperiment]
-        Instrument -> experiment, shared by all groups.
-    texts : Mapping[str, ArtefactText]
-        Name of a figure or table of the group -> what is said of it.
-    artefacts : list[Artefact]
-        Added so far.
+        True for fewer trials; the verdicts must not depend on it.
+    selected : frozenset of str
+        Ids that are requested; others need no work, and their results are not kept.
+    checks : mapping of str to Check
+        All checks of the group by id.
+    report_progress : callable
+        Function that takes the fraction of the group's work that is done, and the name of the present work.
+    folder : Path or None
+        Folder for files of the group, which the report lists; None if nothing is written.
+    experiments : dict of str to MonitorExperiment
+        Monitoring experiments by instrument, shared by all groups.
+    texts : mapping of str to ArtefactText
+        Texts of the group's figures and tables by name.
+    artefacts : list of Artefact
+        Artefacts added so far.
     """
 
     backend: Backend
@@ -79,29 +78,29 @@ class Context:
     artefacts: list[Artefact] = field(default_factory=list)
 
     def wants(self, *prefixes: str) -> bool:
-        """Whether any selected id lies under one of the prefixes."""
+        """Return True if a selected id lies under one of the prefixes."""
         return any(matches(identifier, prefix) for identifier in self.selected for prefix in prefixes)
 
     def count(self, full: int, fast: int) -> int:
-        """How many trials to make, by the length of the run."""
+        """Return the number of trials, by the length of the run."""
         return fast if self.fast else full
 
     def check(self, identifier: str) -> Check:
-        """One of the group's checks, to be evaluated.
+        """Return one of the group's checks.
 
         Raises
         ------
         KeyError
-            The group has none of that id.
+            The group has no check of that id.
         """
         return self.checks[identifier]
 
     def progress(self, fraction: float, text: str) -> None:
-        """Say how far the group is, from 0 to 1, and what it does next."""
+        """Report the fraction of the group's work that is done, from 0 to 1, and the next step."""
         self.report_progress(min(max(fraction, 0.0), 1.0), text)
 
     def experiment(self, instrument: str) -> MonitorExperiment:
-        """The monitoring experiment on an instrument of the library, built once for all groups."""
+        """Return the monitoring experiment on an instrument of the library, built once for all groups."""
         if instrument not in self.experiments:
             self.experiments[instrument] = MonitorExperiment(resolve_job(JobSpec(instrument=instrument)), self.backend)
         return self.experiments[instrument]
@@ -112,24 +111,24 @@ class Context:
         Raises
         ------
         ValueError
-            The group has another of that name.
+            The group already has an artefact of that name.
         """
         if any((artefact.name, artefact.kind) == (other.name, other.kind) for other in self.artefacts):
             raise ValueError(f"two artefacts {artefact.name}.{artefact.kind} in one group")
         self.artefacts.append(artefact)
 
     def figure(self, name: str, drawing: str | bytes, **facts: object) -> None:
-        """Add a drawing, SVG or PNG, under the title and with the caption that stand beside the group's rows."""
+        """Add a drawing, SVG or PNG, with the title and caption from the group's file."""
         said = self._said(name, facts)
         self.add(SvgFigure(name, *said, drawing) if isinstance(drawing, str) else PngFigure(name, *said, drawing))
 
     def table(self, name: str, rows: Sequence[Sequence[Cell]], **facts: object) -> None:
-        """Add a table under the title, caption and heads that stand beside the group's rows."""
+        """Add a table with the title, caption and heads from the group's file."""
         text = self.texts[name]
         self.add(Table(name, *self._said(name, facts), text.heads, rows, text.decimals))
 
     def data(self, name: str, content: dict[str, Any]) -> None:
-        """Add data with the title and caption that stand beside the group's rows."""
+        """Add data with the title and caption from the group's file."""
         self.add(Data(name, *self._said(name, {}), content))
 
     def _said(self, name: str, facts: Mapping[str, Any]) -> tuple[str, str]:
@@ -155,24 +154,24 @@ Run = Callable[[Context], Iterable[CheckResult]]
 
 @dataclass(frozen=True)
 class CheckGroup:
-    """Checks that share work.
+    """Group of checks that share work.
 
     Attributes
     ----------
     prefix : str
-        Name of the group, beginning with the paper's number; where all its ids share a prefix, that.
+        Name of the group, beginning with the paper's number; the common prefix of its ids, if there is one.
     title : str
-        What it is about, for the report.
+        Subject, for the report.
     seconds : float
-        Rough computing time on two cores.
-    checks : tuple[Check, ...]
-        Everything it checks.
+        Approximate computing time on two cores.
+    checks : tuple of Check
+        All checks of the group.
     run : Run
-        Does it; yields one result for every selected check, as soon as it has it.
-    fast_seconds : float | None
-        Rough time of the fast run, None where that is the same.
-    artefacts : Mapping[str, ArtefactText]
-        Name of a figure or table -> what is said of it.
+        Function that yields one result for every selected check as soon as it is known.
+    fast_seconds : float or None
+        Approximate time of the fast run; None if it is the same.
+    artefacts : mapping of str to ArtefactText
+        Texts of figures and tables by name.
     """
 
     prefix: str
@@ -184,7 +183,7 @@ class CheckGroup:
     artefacts: Mapping[str, ArtefactText] = FrozenMap()
 
     def __post_init__(self) -> None:
-        """Refuse groups that cannot be told apart or shown."""
+        """Refuse groups that cannot be distinguished or shown."""
         if not self.checks or self.seconds <= 0 or (self.fast_seconds is not None and self.fast_seconds <= 0):
             raise ValueError(f"group {self.prefix!r} needs checks and a rough time > 0")
         if not self.prefix.replace(".", "").replace("_", "").isalnum():
@@ -193,12 +192,12 @@ class CheckGroup:
             raise ValueError(f"group {self.prefix!r} holds checks of another paper")
 
     def rough_seconds(self, fast: bool) -> float:
-        """Rough computing time of the full or the fast run."""
+        """Return the approximate computing time of the full or the fast run."""
         return self.seconds if self.fast_seconds is None or not fast else self.fast_seconds
 
     @property
     def ids(self) -> tuple[str, ...]:
-        """Ids of its checks."""
+        """Ids of the group's checks."""
         return tuple(check.id for check in self.checks)
 
 
@@ -206,8 +205,10 @@ _Seconds = Annotated[Number, Field(gt=0.0)]
 
 
 class GroupRows(Spec):
-    """Rows that share work; the attributes are those of `CheckGroup`, and ``sentences``: texts by name, for which the
-    name stands in braces in the ``how`` of several rows, or in a later one of these texts.
+    """Rows that share work, as the paper's file states them.
+
+    The attributes are those of `CheckGroup`, and ``sentences``: texts by name, which may be named in braces in the
+    ``how`` of several rows, or in a later one of these texts.
     """
 
     title: Text
@@ -219,7 +220,7 @@ class GroupRows(Spec):
 
 
 class PaperRows(Spec):
-    """The rows of a file, whose other keys are what the paper prints."""
+    """Rows of a paper's file, whose other keys are the printed values."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -228,43 +229,43 @@ class PaperRows(Spec):
 
 @dataclass(frozen=True, eq=False)
 class Printed:
-    """What a paper prints. Keys are dotted, as in ``table1.mtf_nyquist``.
+    """Printed values of a paper. Keys are dotted, as in ``table1.mtf_nyquist``.
 
-    Every reader raises InputError, with file, line and key, where there is nothing of that name or of that kind.
+    Every reader raises InputError, with file, line and key, for a name that does not exist or is of another kind.
     """
 
     content: YamlFile
 
     def number(self, key: str) -> float:
-        """One number."""
+        """Return one number."""
         return self._number(_path(key), self._at(key))
 
     def whole(self, key: str) -> int:
-        """A count."""
+        """Return a count."""
         value = self._at(key)
         if not isinstance(value, int) or isinstance(value, bool):
             raise self._error(_path(key), "no whole number", value)
         return value
 
     def column(self, key: str) -> tuple[float, ...]:
-        """A list of numbers."""
+        """Return a list of numbers."""
         return self._column(_path(key), self._at(key))
 
     def numbers(self, key: str) -> Mapping[str, float]:
-        """A mapping of numbers, in the order of the file."""
+        """Return a mapping of numbers, in the order of the file."""
         return FrozenMap({k: self._number((*_path(key), k), v) for k, v in self._mapping(key).items()})
 
     def columns(self, key: str) -> Mapping[str, tuple[float, ...]]:
-        """A mapping of lists, in the order of the file."""
+        """Return a mapping of lists, in the order of the file."""
         return FrozenMap({k: self._column((*_path(key), k), v) for k, v in self._mapping(key).items()})
 
     @cached_property
     def groups(self) -> Mapping[str, GroupRows]:
-        """Prefix -> rows, in the order of the file, checked."""
+        """Rows by the prefix of their group, in the order of the file, checked."""
         return FrozenMap(validate(PaperRows, replace(self.content, data=self._named(self.content.data))).groups)
 
     def group(self, prefix: str, run: Run) -> CheckGroup:
-        """The group of that prefix, whose rows a function computes.
+        """Return the group of a prefix, whose rows a function computes.
 
         Raises
         ------
@@ -279,8 +280,9 @@ class Printed:
         return CheckGroup(prefix, found.title, found.seconds, rows, run, found.fast_seconds, found.artefacts)
 
     def _named(self, data: Any) -> Any:
-        """The data with each row's id and shared sentences in it, and the number in place of the key that stands for
-        what is printed.
+        """Return the data with the id and the shared sentences inserted into each row.
+
+        The key of a printed value is replaced by its number.
         """
         groups = data.get("groups") if isinstance(data, dict) else None
         if not isinstance(groups, dict):
@@ -345,12 +347,12 @@ class Printed:
 
 @cache
 def load_printed(paper: str) -> Printed:
-    """What a paper prints.
+    """Return the printed values of a paper.
 
     Parameters
     ----------
     paper : str
-        Its number, for instance "001".
+        Number of the paper, for instance "001".
 
     Raises
     ------
@@ -361,8 +363,9 @@ def load_printed(paper: str) -> Printed:
 
 
 def group_of(prefix: str, run: Run = lambda context: ()) -> CheckGroup:
-    """A group by its prefix, with the rows that its paper's file holds, and what computes those that can be checked;
-    errors as of `load_printed`.
+    """Return a group by its prefix, with the rows of its paper's file and the function that computes them.
+
+    Errors are those of `load_printed`.
     """
     return load_printed(prefix.partition(".")[0]).group(prefix, run)
 
@@ -373,14 +376,14 @@ Draw = Callable[..., None]
 def drawing(
     name: str | Callable[..., str], height: float | Callable[..., float]
 ) -> Callable[[Draw], Callable[..., str]]:
-    """Decorator that makes of a function, which draws what it is given into a figure, one that returns the SVG.
+    """Return a decorator that turns a drawing function into one that returns the SVG.
 
     Parameters
     ----------
-    name : str | Callable[..., str]
-        Makes the SVG's identifiers its own.
-    height : float | Callable[..., float]
-        Of the figure, inches; both may be functions of what is drawn.
+    name : str or callable
+        Name that makes the SVG's identifiers unique.
+    height : float or callable
+        Height of the figure, in inches; both may be functions of the drawn values.
     """
 
     def decorate(draw: Draw) -> Callable[..., str]:

@@ -1,4 +1,4 @@
-"""All groups of checks, and how they are selected by the beginnings of their ids."""
+"""Register of all groups of checks, and their selection by the beginnings of their ids."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ _GROUPS = (
     Named("twin.validation.paper_004.distortion:FIGURES"),
     Named("twin.validation.paper_017.bundle:GROUP"),
 )
-"""Where each group is. A new one is added here."""
+"""Place of each group in the source. A new group is added here."""
 
 GROUPS: tuple[CheckGroup, ...]
-"""Every group, in the order in which they run; imported when it is asked for."""
+"""All groups in the order in which they run; they are imported at the first access."""
 
 
 def __getattr__(name: str) -> Any:
@@ -52,24 +52,29 @@ def __getattr__(name: str) -> Any:
 
 
 class UnknownCheck(Exception):
-    """A prefix under which there is no check; the message names the nearest."""
+    """Error raised for a prefix that no check has; the message names the nearest one."""
 
 
 @dataclass(frozen=True)
 class Selection:
-    """A group and those of its ids that are wanted."""
+    """Group with the ids of the checks that are requested."""
 
     group: CheckGroup
     ids: frozenset[str]
 
 
 def require_unique(groups: Iterable[CheckGroup]) -> None:
-    """Refuse groups or ids that come twice.
+    """Raise an error if a group or an id is registered twice.
+
+    Parameters
+    ----------
+    groups : iterable of CheckGroup
+        Groups to be examined.
 
     Raises
     ------
     ValueError
-        One does.
+        A name of a group or an id occurs more than once.
     """
     groups = tuple(groups)
     names = Counter(group.prefix for group in groups)
@@ -80,19 +85,20 @@ def require_unique(groups: Iterable[CheckGroup]) -> None:
 
 
 def select(groups: Sequence[CheckGroup], only: str | None) -> tuple[Selection, ...]:
-    """The groups, with the ids that lie under one of the prefixes; all where ``only`` is None.
+    """Return the groups that have ids under one of the prefixes, with these ids.
 
     Parameters
     ----------
-    groups : Sequence[CheckGroup]
-        All there are.
-    only : str | None
-        Prefixes, separated by commas, that end where a part of an id ends; a row's further ids count as well.
+    groups : sequence of CheckGroup
+        All groups.
+    only : str or None
+        Prefixes separated by commas, each ending where a part of an id ends; further ids of a row count as well. None
+        selects everything.
 
     Raises
     ------
     UnknownCheck
-        There is nothing under one of them.
+        No check has one of the prefixes.
     """
     require_unique(groups)
     if only is None:
@@ -107,12 +113,12 @@ def select(groups: Sequence[CheckGroup], only: str | None) -> tuple[Selection, .
 
 
 def require_known(only: str | None) -> None:
-    """Refuse what `select` would refuse, without any group where none has been imported yet.
+    """Raise the error of `select` for an unknown prefix, without importing a group if none has been imported yet.
 
     Raises
     ------
     UnknownCheck
-        There is nothing under one of the prefixes.
+        No check has one of the prefixes.
     """
     # other distributions' groups are in no file of ours
     if only is not None and not entries() and "GROUPS" not in globals():
@@ -120,12 +126,12 @@ def require_known(only: str | None) -> None:
 
 
 def _known(only: str, ids: Sequence[str]) -> list[str]:
-    """The prefixes, all of which have ids under them.
+    """Return the prefixes after checking that each has ids under it.
 
     Raises
     ------
     UnknownCheck
-        One has not.
+        A prefix has no ids under it.
     """
     prefixes = [part.strip() for part in only.split(",")]
     for prefix in prefixes:
@@ -135,7 +141,7 @@ def _known(only: str, ids: Sequence[str]) -> list[str]:
 
 
 def _unknown(prefix: str, ids: Sequence[str]) -> str:
-    """What is wrong with a prefix, and what was meant."""
+    """Return the message for an unknown prefix, with the nearest known one."""
     if not prefix:
         return "an empty id; --only takes ids or their beginnings, separated by commas, and --list shows them"
     # everything that could have been given; whole parts only

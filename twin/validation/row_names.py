@@ -1,4 +1,4 @@
-"""Ids of the rows of the validation, as their files name them."""
+"""Ids of the validation's rows, read from the papers' files."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import re
 from pathlib import Path
 
 FILE = "printed.yaml"
-"""Name of the file in each paper's folder."""
+"""Name of the file with the rows in each paper's folder."""
 FOLDER = Path(__file__).parent
-"""The folder of the papers' folders."""
+"""Folder that contains the papers' folders."""
 _ROW = re.compile(r"^      (\d{3}(?:\.\w+)+):$|^        also: \[(.*)\]$", re.M)
-"""A row's key below ``groups``, or its further ids."""
+"""Pattern of a row's key below ``groups``, or of its further ids."""
 
 
 def names_in_files() -> list[str]:
-    """Ids of all rows of all papers and further ids of the same rows, paper by paper.
+    """Return the ids of all rows of all papers, and further ids of the same rows, paper by paper.
 
-    They are read from the files as text: who asks for an unknown one is told so before anything that computes is
-    imported, and before YAML is read, which takes a second.
+    The files are read as text. An unknown id is therefore reported before anything that computes is imported, and
+    before the YAML is parsed, which takes a second.
     """
     found: list[str] = []
     for file in sorted(FOLDER.glob(f"paper_*/{FILE}")):
@@ -27,5 +27,8 @@ def names_in_files() -> list[str]:
 
 
 def matches(identifier: str, prefix: str) -> bool:
-    """Whether an id lies under a prefix: ``001.table3`` takes ``001.table3.x`` and itself, but not ``001.table33``."""
+    """Return True if an id lies under a prefix.
+
+    ``001.table3`` matches itself and ``001.table3.x``, but not ``001.table33``.
+    """
     return identifier == prefix or identifier.startswith(f"{prefix}.")

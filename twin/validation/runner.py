@@ -23,15 +23,29 @@ SCHEMA_VERSION = 2
 """Version of validation.json; it rises when a key changes its meaning or is removed."""
 
 FILES = "artefacts"
-"""Folder, in the run folder, of what the groups add; each has a folder of its prefix there."""
+"""Folder of the groups' artefacts in the run folder; each group has a folder named by its prefix there."""
 
 Progress = Callable[[float, str], None]
-"""Takes the rough seconds of work that are done, of ``rough_seconds``, and what is being done."""
+"""Function that takes the estimated seconds of work done, of ``rough_seconds``, and the name of the present work."""
 
 
 @dataclass(frozen=True, eq=False)
 class GroupRun:
-    """What a group gave: results in the order of its checks, artefacts, the time it took, and files it wrote itself."""
+    """Results of one group of checks.
+
+    Attributes
+    ----------
+    group : CheckGroup
+        Group that was run.
+    results : tuple of CheckResult
+        Results in the order of the group's checks.
+    artefacts : tuple of Artefact
+        Figures and tables for the report.
+    seconds : float
+        Computing time.
+    files : tuple of str
+        Files that the group wrote itself, relative to the run folder.
+    """
 
     group: CheckGroup
     results: tuple[CheckResult, ...]
@@ -40,30 +54,32 @@ class GroupRun:
     files: tuple[str, ...] = ()
 
     def place(self, artefact: Artefact) -> str:
-        """Path of an artefact in the run folder."""
+        """Return the path of an artefact in the run folder."""
         return f"{FILES}/{self.group.prefix}/{artefact.name}.{artefact.kind}"
 
 
 @dataclass(frozen=True, eq=False)
 class Validation:
-    """What a validation found.
+    """Results of a validation.
 
     Attributes
     ----------
-    runs : tuple[GroupRun, ...]
-        Group by group.
-    backend, seed : str
-        What it ran with.
-    only : str | None
-        The selection as it was given, None for everything.
+    runs : tuple of GroupRun
+        Results group by group.
+    backend : str
+        Backend of the ray trace.
+    seed : int
+        Seed of all noise.
+    only : str or None
+        Selection as the user gave it; None for all checks.
     fast : bool
-        Whether with fewer trials.
+        True for fewer trials.
     started : float
-        Time of the start, seconds since the epoch.
+        Time of the start, in seconds since the epoch.
     seconds : float
         Computing time.
     written : bool
-        Whether it goes into a run folder.
+        True if the results go into a run folder.
     """
 
     runs: tuple[GroupRun, ...]
@@ -77,22 +93,22 @@ class Validation:
 
     @property
     def results(self) -> tuple[CheckResult, ...]:
-        """All results, sorted by paper and else in the order of the groups."""
+        """All results, sorted by paper and then in the order of the groups."""
         return tuple(sorted((r for run in self.runs for r in run.results), key=lambda r: r.paper))
 
     @property
     def counts(self) -> dict[Verdict, int]:
-        """Verdict -> how many checks have it."""
+        """Number of checks with each verdict."""
         return {verdict: sum(r.verdict == verdict for r in self.results) for verdict in VERDICTS}
 
     @property
     def unexpected(self) -> tuple[tuple[CheckResult, Verdict], ...]:
-        """Results whose verdict is not the expected one, with that one; what could not be computed is among them."""
+        """Results with another verdict than the expected one, and the expected one; failed checks are among them."""
         expected = {check.id: check.expected for run in self.runs for check in run.group.checks}
         return tuple((r, expected[r.id]) for r in self.results if r.verdict != expected[r.id])
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for validation.json."""
+        """Return plain data for validation.json."""
         return {
             "schema": SCHEMA,
             "version": SCHEMA_VERSION,
@@ -127,7 +143,7 @@ class Validation:
 
 
 def rough_seconds(selections: Sequence[Selection], fast: bool = False) -> float:
-    """About how long these groups take."""
+    """Return the estimated computing time of groups, in seconds."""
     return sum(selection.group.rough_seconds(fast) for selection in selections)
 
 
@@ -140,24 +156,29 @@ def run_checks(
     progress: Progress = lambda done, text: None,
     folder: Path | None = None,
 ) -> Validation:
-    """Run the groups one after the other.
+    """Run groups of checks one after the other.
 
     Parameters
     ----------
-    selections : Sequence[Selection]
-        The groups with their wanted ids.
+    selections : sequence of Selection
+        Groups with the ids to be checked.
     backend : Backend
-        Where to trace.
+        Backend of the ray trace.
     seed : int
-        Of all noise.
-    only : str | None
-        The selection as the user gave it, kept in the results.
+        Seed of all noise.
+    only : str or None
+        Selection as the user gave it, kept in the results.
     fast : bool
-        Make fewer trials, as continuous integration wants it.
+        True for fewer trials, as in continuous integration.
     progress : Progress
-        Called whenever a group gets on.
-    folder : Path | None
-        The open run folder, None when nothing is written.
+        Called whenever a group advances.
+    folder : Path or None
+        Open run folder; None if nothing is written.
+
+    Returns
+    -------
+    Validation
+        Results of all groups.
     """
     started, clock = time.time(), time.monotonic()
     experiments: dict[str, MonitorExperiment] = {}
@@ -174,7 +195,7 @@ def run_checks(
 
 
 def _advance(progress: Progress, start: float, group: CheckGroup, seconds: float, fraction: float, text: str) -> None:
-    """Report how far a group is in its share of the progress."""
+    """Report how much of a group is done, as a share of the whole progress."""
     progress(start + fraction * seconds, f"{group.prefix}: {text}")
 
 
@@ -219,12 +240,12 @@ def _run_group(
 
 
 def _keep(result: CheckResult, found: dict[str, CheckResult], group: CheckGroup, wanted: frozenset[str]) -> None:
-    """File a result.
+    """Add a result to the results of its group.
 
     Raises
     ------
     ValueError
-        The group has no such check, or has answered it before.
+        The group has no such check, or has already given a result for it.
     """
     if result.id not in group.ids:
         raise ValueError(f"the group {group.prefix} answered {result.id}, which it does not hold")
@@ -235,14 +256,14 @@ def _keep(result: CheckResult, found: dict[str, CheckResult], group: CheckGroup,
 
 
 def _sentence(error: Exception) -> str:
-    """An error and where it was raised, for a reader of the report."""
+    """Return the message of an error with the place where it was raised, for the report."""
     text = " ".join(str(error).split()) or "no message"
     place = traceback.extract_tb(error.__traceback__)[-1]
     return f"{type(error).__name__}: {text} (in {place.name}, {Path(place.filename).name}:{place.lineno})"
 
 
 def _files(own: Path | None) -> tuple[str, ...]:
-    """Files that the group put into its folder, relative to the run folder; an empty folder is removed."""
+    """Return the files that a group put into its folder, relative to the run folder; an empty folder is removed."""
     if own is None:
         return ()
     files = tuple(sorted(p.relative_to(own.parents[1]).as_posix() for p in own.rglob("*") if p.is_file()))

@@ -1,4 +1,4 @@
-"""The report of the checks, their summary, and the files of a run."""
+"""Report of the validation, its summary page, and the files of its run folder."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ PROGRAM = "twin.validate"
 SUMMARY = "summary"
 """Folder of the summary in the run folder."""
 PAGE = "README.md"
-"""So that a code host shows it when the folder is opened."""
+"""Name of the summary page; code hosts show a README.md when its folder is opened."""
 
 
 def summary_files(validation: Validation) -> dict[str, bytes]:
-    """Name -> content: the page and the figures that it shows."""
+    """Return the files of the summary by name: the page and the figures that it shows."""
     figures = {
         f"{run.group.prefix}-{a.name}.{a.kind}": a
         for run in validation.runs
@@ -81,14 +81,16 @@ def _tables(validation: Validation) -> Iterator[str]:
 
 
 def _measured(result: CheckResult) -> str:
-    """Value, sigma and unit."""
+    """Return the measured value with its sigma and unit as text."""
     text, sigma = measured_text(result), sigma_text(result)
     parts = [text, f"± {sigma}" if sigma else "", "" if result.unit == "1" or result.measured is None else result.unit]
     return " ".join(part for part in parts if part)
 
 
 def _limits(result: CheckResult) -> tuple[str, str, str]:
-    """Tolerance with its reason, what an error must have to be found, and what is to be told."""
+    """Return the tolerance with its reason, the smallest error that would be found, and the alternative statement, as
+    text.
+    """
     if result.power is None or result.tells is None:
         return ("", "", "")
     unit = "" if result.unit == "1" else f" {result.unit}"
@@ -97,7 +99,7 @@ def _limits(result: CheckResult) -> tuple[str, str, str]:
 
 
 def _chosen(validation: Validation) -> Iterator[str]:
-    """Inputs that were chosen here, and how far each may move."""
+    """Yield the lines that list the chosen inputs and their admissible ranges."""
     found = [result for result in validation.results if result.inputs]
     if not found:
         return
@@ -111,7 +113,7 @@ def _chosen(validation: Validation) -> Iterator[str]:
 
 
 def _corrections(validation: Validation) -> Iterator[str]:
-    """Everything that does not agree, with its reason."""
+    """Yield the lines that list all rows without agreement, with the reason."""
     found = [result for result in validation.results if result.verdict not in AGREED.values()]
     if not found:
         return
@@ -126,17 +128,17 @@ def _corrections(validation: Validation) -> Iterator[str]:
 
 
 def _cell(text: str) -> str:
-    """Text that no table of Markdown takes for its own signs."""
+    """Escape text for a cell of a Markdown table."""
     return text.replace("|", "\\|").replace("\n", " ")
 
 
 _LOOKS = "confirmed", "reproduced", "consistent", "corrected", "refuted", "undecided", "silent", "failed"
 MARKS: dict[Verdict, tuple[str, str]] = dict(zip(VERDICTS, zip("=⊜∼≈≠±?✕", _LOOKS, strict=True), strict=True))
-"""Verdict -> mark, so that no meaning hangs on a colour, and class in the page."""
+"""Mark and CSS class of each verdict; the mark makes the meaning independent of the colour."""
 
 
 def render_report(validation: Validation) -> str:
-    """The page as text."""
+    """Return the report page as HTML."""
     count = len(validation.results)
     checks = f"{count} check{'' if count == 1 else 's'}"
     lead = (
@@ -172,7 +174,7 @@ VERDICTS_TEXT = (
 
 
 def verdict(validation: Validation) -> str:
-    """What the checks gave, in two sentences."""
+    """Return the outcome of all checks in two sentences."""
     counts = ", ".join(f"{validation.counts[v]} {v}" for v in VERDICTS if validation.counts[v])
     count, strange = len(validation.results), [r.id for r, _ in validation.unexpected]
     expected = "all verdicts are as expected from earlier work"
@@ -184,7 +186,7 @@ def verdict(validation: Validation) -> str:
 
 
 def _papers(validation: Validation) -> Iterator[Section]:
-    """A section with all rows of each paper."""
+    """Yield a section with all rows of each paper."""
     for number, title in PAPERS.items():
         results = [result for result in validation.results if result.paper == number]
         if results:
@@ -192,7 +194,7 @@ def _papers(validation: Validation) -> Iterator[Section]:
 
 
 def _paper_table(paper: str, results: Sequence[CheckResult]) -> Table:
-    """The rows of a paper; with all digits where they are taken away."""
+    """Return the table of a paper's rows; its downloadable form has all digits."""
     heads = ("id", "equation", "statement", "printed", "sides", "measured", "sigma", "unit", "verdict", "finds", "how")
     full = [
         (
@@ -218,12 +220,12 @@ def _count_table(validation: Validation) -> Table:
 
 
 def duration_text(seconds: float) -> str:
-    """A time as one says it."""
+    """Return a duration in minutes, or in seconds if it is short."""
     return f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"
 
 
 def command(validation: Validation) -> str:
-    """What repeats this validation."""
+    """Return the command line that repeats a validation."""
     return reproduce(_words(validation))
 
 
@@ -234,7 +236,7 @@ def _words(validation: Validation) -> list[str]:
 
 
 def measured_text(result: CheckResult) -> str:
-    """The measured value with the digits that its sigma leaves."""
+    """Return the measured value with the digits that its sigma justifies."""
     if result.measured is None:
         return "\N{EM DASH}"
     if result.sigma:
@@ -243,24 +245,26 @@ def measured_text(result: CheckResult) -> str:
 
 
 def sigma_text(result: CheckResult) -> str:
-    """Two digits of sigma, nothing without noise."""
+    """Return sigma with two digits; empty if there is no noise."""
     return fixed(result.sigma, decimals_for(result.sigma)) if result.sigma else ""
 
 
 def claim_text(result: CheckResult) -> str:
-    """What the paper prints, or in brackets what its statement implies."""
+    """Return the printed value, or in brackets the value that the statement implies."""
     if result.printed is None:
         return "\N{EM DASH}" if result.implied is None else f"[{plain(result.implied)}]"
     return plain(result.printed)
 
 
 def comparison_text(result: CheckResult) -> str:
-    """To which sides of the claim a measurement can disagree; nothing where nothing is compared."""
+    """Return the sides on which a measurement can disagree with the claim; empty if nothing is compared."""
     return result.comparison if result.power is not None else ""
 
 
 def power_text(result: CheckResult) -> str:
-    """The smallest error of the statement that the row would have found, in its unit and of the claim."""
+    """Return the smallest error of the statement that the row would have found, in its unit and as a share of the
+    claim.
+    """
     if result.power is None:
         return "\N{EM DASH}"
     text = significant(result.power, 2, floor=0.0)
@@ -289,12 +293,15 @@ def _row(result: CheckResult) -> tuple[Marked, ...]:
 
 
 def _typeset(text: str) -> str:
-    """Hyphens before numbers as minus signs."""
+    """Return text with minus signs in place of hyphens before numbers."""
     return re.sub(r"(?<![\w.,-])-(?=[\d.])|(?<=\de)-(?=\d)", "\N{MINUS SIGN}", text)
 
 
 def _angles(page: str) -> str:
-    """A page with angles in the units of all reports: papers, and with them the checks, print 0.1 arcsec as 0.1″."""
+    """Return a page with angles in the units of all reports.
+
+    The papers, and with them the checks, print 0.1 arcsec as 0.1″.
+    """
     page = re.sub(r"(?<=/)\N{DOUBLE PRIME}", "arcsec", page)
     page = re.sub(r"[ \N{NO-BREAK SPACE}]?\N{DOUBLE PRIME}", " arcsec", page)
     return re.sub(r"(?<=[\d)])\N{PRIME}", " arcmin", page)
