@@ -227,15 +227,15 @@ VERDICTS: dict[Verdict, str] = {
     CONFIRMED: "The simulation gives the printed value or finds the printed statement to hold, within the check's "
     "tolerance plus three sigma, with inputs that were not chosen for it: it could have failed.",
     REPRODUCED: "It gives the printed value or finds the statement to hold with inputs that the paper does not print "
-    "and that were chosen here. They stand beside it, with how far each may move before the row fails.",
-    CONSISTENT: "The paper prints nothing of it: the simulation agrees with the theory that the row names.",
-    CORRECTED: "It does not agree, and it does give the value that follows when a named fault, gap or ambiguity of "
-    "what is printed is put right; the correction stands beside it.",
-    REFUTED: "It does not agree, and no correction of the print would make it do so: the statement does not hold for "
-    "the simulated instrument, or the cause is not known. What was found stands beside it.",
-    UNDECIDED: "It agrees, but tolerance plus three sigma is more than what the row is to tell: a wrong statement "
+    "and that were chosen here. They are listed, with the range of each within which the row agrees.",
+    CONSISTENT: "The paper prints no value: the simulation agrees with the theory that the row names.",
+    CORRECTED: "It does not agree with the print, but with the value that follows when a named fault, gap or ambiguity "
+    "of the print is corrected; the correction is given.",
+    REFUTED: "It does not agree, and no correction of the print makes it agree: the statement does not hold for "
+    "the simulated instrument, or the cause is not known. The finding is given.",
+    UNDECIDED: "It agrees, but tolerance plus three sigma exceed the distance of the alternative: a wrong statement "
     "would have passed as well.",
-    NOT_CHECKABLE: "The text does not print what a comparison needs; the reason stands beside it.",
+    NOT_CHECKABLE: "The paper does not print what a comparison needs; the reason is given.",
     FAILED: "The check could not be computed; this says nothing about the paper.",
 }
 """Meaning of each verdict."""
@@ -380,8 +380,7 @@ class Explanation(Spec):
 
 
 class Check(Spec):
-    """Row of the validation: a paper's statement, its tolerance with the reason, and the alternative it is tested
-    against.
+    """Row of the validation: a paper's statement, its tolerance with the reason, and the alternative to be excluded.
 
     A row stands in the paper's ``printed.yaml`` and is known before anything is computed, so that no tolerance can
     follow a result. `evaluate` compares the measured value, with the inputs that were chosen for it, and gives the
@@ -404,8 +403,8 @@ class Check(Spec):
     because : str
         Reason of the tolerance.
     comparison : {"two-sided", "at most", "at least"}
-        ``two-sided`` if a difference to either side counts; ``at most`` or ``at least`` if the paper claims a limit,
-        so that any value on the other side agrees.
+        ``two-sided`` if a difference to either side counts; ``at most`` or ``at least`` if the paper claims a limit, so
+        that any value on the other side agrees.
     expected : Verdict
         Verdict known from earlier work; any other one is reported and fails the command. Agreement by default.
     tells : float or None
@@ -561,26 +560,26 @@ class Check(Spec):
         limit = f"Measured minus {name}: {measured - goal:+.3g}; allowed {sign}{allowed:.3g}, that is "
         limit += f"{self.tolerance:.3g} ({self.because})" + (" + 3 sigma." if noise else ".")
         if self.comparison != "two-sided":
-            limit += f" One-sided: whatever is {'less' if self.comparison == 'at most' else 'more'} agrees."
-        limit += f" To be told from {self.against}, {self.tells:.3g} away."
+            limit += f" One-sided: any value that is {'less' if self.comparison == 'at most' else 'more'} agrees."
+        limit += f" The alternative, {self.against}, is {self.tells:.3g} away."
         text = "\n".join(part for part in (sentence(self.how, facts) + how, chosen, reason, limit) if part)
         found = self._result(measured, sigma, verdict, text)
         return replace(found, implied=None if self.printed is not None else goal, power=allowed, inputs=ranges)
 
     def worse(self, *results: CheckResult) -> CheckResult:
-        """The result of a statement in several forms: the first that is not the expected one, otherwise the first."""
+        """Return the result of a statement in several forms: the first unexpected one, otherwise the first."""
         return next((r for r in results if r.verdict != self.expected), results[0])
 
     def failed(self, why: str) -> CheckResult:
-        """The result when it could not be computed."""
+        """Return the result of a check that could not be computed."""
         return self._result(None, None, FAILED, f"Could not be computed: {why}")
 
     def without_comparison(self) -> CheckResult:
-        """The result where the text does not print what a comparison needs."""
+        """Return the result of a row whose paper does not print what a comparison needs."""
         return self._result(None, None, NOT_CHECKABLE, self.not_checkable)
 
     def outside(self, measured: float, goal: float) -> float:
-        """By how much a value is not what is claimed, on the claim's side."""
+        """Return the distance of a value from the claim, positive where it disagrees."""
         distance = measured - goal
         return {"two-sided": abs(distance), "at most": distance, "at least": -distance}[self.comparison]
 
@@ -589,7 +588,7 @@ class Check(Spec):
     ) -> tuple[Verdict, str]:
         assert self.tells is not None
         weak = (
-            f"tolerance plus three sigma, {allowed:.3g}, is more than what the row is to tell: {self.against} is "
+            f"tolerance plus three sigma, {allowed:.3g}, exceed the distance of the alternative: {self.against} is "
             f"{self.tells:.3g} away and would have passed as well."
         )
         if self.outside(measured, goal) <= allowed:
@@ -606,7 +605,7 @@ class Check(Spec):
                     return UNDECIDED, f"{text} But {weak}"
                 return reason.verdict, text
         tried = ", ".join(f"{value:.6g}" for value, _ in known)
-        unknown = f"The cause is not known{f'; what was thought of gives {tried}' if tried else ''}."
+        unknown = f"The cause is not known{f'; the known explanations give {tried}' if tried else ''}."
         return REFUTED, sentence(self.otherwise, facts) or unknown
 
     def _result(self, measured: float | None, sigma: float | None, verdict: Verdict, how: str) -> CheckResult:
@@ -621,4 +620,4 @@ _OF_THE_ROW = (
     "id", "also", "paper", "equation", "statement", "printed", "unit", "tolerance", "comparison", "because", "tells",
     "against", "theory",
 )  # fmt: skip
-"""What a result repeats of its row."""
+"""Attributes of a row that its result repeats."""

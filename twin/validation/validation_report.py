@@ -57,7 +57,7 @@ def _head(validation: Validation) -> Iterator[str]:
         "measurement may be apart without the noise, and why. **Finds**: the smallest error of the statement that the "
         "row would have found, tolerance plus three sigma, and its share of the claim; an error just so large is found "
         "half the time. **Sides**: two-sided where a measurement can disagree on both sides of the claim; at most and "
-        "at least where it agrees however far below or above it lies. **To be told from**: the nearest other statement "
+        "at least where it agrees however far below or above it lies. **Alternative**: the nearest other statement "
         "and how far away it is; a row that finds only errors larger than that is undecided."
     )
     yield ""
@@ -70,7 +70,7 @@ def _tables(validation: Validation) -> Iterator[str]:
             continue
         yield f"## Paper {number}: {title}"
         yield ""
-        yield "| check | what is compared | claim | sides | measured | tolerance | finds | to be told from | verdict |"
+        yield "| check | what is compared | claim | sides | measured | tolerance | finds | alternative | verdict |"
         yield "|---|---|---:|---|---:|---|---|---|---|"
         for r in rows:
             names, about = " = ".join(f"`{name}`" for name in (r.id, *r.also)), f"{r.equation}: {r.statement}"
@@ -88,9 +88,7 @@ def _measured(result: CheckResult) -> str:
 
 
 def _limits(result: CheckResult) -> tuple[str, str, str]:
-    """Return the tolerance with its reason, the smallest error that would be found, and the alternative statement, as
-    text.
-    """
+    """Return tolerance with reason, the smallest error that would be found, and the alternative, as text."""
     if result.power is None or result.tells is None:
         return ("", "", "")
     unit = "" if result.unit == "1" else f" {result.unit}"
@@ -262,9 +260,7 @@ def comparison_text(result: CheckResult) -> str:
 
 
 def power_text(result: CheckResult) -> str:
-    """Return the smallest error of the statement that the row would have found, in its unit and as a share of the
-    claim.
-    """
+    """Return the smallest error that the row would have found, in its unit and as a share of the claim."""
     if result.power is None:
         return "\N{EM DASH}"
     text = significant(result.power, 2, floor=0.0)
