@@ -478,7 +478,7 @@ class BaseSpec(Spec):
     Attributes
     ----------
     command : str
-        Command that runs it, as in `python -m twin.COMMAND`.
+        Command that runs it, such as `render` for `python -m twin.render`.
     file : Reference
         File of the job or test, or the config.yaml of one of its runs, relative to the study's file; for lab and orbit
         also a name in the library.
