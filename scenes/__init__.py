@@ -1,6 +1,4 @@
-"""What stands where: cameras, instruments, detectors and jobs in YAML, and what turns them into optical assemblies and
-scenes.
-"""
+"""Input files, and the optical assemblies and scenes made of them: cameras, instruments, detectors and jobs in YAML."""
 
 import os
 import sys

@@ -1,7 +1,7 @@
 """JSON Schemas of the YAML files, for editors: `python -m scenes.schema [--out DIR]`.
 
-An editor that knows them completes keys, shows what they mean and marks mistakes while typing. With the YAML language
-server, the first line of a file names its schema: `# yaml-language-server: $schema=schemas/job.schema.json`.
+An editor with these schemas completes keys, shows what they mean and marks mistakes while typing. With the YAML
+language server, the first line of a file names its schema: `# yaml-language-server: $schema=schemas/job.schema.json`.
 """
 
 from __future__ import annotations
@@ -33,36 +33,36 @@ if TYPE_CHECKING:
 
     MODELS: dict[str, type[Spec]]
 
-_ATTRIBUTE = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.MULTILINE)
-_SI_UNIT = re.compile(r",? (?:metres|radians|seconds)\b")
+_ATTRIBUTE = re.compile(r"^(\w+(?:, \w+)*)(?: : .*)?\n((?:(?: {4}.*)?\n)*(?: {4}.*))", re.MULTILINE)
+_SI_UNIT = re.compile(r",? (?:in )?(?:metres|radians|seconds)\b")
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
 @cache
 def _models() -> dict[str, type[Spec]]:
-    """Name of each kind of file -> model of what it may say; all modules of them are imported here."""
+    """Return the specification class of each kind of file, by name; their modules are imported here."""
     return {kind.name: kind.model for kind in file_kinds()}
 
 
 def __getattr__(name: str) -> Any:
-    """``MODELS`` when it is first used: ``--help`` does not wait for it."""
+    """Return ``MODELS`` on first use, so that ``--help`` does not wait for it."""
     if name == "MODELS":
         return _models()
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def json_schema(name: str) -> dict[str, Any]:
-    """The JSON Schema of one sort of file.
+    """Return the JSON Schema of one kind of file.
 
     Parameters
     ----------
     name : str
-        One of MODELS.
+        Kind of file, one of ``MODELS``.
 
     Raises
     ------
     KeyError
-        Another name.
+        There is no such kind.
     """
     schema = _models()[name].model_json_schema(schema_generator=WithUnits)
     for model in (schema, *schema.get("$defs", {}).values()):
@@ -71,10 +71,10 @@ def json_schema(name: str) -> dict[str, Any]:
 
 
 class WithUnits(GenerateJsonSchema):
-    """Writes the defaults of quantities as text with a unit, as they stand in files."""
+    """Schema generator that writes defaults of quantities as text with a unit, as in files."""
 
     def default_schema(self, schema: core_schema.WithDefaultSchema) -> JsonSchemaValue:
-        """Return the schema of a key, its default as files write it."""
+        """Return the schema of a key, with its default as files write it."""
         result = super().default_schema(schema)
         if isinstance(schema.get("default"), float | tuple) and schema["default"] != ():
             result["default"] = SchemaSerializer(schema["schema"]).to_python(schema["default"], mode="json")
@@ -82,22 +82,23 @@ class WithUnits(GenerateJsonSchema):
 
 
 def _describe(model: dict[str, Any]) -> None:
-    """Move what a class's docstring says of its attributes to where an editor shows it."""
+    """Move the descriptions of attributes in a class's docstring to the keys, where an editor shows them."""
     text = model.get("description", "")
     model["description"] = text.split("\n\n")[0]
-    each = [(name, description) for names, description in _ATTRIBUTE.findall(text) for name in names.split(", ")]
+    listed = text.partition("\nAttributes\n----------\n")[2]
+    each = [(name, description) for names, description in _ATTRIBUTE.findall(listed) for name in names.split(", ")]
     for name, description in each:
         item = model.get("properties", {}).get(name)
         if item is not None:
             description = " ".join(description.split())
-            # In the file a quantity has the unit that is written beside it.
+            # A quantity of a file has the unit written beside it, not that of the attribute.
             one = item.get("anyOf", [item])[0]
             unit = item.get("description") or one.get("description") or one.get("items", {}).get("description")
             item["description"] = f"{_SI_UNIT.sub('', description).rstrip('.')}: {unit}" if unit else description
 
 
 def shipped_nodes() -> dict[str, Mapping[str, NodeInfo]]:
-    """Instrument of the library -> node path -> what may be done to it.
+    """Return the nodes of each instrument of the library, by path, with what they allow.
 
     Raises
     ------
@@ -118,14 +119,14 @@ def shipped_nodes() -> dict[str, Mapping[str, NodeInfo]]:
 
 
 def with_nodes(schema: dict[str, Any], instruments: Mapping[str, Mapping[str, NodeInfo]]) -> dict[str, Any]:
-    """The schema of a job in which the nodes of known instruments, their pivots and what they allow are listed.
+    """Return the schema of a job that lists the nodes of known instruments, their pivots and what they allow.
 
     Parameters
     ----------
     schema : dict[str, Any]
-        Of a job.
+        Schema of a job.
     instruments : Mapping[str, Mapping[str, NodeInfo]]
-        Name -> node path -> what may be done to it. A job of another instrument may name any node.
+        Instrument name -> node path -> what the node allows. A job of another instrument may name any node.
     """
     named = {**schema["properties"]["instrument"], "examples": list(instruments)}
     rules = []
@@ -140,12 +141,12 @@ def with_nodes(schema: dict[str, Any], instruments: Mapping[str, Mapping[str, No
 
 
 def _only(properties: Mapping[str, Any]) -> dict[str, Any]:
-    """A mapping with no other keys."""
+    """Return the schema of a mapping with no other keys."""
     return {"properties": dict(properties), "propertyNames": {"enum": list(properties)}}
 
 
 def _of_nodes(nodes: Mapping[str, NodeInfo]) -> dict[str, Any]:
-    """Node path -> what may stand below it."""
+    """Return the schema of each node's content, by path."""
     from scenes.specs.perturbation import ACTIONS
 
     out = {}
@@ -158,19 +159,19 @@ def _of_nodes(nodes: Mapping[str, NodeInfo]) -> dict[str, Any]:
 
 
 def write_schemas(folder: Path, instruments: Mapping[str, Mapping[str, NodeInfo]]) -> list[Path]:
-    """Write all schemas as `<name>.schema.json` into a folder, which is made if need be, and return their paths.
+    """Write all schemas as `<name>.schema.json` into a folder, which is created if necessary, and return their paths.
 
     Parameters
     ----------
     folder : Path
-        To write into.
+        Folder to write into.
     instruments : Mapping[str, Mapping[str, NodeInfo]]
-        Those whose nodes the schema of jobs lists, as for ``with_nodes``.
+        Instruments whose nodes the schema of jobs lists, as for ``with_nodes``.
 
     Raises
     ------
     OSError
-        It cannot be written.
+        The files cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
@@ -188,8 +189,8 @@ def main(
 ) -> None:
     """Write the JSON Schemas of the twin's YAML files, for editors.
 
-    That of a job lists the nodes of the library's instruments, their pivots and what may be done to each; quantities
-    are checked for the usual units of their kind.
+    The schema of a job lists the nodes of the library's instruments, their pivots and what may be done to each;
+    quantities are checked for the usual units of their kind.
 
     Example: python -m scenes.schema --out schemas
 

@@ -1,8 +1,8 @@
-"""Is this machine ready? `python -m twin.doctor [--quick] [--json]`.
+"""Command ``python -m twin.doctor [--quick] [--json]``: checks that this machine can run the twin.
 
-Reports Python, cores, LLVM, Dr.Jit, Mitsuba, GPU, the versions of the dependencies and whether all packages are those
-of the lock files, and runs a small float64 kernel and a small render in child processes, so that an unsuitable LLVM,
-which aborts the process that uses it, cannot take the doctor with it. Exit code 0 if the twin can run, 1 if not.
+It reports Python, cores, LLVM, Dr.Jit, Mitsuba, GPU, the versions of the dependencies and whether all packages are
+those of the lock files. A small float64 kernel and a small render run in child processes, so that an unsuitable LLVM,
+which aborts its process, does not abort the doctor. Exit code 0 if the twin can run, 1 if not.
 """
 
 if __name__ == "__main__":
@@ -33,14 +33,14 @@ from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 DISTRIBUTION = "space-camera-twin"
 OLDEST_PYTHON = (3, 11)
 PROBE_TIMEOUT_S = 120.0
-"""A probe takes about a second; this is only reached when something hangs."""
+"""Time limit of a probe, in seconds: it normally takes about one, so that this is reached only if something hangs."""
 
 Status = Literal["ok", "note", "failed"]
 
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the doctor's report. Only status "failed" makes the exit code 1; "note" is worth reading, no more."""
+    """One line of the doctor's report. Only the status "failed" makes the exit code 1; "note" is information."""
 
     name: str
     status: Status
@@ -53,14 +53,14 @@ def run_probe(arguments: list[str], timeout_s: float = PROBE_TIMEOUT_S) -> dict[
     Parameters
     ----------
     arguments : list[str]
-        What follows the interpreter, for instance ["-m", "twin.framework.doctor_probe", "kernel"].
+        Arguments of the interpreter, for instance ["-m", "twin.framework.doctor_probe", "kernel"].
     timeout_s : float
-        The child is killed after this many seconds.
+        Time in seconds after which the child is killed.
 
     Raises
     ------
     RuntimeError
-        It crashed, hung, failed, or answered no JSON; the message is fit to show to a user.
+        The child crashed, hung, failed, or returned no JSON; the message can be shown to users.
     """
     root = str(Path(__file__).resolve().parent.parent)
     environment = dict(os.environ)
@@ -84,7 +84,7 @@ def run_probe(arguments: list[str], timeout_s: float = PROBE_TIMEOUT_S) -> dict[
     try:
         answer = json.loads(child.stdout.strip().splitlines()[-1])
     except (IndexError, json.JSONDecodeError) as error:
-        raise RuntimeError(f"exit code {child.returncode} and no answer{_last_words(child.stderr)}") from error
+        raise RuntimeError(f"exit code {child.returncode} without a result{_last_words(child.stderr)}") from error
     if "error" in answer:
         raise RuntimeError(str(answer["error"]))
     result: dict[str, Any] = answer["result"]
@@ -92,12 +92,12 @@ def run_probe(arguments: list[str], timeout_s: float = PROBE_TIMEOUT_S) -> dict[
 
 
 def examine(quick: bool = False) -> list[Check]:
-    """All checks, in the order of the report.
+    """Return all checks, in the order of the report.
 
     Parameters
     ----------
     quick : bool
-        Leave out what the twin can do without: the GPU and the second Mitsuba variant.
+        Omit checks of optional parts: the GPU and the second Mitsuba variant.
     """
     checks = [_python(), _system(), _libatomic(), _llvm()]
     checks.append(
@@ -117,17 +117,20 @@ def examine(quick: bool = False) -> list[Check]:
 
 
 def _python() -> Check:
+    """Check the version of Python."""
     good = sys.version_info >= OLDEST_PYTHON
     needed = "" if good else f"; needs {'.'.join(map(str, OLDEST_PYTHON))} or newer"
     return Check("Python", "ok" if good else "failed", f"{platform.python_version()} at {sys.executable}{needed}")
 
 
 def _system() -> Check:
+    """Report platform and cores."""
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return Check("system", "ok", f"{platform.platform()}, {usable} of {os.cpu_count()} cores usable")
 
 
 def _libatomic() -> Check:
+    """Check that libatomic loads."""
     try:
         from optics.numerics.llvm import check_libatomic
 
@@ -138,6 +141,7 @@ def _libatomic() -> Check:
 
 
 def _llvm() -> Check:
+    """Find the LLVM library that Dr.Jit uses."""
     chosen = "named by DRJIT_LIBLLVM_PATH" if os.environ.get("DRJIT_LIBLLVM_PATH") else "from karellen-llvm-core"
     try:
         from optics.numerics.llvm import ensure_llvm, find_llvm
@@ -146,13 +150,14 @@ def _llvm() -> Check:
     except ImportError as error:
         return Check("LLVM", "failed", str(error))
     if library is None:
-        return Check("LLVM", "note", "left to Dr.Jit's own search")
-    # Importing optics sets the variable, so what it holds now may come from either.
+        return Check("LLVM", "note", "searched by Dr.Jit itself")
+    # Importing optics sets the variable, so that its present value may come from either.
     chosen = "from karellen-llvm-core" if library == find_llvm() else chosen
     return Check("LLVM", "ok", f"{library} ({chosen})")
 
 
 def _probe(name: str, arguments: list[str], describe: Any) -> Check:
+    """Run a probe of ``twin.framework.doctor_probe`` and describe its result."""
     try:
         return Check(name, "ok", describe(run_probe(["-m", f"{__package__}.framework.doctor_probe", *arguments])))
     except RuntimeError as error:
@@ -160,18 +165,20 @@ def _probe(name: str, arguments: list[str], describe: Any) -> Check:
 
 
 def _gpu() -> Check:
+    """Check that Dr.Jit can use a GPU."""
     try:
         result = run_probe(["-m", f"{__package__}.framework.doctor_probe", "gpu"])
     except RuntimeError as error:
         return Check("GPU", "note", f"--backend cuda does not work: {error}")
     if not result["available"]:
-        return Check("GPU", "note", "none that Dr.Jit can use; --backend cuda is not available")
+        return Check("GPU", "note", "no GPU that Dr.Jit can use; --backend cuda is not available")
     return Check(
         "GPU", "ok", f"{_gpu_name()}, CUDA {result['version']}, compute capability {result['compute_capability']}"
     )
 
 
 def _gpu_name() -> str:
+    """Return the names of the GPUs by nvidia-smi."""
     command = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
     try:
         answer = subprocess.run(command, capture_output=True, text=True, timeout=20.0, check=True)
@@ -181,9 +188,9 @@ def _gpu_name() -> str:
 
 
 def requirements() -> list[Requirement]:
-    """Dependencies with the versions that pyproject.toml allows, those that this Python and platform use.
+    """Return the dependencies that apply to this Python and platform, with the versions that pyproject.toml allows.
 
-    Read from the installed distribution, or from pyproject.toml when the twin runs from a folder without being
+    They are read from the installed distribution, or from pyproject.toml when the twin runs from a folder without being
     installed.
     """
     try:
@@ -196,6 +203,7 @@ def requirements() -> list[Requirement]:
 
 
 def _versions() -> list[Check]:
+    """Check the installed version of each dependency."""
     checks = []
     for one in requirements():
         try:
@@ -204,13 +212,14 @@ def _versions() -> list[Check]:
             checks.append(Check(one.name, "failed", f"not installed; pip install '{one.name}{one.specifier}'"))
             continue
         good = one.specifier.contains(found, prereleases=True)
-        checks.append(Check(one.name, *(("ok", found) if good else ("note", f"{found}, asked for {one.specifier}"))))
+        checks.append(Check(one.name, *(("ok", found) if good else ("note", f"{found}, required {one.specifier}"))))
     return checks
 
 
 def _lock() -> list[Check]:
-    """Whether all that is installed, also by what the dependencies need, is what setup.sh installs; nothing where there
-    are no lock files, as beside an installed wheel.
+    """Compare all installed packages, indirect dependencies included, with the lock files that setup.sh installs.
+
+    There is no check without lock files, as beside an installed wheel.
     """
     from twin.framework.lock_file import FOLDER, LockError, differences
 
@@ -222,11 +231,11 @@ def _lock() -> list[Check]:
         return [Check("lock", "failed", f"cannot be read: {error}")]
     parts = [f"{found.equal} packages as in docs/supply/lock"]
     if found.other:
-        parts.append(f"other than locked: {'; '.join(found.other)}")
+        parts.append(f"other versions than locked: {'; '.join(found.other)}")
     if found.missing:
         parts.append(f"not installed: {', '.join(found.missing)}")
     if found.other or found.missing:
-        parts.append("to have them as locked, delete .venv/installed and run bash setup.sh")
+        parts.append("to install the locked versions, delete .venv/installed and run bash setup.sh")
     if found.unknown:
         parts.append(f"not in the lock: {', '.join(found.unknown)}")
     status: Status = "failed" if found.missing else "note" if found.other else "ok"
@@ -234,6 +243,7 @@ def _lock() -> list[Check]:
 
 
 def _show(checks: list[Check], good: bool, console: Console) -> None:
+    """Print the checks as a table."""
     styles = {"ok": "green", "note": "yellow", "failed": "bold red"}
     table = Table(title="space camera twin: doctor", title_justify="left")
     table.add_column("check")
@@ -246,11 +256,12 @@ def _show(checks: list[Check], good: bool, console: Console) -> None:
 
 
 def main(
-    quick: Annotated[bool, typer.Option("--quick", help="Leave out the GPU and the second Mitsuba variant.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Skip the GPU and the second Mitsuba variant.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Write JSON instead of a table.")] = False,
 ) -> None:
-    """Check Python, LLVM, Dr.Jit, Mitsuba, GPU and the versions of the dependencies. Exit code 0 if the twin can run, 1
-    if not.
+    """Check Python, LLVM, Dr.Jit, Mitsuba, GPU and the versions of the dependencies.
+
+    Exit code 0 if the twin can run, 1 if not.
 
     Example: python -m twin.doctor --quick
     """
@@ -265,7 +276,7 @@ def main(
 
 
 def _last_words(stderr: str) -> str:
-    """What the child said went wrong: LLVM's own error line if there is one, else the last line."""
+    """Return the error line of a child process: LLVM's if there is one, else the last line."""
     lines = [line.strip() for line in stderr.splitlines() if line.strip()]
     fatal = [line for line in lines if "LLVM ERROR" in line] or lines[-1:]
     return f": {fatal[0][:300]}" if fatal else ""

@@ -1,6 +1,4 @@
-"""``python -m twin.lab``: laboratory tests of a camera, rendered or from files of measurements, and measured (paper
-004).
-"""
+"""Command ``python -m twin.lab``: laboratory tests of a camera, simulated or from files of measurements (paper 004)."""
 
 from __future__ import annotations
 
@@ -17,15 +15,16 @@ app = program(no_args_is_help=True)
 
 @app.callback()
 def main() -> None:
-    """Test a camera in the laboratory as paper 004 does: every image is rendered through the traced camera, noise
-    included, and only images and readings reach the analysis.
+    """Test a camera in the laboratory as paper 004 does.
+
+    Every image is rendered through the traced camera, noise included, and only images and readings reach the analysis.
 
     With `measured:` in the test's file, tables and images of a real bench go through the same analysis
-    (docs/measured_laboratory.md); `--export DIR` writes a simulated bench's as such files.
+    (docs/measured_laboratory.md); `--export DIR` writes those of a simulated bench as such files.
 
     Examples of all three files are in scenes/lab, and of measurements in scenes/lab/measured. The run folder gets
-    config.yaml, the numbers as JSON, a self-contained report.html, figures and tables in artefacts/ and recorded
-    frames in images/.
+    config.yaml, the numbers as JSON, a self-contained report.html, figures and tables in artefacts/ and recorded frames
+    in images/.
 
     Example: `python -m twin.lab turntable scenes/lab/turntable.yaml`
 

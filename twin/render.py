@@ -1,4 +1,4 @@
-"""``python -m twin.render``: a perturbed instrument's images, and what can be recovered from them."""
+"""Command ``python -m twin.render``: images of a perturbed instrument, and the perturbation recovered from them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ app = cli.program()
 @app.command()
 @cli.with_options("export")
 def main(
-    # readable=False: our own loader says what is wrong with a file, in the same words for all files
+    # readable=False: the loader reports errors of files, in the same words for all files.
     job: Annotated[
         Path, typer.Argument(readable=False, help="YAML file of the job, e.g. scenes/examples/perturb.yaml.")
     ],
@@ -51,10 +51,9 @@ def main(
         ),
     ] = False,
 ) -> None:
-    """Perturb an instrument, render the spot images of its autocollimation monitor and recover the perturbation from
-    them.
+    """Render the monitor's spot images of a perturbed instrument and recover the perturbation from them.
 
-    The job file names an instrument and says what moves:
+    The job file names an instrument and its perturbation:
 
         instrument: gf7_pair
 
@@ -68,8 +67,8 @@ def main(
 
     Every quantity carries its unit. The run folder gets the images (TIFF), the expected irradiance (netCDF),
     truth.json, recovered.json, crosstalk.json, a self-contained report.html and scene.glb. A run's own config.yaml
-    can be given as the job to repeat it. The terminal, the report and recovered.json begin or end with a verdict: one
-    sentence about what was recovered, how well, and what limits it.
+    can be given as the job to repeat it. The terminal, the report and recovered.json have a verdict: the result, its
+    accuracy, and what limits it.
 
     A job with a course, a table of temperatures and motions over time (scenes/examples/orbit.yaml, launch.yaml and
     heat_soak.yaml), also gets every time's numbers and images: course.json, course.nc and
@@ -77,19 +76,19 @@ def main(
 
     With `render: {images: [spots, knife_edge, bars]}` (also star and pinhole) test targets at infinity are imaged on
     every camera's panchromatic line CCD, in its middle and near its ends, before and after; mtf.json has the MTF
-    measured in the images beside that of the traced pupil (scenes/examples/targets.yaml).
+    measured in the images and that of the traced pupil (scenes/examples/targets.yaml).
 
     With `render: {stray: true}` ghosts and scattered light are path-traced and added to the images; stray.json lists
     them.
 
-    With `render: {quality: true}` wavefront errors, defocus and MTF on the line CCDs are worked out before and after;
-    quality.json has them. What prisms and other bodies take of the cameras' beams is missing in their pupils, here and
-    in the targets' images; `render: {obstruction: ignore}` leaves it out.
+    With `render: {quality: true}` wavefront errors, defocus and MTF on the line CCDs are computed before and after;
+    quality.json has them. Prisms and other bodies obstruct the cameras' pupils, here and in the targets' images;
+    `render: {obstruction: ignore}` omits this obstruction.
 
-    What can be perturbed in a job's instrument: --list-nodes.
+    The option --list-nodes prints what can be perturbed in a job's instrument.
 
     With --picture the run folder also gets picture.png (the instrument), picture_prisms.png and
-    picture_focal_plane.png, rendered with Mitsuba; this takes about half a minute. If Mitsuba cannot, the rest of the
+    picture_focal_plane.png, rendered with Mitsuba; this takes about half a minute. If Mitsuba fails, the rest of the
     run is kept and the exit code is 1.
 
     Example: `python -m twin.render scenes/examples/perturb.yaml --out runs/first`
@@ -109,12 +108,12 @@ def main(
 
 
 def print_nodes(job: Path, backend: str, as_json: bool) -> None:
-    """Print what can be perturbed in the instrument of a job.
+    """Print the nodes of a job's instrument that can be perturbed.
 
     Raises
     ------
     typer.Exit
-        With the exit code of a failure, which has been told.
+        The job cannot be read or built; the error has been printed.
     """
     errors = Console(stderr=True)
     with cli.explained(errors):
@@ -134,7 +133,7 @@ def print_nodes(job: Path, backend: str, as_json: bool) -> None:
             print_json({"instrument": resolved.instrument.name, "nodes": allowed})
             return
         table = cli.result_table(f"nodes of {resolved.instrument.name}")
-        for head in ("node", "pivots", "may be given"):
+        for head in ("node", "pivots", "allowed changes"):
             table.add_column(head, no_wrap=True)
         for path, info in nodes.items():
             actions = ", ".join(action for action in ACTIONS if action in info.allows)

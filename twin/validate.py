@@ -1,4 +1,4 @@
-"""``python -m twin.validate``: the source papers' formulas and numbers, one by one, against the simulation."""
+"""Command ``python -m twin.validate``: checks formulas and numbers of the source papers against the simulation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from scenes.yaml.standard_output import FAILURE, Terminal, print_json, to_stdout
 from twin.framework import cli
 from twin.framework.durable import exit_on_terminate
 
-if TYPE_CHECKING:  # all that the checks compute with is imported when one is asked for
+if TYPE_CHECKING:  # modules that compute are imported on use
     from twin.framework.run_folder import RunFolder
     from twin.validation.registry import Selection
     from twin.validation.runner import Validation
@@ -31,7 +31,7 @@ LISTED = (
     "id", "paper", "equation", "statement", "also", "printed", "unit", "comparison", "tolerance", "because", "tells",
     "against", "basis", "expected",
 )  # fmt: skip
-"""What ``--list --json`` tells of a row."""
+"""Attributes of a row that ``--list --json`` prints."""
 
 app = cli.program()
 
@@ -49,7 +49,7 @@ def main(
         ),
     ] = False,
     list_checks: Annotated[
-        bool, typer.Option("--list", help="Print the ids with their statements and rough times; run nothing.")
+        bool, typer.Option("--list", help="Print the ids with their statements and approximate times; run nothing.")
     ] = False,
     out: Annotated[
         Path | None, typer.Option(readable=False, help="Run folder to make. Default: nothing is written.")
@@ -61,7 +61,7 @@ def main(
         bool, typer.Option("--json", help="Print validation.json (or the list) on stdout, and nothing else.")
     ] = False,
 ) -> None:
-    """Check what the source papers print, formula by formula and number by number, by simulation.
+    """Check the formulas and numbers of the source papers one by one against the simulation.
 
     Every check has a dotted id that begins with the paper's number, a tolerance that is fixed beforehand, and a
     verdict that follows from the numbers:
@@ -69,32 +69,32 @@ def main(
     - **confirmed**: the simulation gives the printed value, or the printed statement holds, within the tolerance plus
     three sigma, with inputs that were not chosen for it.
 
-    - **reproduced**: the same with inputs that the paper does not print and that were chosen here; they stand beside
-    it, with how far each may move.
+    - **reproduced**: the same, with inputs that the paper does not print and that were chosen here; they are listed
+    with their allowed ranges.
 
-    - **consistent**: nothing is printed; the simulation agrees with the theory that the row names.
+    - **consistent**: the paper prints no value; the simulation agrees with the theory that the row names.
 
-    - **confirmed with correction**: it does not, and it does give the value that follows when a named fault, gap or
-    ambiguity of the print is put right.
+    - **confirmed with correction**: the simulation does not give the printed value, but the one that follows when a
+    named fault, gap or ambiguity of the paper is corrected.
 
-    - **refuted**: it does not, and no correction of the print would make it do so.
+    - **refuted**: the simulation does not give the printed value, and no correction of the paper would change that.
 
-    - **undecided**: it agrees, but tolerance plus three sigma is more than what the row is to tell.
+    - **undecided**: it agrees, but tolerance plus three sigma is larger than the effect that the row is to detect.
 
-    - **not checkable**: the text does not print what a comparison needs.
+    - **not checkable**: the paper does not print what a comparison needs.
 
     - **failed**: the check could not be computed; this says nothing about the paper.
 
-    A row is two-sided, or it is of a claim of **at most** or **at least** and agrees however far below or above it
-    lies: the column *sides*.
+    A row is two-sided, or it checks a claim of **at most** or **at least** and agrees with any value below or above:
+    the column *sides*.
 
     The run folder gets validation.json, a self-contained validation.html, a summary in summary/, and figures and
     tables in artefacts/.
 
     Examples: `python -m twin.validate --list` and `python -m twin.validate --only 004.eq2 --fast`
 
-    Exit codes: 0 every verdict is the expected one; 1 a verdict is another one, a check failed, or the backend cannot
-    be used; 2 bad input; 130 interrupted, 143 terminated. After 2, 130 and 143 nothing is left behind.
+    Exit codes: 0 every verdict is as expected; 1 a verdict differs, a check failed, or the backend cannot be used; 2
+    bad input; 130 interrupted, 143 terminated. After 2, 130 and 143 nothing is written.
     """
     errors = Console(stderr=True)
     with cli.explained(errors):
@@ -124,7 +124,7 @@ def main(
         else:
             _print_result(validation, None if folder is None else folder.target)
     for result, expected in validation.unexpected:
-        text = f"{result.id} is {result.verdict}, not {expected} as expected: {result.how}"
+        text = f"{result.id} is {result.verdict}, expected {expected}: {result.how}"
         if result.verdict == FAILED:
             text = f"{result.id} failed: {result.how}"
         errors.print(text, style="red", markup=False, highlight=False, soft_wrap=True)
@@ -141,6 +141,7 @@ def _run(
     folder: RunFolder | None,
     errors: Console,
 ) -> Validation:
+    """Run the selected checks with a progress bar, and write the run folder if there is one."""
     from optics.numerics.backend import load_backend
     from twin.framework.provenance import program_digest
     from twin.validation.runner import rough_seconds, run_checks
@@ -148,7 +149,7 @@ def _run(
 
     text = TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis"))
     tracer = load_backend(backend)
-    program_digest()  # of the files that compute, which may be others when the checks end
+    program_digest()  # computed now, because the program's files may change before the checks end
     total = rough_seconds(selections, fast)
     if total > cli.LONG:
         errors.print(f"note: this takes about {cli.time_text(total)}", highlight=False)
@@ -159,6 +160,7 @@ def _run(
         begun, at = time.monotonic(), "start"
 
         def show(done: float, text: str) -> None:
+            """Update the progress bar."""
             nonlocal at
             left = (time.monotonic() - begun) * (total - done) / done if done > 0.05 * total else total - done
             at = f"{text}, about {cli.time_text(left)} left"
@@ -177,7 +179,7 @@ def _run(
 
 
 def _print_list(selections: Sequence[Selection], fast: bool, as_json: bool) -> None:
-    """Ids, statements and rough times of the selected checks."""
+    """Print ids, statements and approximate times of the selected checks."""
     groups = [(one.group, [c for c in one.group.checks if c.id in one.ids]) for one in selections]
     if as_json:
         rows = [
@@ -201,7 +203,7 @@ def _print_list(selections: Sequence[Selection], fast: bool, as_json: bool) -> N
 
 
 def _print_result(validation: Validation, target: Path | None) -> None:
-    """Every check in a line, and where to read more."""
+    """Print a line for every check, and the path of the report."""
     from twin.validation import check
     from twin.validation.validation_report import claim_text, comparison_text, measured_text, sigma_text, verdict
 
@@ -219,7 +221,7 @@ def _print_result(validation: Validation, target: Path | None) -> None:
     cli.print_verdict(console, verdict(validation))
     cli.print_whole(console, table)
     if target is None:
-        console.print("How each was done: --out DIR writes a report, --json prints it.", style="dim", soft_wrap=True)
+        console.print("For details, --out DIR writes a report and --json prints them.", style="dim", soft_wrap=True)
     else:
         console.print(f"report: {target / 'validation.html'}", markup=False, highlight=False, soft_wrap=True)
 

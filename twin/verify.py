@@ -1,4 +1,4 @@
-"""``python -m twin.verify``: is a run folder as its run left it, and does the run come out the same again."""
+"""Command ``python -m twin.verify``: checks that a run folder is unchanged and that its run can be reproduced."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rich.console import Console
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 from twin.framework import cli, durable
 
-if TYPE_CHECKING:  # what computes is imported when it is needed
+if TYPE_CHECKING:  # modules that compute are imported on use
     from twin.compare.folder_state import FolderState
     from twin.compare.verification import Repetition
 
@@ -27,40 +27,40 @@ app = cli.program()
 def main(
     run: Annotated[Path, typer.Argument(readable=False, help="Run folder of any command.")],
     files: Annotated[
-        bool, typer.Option("--files", help="Only look at the files; make nothing again. A second for most folders.")
+        bool, typer.Option("--files", help="Check only the files; repeat nothing. A second for most folders.")
     ] = False,
     every: Annotated[
-        bool, typer.Option("--all", help="Of a study make all runs again on all cores, not one block of them.")
+        bool, typer.Option("--all", help="Repeat all runs of a study on all cores, not one block of them.")
     ] = False,
     keep: Annotated[
         Path | None,
-        typer.Option("--keep", readable=False, metavar="DIR", help="Keep what is made again as this run folder."),
+        typer.Option("--keep", readable=False, metavar="DIR", help="Keep the repeated run as this run folder."),
     ] = None,
     as_json: cli.AsJson = False,
     quiet: cli.Quiet = False,
 ) -> None:
-    """Verify a run folder: every file against the checksum that the run left of it, then the run itself, which is made
-    again from the config.yaml and the inputs that the folder names, and compared number by number.
+    """Verify a run folder: its files by their checksums, then its results by repeating the run.
+
+    The run is repeated from the config.yaml and the inputs that the folder names, and compared number by number.
 
         python -m twin.verify runs/perturb-001
 
         python -m twin.verify runs/perturb-001 --files
 
-    **The files.** A changed byte, a file that is gone, and one that the run did not write are named, also in the
-    manifest itself. Files outside the folder that the run read, such as measured frames,
-    are held against what they were then.
+    **Files.** Changed files, missing files, and files that the run did not write are named, the manifest itself
+    included. Files outside the folder that the run read, such as measured frames, are compared with their checksums at
+    that time.
 
-    **The run made again** takes as long as the run did, which is said first; of a study one block of runs is
-    computed, a few seconds, and all are held against study.nc. Every number is the same to the bit, the same but for
-    rounding (1e-9 of the largest of its sort, on another processor 1e-6, or 1e-3 of its sigma), or different, with key,
-    old and new value.
-    Pages are left out: they name the time. What was made by another version of the program, with other packages or on
-    another processor, is said to be so.
+    **Repeated run.** It takes as long as the run did, which is printed first. For a study one block of runs is
+    computed, a few seconds, and compared with study.nc. Every number is identical to the bit, equal up to rounding
+    (1e-9 of the largest of its kind, on another processor 1e-6, or 1e-3 of its sigma), or different, with key, old and
+    new value. Report pages are not compared: they contain the time. Differences in the version of the program, in
+    packages or in the processor are reported.
 
-    Nothing is written, but for `--keep`. `python -m twin.compare RUN DIR` then shows both beside each other.
+    Nothing is written, except with `--keep`. `python -m twin.compare RUN DIR` then compares both in a report.
 
-    Exit codes: 0 everything is as it was, 1 something differs, 2 it cannot be told: no run folder, an unfinished run,
-    inputs that are gone or have changed.
+    Exit codes: 0 everything is unchanged, 1 something differs, 2 it cannot be checked: no run folder, an unfinished
+    run, inputs that are missing or have changed.
     """
     errors = Console(stderr=True)
     silent = as_json or quiet
@@ -69,19 +69,19 @@ def main(
         from twin.compare.folder_state import folder_state
 
         if files and (every or keep is not None):
-            raise cli.InputErrorText("--files makes nothing again, so --all and --keep have no meaning with it")
+            raise cli.InputErrorText("--files repeats nothing, so that it cannot be combined with --all or --keep")
         if keep is not None and (keep.exists() or keep.is_symlink()):
             raise cli.InputErrorText(f"--keep: {keep} exists; choose another folder")
         state = folder_state(run)
         if every and not state.is_study:
-            raise cli.InputErrorText("--all is for studies; of other runs everything is made again anyway")
+            raise cli.InputErrorText("--all is for studies; other runs are always repeated as a whole")
         block = state.is_study and not every and keep is None
         why, made = "" if files else verification.obstacle(state), None
         if not files and not why:
             if not silent:
                 took = cli.time_text(state.manifest.wall_time_s)
                 text = "one block of the study" if block else f"the run, which took {took}"
-                errors.print(f"making again {text}", markup=False, highlight=False, soft_wrap=True)
+                errors.print(f"repeating {text}", markup=False, highlight=False, soft_wrap=True)
             try:
                 made = verification.repeat_block(state) if block else _whole(state, keep, silent)
             except verification.CannotRepeat as error:
@@ -100,6 +100,7 @@ def main(
 
 
 def _whole(state: FolderState, keep: Path | None, silent: bool) -> Repetition:
+    """Repeat the whole run, in a folder to keep or in a temporary one."""
     from twin.compare.verification import repeat
     from twin.framework.owned_files import scratch
 

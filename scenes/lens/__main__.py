@@ -1,4 +1,4 @@
-"""``python -m scenes.lens``: prescriptions of other optical programs as cameras of the twin, and back."""
+"""Command ``python -m scenes.lens``: prescriptions of other optical programs to cameras of the twin, and back."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Force = Annotated[bool, typer.Option("--force", help="Replace the file if it exi
 
 @contextmanager
 def _explained(errors: Console) -> Iterator[None]:
-    """Turn the errors that a user can cause into one sentence and an exit code."""
+    """Print the errors that a user can cause as one sentence, and exit with their code."""
     from optics.numerics.backend import BackendUnavailable
     from optics.numerics.llvm import LibraryMissing
 
@@ -53,7 +53,7 @@ def _explained(errors: Console) -> Iterator[None]:
 
 
 def _quantity(option: str, text: str | None, kind: Kind) -> float | None:
-    """The value of an option with a unit."""
+    """Return the value of an option with a unit, in SI."""
     if text is None:
         return None
     try:
@@ -66,14 +66,15 @@ def _quantity(option: str, text: str | None, kind: Kind) -> float | None:
 
 
 def _check_out(out: Path, suffixes: Sequence[str], force: bool) -> None:
+    """Raise InputError if an output file has an unknown suffix or exists."""
     if out.suffix.lower() not in suffixes:
-        raise InputError(Issue("what kind of file is this to be?", str(out), allowed=", ".join(suffixes)))
+        raise InputError(Issue("unknown suffix of an output file", str(out), allowed=", ".join(suffixes)))
     if out.exists() and not force:
-        raise InputError(Issue("exists", str(out), allowed="another name, or --force to replace it"))
+        raise InputError(Issue("the file exists", str(out), allowed="another name, or --force to replace it"))
 
 
 def _write(out: Path, content: bytes) -> None:
-    """A file, whole or not at all."""
+    """Write a file atomically."""
     handle, name = -1, ""
     try:
         handle, name = tempfile.mkstemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent)
@@ -90,35 +91,35 @@ def _write(out: Path, content: bytes) -> None:
 
 
 def read_prescription(path: Path, glasses: Sequence[Path] = (), wavelength: float | None = None) -> Prescription:
-    """A foreign file by its ending.
+    """Read a file of another program, whose format follows from its suffix.
 
     Parameters
     ----------
     path : Path
-        Of a .zmx, .seq or .yaml file.
-    glasses : Sequence[Path]
+        A .zmx, .seq or .yaml file.
+    glasses : sequence of Path
         AGF catalogues.
-    wavelength : float | None
-        For a file of batoid, which names none, metres.
+    wavelength : float or None
+        Wavelength for a batoid file, which names none, in metres.
 
     Raises
     ------
     InputError
-        The file cannot be read as what it is.
+        The file is not valid in its format.
     """
     from scenes.lens.statements import read_catalogues
 
     kind = READS.get(path.suffix.lower())
     if kind is None:
-        raise InputError(Issue("what kind of file is this?", str(path), allowed=", ".join(READS)))
+        raise InputError(Issue("unknown suffix of a prescription", str(path), allowed=", ".join(READS)))
     if kind == "batoid":
         from scenes.lens.batoid_reader import read_batoid
 
         if wavelength is None:
-            raise InputError(Issue("a file of batoid names no wavelength", str(path), allowed='--wavelength "620 nm"'))
+            raise InputError(Issue("a batoid file names no wavelength", str(path), allowed='--wavelength "620 nm"'))
         return read_batoid(path, wavelength)
     if wavelength is not None:
-        raise InputError(Issue("--wavelength is for files of batoid; this one names its own", str(path)))
+        raise InputError(Issue("--wavelength is for batoid files; this file names its wavelengths", str(path)))
     known = read_catalogues(glasses)
     if kind == "Zemax":
         from scenes.lens.zemax_reader import read_zemax
@@ -144,14 +145,14 @@ def read(
     field: Annotated[
         str | None, typer.Option(help='Half field about the axis, "1.5 deg", in place of the file\'s.')
     ] = None,
-    wavelength: Annotated[str | None, typer.Option(help='"620 nm", for files of batoid, which name none.')] = None,
-    pitch: Annotated[str, typer.Option(help="Of the line CCD's pixels, which no such file has.")] = "7 um",
+    wavelength: Annotated[str | None, typer.Option(help='"620 nm", for batoid files, which name none.')] = None,
+    pitch: Annotated[str, typer.Option(help="Pixel pitch of the line CCD, which such files do not have.")] = "7 um",
     flat_image: Annotated[
-        bool, typer.Option("--flat-image", help="Of a curved image, take the plane that touches it.")
+        bool, typer.Option("--flat-image", help="Replace a curved image by the tangent plane at its middle.")
     ] = False,
     force: Force = False,
 ) -> None:
-    """Make a camera's file of another program's prescription, and say what of it did not come along.
+    """Convert another program's prescription to a camera's file, and list what was not converted.
 
         python -m scenes.lens read threemir.seq --out threemir.yaml
 
@@ -159,9 +160,10 @@ def read(
 
         python -m scenes.lens read LSST_r.yaml --wavelength "620 nm" --field "1.75 deg" --pupil "8.36 m" --out lsst.yaml
 
-    Both are traced before the file is written, and the largest difference is said. What would be taken wrongly is
-    refused with its line, every statement that was not understood is listed with its own. Pupil and field are the
-    file's, unless they are given here. Exit code 2 for a file that cannot be read.
+    Both are traced before the camera's file is written, and the largest difference between their rays is printed. A
+    statement that would change the optics if it were ignored is refused with its line; every other statement that is
+    not understood is listed. Pupil and field are those of the file unless they are given here. Exit code 2 for a file
+    that cannot be read.
     """
     errors = Console(stderr=True)
     with _explained(errors):
@@ -194,14 +196,14 @@ def write(
     camera: Annotated[Path, typer.Argument(readable=False, help="A camera of the library (gf7), or a camera's file.")],
     out: Annotated[Path, typer.Option(readable=False, help="Zemax .zmx, or .yaml for batoid.")],
     perturbed: Annotated[
-        Path | None, typer.Option(readable=False, help="A job: the camera as it stands in the job's perturbed state.")
+        Path | None, typer.Option(readable=False, help="A job, in whose perturbed state the camera is written.")
     ] = None,
     mounted: Annotated[
         str | None, typer.Option("--camera", help="With --perturbed: which of the instrument's cameras.")
     ] = None,
     force: Force = False,
 ) -> None:
-    """Write a camera as a prescription that other programs read, as designed or as a job has perturbed it.
+    """Write a camera as a prescription for other programs, as designed or in the perturbed state of a job.
 
         python -m scenes.lens write gf7 --out gf7.zmx
 
@@ -209,8 +211,8 @@ def write(
 
         python -m scenes.lens write gf7 --perturbed perturb.yaml --camera forward --out forward.zmx
 
-    Motions of mirrors, of the camera and of the focal plane are coordinate breaks, growth is in the shapes, figures are
-    Zernike terms (Noll, rms). What a format cannot hold exactly is refused by name.
+    Motions of mirrors, of the camera and of the focal plane become coordinate breaks, thermal expansion changes the
+    shapes, figures are Zernike terms (Noll, rms). What a format cannot represent exactly is refused with its name.
     """
     errors = Console(stderr=True)
     with _explained(errors):
@@ -235,11 +237,12 @@ def write(
         _write(out, content)
     with to_stdout(errors, f"the prescription is complete in {out}"):
         for note in notes:
-            sys.stdout.write(f"not carried: {printable(str(note))}\n")
+            sys.stdout.write(f"omitted: {printable(str(note))}\n")
         sys.stdout.write(f"{out}\n")
 
 
 def _designed(camera: Path, backend: Backend) -> Prescription:
+    """Return the prescription of a camera as designed."""
     from scenes.lens.camera_writer import prescription_of
     from scenes.models.camera_model import derive_camera
     from scenes.specs.load import load_camera
@@ -248,7 +251,7 @@ def _designed(camera: Path, backend: Backend) -> Prescription:
 
 
 def _perturbed(camera: Path, job_file: Path, mounted: str | None, backend: Backend) -> Prescription:
-    """A camera of a job's instrument in the job's state."""
+    """Return the prescription of a camera of a job's instrument in the job's state."""
     from scenes.lens.camera_writer import perturbed_prescription
     from scenes.models.instrument_builder import build_instrument
     from scenes.models.job_state import job_state
@@ -266,7 +269,8 @@ def _perturbed(camera: Path, job_file: Path, mounted: str | None, backend: Backe
         allowed = names_text(f"{known} ({name})" for name, known in cameras.items())
         raise InputError(Issue("the job's instrument has no such camera", str(job_file), None, (), wanted, allowed))
     if mounted is None and len(places) > 1:
-        raise InputError(Issue("which of them?", str(job_file), None, (), None, f"--camera {' or '.join(places)}"))
+        problem, choice = "the instrument has this camera several times", f"--camera {' or '.join(places)}"
+        raise InputError(Issue(problem, str(job_file), None, (), None, choice))
     if mounted is not None and mounted not in places:
         raise InputError(unknown("no such camera", mounted, places).at(str(job_file)))
     instrument = build_instrument(resolved.instrument, resolved.cameras, backend)

@@ -1,6 +1,6 @@
-"""Prescriptions from batoid's YAML files.
+"""Reader of batoid's YAML files.
 
-There light comes down from +z; here it enters toward +z. Everything is turned about x by half a turn.
+In batoid light comes down from +z; here it enters toward +z. Everything is rotated about x by 180 deg.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _TURNS = {"rotX": 0, "rotY": 1, "rotZ": 2}
 _SHIFTS = {"x": 0, "y": 1, "z": 2}
 DEEPEST = 20
 LARGEST_FILE = 100_000
-"""Bytes: four times the largest of batoid's own; to read them takes a second or two."""
+"""Largest file, in bytes: four times the largest of batoid's own; reading it takes a second or two."""
 MOST_SURFACES = 2000
 
 
@@ -46,11 +46,11 @@ _OF_OPTICS = frozenset(
     "type name surface coordSys inMedium outMedium medium items obscuration backDist sphereRadius pupilSize "
     "pupilObscuration R_outer R_inner parent stopSurface".split()
 )
-"""Keys of an optic that say where it is and what it does, or where a calculation of wavefronts begins."""
+"""Keys of an optic that describe its position and function, or the start of a wavefront calculation."""
 
 
 class _Reader:
-    """A file while it is read."""
+    """State of a batoid file while it is read."""
 
     def __init__(self, file: str, data: object, wavelength: float) -> None:
         self.file, self.data, self.wavelength = file, data, wavelength
@@ -60,12 +60,12 @@ class _Reader:
         self.named: dict[float, CatalogueGlass] = {}
 
     def error(self, key: KeyPath, problem: str, found: object = None, allowed: str | None = None) -> InputError:
-        """What is wrong at a key."""
+        """Return an error at a key of the file."""
         text = None if found is None else shown(found)
         return InputError(Issue(problem, self.file, self.line(key), key, text, allowed))
 
     def line(self, key: KeyPath) -> int:
-        """Line of a key, or of the innermost thing around it that has one, counted from 1."""
+        """Return the line of a key, or of the innermost enclosing item that has one, counted from 1."""
         here, line = self.data, 1
         for part in key:
             marks = getattr(here, "lc", None)
@@ -77,7 +77,7 @@ class _Reader:
         return line
 
     def number(self, given: Mapping[str, Any], name: str, key: KeyPath, default: float | None = None) -> float:
-        """A finite number of a mapping."""
+        """Return a finite number of a mapping. Raises InputError."""
         if name not in given and default is not None:
             return default
         value = given.get(name)
@@ -86,19 +86,19 @@ class _Reader:
         return float(value)
 
     def mapping(self, value: object, key: KeyPath) -> Mapping[str, Any]:
-        """A mapping."""
+        """Return a value that must be a mapping. Raises InputError."""
         if not isinstance(value, Mapping):
             raise self.error(key, "not a mapping", value, "a mapping with a type")
         return value
 
     def listed(self, value: object, key: KeyPath) -> list[Any]:
-        """A list."""
+        """Return a value that must be a list. Raises InputError."""
         if not isinstance(value, list):
             raise self.error(key, "not a list", value, "a list")
         return value
 
     def _only(self, given: Mapping[str, Any], key: KeyPath, known: Mapping[str, tuple[str, ...]]) -> None:
-        """Refuse a number that would be left out: keys beyond those of a kind; R where a kind has no list."""
+        """Raise InputError for keys that a kind does not have, since their numbers would be ignored."""
         for name in given:
             names = known.get(str(given.get("type")), ("R", "items"))
             if name != "type" and name not in names:
@@ -107,7 +107,7 @@ class _Reader:
     # ----------------------------------------------------------------------------------------------------- parts
 
     def optic(self, given: Mapping[str, Any], key: KeyPath, pose: Pose, before: float, after: float) -> None:
-        """One optic with all below it, in its parent's frame and media."""
+        """Read an optic and all optics inside it, in its parent's frame and media."""
         if len(key) > 2 * DEEPEST:
             raise self.error(key, "optics within optics without end", allowed=f"at most {DEEPEST} levels")
         kind = given.get("type")
@@ -147,6 +147,7 @@ class _Reader:
                 raise self.error((*key, "type"), "an optic that is not known here", kind, known)
 
     def _add(self, given: Mapping[str, Any], key: KeyPath, pose: Pose, how: Interaction, index: float) -> None:
+        """Append a surface of an optic."""
         if len(self.surfaces) >= MOST_SURFACES:
             raise self.error(key, "too many surfaces", allowed=f"at most {MOST_SURFACES}")
         name = str(given.get("name", "")) or f"S{len(self.surfaces) + 1}"
@@ -179,7 +180,7 @@ class _Reader:
         self.surfaces.append(turned_over(LensSurface(**{**vars(surface), "pose": OVER @ pose})))
 
     def _placed(self, given: Mapping[str, Any], key: KeyPath, pose: Pose) -> Pose:
-        """Shifts and turns of a coordinate system, in the order in which they stand, each in the axes so far."""
+        """Return the pose after a coordinate system's shifts and rotations, in order, each about the current axes."""
         if "coordSys" not in given:
             return pose
         key = (*key, "coordSys")
@@ -200,7 +201,7 @@ class _Reader:
         return pose
 
     def shape(self, given: Mapping[str, Any], key: KeyPath, depth: int = 0) -> Surface:
-        """A surface."""
+        """Return the shape of a surface."""
         kind = given.get("type")
         self._only(given, key, {"Quadric": ("R", "conic"), "Asphere": ("R", "conic", "coefs", "imin"), "Plane": ()})
         match kind:
@@ -230,6 +231,7 @@ class _Reader:
                 raise self.error((*key, "type"), "a surface that is not known here", kind, known)
 
     def _sum(self, given: Mapping[str, Any], key: KeyPath) -> Surface:
+        """Return the shape of a sum of a conic and a Zernike surface."""
         items = self.listed(given.get("items"), (*key, "items"))
         shape, radius, centre = None, 0.0, (0.0, 0.0)
         terms: dict[int, float] = {}
@@ -256,7 +258,7 @@ class _Reader:
         return shape.with_figure(ZernikeFigure(radius, centre, terms)) if terms else shape
 
     def medium(self, given: object, key: KeyPath) -> float:
-        """Refractive index at the wavelength."""
+        """Return the refractive index of a medium at the wavelength."""
         if isinstance(given, int | float) and not isinstance(given, bool) and 0.1 < given < 10.0:
             return float(given)
         medium = self.mapping(given, key)
@@ -270,6 +272,7 @@ class _Reader:
         return index
 
     def _index(self, medium: Mapping[str, Any], key: KeyPath, kind: object, w: float) -> float:
+        """Return the index by the kind of the medium; NaN outside its range."""
         um = 1e6 * w
         numbers = {
             "ConstMedium": ("n",),
@@ -310,7 +313,7 @@ class _Reader:
                 raise self.error((*key, "type"), "a medium that is not known here", kind, known)
 
     def _keep_sellmeier(self, index: float, b_and_c: list[float]) -> None:
-        """Remember a Sellmeier glass by its index. The file says no range; it is taken well between the poles."""
+        """Store a Sellmeier glass by its index. The file states no range, so one well between the poles is assumed."""
         b, c = b_and_c[:3], b_and_c[3:]
         poles = [math.sqrt(pole) for pole in c if pole > 0.0]
         below = [pole for pole in poles if pole < self.wavelength * 1e6]
@@ -323,7 +326,7 @@ class _Reader:
         self.named[index] = CatalogueGlass(name, 2, (*pairs, *[0.0] * 6), first * 1e-6, last * 1e-6)
 
     def edges(self, given: Mapping[str, Any], key: KeyPath, name: str, depth: int = 0) -> tuple[Edge, ...]:
-        """What an obscuration cuts; clear apertures first. What has no place here is noted."""
+        """Return the edges of an obscuration, clear apertures first; kinds that are not supported are noted."""
         kind = str(given.get("type"))
         if kind == "ObscUnion" and depth == 0:
             found: list[Edge] = []
@@ -360,7 +363,10 @@ class _Reader:
 
 
 def _air(um: float, pressure: float, temperature: float, water: float) -> float:
-    """Index of air by wavelength in um, kPa, K and the water vapour's kPa (Filippenko, PASP 94, 715 (1982))."""
+    """Return the index of air at a wavelength (um), pressure (kPa), temperature (K) and vapour pressure (kPa).
+
+    Filippenko, PASP 94, 715 (1982).
+    """
     mm, celsius, vapour = pressure * 7.50061683, temperature - 273.15, water * 7.50061683
     s2 = 1.0 / um**2
     n = (64.328 + 29498.1 / (146.0 - s2) + 255.4 / (41.0 - s2)) * 1e-6
@@ -374,15 +380,15 @@ def read_batoid(path: str | Path, wavelength: float) -> Prescription:
 
     Parameters
     ----------
-    path : str | Path
-        Of its YAML file.
+    path : str or Path
+        Path of its YAML file.
     wavelength : float
-        At which light goes through its glasses, metres; its files name none.
+        Wavelength at which the glasses' indices are taken, in metres; batoid's files name none.
 
     Raises
     ------
     InputError
-        The file is damaged, or has what is not known here; with the line.
+        The file is damaged or has unsupported content; the message names the line.
     """
     reader = _Reader(str(path), _loaded(path), wavelength)
     system = reader.mapping(reader.mapping(reader.data, ()).get("opticalSystem"), ("opticalSystem",))
@@ -414,7 +420,7 @@ def read_batoid(path: str | Path, wavelength: float) -> Prescription:
 
 
 def _loaded(path: str | Path) -> object:
-    """The contents of a YAML file that may name parts of itself again, with the places of its keys."""
+    """Return the contents of a YAML file, which may use anchors, with the lines of its keys."""
     source = Source(str(path))
     text = "\n".join(read_lines(source, "a telescope in YAML", LARGEST_FILE))
     try:

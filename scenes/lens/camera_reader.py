@@ -1,6 +1,7 @@
-"""From a foreign prescription to a camera's file, and whether both trace the same.
+"""Conversion of a foreign prescription to a camera's file, checked by tracing both.
 
-Prescriptions without what a camera's file has no place for: flat folds before a turned image, and a curved image.
+``unfolded`` and ``with_flat_image`` remove what a camera's file cannot represent: flat folds before a rotated image,
+and a curved image.
 """
 
 from __future__ import annotations
@@ -39,14 +40,14 @@ from scenes.yaml.errors import InputError, Problem, printable
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity, power_of_length
 
 _FLIP = np.diag([1.0, -1.0, 1.0])
-"""A mirror image has no right-handed axes; with its y the other way round it has."""
+"""Reflection of y, which makes the axes of a mirror image right-handed again."""
 
 
 def unfolded(lens: Prescription) -> Prescription:
-    """Return the prescription with its flat mirrors taken out, and what follows each as the mirror shows it.
+    """Return the prescription without its flat mirrors; what follows each of them is replaced by its mirror image.
 
-    Rays go the same ways in length and in angles; an odd number of mirrors turns the image's y round. A flat that is
-    the stop or has edges stays as a plane that light passes.
+    Lengths and angles of the rays stay; an odd number of mirrors reverses the image's y. A flat that is the stop or has
+    edges stays as a plane that light passes.
 
     Parameters
     ----------
@@ -56,7 +57,7 @@ def unfolded(lens: Prescription) -> Prescription:
     Raises
     ------
     InputError
-        a surface behind a fold is not of revolution.
+        A surface behind a fold is not a surface of revolution.
     """
     turn, shift, stop, notes = np.eye(3), np.zeros(3), lens.surfaces[lens.stop].name, []
     kept: list[LensSurface] = []
@@ -64,7 +65,7 @@ def unfolded(lens: Prescription) -> Prescription:
         rotation, place, shape = turn @ surface.pose.rotation, turn @ surface.pose.translation + shift, surface.surface
         if np.linalg.det(turn) < 0.0:
             if shape.terms or shape.figure is not None:
-                problem = "a fold before a surface that is not of revolution, which cannot be unfolded"
+                problem = "a fold before a surface that is not a surface of revolution cannot be unfolded"
                 raise lens.error(problem, surface.line, surface.name, "an image square to the axis of the light")
             rotation = rotation @ _FLIP
             edge = surface.aperture and replace(
@@ -75,9 +76,7 @@ def unfolded(lens: Prescription) -> Prescription:
         if surface.interaction is Interaction.REFLECT and shape.is_plane and shape.figure is None:
             mirror = np.eye(3) - 2.0 * np.outer(rotation[:, 2], rotation[:, 2])
             turn, shift = mirror @ turn, place + mirror @ (shift - place)
-            text = (
-                "a flat mirror, unfolded: its errors are not carried, nor its shadow, which an edge that blocks states"
-            )
+            text = "a flat mirror, unfolded: its errors and its shadow are omitted; an edge may describe the shadow"
             notes.append(Note(surface.line, surface.name, text))
             surface = replace(surface, interaction=Interaction.PASS)
             if surface.name != stop and not surface.every_edge:
@@ -88,27 +87,28 @@ def unfolded(lens: Prescription) -> Prescription:
 
 
 def with_flat_image(lens: Prescription) -> Prescription:
-    """Return the prescription with the plane that touches its image in the image's middle."""
+    """Return the prescription with its curved image replaced by the tangent plane at the image's middle."""
     image, radius = lens.image, 1.0 / (lens.image.surface.curvature or np.inf)
     text = (
-        f"curved, radius {radius:.6g} m: the plane that touches it is taken, which is {500.0 / radius:.3g} mm x "
-        "(h / 1 m)^2 away from it at a height h; python -m twin.camera --refocus finds the best plane"
+        f"curved, radius {radius:.6g} m: replaced by its tangent plane, which differs by {500.0 / radius:.3g} mm x "
+        "(h / 1 m)^2 at a height h; python -m twin.camera --refocus finds the best plane"
     )
     flat = replace(image, surface=plane())
     return replace(lens, surfaces=(*lens.surfaces[:-1], flat)).with_notes(Note(image.line, image.name, text))
 
 
 PITCH = 7e-6
-"""Pitch of a line CCD's pixels where none is asked for, metres."""
+"""Default pixel pitch of the line CCD, in metres."""
 LARGEST_TILT, TURNED = math.radians(45.0), 1e-12
-"""Largest turn of an image about x, radians, and sine of its turn about y that is rounding."""
+"""Largest tilt of an image about x, in radians, and largest sine of its tilt about y that is only rounding."""
 FAR = 1e6
-"""An object beyond this distance is at infinity, metres: programs write 1e9 millimetres and more for one."""
+"""Distance beyond which an object is at infinity, in metres: programs write 1e9 millimetres and more for infinity."""
 SAME = 1e-9
-"""Farthest that a ray of the camera may meet the image from where the prescription's does, metres. Both are traced by
-the same code: what is left is the rounding of poses and numbers."""
+"""Largest distance on the image between a ray of the camera and that of the prescription, in metres. Both are traced by
+the same code: only the rounding of poses and numbers remains.
+"""
 _SAME_INDEX = 1e-11
-"""Coefficients of one glass in two files agree to the digits that are printed of them."""
+"""Tolerance of an index within which two files name the same glass: the printed digits of its coefficients."""
 _SINGLE_FIELD = math.radians(0.05)
 _RIM, _FINE_RIM = 12, 720
 _LIGHT = {Interaction.REFRACT: "refracts", Interaction.PASS: "passes"}
@@ -116,14 +116,14 @@ _LETTER = {Interaction.REFLECT: "M", Interaction.REFRACT: "L", Interaction.PASS:
 
 
 class Width(NamedTuple):
-    """What a user says in place of the file.
+    """Options that replace or add to numbers of the file.
 
     Attributes
     ----------
-    pupil : float | None
-        Diameter of the entrance pupil, metres.
+    pupil : float or None
+        Diameter of the entrance pupil, in metres.
     pitch : float
-        Of the line CCD's pixels, metres.
+        Pixel pitch of the line CCD, in metres.
     """
 
     pupil: float | None = None
@@ -135,20 +135,20 @@ AS_IN_FILE = Width()
 
 @dataclass(frozen=True, eq=False)
 class ReadCamera:
-    """A camera made of a prescription.
+    """Camera made from a prescription.
 
     Attributes
     ----------
     camera : CameraSpec
-        What its file says.
+        Content of the camera's file.
     names : dict[str, str]
         Surface of the camera -> surface of the prescription.
     notes : tuple[Note, ...]
-        What did not come along, and what was put in.
+        Omissions and assumptions of the conversion.
     difference : float
-        Farthest distance at the image between rays of both, metres.
+        Largest distance at the image between rays of both, in metres.
     rays : int
-        That were compared.
+        Number of rays compared.
     """
 
     camera: CameraSpec
@@ -158,7 +158,7 @@ class ReadCamera:
     rays: int
 
     def told(self, lens: Prescription) -> list[str]:
-        """What there is to say of it."""
+        """Return the lines of a summary for the user."""
         spec = self.camera
         mirrors = sum(m.light is None for m in spec.mirrors.values())
         faces = sum(m.light == "refracts" for m in spec.mirrors.values())
@@ -167,29 +167,29 @@ class ReadCamera:
         return [
             f"{lens.name}: {', '.join(parts)}, stop {spec.stop}, f {spec.focal_length:.7g} m, entrance pupil "
             f"{spec.entrance_pupil:.6g} m, field {angles[0]} x {angles[1]} deg about {angles[2]} deg",
-            f"{self.rays} rays through both meet the image within {self.difference:.1e} m",
+            f"{self.rays} rays traced through both differ by at most {self.difference:.1e} m on the image",
             *(f"note: {note}" for note in self.notes),
         ]
 
 
 def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = AS_IN_FILE) -> ReadCamera:
-    """Make a camera of a prescription.
+    """Make a camera from a prescription.
 
     Parameters
     ----------
     lens : Prescription
         The prescription.
     name : str
-        Of the camera.
+        Name of the camera.
     backend : Backend
-        Where to trace.
+        Backend that traces the rays.
     width : Width
-        What the user says of the beam and the pixels.
+        The user's options for beam and pixels.
 
     Raises
     ------
     InputError
-        The prescription has what a camera's file cannot hold, or light does not come through.
+        The prescription has content that a camera's file cannot represent, or light does not come through.
     """
     if abs(lens.image.pose.rotation[0, 2]) > TURNED or abs(_image(lens)[1]) > LARGEST_TILT:
         lens = unfolded(lens)
@@ -200,16 +200,16 @@ def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = AS
         try:
             return _camera_of(lens, name, backend, width)
         except InputError:
-            # its corners are farther out than anything the file asks for
+            # The corners of a square field are farther out than any field of the file.
             return _camera_of(replace(lens, round_field=True), name, backend, width)
     return _camera_of(lens, name, backend, width)
 
 
 def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) -> ReadCamera:
-    """What `camera_of` says, with the field as the prescription has it."""
+    """Make a camera with the field as the prescription has it."""
     notes = list(lens.notes)
     sources = {name: getattr(glass, "source", "") for name, glass in lens.glasses.items()}
-    taken_from = "the glass of {}; --glasses FILE.agf takes another"
+    taken_from = "the glass of {} is used; --glasses FILE.agf replaces it"
     notes += [Note(0, name, taken_from.format(source)) for name, source in sources.items() if source]
     surfaces, stop, origin, taken = _surfaces(lens, notes)
     bias, half_x, half_y = _field(lens, surfaces, notes)
@@ -230,12 +230,12 @@ def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) ->
         "line": {"pixels": 2, "pitch": format_quantity(width.pitch, LENGTH)},
     }
     if any("glass" in surface for surface in surfaces.values()):
-        plain["medium"] = "air"  # which other programs take glasses against
+        plain["medium"] = "air"  # Indices of other programs are relative to air.
     narrow = _derived(lens, plain, backend)
     pupil = _pupil(lens, narrow, plain, backend, width)
     focal = narrow.line_principal_distance
     if math.isfinite(lens.object_distance):
-        nearer, far = 1e6 * focal**2 / lens.object_distance, f"{lens.object_distance:.6g} m away is taken for infinity"
+        nearer, far = 1e6 * focal**2 / lens.object_distance, f"{lens.object_distance:.6g} m away, treated as infinity"
         notes.append(Note(0, "object", f"{far}, whose image is {nearer:.3g} um nearer to the optics"))
     pixels = 2.0 * focal * math.tan(half_x) / width.pitch
     if not 2.0 <= pixels <= 1e6:
@@ -247,7 +247,9 @@ def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) ->
     plain["entrance_pupil"] = written(pupil, LENGTH)
     plain["line"]["pixels"] = math.ceil(pixels)
     plain["edge_margin"] = format_quantity(float(f"{min(0.005, 0.05 * pupil):.3g}"), LENGTH)
-    text = f"{plain['line']['pixels']} pixels of {format_quantity(width.pitch, LENGTH)} put in, which cover the field"
+    text = (
+        f"added with {plain['line']['pixels']} pixels of {format_quantity(width.pitch, LENGTH)}, which cover the field"
+    )
     notes.append(Note(0, "line CCD", text))
     model = _without_idle_edges(_derived(lens, plain, backend), lens, plain, taken, notes, backend)
     compared = _compared(lens, origin, model, backend)
@@ -256,13 +258,13 @@ def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) ->
     difference, rays = compared
     if not difference < SAME:
         raise lens.error(
-            "the camera would not trace as this prescription does", None, f"{difference:.2g} m apart", "1 nm"
+            "rays of the camera differ from those of the prescription", None, f"{difference:.2g} m", "at most 1 nm"
         )
     return ReadCamera(model.spec, taken, tuple(notes), difference, rays)
 
 
 def _round_field(lens: Prescription) -> Prescription:
-    """The prescription with a round field in place of one whose corners edges leave dark.
+    """Return the prescription with a round field in place of one whose corners are fully vignetted.
 
     Raises
     ------
@@ -271,34 +273,35 @@ def _round_field(lens: Prescription) -> Prescription:
     """
     x, y = np.array(lens.fields).T
     if lens.round_field:
-        raise lens.error("edges leave no light at the end of the field", allowed="a smaller field, or other edges")
+        raise lens.error("edges block all light at the end of the field", allowed="a smaller field, or other edges")
     largest = float(np.max(np.hypot(x, y)))
-    note = Note(0, "field", "edges leave no light between the ends of its axes: taken to be round")
+    note = Note(0, "field", "edges block all light at its corners: treated as round")
     fields = ((0.0, -largest), (0.0, 0.0), (0.0, largest))
     return replace(lens, fields=fields, round_field=True).with_notes(note)
 
 
 def _by_angles(lens: Prescription, name: str, backend: Backend, width: Width) -> Prescription:
-    """Return the prescription with the directions from which light comes to its fields' heights."""
+    """Return the prescription with its fields' heights converted to directions of the light."""
     heights = np.array(lens.heights)
     if lens.field_kind == "object heights":
         if not FAR <= abs(lens.object_distance) < math.inf:
             found = f"{lens.object_distance:.6g} m"
-            raise lens.error("heights on an object that is near, or nowhere", None, found, "field angles: --field")
+            raise lens.error("object heights without a distant object", None, found, "field angles: --field")
         tangents = -heights / lens.object_distance
     else:
         middle = replace(lens, fields=((0.0, 0.0),), heights=(), field_kind="angles")
         _check(middle)
         model = derive_camera(_camera_of(middle, name, backend, width).camera, backend)
         tangents = _tangents_at(model, lens, heights, backend)
-    note = Note(0, "field", f"{lens.field_kind}: the directions are taken whose chief rays belong to them")
+    note = Note(0, "field", f"{lens.field_kind}: converted to the directions of their chief rays")
     fields = tuple((float(x), float(y)) for x, y in np.arctan(tangents))
     return replace(lens, fields=fields, heights=(), field_kind="angles").with_notes(note)
 
 
 def _tangents_at(model: CameraModel, lens: Prescription, heights: np.ndarray, backend: Backend) -> np.ndarray:
-    """Return the tangents (F, 2) of the directions whose chief rays meet the image at heights (F, 2), metres; by the
-    slope in the middle where the heights are paraxial.
+    """Return the tangents (F, 2) of the directions whose chief rays meet the image at heights (F, 2), in metres.
+
+    Paraxial heights are converted by the scale in the middle of the image.
     """
     bare, names = model.bare_assembly(apertures=False), model.mirrors
     to_stop, imaging = assemble(bare, [names[: names.index(model.spec.stop) + 1]]), assemble(bare, ["imaging"])
@@ -314,46 +317,46 @@ def _tangents_at(model: CameraModel, lens: Prescription, heights: np.ndarray, ba
         back = np.linalg.inv((np.array(steps) - middle).T / _SMALL_STEP).T
         tangents = (heights - middle) @ back
         off = np.zeros(())
-        # distortion alone is left of each step
+        # Each step leaves the distortion alone.
         for _ in range(_STEPS if lens.field_kind == "real image heights" else 0):
             off = heights - places(tangents)
             tangents = tangents + off @ back
     except (AimError, BeamMissedError):
         off = np.array(np.nan)
     if not np.all(np.abs(off) <= _REACHED * np.max(np.abs(heights))):
-        raise lens.error(f"no light at its {lens.field_kind}", allowed="a smaller field: --field")
+        raise lens.error(f"no chief ray reaches its {lens.field_kind}", allowed="a smaller field: --field")
     return np.asarray(tangents)
 
 
 _SMALL_STEP, _STEPS, _REACHED = 1e-6, 40, 1e-9
-"""Tangent by which the scale in the middle of the image is found, steps to a height, and how near to it, in shares of
-the largest height, the last but one must come: distortion of 50 % ends at 1e-12 of it, and heights that no light has
-do not end."""
+"""Tangent for the scale in the middle of the image, largest number of steps to a height, and tolerance of the last but
+one step relative to the largest height. With a distortion of 50 % it reaches 1e-12; heights without a ray do not
+converge."""
 
 
 def _check(lens: Prescription) -> None:
-    """Refuse what a camera's file cannot hold."""
+    """Raise InputError for content that a camera's file cannot represent."""
     if abs(lens.object_distance) < FAR:
         found = f"{lens.object_distance:.6g} m"
         raise lens.error("the object is at a finite distance", lens.surfaces[0].line, found, "a scene at infinity")
     if not lens.fields:
-        raise lens.error("no directions of the field in this file", None, lens.field_kind, "field angles")
+        raise lens.error("this kind of field is not supported", None, lens.field_kind, "field angles")
     image = lens.image
     if not image.surface.is_plane or image.surface.figure is not None:
-        raise lens.error("a curved image", image.line, allowed="a plane: --flat-image takes the one that touches it")
+        raise lens.error("the image is curved", image.line, allowed="a plane: --flat-image uses the tangent plane")
     if image.index != 1.0 or image.interaction is not Interaction.PASS:
-        raise lens.error("an image in glass", image.line, allowed="an image in the object's medium")
+        raise lens.error("the image is in glass", image.line, allowed="an image in the object's medium")
     normal = image.pose.rotation[:, 2]
     if abs(normal[0]) > TURNED:
-        raise lens.error("an image that is turned out of the plane of symmetry", image.line, allowed="a turn about x")
+        raise lens.error("the image is tilted out of the plane of symmetry", image.line, allowed="a tilt about x")
     if abs(_image(lens)[1]) > LARGEST_TILT:
         found = f"{math.degrees(_image(lens)[1]):.4g} deg"
-        problem = "an image turned too far from square to the axis that light enters along"
+        problem = "the image is tilted too far relative to the axis along which light enters"
         raise lens.error(problem, image.line, found, "45 deg at most")
 
 
 def _image(lens: Prescription) -> tuple[float, float]:
-    """Where the image plane crosses the parent axis, metres, and its turn about x, radians."""
+    """Return the image plane's position on the parent axis, in metres, and its tilt about x, in radians."""
     pose = lens.image.pose
     normal = pose.rotation[:, 2] * math.copysign(1.0, pose.rotation[2, 2])
     z = float(normal @ pose.translation / normal[2]) if abs(normal[2]) > 1e-3 else math.inf
@@ -362,14 +365,14 @@ def _image(lens: Prescription) -> tuple[float, float]:
 
 
 def _surfaces(lens: Prescription, notes: list[Note]) -> tuple[dict[str, Any], str, Prescription, dict[str, str]]:
-    """Surfaces as a camera's file has them, the stop among them, the prescription of those that came along, names."""
+    """Return the surfaces of a camera's file, the stop's name, the prescription of the same surfaces, and names."""
     out: dict[str, Any] = {}
     taken: dict[str, str] = {}
     stop, kept, count = "", [], dict.fromkeys(_LETTER.values(), 0)
     for k, surface in enumerate(lens.surfaces[:-1]):
         idle = surface.interaction is Interaction.PASS
         if idle and k != lens.stop and not (surface.every_edge and surface.surface.is_plane):
-            notes.append(Note(surface.line, surface.name, "a surface that does nothing: not carried"))
+            notes.append(Note(surface.line, surface.name, "a dummy surface: omitted"))
             continue
         kept.append(surface)
         letter = _LETTER[surface.interaction]
@@ -378,13 +381,13 @@ def _surfaces(lens: Prescription, notes: list[Note]) -> tuple[dict[str, Any], st
         if k == lens.stop:
             stop = name
             if surface.aperture is not None:
-                text = "the stop's outer edge is not carried: it is the disk that the entrance pupil asks for"
+                text = "the stop's outer edge is omitted: the entrance pupil determines it"
                 notes.append(Note(surface.line, surface.name, text))
                 surface = without_rim(surface)
         taken[name] = surface.name
         out[name] = _written(lens, facing(surface))
     if lens.image.every_edge:
-        text = "the image's edge is not carried: it ends the field, and stops no light within"
+        text = "the image's edge is omitted: it limits the field, and vignettes no light within"
         notes.append(Note(lens.image.line, lens.image.name, text))
     if not any(s.interaction is not Interaction.PASS for s in kept):
         raise lens.error("nothing in this file reflects or refracts light", lens.surfaces[0].line)
@@ -393,7 +396,7 @@ def _surfaces(lens: Prescription, notes: list[Note]) -> tuple[dict[str, Any], st
 
 
 def _written(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
-    """A surface as a camera's file has it."""
+    """Return a surface as a camera's file has it."""
     shape = surface.surface
     x, y, z = (float(v) for v in surface.pose.translation)
     out: dict[str, Any] = {"z": written(z, LENGTH)}
@@ -422,7 +425,7 @@ def _written(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
 
 
 def _behind(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
-    """Glass behind a surface where its dispersion is known and makes its index, else the index alone."""
+    """Return the glass behind a surface if its known dispersion agrees with the index, else the index alone."""
     known = lens.glasses.get(surface.glass)
     if known is None or abs(known(lens.wavelength) - surface.index) > _SAME_INDEX:
         return {"index": surface.index}
@@ -433,18 +436,18 @@ def _behind(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
 
 
 def _terms(lens: Prescription, surface: LensSurface, shape: Surface) -> dict[str, Any]:
-    """Further terms of a sag as a camera's file has them."""
+    """Return further terms of a sag as a camera's file has them."""
     terms = list(shape.terms)
     if isinstance(shape.figure, ZernikeFigure):
         last = max(shape.figure.terms, default=0)
         if last > LAST_NOLL:
-            problem = "Zernike terms, or a polynomial, beyond what a camera's file has a place for"
+            problem = "Zernike terms, or a polynomial, of a higher order than a camera's file allows"
             raise lens.error(problem, surface.line, f"Z{last}", f"Z1 to Z{LAST_NOLL}, polynomials to order 7")
         given = {f"Z{j}": a for j, a in shape.figure.terms.items()}
         x0, y0 = shape.figure.centre
         terms.append(ZernikeSag(radius=shape.figure.radius, x0=x0, y0=y0, **given))
     elif shape.figure is not None:
-        raise lens.error("a figure on a grid, which a camera's file has no place for", surface.line, surface.name)
+        raise lens.error("a camera's file cannot represent a figure on a grid", surface.line, surface.name)
     kinds = {kind: name for name, kind in SAG_TERMS.items()}
     return {
         kinds[type(term)]: {
@@ -457,27 +460,27 @@ def _terms(lens: Prescription, surface: LensSurface, shape: Surface) -> dict[str
 
 
 def _one_axis(lens: Prescription) -> bool:
-    """Whether the fields stand on one axis, from the middle outward."""
+    """Return True if the fields lie on one axis and include its origin."""
     x, y = np.array(lens.fields).T
     out = np.hypot(x, y)
     return bool((np.all(x == 0.0) or np.all(y == 0.0)) and np.max(out) > 0.0 and np.min(out) == 0.0)
 
 
 def _field(lens: Prescription, surfaces: dict[str, Any], notes: list[Note]) -> tuple[float, float, float]:
-    """Field bias and half angles along x and y, radians."""
+    """Return field bias and half angles along x and y, in radians."""
     x, y = np.array(lens.fields).T
     upright = not any({"decentre", "rotate", "sag"} & set(s) for s in surfaces.values()) and not _image(lens)[1]
     largest = float(np.max(np.hypot(x, y)))
     if upright and _one_axis(lens):
         wide = math.degrees(largest)
         if lens.round_field:
-            text = f"a circle of {wide:.6g} deg about the axis; the square in it is taken"
+            text = f"a circle of {wide:.6g} deg about the axis; the camera's field is the inscribed square"
             notes.append(Note(0, "field", text))
             return 0.0, largest / math.sqrt(2.0), largest / math.sqrt(2.0)
         text = (
             f"angles along one axis alone, to {wide:.6g} deg; the camera's field is a square of {wide:.6g} deg to each "
-            f"side, whose corners are {math.sqrt(2.0) * wide:.4g} deg out. --field '{wide:.6g} deg' takes the square "
-            "in the circle"
+            f"side, with corners at {math.sqrt(2.0) * wide:.4g} deg. --field '{wide:.6g} deg' uses the inscribed "
+            "square"
         )
         notes.append(Note(0, "field", text))
         return 0.0, largest, largest
@@ -485,21 +488,21 @@ def _field(lens: Prescription, surfaces: dict[str, Any], notes: list[Note]) -> t
     half_x, half_y = float(np.max(np.abs(x))), 0.5 * float(y.max() - y.min())
     if half_x == 0.0 and half_y == 0.0:
         half_x = half_y = _SINGLE_FIELD
-        notes.append(Note(0, "field", f"one direction alone; half angles of {math.degrees(half_x):g} deg put in"))
+        notes.append(Note(0, "field", f"a single direction; half angles of {math.degrees(half_x):g} deg assumed"))
     elif half_x == 0.0 or half_y == 0.0:
         half_x = half_y = max(half_x, half_y)
-        notes.append(Note(0, "field", "angles along one axis alone; as much put in along the other"))
+        notes.append(Note(0, "field", "angles along one axis alone; the same assumed along the other"))
     return bias, half_x, half_y
 
 
 def _derived(lens: Prescription, plain: dict[str, Any], backend: Backend) -> CameraModel:
-    """The camera of a plain mapping, traced."""
+    """Return the traced camera of a plain mapping."""
     try:
         spec = CameraSpec.model_validate(plain)
     except ValueError as error:
         reason = next((str(e["ctx"]["error"]) for e in getattr(error, "errors", list)() if "ctx" in e), str(error))
         problem = error.problem if isinstance(error, Problem) else reason.splitlines()[0]
-        raise lens.error(f"a camera's file cannot hold this: {problem}") from error
+        raise lens.error(f"a camera's file cannot represent this: {problem}") from error
     try:
         return derive_camera(spec, backend, stated=False)
     except InputError as error:
@@ -507,12 +510,12 @@ def _derived(lens: Prescription, plain: dict[str, Any], backend: Backend) -> Cam
 
 
 def _pupil(lens: Prescription, narrow: CameraModel, plain: dict[str, Any], backend: Backend, width: Width) -> float:
-    """Diameter of the entrance pupil, metres."""
+    """Return the diameter of the entrance pupil, in metres."""
     if width.pupil is not None:
         return width.pupil
     allowed = "the entrance pupil's diameter: --pupil"
     if lens.pupil is None:
-        raise lens.error("the file does not say how wide the beam is", allowed=allowed)
+        raise lens.error("the file does not define the width of the beam", allowed=allowed)
     if lens.pupil.kind == "diameter":
         return lens.pupil.value
     if lens.pupil.kind == "stop":
@@ -520,14 +523,14 @@ def _pupil(lens: Prescription, narrow: CameraModel, plain: dict[str, Any], backe
         return float(f"{_derived(lens, plain, backend).entrance_pupil:.9g}")
     if lens.pupil.kind == "f_number":
         if any({"decentre", "rotate"} & set(surface) for surface in plain["mirrors"].values()):
-            problem = "an F-number of a system with surfaces that are turned or off the axis"
+            problem = "an F-number of a system with rotated or off-axis surfaces"
             raise lens.error(problem, lens.pupil.line, allowed=allowed)
         return narrow.paraxial.focal_length / lens.pupil.value
     raise lens.error("a numerical aperture in object space", lens.pupil.line, allowed=allowed)
 
 
 def _beams(model: CameraModel, lens: Prescription, stop: np.ndarray, fields: int, backend: Backend) -> Rays:
-    """Rays of fields x fields directions over the whole field through points (N, 2) of the stop, in its radii."""
+    """Return rays of ``fields`` x ``fields`` directions through points (N, 2) of the stop, in its radii."""
     spec, names = model.spec, model.mirrors
     to_stop = assemble(model.bare_assembly(apertures=False), [names[: names.index(spec.stop) + 1]])
     shares = np.linspace(-1.0, 1.0, fields)
@@ -538,7 +541,7 @@ def _beams(model: CameraModel, lens: Prescription, stop: np.ndarray, fields: int
 
 
 def _met(model: CameraModel, lens: Prescription, stop: np.ndarray, fields: int, backend: Backend) -> list[np.ndarray]:
-    """Where rays as of ``_beams`` meet each mirror, (rays, 3), in its own frame."""
+    """Return the points (rays, 3) at which the rays of ``_beams`` meet each mirror, in its own frame."""
     rays = _beams(model, lens, stop, fields, backend)
     every = range(len(model.mirrors))
     traced = trace(backend, assemble(model.bare_assembly(apertures=False), ["imaging"]), rays, keep=every)
@@ -548,13 +551,14 @@ def _met(model: CameraModel, lens: Prescription, stop: np.ndarray, fields: int, 
 def _compared(
     lens: Prescription, origin: Prescription, model: CameraModel, backend: Backend
 ) -> tuple[float, int] | None:
-    """Farthest distance at the image between rays of a prescription and of its camera, metres, and how many rays; None
-    where edges leave a field dark.
+    """Return the largest distance, in metres, at the image between rays of both, and the number of rays.
+
+    None if a field is fully vignetted.
     """
     bare = model.bare_assembly(apertures=False)
     turn = 2.0 * np.pi * np.arange(_RIM) / _RIM
     rim = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    # of a cut beam middle and rim may be missing
+    # Middle and rim of a vignetted beam may be missing.
     stop = np.concatenate([np.zeros((1, 2)), *([0.75 * rim, 0.9 * rim] if model.edges else []), rim])
     rays, places, comes = _beams(model, lens, stop, 3, backend), [], []
     for assembly, sequence in ((bare, "imaging"), (origin.assembly(apertures=False), SEQUENCE)):
@@ -564,7 +568,7 @@ def _compared(
         comes.append(valid[0])
     through = comes[0]
     if model.edges:
-        # light that an edge stops need not come on, but some of every field has to
+        # Rays that an edge blocks need not arrive, but some rays of every field have to.
         met = _met(model, lens, stop, 3, backend)
         through = through & model.uncut(lambda name: met[model.mirrors.index(name)])
         if not np.any(through.reshape(9, -1), axis=-1).all():
@@ -573,7 +577,7 @@ def _compared(
     else:
         lost = not (comes[0].all() and comes[1].all())
     if lost:
-        raise lens.error("rays of the whole field do not come through", allowed="a smaller field or pupil")
+        raise lens.error("rays of the full field do not come through", allowed="a smaller field or pupil")
     places = [place[through] for place in places]
     return float(np.max(np.abs(places[0] - places[1]))), len(places[0])
 
@@ -586,7 +590,7 @@ def _without_idle_edges(
     notes: list[Note],
     backend: Backend,
 ) -> CameraModel:
-    """The camera without clear apertures that stop no light of its field."""
+    """Return the camera without clear apertures that block no light of its field."""
     if not model.edges:
         return model
     turn = 2.0 * np.pi * np.arange(_FINE_RIM) / _FINE_RIM
@@ -609,12 +613,12 @@ def _without_idle_edges(
                 del plain["mirrors"][name], taken[name]
     if not idle:
         return model
-    notes.append(Note(0, "clear apertures", f"{idle} of them stop no light of the field: not carried"))
+    notes.append(Note(0, "clear apertures", f"{idle} of them block no light of the field: omitted"))
     return _derived(lens, plain, backend)
 
 
 def camera_text(made: ReadCamera, lens: Prescription) -> str:
-    """Text of the camera's file, with what did not come along at its head."""
+    """Return the text of the camera's file, with the notes of the conversion in its head."""
     remark = [f"Read from {lens.file} by python -m scenes.lens read."]
     remark += [f"{name}: {surface}" for name, surface in made.names.items() if name != surface]
     remark += [str(note) for note in made.notes]

@@ -1,14 +1,10 @@
-"""A camera of the twin as a sequential prescription: as designed, or as it stands in a job's perturbed state.
+"""Writers of a camera, as designed or in a job's perturbed state, as a Zemax sequential file or a batoid YAML file.
 
-A prescription as a Zemax sequential file (.zmx).
+Zemax (.zmx): surface 1 is a dummy plane, the frame of the prescription. A rotated or off-axis surface lies between two
+coordinate breaks, the second of which undoes the first (order flag 1), so that distances remain those along the axis.
+The pupil is defined by the size of the stop, with real ray aiming.
 
-Surface 1 is a plane that does nothing: the prescription's own frame. A surface that is turned or off the axis stands
-between two coordinate breaks, the second of which undoes the first (order flag 1), so that distances stay those along
-the axis. The pupil is the size of the stop, with real ray aiming.
-
-A prescription as a YAML file of batoid.
-
-There light comes down from +z; here it enters toward +z. Everything is turned about x by half a turn.
+batoid: there light comes down from +z; here it enters toward +z. Everything is rotated about x by 180 deg.
 """
 
 from __future__ import annotations
@@ -37,7 +33,7 @@ from scenes.yaml.yaml_file import dump_yaml
 
 
 def prescription_of(model: CameraModel) -> Prescription:
-    """A camera as designed."""
+    """Return the prescription of a camera as designed."""
     spec, behind, index = model.spec, {}, 1.0
     for name, mirror in spec.mirrors.items():
         index = spec.index_behind(name) if mirror.light == "refracts" else index
@@ -63,25 +59,25 @@ def prescription_of(model: CameraModel) -> Prescription:
         (spec.wavelength,),
         field_angles(model),
         "angles",
-        # the stop's own size: a pupil's diameter means another ray in every program
+        # The size of the stop, because every program defines a pupil's diameter by another ray.
         Pupil("stop", float(model.apertures[spec.stop].bounds[1])),
     )
 
 
 def _cut(model: CameraModel, name: str) -> tuple[Any, ...]:
-    """Clear aperture of a surface, the line and the glass of no file, and its further edges."""
+    """Return clear aperture, line and glass (none here), and further edges of a surface."""
     edges = model.edges.get(name, ())
     if name == model.spec.stop or not edges:
         return model.apertures[name], 0, "", edges
     first = edges[0].shape
     if not edges[0].blocks and not edges[0].rotation and isinstance(first, Aperture):
         return first, 0, "", edges[1:]
-    # what stands in the file, and not the box about the beams
+    # Write the edges of the file, not the box around the beams.
     return None, 0, "", edges
 
 
 def field_angles(model: CameraModel) -> tuple[tuple[float, float], ...]:
-    """Middle, ends and corners of the field, angles about x and y whose tangents are the light's, radians."""
+    """Return centre, ends and corners of the field as angles, in radians, whose tangents are the light's."""
     spec = model.spec
     sides = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]
     shares = [(0.0, 0.0), *sides, *product((1.0, -1.0), repeat=2)]
@@ -89,24 +85,25 @@ def field_angles(model: CameraModel) -> tuple[tuple[float, float], ...]:
 
 
 def perturbed_prescription(instrument: Instrument, camera: str, state: State) -> Prescription:
-    """A camera of an instrument in a perturbed state, in the frame in which it was designed.
+    """Return a camera of an instrument in a perturbed state, in the frame in which it was designed.
 
-    Motions of all that carries its mirrors are in their poses, growth in their shapes, figures on their surfaces. What
-    is no part of the camera, as prisms, is left out, and said in the notes.
+    Poses of the mirrors include the motions of all bodies that carry them, shapes include thermal expansion, and
+    figures lie on the surfaces. Parts that do not belong to the camera, such as prisms, are omitted and listed in the
+    notes.
 
     Parameters
     ----------
     instrument : Instrument
-        In which it stands.
+        The instrument.
     camera : str
-        Its name there.
+        Name of the camera in it.
     state : State
         Body path -> motion.
 
     Raises
     ------
     ValueError
-        a figure that no surface can carry.
+        A figure cannot be represented on its surface.
     """
     model, assembly = instrument.cameras[camera], instrument.assembly
     root = f"{BASE}/{camera}"
@@ -133,17 +130,17 @@ def perturbed_prescription(instrument: Instrument, camera: str, state: State) ->
 
 
 def _left_out(state: Mapping[str, object], root: str) -> list[Note]:
-    """Bodies of a state that a camera's prescription does not have."""
+    """Return notes on the bodies of a state that do not belong to a camera's prescription."""
     ours = {BASE, root}
     carried = [
         p for p in state if p in ours or (p.startswith(f"{root}/") and "/monitor" not in p and "area_ccd" not in p)
     ]
     count_unknown = [p for p in state if p not in carried]
-    return [Note(0, path, "is no part of this camera: not carried") for path in count_unknown]
+    return [Note(0, path, "not part of this camera: omitted") for path in count_unknown]
 
 
 def rounded(pose: Pose) -> Pose:
-    """A pose without the last digit's noise of products of poses: what is below 1e-15 m and 1e-15 rad is none."""
+    """Return a pose without the rounding errors of pose products, those below 1e-15 m and 1e-15 rad."""
     rotation = np.where(np.abs(pose.rotation) < 1e-15, 0.0, pose.rotation)
     if np.allclose(rotation, np.eye(3), rtol=0.0, atol=2e-16):
         rotation = np.eye(3)
@@ -152,16 +149,16 @@ def rounded(pose: Pose) -> Pose:
 
 MM = 1e3
 LAST_EVEN = 16
-"""Highest even power of the radius that EVENASPH and SZERNSAG have."""
+"""Highest even power of the radius in EVENASPH and SZERNSAG."""
 
 
 def zemax_text(lens: Prescription) -> str:
-    """The file's text; write it as UTF-16 with a mark, or as UTF-8.
+    """Return the text of a Zemax file; encode it as UTF-16 with a byte order mark, or as UTF-8.
 
     Raises
     ------
     InputError
-        a surface that the format cannot hold exactly.
+        The format cannot represent a surface exactly.
     """
     lines = [
         "VERS 161019 0 0",
@@ -182,11 +179,12 @@ def zemax_text(lens: Prescription) -> str:
     number = 0
 
     def surface(kind: str, *rest: str, thickness: float = 0.0, curvature: float = 0.0) -> None:
+        """Append the statements of one surface."""
         nonlocal number
         stop = [r for r in rest if r == "STOP"]
         others = [r for r in rest if r != "STOP"]
         far = "INFINITY" if math.isinf(thickness) else _number(thickness * MM)
-        # a semi-diameter stands before the edge that it is the size of: readers take the edge as a change of it
+        # A semi-diameter precedes the edge that it belongs to: readers treat the edge as a change of it.
         edges = [r for r in others if r.split()[0] in ("DIAM", "CLAP", "OBSC", "SQAP", "SQOB", "ELAP", "ELOB", "OBDC")]
         shape = [r for r in others if r not in edges]
         body = [*stop, f"TYPE {kind}", f"CURV {_number(curvature / MM)} 0 0 0 0", *shape, f"DISZ {far}", *edges]
@@ -216,15 +214,17 @@ def zemax_text(lens: Prescription) -> str:
 
 
 def _number(value: float) -> str:
+    """Return a number with all its digits."""
     return repr(float(value))
 
 
 def _plain(text: str) -> str:
+    """Return a text with printable ASCII characters alone."""
     return "".join(c if " " <= c <= "~" and c != '"' else "?" for c in text)
 
 
 def _breaks(pose: Pose) -> tuple[list[str], list[str]]:
-    """Parameters of the coordinate break before a surface, and of the one behind it; empty for one on the axis."""
+    """Return the parameters of the coordinate breaks before and behind a surface; empty for one on the axis."""
     r, (x, y, _) = pose.rotation, pose.translation
     if np.array_equal(r, np.eye(3)) and x == 0.0 and y == 0.0:
         return [], []
@@ -238,7 +238,7 @@ def _breaks(pose: Pose) -> tuple[list[str], list[str]]:
 
 
 def _edges(lens: Prescription, given: LensSurface) -> list[str]:
-    """Statements of what cuts the light: a clear aperture, an obscuration, or a disk with a hole."""
+    """Return the statements of a surface's edge: a clear aperture, an obscuration, or a disk with a hole."""
     aperture, further = given.aperture, given.edges
     if len(further) == 1 and isinstance(aperture, Circle) and not aperture.inner and further[0].blocks:
         hole = further[0].shape
@@ -246,7 +246,7 @@ def _edges(lens: Prescription, given: LensSurface) -> list[str]:
             aperture, further = Circle(aperture.radius, aperture.centre, hole.radius), ()
     blocked = further[0].shape if len(further) == 1 and aperture is None and further[0].blocks else None
     if further and (not isinstance(blocked, Aperture) or further[0].rotation):
-        what = "edges beyond a clear aperture or an obscuration of its own"
+        what = "edges other than a clear aperture or an obscuration"
         raise _cannot(lens, given, what, "one circle, rectangle or ellipse, or a batoid YAML")
     if isinstance(blocked, Circle) and blocked.inner:
         raise _cannot(lens, given, "an obscuration with a hole", "one circle, rectangle or ellipse, or a batoid YAML")
@@ -268,10 +268,10 @@ def _edges(lens: Prescription, given: LensSurface) -> list[str]:
 
 
 def _shape(lens: Prescription, given: LensSurface) -> tuple[str, list[str]]:
-    """Kind of a surface and the statements of its shape."""
+    """Return the Zemax kind of a surface and the statements of its shape."""
     if given.interaction is Interaction.REFRACT:
         raise _cannot(
-            lens, given, "a face of a lens: a .zmx names a glass, and a camera's file an index", "batoid YAML"
+            lens, given, "a face of a lens: it names a glass where a camera's file has an index", "batoid YAML"
         )
     shape = given.surface
     conic = [f"CONI {_number(shape.conic)}"] if shape.conic else []
@@ -279,7 +279,7 @@ def _shape(lens: Prescription, given: LensSurface) -> tuple[str, list[str]]:
         raise _cannot(lens, given, "a figure on a grid", "Zernike terms")
     if isinstance(shape.figure, ZernikeFigure) and any(shape.figure.terms.values()):
         if shape.terms:
-            raise _cannot(lens, given, "Zernike terms on a surface with other terms of its sag", "one of both")
+            raise _cannot(lens, given, "Zernike terms on a surface with other sag terms", "one kind of terms")
         return "SZERNSAG", [*conic, *_even(lens, given, shape), *_zernike(shape.figure)]
     if shape.terms:
         return "XPOLYNOM", [*conic, *_polynomial(lens, given, shape)]
@@ -289,6 +289,7 @@ def _shape(lens: Prescription, given: LensSurface) -> tuple[str, list[str]]:
 
 
 def _even(lens: Prescription, given: LensSurface, shape: Surface) -> list[str]:
+    """Return the statements of even powers of the radius."""
     if 2 * len(shape.even) + 2 > LAST_EVEN:
         raise _cannot(lens, given, f"even powers beyond r^{LAST_EVEN}", f"A4 to A{LAST_EVEN}")
     terms = [0.0, *(a * MM ** (-2 * n - 3) for n, a in enumerate(shape.even))]
@@ -296,6 +297,7 @@ def _even(lens: Prescription, given: LensSurface, shape: Surface) -> list[str]:
 
 
 def _zernike(figure: ZernikeFigure) -> list[str]:
+    """Return the statements of Zernike terms."""
     last = max(figure.terms)
     lines = [f"PARM 9 {_number(figure.centre[0] * MM)}", f"PARM 10 {_number(figure.centre[1] * MM)}"]
     values = [float(last), figure.radius * MM, *(figure.terms.get(j, 0.0) * MM for j in range(1, last + 1))]
@@ -303,8 +305,9 @@ def _zernike(figure: ZernikeFigure) -> list[str]:
 
 
 def _polynomial(lens: Prescription, given: LensSurface, shape: Surface) -> list[str]:
+    """Return the statements of an xy polynomial."""
     if any(not isinstance(term, XYPolynomial) for term in shape.terms):
-        raise _cannot(lens, given, "terms of a sag that the format does not have", "polynomial")
+        raise _cannot(lens, given, "sag terms that the format does not have", "polynomial")
     radius = 0.1
     terms: Mapping[tuple[int, int], float] = polynomial_of(shape)
     order = max(a + b for a, b in terms)
@@ -316,16 +319,17 @@ def _polynomial(lens: Prescription, given: LensSurface, shape: Surface) -> list[
 
 
 def _cannot(lens: Prescription, given: LensSurface, what: str, allowed: str) -> InputError:
-    return lens.error(f"a .zmx cannot carry {what}", given.line, given.name, allowed)
+    """Return an error about content that a .zmx file cannot represent."""
+    return lens.error(f"a .zmx file cannot represent {what}", given.line, given.name, allowed)
 
 
 def batoid_text(lens: prescription.Prescription) -> tuple[str, tuple[prescription.Note, ...]]:
-    """The file's text, and what of the prescription is not in it.
+    """Return the text of a batoid file, and notes on what it omits.
 
     Raises
     ------
     InputError
-        a surface that batoid does not know.
+        Batoid has no such surface.
     """
     notes: list[prescription.Note] = []
     items: list[dict[str, Any]] = []
@@ -334,7 +338,7 @@ def batoid_text(lens: prescription.Prescription) -> tuple[str, tuple[prescriptio
         try:
             over = prescription.turned_over(surface)
         except TypeError as error:
-            problem = f"batoid's file cannot carry this: {error}"
+            problem = f"a batoid file cannot represent this: {error}"
             raise lens.error(problem, surface.line, surface.name, "polynomials and Zernike terms") from None
         pose = rounded(prescription.OVER @ over.pose)
         last = k == len(lens.surfaces) - 1
@@ -355,21 +359,21 @@ def batoid_text(lens: prescription.Prescription) -> tuple[str, tuple[prescriptio
         if parts and item["type"] != "Interface":
             item["obscuration"] = parts[0] if len(parts) == 1 else {"type": "ObscUnion", "items": parts}
         if len(parts) < len(cuts) or (cuts and item["type"] == "Interface"):
-            notes.append(prescription.Note(0, surface.name, "its aperture is not carried"))
+            notes.append(prescription.Note(0, surface.name, "its aperture is omitted"))
         if item["type"] == "Interface":
             item.pop("inMedium"), item.pop("outMedium")
         items.append(item)
     system = {"type": "CompoundOptic", "name": lens.name, "inMedium": 1.0, "items": items}
     remarks = [
         f"# {lens.name} at {lens.wavelength * 1e9:.6g} nm, written by python -m scenes.lens write. Metres, radians.",
-        "# Light comes down from +z: batoid's x is the prescription's, y and z are turned about it by half a turn.",
+        "# Light comes down from +z: batoid's x is the prescription's, y and z are rotated about it by 180 deg.",
         *(f"# {note}" for note in (*lens.notes, *notes)),
     ]
     return "\n".join(remarks) + "\n" + dump_yaml({"opticalSystem": system}), tuple(notes)
 
 
 def _place(pose: Pose) -> dict[str, float]:
-    """A coordinate system as shifts, then turns about x, y and z, each about the axes that the one before has made."""
+    """Return a pose as shifts, then rotations about x, y and z, each about the axes left by the one before."""
     out = {name: float(v) for name, v in zip("xyz", pose.translation, strict=True) if v}
     r = pose.rotation
     if not np.array_equal(r, np.eye(3)):
@@ -383,6 +387,7 @@ def _place(pose: Pose) -> dict[str, float]:
 
 
 def _surface(lens: prescription.Prescription, given: prescription.LensSurface) -> dict[str, Any]:
+    """Return the shape of a surface as batoid has it."""
     shape = given.surface
     freeform = prescription.polynomial_of(Surface(terms=shape.terms)) if shape.terms else {}
     radius = 0.0
@@ -399,7 +404,7 @@ def _surface(lens: prescription.Prescription, given: prescription.LensSurface) -
         if any(shape.even):
             base = {**base, "type": "Asphere", "coefs": [float(a) for a in shape.even]}
         elif shape.conic == -1.0:
-            # where a ray runs along the axis of a Quadric with this conic, batoid divides by zero
+            # For a ray along the axis of a Quadric with this conic, batoid divides by zero.
             base = {"type": "Paraboloid", "R": 1.0 / shape.curvature}
     elif any(shape.even):
         for pair, value in prescription.polynomial_of(Surface(even=shape.even)).items():
@@ -408,7 +413,7 @@ def _surface(lens: prescription.Prescription, given: prescription.LensSurface) -
     if freeform:
         radius = radius or (0.5 * float(np.ptp(given.aperture.bounds[:2])) if given.aperture else 0.1)
         if max(a + b for a, b in freeform) > prescription.LARGEST_ORDER:
-            raise lens.error("batoid's file cannot carry a polynomial of so high an order", given.line, given.name)
+            raise lens.error("a batoid file cannot represent a polynomial of so high an order", given.line, given.name)
         terms = prescription.zernike_of({(a, b): c * radius ** (a + b) for (a, b), c in freeform.items()})
     elif isinstance(figure, ZernikeFigure):
         terms = {j: a for j, a in figure.terms.items() if a}
@@ -419,7 +424,7 @@ def _surface(lens: prescription.Prescription, given: prescription.LensSurface) -
 
 
 def _obscuration(edge: Edge) -> dict[str, Any] | None:
-    """What cuts the light; None for what batoid does not know."""
+    """Return an edge as batoid has it; None for an unsupported kind."""
     way, shape = "Obsc" if edge.blocks else "Clear", edge.shape
     x, y = shape.centre
     turn = {"theta": edge.rotation} if edge.rotation else {}

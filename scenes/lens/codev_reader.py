@@ -1,16 +1,14 @@
-"""CODE V sequential files (.seq) as prescriptions.
+"""Reader of CODE V sequential files (.seq).
 
-Decentres shift along x, y and z and then turn about x, y and z in this order, each about the axes that the turn before
-has made. Turns about x and y are left-handed, those about z right-handed: ADE > 0 turns +z toward +y.
+Decentres shift along x, y and z and then rotate about x, y and z in this order, each about the axes left by the
+rotation before. Rotations about x and y are left-handed, those about z right-handed: ADE > 0 rotates +z toward +y.
 
-| kind | what it does |
+| kind | effect |
 |---|---|
-| DEC (no keyword) | the surface and all that follow stand in the new frame |
+| DEC (no keyword) | the surface and all that follow are in the new frame |
 | DAR | the surface alone; what follows stands as if it were not decentred |
-| BEN | the turn before the surface and once more behind it: what follows stands about the reflected axis |
-| REV | the reverse of the same decentre, behind the surface: it undoes one |
-
-Statements of CODE V sequential files (.seq), taken into the surfaces and the system that they describe.
+| BEN | the rotation before the surface and once more behind it: what follows stands about the reflected axis |
+| REV | the inverse of the same decentre, behind the surface: it undoes one |
 """
 
 from __future__ import annotations
@@ -43,7 +41,7 @@ from scenes.lens.statements import (
 
 UNITS = {"M": 1e-3, "MM": 1e-3, "C": 1e-2, "CM": 1e-2, "I": 25.4e-3, "IN": 25.4e-3}
 _POWERS = {name: 4 + 2 * k for k, name in enumerate("ABCDEFGHJ")}
-"""CODE V leaves I out."""
+"""Command -> power of the radius. CODE V skips the letter I."""
 
 OF_NO_EFFECT = frozenset(
     # the program's version and author, weights, vignetting solves, variables, couplings, zoom lists, colours,
@@ -82,7 +80,7 @@ _REFUSED = {
 
 @dataclass
 class CodevSurface:
-    """A surface while its statements are read."""
+    """State of a surface while its statements are read."""
 
     name: str
     line: int
@@ -103,7 +101,7 @@ class CodevSurface:
 
 @dataclass
 class CodevSystem:
-    """A file while it is read."""
+    """State of a file while it is read."""
 
     source: Source
     scale: float = 1e-3
@@ -120,7 +118,7 @@ class CodevSystem:
 
 
 def statements(lines: list[str]) -> list[Statement]:
-    """Commands between semicolons; & at the end of a line goes on, ! begins a remark."""
+    """Return the statements of a file: commands end at semicolons, & continues a line, ! starts a comment."""
     out: list[Statement | None] = []
     pending, begun = "", 0
     for number, text in enumerate(lines, start=1):
@@ -135,7 +133,7 @@ def statements(lines: list[str]) -> list[Statement]:
 
 
 def _cut(text: str, mark: str) -> list[str]:
-    """Pieces of a text between marks that stand outside of quotes."""
+    """Return the pieces of a text between marks outside of quotes."""
     parts, quote = [""], ""
     for k, c in enumerate(text):
         if quote:
@@ -150,7 +148,7 @@ def _cut(text: str, mark: str) -> list[str]:
 
 
 def take(system: CodevSystem, s: Statement) -> None:
-    """What one statement says."""
+    """Process one statement."""
     source, command = system.source, s.command
     if command in ("SO", "S", "SI") or (command[0] == "S" and command[1:].isdigit()):
         _surface(system, s)
@@ -188,12 +186,13 @@ _FIELDS = {
 
 
 def _qualified(s: Statement) -> bool:
-    """Whether the first word names a surface: S4, SI, S3..5."""
+    """Return True if the first word names a surface: S4, SI, S3..5."""
     word = s.words[0].upper() if s.words else ""
     return word in ("SI", "SO", "SS") or (word[:1] == "S" and word[1:2].isdigit())
 
 
 def _take_system(system: CodevSystem, s: Statement) -> None:
+    """Process a statement about the system."""
     source = system.source
     match s.command:
         case "RDM":
@@ -249,7 +248,7 @@ def _take_system(system: CodevSystem, s: Statement) -> None:
 
 
 def _surface(system: CodevSystem, s: Statement) -> None:
-    """SO, S or SI: radius or curvature, thickness, what lies behind."""
+    """Append the surface of an SO, S or SI statement: radius or curvature, thickness, medium behind it."""
     source = system.source
     if system.surfaces and system.surfaces[-1].name == "SI":
         raise source.error("a surface behind the image", s.line, s.text)
@@ -276,7 +275,7 @@ def _surface(system: CodevSystem, s: Statement) -> None:
 
 
 def _take_surface(system: CodevSystem, surface: CodevSurface, s: Statement) -> bool:
-    """What a statement says of the last surface; False if it says nothing that is known."""
+    """Process a statement about the last surface; return False if it is unknown."""
     source = system.source
     match s.command:
         case "STO":
@@ -314,7 +313,7 @@ def _take_surface(system: CodevSystem, surface: CodevSurface, s: Statement) -> b
 
 
 def _edge(system: CodevSystem, surface: CodevSurface, s: Statement) -> bool:
-    """Apertures: CIR r, CIR OBS r, CIR HOL r, REX, REY, ELX, ELY with ADX, ADY."""
+    """Process an aperture: CIR r, CIR OBS r, CIR HOL r, REX, REY, ELX, ELY with ADX, ADY."""
     source = system.source
     words = [w.upper() for w in s.words if not (w[:1] in "'\"" or w.upper()[:2] == "L'")]
     kinds = [w for w in words if not is_number(w) and w not in ("'", '"')]
@@ -341,15 +340,15 @@ def read_codev(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
 
     Parameters
     ----------
-    path : str | Path
-        Of the file, UTF-8, UTF-16 or ISO 8859-1.
+    path : str or Path
+        Path of the file, in UTF-8, UTF-16 or ISO 8859-1.
     glasses : Glasses
-        That its surfaces may name.
+        Glasses that its surfaces may name.
 
     Raises
     ------
     InputError
-        The file is damaged, or says something that would be taken wrongly; with the line.
+        The file is damaged, or has a statement that would be misread; the message names the line.
     """
     source = Source(str(path))
     lines = read_lines(source)
@@ -370,6 +369,7 @@ def read_codev(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
 
 
 def _prescription(system: CodevSystem, glasses: Glasses) -> Prescription:
+    """Return the prescription of a file whose statements are read."""
     source, scale, read = system.source, system.scale, system.surfaces
     if not system.waves:
         raise source.error("no wavelength in this file", read[0].line, allowed="WL")
@@ -432,14 +432,16 @@ def _prescription(system: CodevSystem, glasses: Glasses) -> Prescription:
 
 
 def _pairs(system: CodevSystem) -> tuple[tuple[float, float], ...]:
+    """Return the fields (x, y) of the file, missing numbers as 0."""
     count = max(len(system.x), len(system.y))
     x, y = ([*given, *[0.0] * count][:count] for given in (system.x, system.y))
     return tuple(zip(x, y, strict=True))
 
 
 def _behind(source: Source, surface: CodevSurface, wavelength: float, glasses: Glasses) -> tuple[float, str] | None:
-    """Index and name of what lies behind a surface; None for a mirror. Six digits and a point are a fictitious glass,
-    index and dispersion.
+    """Return index and name of the medium behind a surface; None for a mirror.
+
+    Six digits and a point are a fictitious glass, index and dispersion.
     """
     medium = surface.medium.strip("'\"")
     match medium.upper():
@@ -461,6 +463,7 @@ def _behind(source: Source, surface: CodevSurface, wavelength: float, glasses: G
 
 
 def _shape(system: CodevSystem, surface: CodevSurface) -> Surface:
+    """Return the shape of a surface."""
     scale = system.scale
     powers = {n: a * scale ** (1 - n) for n, a in surface.powers.items()}
     if not surface.special:
@@ -481,7 +484,7 @@ def _shape(system: CodevSystem, surface: CodevSurface) -> Surface:
 
 
 def _edges_of(surface: CodevSurface) -> tuple[Aperture | None, tuple[Edge, ...]]:
-    """Clear aperture, and the hole in it where it is not round."""
+    """Return the clear aperture, and the hole in it where it is not round."""
     sizes = surface.sizes
     centre = (surface.centre.get("ADX", 0.0), surface.centre.get("ADY", 0.0))
     blocked = (Edge(Circle(surface.hole, centre), blocks=True),) if surface.hole else ()

@@ -1,4 +1,4 @@
-"""A sequential prescription as other optical programs write it, and its shapes as the tracer's."""
+"""Sequential prescription of another optical program, and its shapes as the tracer has them."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.units import ANGLE, LENGTH, Kind, format_quantity
 
 LARGEST_ORDER = 10
-"""Largest order of polynomials and Zernike terms; beyond it monomials lose digits."""
+"""Largest order of polynomials and Zernike terms; monomials of higher orders lose digits."""
 _POLYNOMIAL = {(a, n - a): (f"x{a}" if a > 1 else "x" * a) + (f"y{n - a}" if n - a > 1 else "y" * (n - a))
                for n in (2, 3, 4) for a in range(n + 1)}  # fmt: skip
 
 
 def even_asphere(curvature: float, conic: float, powers: Mapping[int, float]) -> Surface:
-    """A conic with even powers of the radius, the second one among them.
+    """Return a conic with even powers of the radius, r^2 included.
 
     Parameters
     ----------
     curvature : float
-        1/m.
+        Curvature at the vertex, 1/m.
     conic : float
-        Schwarzschild's constant.
+        Conic (Schwarzschild) constant.
     powers : Mapping[int, float]
         Power n -> coefficient of r^n, m^(1-n); n even, 2 to 20.
     """
@@ -48,21 +48,21 @@ def even_asphere(curvature: float, conic: float, powers: Mapping[int, float]) ->
 
 
 def polynomial(surface: Surface, coefficients: Mapping[tuple[int, int], float], radius: float) -> Surface:
-    """The surface with a polynomial in x and y on top.
+    """Return the surface with a polynomial in x and y added to its sag.
 
     Parameters
     ----------
     surface : Surface
-        Without a figure or polynomial of its own.
+        Surface without a figure or polynomial.
     coefficients : Mapping[tuple[int, int], float]
-        (a, b) -> c_ab of (x/radius)^a (y/radius)^b, metres.
+        (a, b) -> c_ab of (x/radius)^a (y/radius)^b, in metres.
     radius : float
-        Of the disk that the coefficients are for, metres.
+        Normalisation radius of the coefficients, in metres.
 
     Raises
     ------
     ValueError
-        An order above LARGEST_ORDER.
+        The order is above LARGEST_ORDER.
     """
     given = {k: c for k, c in coefficients.items() if c != 0.0}
     order = max((a + b for a, b in given), default=0)
@@ -77,7 +77,10 @@ def polynomial(surface: Surface, coefficients: Mapping[tuple[int, int], float], 
 
 
 def zernike_of(coefficients: Mapping[tuple[int, int], float]) -> dict[int, float]:
-    """Zernike terms, Noll index -> amplitude, of a polynomial on the unit disk, (a, b) -> coefficient of x^a y^b."""
+    """Return the Zernike terms of a polynomial on the unit disk.
+
+    The polynomial is (a, b) -> coefficient of x^a y^b, the result Noll index -> amplitude.
+    """
     order = max((a + b for a, b in coefficients), default=0)
     size = triangle_size(order)
     matrix, wanted = np.zeros((size, size)), np.zeros(size)
@@ -92,7 +95,7 @@ def zernike_of(coefficients: Mapping[tuple[int, int], float]) -> dict[int, float
 def moved_polynomial(
     coefficients: Mapping[tuple[int, int], float], centre: tuple[float, float]
 ) -> dict[tuple[int, int], float]:
-    """A polynomial in x - cx and y - cy as one in x and y."""
+    """Return a polynomial in x - cx and y - cy as one in x and y."""
     out: dict[tuple[int, int], float] = {}
     cx, cy = centre
     for (a, b), c in coefficients.items():
@@ -104,12 +107,12 @@ def moved_polynomial(
 
 
 def joined(surface: Surface) -> Surface:
-    """The surface with the Zernike terms of its own sag in its figure: one set of them, as other programs have it.
+    """Return the surface with the Zernike terms of its sag merged into its figure, as other programs have them.
 
     Raises
     ------
     ValueError
-        The figure is one on a grid, or has a term beyond those of Noll's that are known.
+        The figure is on a grid, or has a term beyond the known Noll indices.
     """
     own = next((term for term in surface.terms if isinstance(term, ZernikeSag)), None)
     if own is None:
@@ -134,7 +137,7 @@ def joined(surface: Surface) -> Surface:
 
 
 def about_vertex(figure: ZernikeFigure) -> dict[tuple[int, int], float]:
-    """A figure as a polynomial in x and y: (a, b) -> c_ab, m^(1-a-b)."""
+    """Return a figure as a polynomial in x and y: (a, b) -> c_ab, m^(1-a-b)."""
     order = max(figure.order, 0)
     table = monomials(figure.terms, order, figure.radius)
     own = {(n - b, b): float(table[triangle_index(n - b, b)]) for n in range(order + 1) for b in range(n + 1)}
@@ -148,12 +151,12 @@ def clear(
     ellipse: tuple[float, float] | None = None,
     centre: tuple[float, float] = (0.0, 0.0),
 ) -> Aperture | None:
-    """A clear aperture of what a file gives, in metres; None for nothing.
+    """Return the clear aperture of sizes in metres; None if there are none.
 
     Raises
     ------
     ValueError
-        Sizes that no aperture has.
+        The sizes are not those of an aperture.
     """
     if rectangle is not None:
         return Rectangle(*rectangle, centre)
@@ -165,8 +168,9 @@ def clear(
 
 
 def facing(surface: LensSurface) -> LensSurface:
-    """Tell a surface in a frame whose z has no part against the prescription's: turned about its own x by half a
-    turn where it has, which is the same body.
+    """Return a surface in a frame whose z points along the prescription's, rotated by 180 deg about x if necessary.
+
+    The body is the same in both frames.
     """
     if surface.pose.rotation[2, 2] >= 0.0:
         return surface
@@ -174,11 +178,11 @@ def facing(surface: LensSurface) -> LensSurface:
 
 
 OVER = Pose(np.diag([1.0, -1.0, -1.0]))
-"""Half a turn about x."""
+"""Rotation by 180 deg about x."""
 
 
 def turned_over(surface: LensSurface) -> LensSurface:
-    """Tell a surface in a frame that is turned about its x by half a turn."""
+    """Return the same surface in a frame rotated by 180 deg about its x."""
     shape = surface.surface
     terms = []
     for term in shape.terms:
@@ -207,8 +211,9 @@ def turned_over(surface: LensSurface) -> LensSurface:
 
 
 def polynomial_of(shape: Surface) -> dict[tuple[int, int], float]:
-    """Polynomial of all that a surface whose terms are polynomials has beyond its conic but a figure: (a, b) -> c_ab of
-    x^a y^b, m^(1-a-b).
+    """Return the polynomial of a surface beyond its conic, without its figure: (a, b) -> c_ab of x^a y^b, m^(1-a-b).
+
+    All terms of the surface must be polynomials.
     """
     out: dict[tuple[int, int], float] = {}
     for term in shape.terms:
@@ -222,40 +227,41 @@ def polynomial_of(shape: Surface) -> dict[tuple[int, int], float]:
 
 
 def without_rim(surface: LensSurface) -> LensSurface:
-    """A stop without its outer edge; the hole in it stays."""
+    """Return a stop without its outer edge; a hole in it stays."""
     rim = surface.aperture
     hole = Edge(Circle(rim.inner, rim.centre), blocks=True) if isinstance(rim, Circle) and rim.inner else None
     return replace(surface, aperture=None, edges=(*(() if hole is None else (hole,)), *surface.edges))
 
 
 def written(value: float, kind: Kind) -> str:
-    """A number of another program's file as a camera's file has it, without the tail that conversions leave: 540 arcsec
-    and not 539.9999999999999 arcsec.
+    """Return a number of another program's file as text of a camera's file, without digits that unit conversions leave.
+
+    It gives 540 arcsec and not 539.9999999999999 arcsec.
 
     Parameters
     ----------
     value : float
-        SI.
+        Value, SI.
     kind : Kind
-        What it measures.
+        Kind of quantity.
     """
     return format_quantity(value, kind, _ROUNDING.get(kind.si, 0.0) + 2e-15 * abs(value))
 
 
 _ROUNDING = {ANGLE.si: 1e-14, LENGTH.si: 1e-15}
-"""SI unit -> what sums and differences of such numbers leave in them; the ray's wavelength is 1e8 times as much."""
+"""SI unit -> rounding error of sums and differences of such numbers; the wavelength of light is 1e8 times as much."""
 
 _LARGEST_EDGE = 100.0
-"""Metres; beyond that an edge is none."""
+"""Size in metres above which an edge is ignored."""
 
 
 def edge_entries(edges: Iterable[Edge]) -> list[dict[str, Any]]:
-    """Edges as a camera's file has them, without those that are too large to cut anything."""
+    """Return edges as a camera's file has them, without those that are too large to vignette light."""
     return [_entry(edge) for edge in edges if _size(edge) < _LARGEST_EDGE]
 
 
 def _size(edge: Edge) -> float:
-    """Largest number of an edge, metres."""
+    """Return the largest number of an edge, in metres."""
     shape = edge.shape
     numbers = [*shape.centre]
     match shape:
@@ -271,6 +277,7 @@ def _size(edge: Edge) -> float:
 
 
 def _entry(edge: Edge) -> dict[str, Any]:
+    """Return an edge as a camera's file has it."""
     shape = edge.shape
     kind = {Circle: "circle", Rectangle: "rectangle", Ellipse: "ellipse", Ray: "ray", Polygon: "polygon"}[type(shape)]
 
@@ -298,21 +305,21 @@ def _entry(edge: Edge) -> dict[str, Any]:
 
 
 SEQUENCE = "imaging"
-"""Name of the way of the light in a prescription's assembly."""
+"""Name of the sequence of the light in a prescription's assembly."""
 
 
 @dataclass(frozen=True)
 class Note:
-    """What of a foreign file did not come along, or how it was taken.
+    """Note on an omission or an assumption of the conversion of a foreign file.
 
     Attributes
     ----------
     line : int
-        Of the file, counted from 1; 0 for the file as a whole.
+        Line of the file, counted from 1; 0 for the file as a whole.
     statement : str
-        As it stands there.
+        Statement as it is in the file.
     text : str
-        What became of it.
+        Treatment of the statement.
     """
 
     line: int
@@ -331,23 +338,23 @@ class LensSurface:
     Attributes
     ----------
     name : str
-        Unique in it.
+        Unique name.
     pose : Pose
-        Its frame in the prescription's, z along the axis that light enters along; metres.
+        Pose of its frame in the prescription's, z along the axis along which light enters; metres.
     surface : Surface
-        Its shape.
+        Shape.
     interaction : Interaction
-        Reflects, refracts or lets pass.
+        Reflection, refraction or passage of light.
     index : float
-        Refractive index of what lies behind it for the light, at the prescription's wavelength.
-    aperture : Aperture | None
+        Refractive index behind it in the order of the light, at the prescription's wavelength.
+    aperture : Aperture or None
         Clear aperture, None for an unlimited one.
-    edges : tuple[Edge, ...]
-        What cuts light there beside the clear aperture: obscurations, vanes.
     line : int
-        Where it begins in the file.
+        Line of the file at which it begins.
     glass : str
-        Name of what lies behind it, empty for the medium of the object.
+        Name of the glass behind it, empty for the medium of the object.
+    edges : tuple[Edge, ...]
+        Further edges that vignette light: obscurations, vanes.
     """
 
     name: str
@@ -362,23 +369,25 @@ class LensSurface:
 
     @property
     def every_edge(self) -> tuple[Edge, ...]:
-        """The clear aperture among its edges."""
+        """All edges, the clear aperture first."""
         return (*(() if self.aperture is None else (Edge(self.aperture),)), *self.edges)
 
 
 @dataclass(frozen=True)
 class Pupil:
-    """How a file says how wide the beam is: by the diameter of the entrance pupil (metres), the F-number in image
-    space, the numerical aperture in object space, or the radius of the stop (metres).
+    """Definition of the beam's width in a file.
+
+    It is the diameter of the entrance pupil (metres), the F-number in image space, the numerical aperture in object
+    space, or the radius of the stop (metres).
 
     Attributes
     ----------
     kind : str
         ``diameter``, ``f_number``, ``object_na`` or ``stop``.
     value : float
-        Of it.
+        Value of that quantity.
     line : int
-        Where it stands.
+        Line of the file.
     """
 
     kind: str
@@ -388,42 +397,41 @@ class Pupil:
 
 @dataclass(frozen=True, eq=False)
 class Prescription:
-    """A sequential system, in metres and radians.
+    """Sequential optical system, in metres and radians.
 
     Frame: that of the first surface after the object, before its own decentre; light enters toward +z.
 
     Attributes
     ----------
     name : str
-        Of the file's title, or of the file.
+        Title in the file, or name of the file.
     file : str
-        Its path, as the user gave it.
+        Path of the file as the user gave it.
     surfaces : tuple[LensSurface, ...]
-        In the order of the light, the image last; planes that do nothing are left out.
+        Surfaces in the order of the light, the image last; dummy planes are omitted.
     stop : int
         Index of the surface that is the aperture stop.
     wavelength : float
-        At which indices hold, metres.
+        Wavelength of the indices, in metres.
     wavelengths : tuple[float, ...]
-        All that the file names, metres.
+        All wavelengths that the file names, in metres.
     fields : tuple[tuple[float, float], ...]
-        Directions (x, y) from which light comes as their tangents' angles, radians; empty where the file has other
-        fields than angles.
+        Directions (x, y) from which light comes, as angles of their tangents, in radians; empty where the file defines
+        its fields otherwise.
     field_kind : str
-        What the file's fields are, for messages.
-    pupil : Pupil | None
-        How wide the beam is; None where the file does not say.
+        Kind of the file's fields, for messages.
+    pupil : Pupil or None
+        Width of the beam; None where the file does not define it.
     object_distance : float
-        From the object to the frame's origin, metres; infinite for a scene.
+        Distance from the object to the frame's origin, in metres; infinite for a scene.
     notes : tuple[Note, ...]
-        What did not come along.
+        Omissions and assumptions of the conversion.
     round_field : bool
-        The fields say how wide a round field about the axis is, of which a camera has the square in it.
-    glasses : Mapping[str, Callable[[float], float]]
-        Of its surfaces by their names, those whose dispersion is known; called with a wavelength (metres) each gives
-        its index.
+        Whether the fields give the radius of a round field about the axis, of which a camera has the inscribed square.
+    glasses : Mapping[str, callable]
+        Glasses of its surfaces with known dispersion, by name: functions from wavelength (metres) to index.
     heights : tuple[tuple[float, float], ...]
-        Fields that the file has as heights (x, y) on object or image, metres; empty for others.
+        Fields given as heights (x, y) on object or image, in metres; empty for others.
     """
 
     name: str
@@ -443,13 +451,13 @@ class Prescription:
 
     @property
     def image(self) -> LensSurface:
-        """The last surface."""
+        """Last surface."""
         return self.surfaces[-1]
 
     def error(
         self, problem: str, line: int | None = None, found: str | None = None, allowed: str | None = None
     ) -> InputError:
-        """What is wrong with the file at a line."""
+        """Return an error at a line of the file."""
         return InputError(Issue(problem, self.file, line or None, (), found, allowed))
 
     def with_notes(self, *notes: Note) -> Prescription:
@@ -457,12 +465,12 @@ class Prescription:
         return replace(self, notes=(*self.notes, *notes))
 
     def assembly(self, apertures: bool = True) -> Assembly:
-        """What the tracer traces: one body and one element for each surface, the way of the light as ``SEQUENCE``.
+        """Return the assembly for the tracer: a body and an element per surface, and the sequence ``SEQUENCE``.
 
         Parameters
         ----------
         apertures : bool
-            Whether clear apertures stop rays.
+            Whether clear apertures vignette rays.
         """
         bodies = tuple(Body(s.name, s.pose) for s in self.surfaces)
         elements = {

@@ -1,9 +1,8 @@
-"""Foreign prescription files as numbered statements: encodings, words, numbers, what is said of a wrong one; and the
-chain of surfaces that a reader makes of them.
+"""Statements of foreign prescription files, glasses that they name, and the chain of surfaces that a reader builds.
 
-Glasses of AGF catalogues, as makers publish them, and those of the twin, by the names that prescriptions use.
-
-Indices are against air of 20 C and 1013 hPa, as prescriptions on the ground take them.
+A file is decoded into numbered statements of words and numbers, and errors name their line. Glasses are those of AGF
+catalogues, as manufacturers publish them, and those of the twin, by the names that prescriptions use. Indices are
+relative to air of 20 C and 1013 hPa, as in prescriptions on the ground.
 """
 
 from __future__ import annotations
@@ -28,10 +27,10 @@ from scenes.yaml.errors import InputError, Issue, shown
 from scenes.yaml.input_file import read_bytes
 
 LARGEST_FILE = 16 << 20
-"""Bytes; prescriptions have some ten thousand."""
+"""Largest file, in bytes; prescriptions have some ten thousand."""
 LONGEST_LINE = 100_000
 LARGEST_NUMBER = 1e20
-"""Objects at infinity are written as 1e10 to 1e18 millimetres; more is no length."""
+"""Largest number: objects at infinity are written as 1e10 to 1e18 millimetres."""
 MOST_SURFACES = 2000
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?")
@@ -40,18 +39,18 @@ _MARKS = ((b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"), (b"\xef\xbb\xbf", "u
 
 @dataclass(frozen=True)
 class Statement:
-    """A command of a file with its words.
+    """Command of a file with its words.
 
     Attributes
     ----------
     line : int
-        On which it begins, counted from 1.
+        Line on which it begins, counted from 1.
     command : str
-        In capitals.
+        Command in capitals.
     words : tuple[str, ...]
-        After it.
+        Words after it.
     text : str
-        The whole of it, as it stands there.
+        Full text as in the file.
     """
 
     line: int
@@ -62,14 +61,14 @@ class Statement:
 
 @dataclass
 class Source:
-    """A file while it is read.
+    """State of a file while it is read.
 
     Attributes
     ----------
     file : str
         Path as the user gave it.
     notes : list[Note]
-        What was not understood so far.
+        Notes on statements that were not understood.
     """
 
     file: str
@@ -83,26 +82,26 @@ class Source:
         allowed: str | None = None,
         suggestion: str | None = None,
     ) -> InputError:
-        """What is wrong at a line."""
+        """Return an error at a line of the file."""
         text = None if found is None else shown(found)
         return InputError(Issue(problem, self.file, line, (), text, allowed, suggestion))
 
     def note(self, statement: Statement, text: str) -> None:
-        """Remember what became of a statement."""
+        """Add a note on the treatment of a statement."""
         whole = statement.text if len(statement.text) <= 60 else statement.text[:57] + "..."
         self.notes.append(Note(statement.line, whole, text))
 
     def numbers(self, statement: Statement, what: str = "a number") -> tuple[float, ...]:
-        """All words of a statement as finite numbers. Raises InputError as ``number``."""
+        """Return all words of a statement as finite numbers. Raises InputError as ``number``."""
         return tuple(self.finite(statement, k, what) for k in range(len(statement.words)))
 
     def number(self, statement: Statement, place: int, what: str, default: float | None = None) -> float:
-        """The number in one of the statement's words.
+        """Return one of the statement's words as a number.
 
         Raises
         ------
         InputError
-            There is none and no default, or it is none, or too large for anything.
+            The word is missing without a default, is not a number, or is too large.
         """
         if place >= len(statement.words):
             if default is not None:
@@ -111,7 +110,7 @@ class Source:
         return self.value(statement, statement.words[place], what)
 
     def value(self, statement: Statement, word: str, what: str) -> float:
-        """The number that a word of a statement is. Raises InputError as ``number``."""
+        """Return a word of a statement as a number. Raises InputError as ``number``."""
         if word.upper() in ("INFINITY", "INF"):
             return math.inf
         if not _NUMBER.fullmatch(word):
@@ -122,7 +121,7 @@ class Source:
         return value
 
     def finite(self, statement: Statement, place: int, what: str, default: float | None = None) -> float:
-        """The number in one of the statement's words, as of ``number``, refusing infinity."""
+        """Return one of the statement's words as a finite number, as ``number`` does."""
         value = self.number(statement, place, what, default)
         if not math.isfinite(value):
             raise self.error(f"{what} of {statement.command} is infinite", statement.line, statement.text)
@@ -131,7 +130,7 @@ class Source:
     def whole(
         self, statement: Statement, place: int, what: str, least: int, most: int, default: int | None = None
     ) -> int:
-        """A whole number between limits. Raises InputError as ``number``."""
+        """Return one of the statement's words as a whole number between limits. Raises InputError as ``number``."""
         value = self.finite(statement, place, what, default)
         if value != int(value) or not least <= value <= most:
             allowed = f"whole numbers {least} to {most}"
@@ -140,26 +139,26 @@ class Source:
 
 
 def is_number(word: str) -> bool:
-    """Whether a word is a number."""
+    """Return True if a word is a number."""
     return _NUMBER.fullmatch(word) is not None
 
 
 def read_lines(source: Source, what: str = "a prescription", most: int = LARGEST_FILE) -> list[str]:
-    """The lines of a source's file: UTF-16 of either order, with or without a mark, UTF-8, or one byte a character.
+    """Return the lines of a source's file: UTF-16 of either order, with or without a mark, UTF-8, or ISO 8859-1.
 
     Parameters
     ----------
     source : Source
-        To read from.
+        The file.
     what : str
-        Its file should be, for messages.
+        Expected content, for messages.
     most : int
-        Bytes that it may have.
+        Largest size, in bytes.
 
     Raises
     ------
     InputError
-        The file cannot be read, is too large or empty, or holds bytes that no text of its encoding has, with their
+        The file cannot be read, is too large or empty, or holds bytes that are invalid in its encoding, with their
         line.
     """
     content = read_bytes(source.file, what, most, (Path(source.file).suffix,))
@@ -193,70 +192,70 @@ def read_lines(source: Source, what: str = "a prescription", most: int = LARGEST
 
 
 def split_words(text: str) -> tuple[str, ...]:
-    """Words of a statement; what stands in quotes is one word, with its quotes."""
+    """Return the words of a statement; a quoted text is one word, with its quotes."""
     return tuple(re.findall(r"\"[^\"]*\"|'[^']*'|[^\s\"']+|[\"']", text))
 
 
 def statement_of(line: int, text: str) -> Statement | None:
-    """The statement of a line, or of a part of one; None where no word stands."""
+    """Return the statement of a line or of a part of one; None if it is empty."""
     words = split_words(text)
     return Statement(line, words[0].upper(), words[1:], text.strip()) if words else None
 
 
 def joined(words: Sequence[str]) -> str:
-    """Words as a text, without quotes around it."""
+    """Return words as a text, without quotes around it."""
     return " ".join(words).strip().strip("\"'").strip()
 
 
 Glasses = Mapping[str, Callable[[float], float]]
-"""Name of a glass as ``glass_key`` makes it -> refractive index by wavelength, metres."""
+"""Name of a glass as ``glass_key`` makes it -> refractive index as a function of wavelength, in metres."""
 NO_GLASSES: Glasses = FrozenMap()
 FARTHEST = 1e8
-"""An object beyond this distance is at infinity, metres; programs write it as 1e10 or 1e13 millimetres."""
+"""Distance beyond which an object is at infinity, in metres; programs write it as 1e10 or 1e13 millimetres."""
 D_LINE, _D_WIDTH = ABBE_LINES[0], 0.1e-9
 """Wavelength at which the index of a glass without a catalogue is stated, and how near to it one has to be, metres."""
 
 
 def glass_key(name: str) -> str:
-    """A glass's name as it is looked for: letters and digits alone, without the maker's name behind ``_``.
+    """Return the key of a glass's name: letters and digits alone, without the manufacturer's name after ``_``.
 
-    CODE V writes NBK7_SCHOTT for what Zemax and its makers call N-BK7.
+    CODE V writes NBK7_SCHOTT for what Zemax and the manufacturers call N-BK7.
     """
     head = name.strip("'\"").partition("_")[0] or name
     return "".join(c for c in head.upper() if c.isalnum())
 
 
 MAKERS = ("SCHOTT", "OHARA", "HOYA", "CDGM")
-"""Makers of common glasses; several have glasses of one name, as F2."""
+"""Manufacturers of common glasses; several have glasses of the same name, such as F2."""
 
 
 def of_makers(glasses: Glasses, makers: Sequence[str]) -> Glasses:
-    """Return glasses without common ones of other makers than those that a file names, if it names any."""
+    """Return the glasses without common ones of other manufacturers than those that a file names, if it names any."""
     others = set(MAKERS).difference(makers) if set(MAKERS).intersection(makers) else set()
     dropped = {k for k, g in glasses.items() if getattr(g, "source", "").partition("'")[0].upper() in others}
     return FrozenMap({k: g for k, g in glasses.items() if k not in dropped}) if dropped else glasses
 
 
 def index_of(source: Source, glasses: Glasses, name: str, wavelength: float, line: int) -> float:
-    """Refractive index of a catalogue's glass that a file names.
+    """Return the refractive index of a catalogue glass that a file names.
 
     Parameters
     ----------
     source : Source
         The file.
     glasses : Glasses
-        That are known.
+        Known glasses.
     name : str
-        As the file has it.
+        Name of the glass in the file.
     wavelength : float
-        metres.
+        Wavelength, in metres.
     line : int
-        Of the file.
+        Line of the file.
 
     Raises
     ------
     InputError
-        No such glass, or none whose index is known there.
+        The glass is unknown, or its index is not known at the wavelength.
     """
     found = of_makers(glasses, [name.strip("'\"").upper().partition("_")[2]]).get(glass_key(name))
     if found is None:
@@ -269,13 +268,13 @@ def index_of(source: Source, glasses: Glasses, name: str, wavelength: float, lin
 
 
 def named_glasses(glasses: Glasses, surfaces: Iterable[LensSurface]) -> Glasses:
-    """Those glasses of surfaces whose dispersion is known, by the names that the surfaces have for them."""
+    """Return the glasses of surfaces with known dispersion, by the surfaces' names for them."""
     names = {surface.glass for surface in surfaces if surface.glass}
     return FrozenMap({name: glasses[glass_key(name)] for name in sorted(names) if glass_key(name) in glasses})
 
 
 def require_d_line(source: Source, what: str, name: str, wavelength: float, line: int) -> None:
-    """Refuse a glass without a catalogue at another wavelength (metres) than that of its index."""
+    """Raise InputError for a glass without a catalogue at a wavelength (metres) other than that of its index."""
     if abs(wavelength - D_LINE) > _D_WIDTH:
         problem = f"a {what} glass, whose index is stated at 587.56 nm alone"
         raise source.error(problem, line, f"{name} at {wavelength * 1e9:.6g} nm", "a catalogue's glass")
@@ -283,20 +282,22 @@ def require_d_line(source: Source, what: str, name: str, wavelength: float, line
 
 @dataclass
 class Chain:
-    """Surfaces as a reader meets them, one frame after the other; a reader's own workspace.
+    """Surfaces that a reader has met so far, with the frame of the next one.
 
     Attributes
     ----------
     source : Source
         The file.
     pose : Pose
-        Frame that the next surface stands in.
+        Frame of the next surface.
     surfaces : list[LensSurface]
-        So far.
+        Surfaces so far.
     stop : int
-        Number of the aperture stop among them, -1 as long as there is none.
-    index, glass : float
-        What lies behind the last surface.
+        Index of the aperture stop among them, -1 as long as there is none.
+    index : float
+        Index behind the last surface.
+    glass : str
+        Glass behind the last surface.
     """
 
     source: Source
@@ -307,7 +308,7 @@ class Chain:
     glass: str = ""
 
     def move(self, shift: Sequence[float] = (0.0, 0.0, 0.0), rotation: np.ndarray | None = None) -> None:
-        """Go on in a frame that is shifted by a vector in the present axes and then turned about its own."""
+        """Move the frame by a shift along its axes and then a rotation about them."""
         self.pose = self.pose @ Pose(np.eye(3) if rotation is None else rotation, np.array(shift, np.float64))
 
     def meet(
@@ -320,20 +321,20 @@ class Chain:
         stop: bool,
         last: bool,
     ) -> None:
-        """Take the next surface, under another name where its own is taken; a plane that does nothing is left out.
+        """Append the next surface, with a number added to a name that is taken; a dummy plane is omitted.
 
         Parameters
         ----------
         name : str
-            Of the surface.
+            Name of the surface.
         shape : Surface
-            Of it.
-        edges : tuple[Aperture | None, tuple[Edge, ...]]
-            Its clear aperture, and what it blocks.
-        behind : tuple[float, str] | None
-            Index and glass of what lies behind it; None for a mirror.
+            Its shape.
+        edges : tuple[Aperture or None, tuple[Edge, ...]]
+            Its clear aperture and its obscurations.
+        behind : tuple[float, str] or None
+            Index and glass behind it; None for a mirror.
         line : int
-            Where it begins in the file.
+            Line of the file at which it begins.
         stop : bool
             Whether it is the aperture stop.
         last : bool
@@ -361,18 +362,18 @@ class Chain:
         self.surfaces.append(made)
 
     def prescription(self, keyword: str, distance: float, name: str, **said: Any) -> Prescription:
-        """What the file describes.
+        """Return the prescription of the surfaces.
 
         Parameters
         ----------
         keyword : str
-            That names the stop in the file.
+            Keyword of the stop in the file.
         distance : float
-            Of the object, metres.
+            Distance of the object, in metres.
         name : str
             Title of the file, empty for none.
         said : Any
-            Further numbers of the prescription.
+            Further attributes of the prescription.
 
         Raises
         ------
@@ -397,11 +398,12 @@ class Chain:
 
 
 _CONSTANTS = 6
-"""Numbers of Schott's formula of dn/dT on a TD line; the seventh is the temperature of reference, 20 C."""
+"""Number of constants of Schott's formula of dn/dT on a TD line; the seventh number is the reference temperature, 20 C.
+"""
 
 
 def own_glasses() -> Glasses:
-    """Return the twin's glasses and the common ones; fused silica also by the names that catalogues have for it."""
+    """Return the twin's glasses and the common ones; fused silica also by its names in catalogues."""
     own: dict[str, Callable[[float], float]] = {glass_key(name): glass for name, glass in common_glasses().items()}
     own |= {glass_key(name): glass.index for name, glass in GLASSES.items()}
     own |= dict.fromkeys(("SILICA", "FSILICA"), own[glass_key("fused silica")])
@@ -410,17 +412,17 @@ def own_glasses() -> Glasses:
 
 
 def read_catalogues(paths: Sequence[str | Path]) -> Glasses:
-    """The twin's glasses and those of AGF files; of one name the first file's counts, before the twin's own.
+    """Return the twin's glasses and those of AGF files, which take precedence, the first file before the others.
 
     Parameters
     ----------
-    paths : Sequence[str | Path]
-        Of the files.
+    paths : sequence of str or Path
+        Paths of the files.
 
     Raises
     ------
     InputError
-        a file cannot be read or is damaged.
+        A file cannot be read or is damaged.
     """
     out = dict(own_glasses())
     for path in reversed(paths):
@@ -429,12 +431,12 @@ def read_catalogues(paths: Sequence[str | Path]) -> Glasses:
 
 
 def read_catalogue(path: str | Path) -> tuple[CatalogueGlass, ...]:
-    """The glasses of an AGF file.
+    """Return the glasses of an AGF file.
 
     Raises
     ------
     InputError
-        It cannot be read, or says of a glass what cannot be; with the line.
+        The file cannot be read, or has invalid data of a glass; the message names the line.
     """
     source = Source(str(path))
     glasses: list[CatalogueGlass] = []

@@ -1,7 +1,8 @@
-"""Zemax sequential files (.zmx) as prescriptions.
+"""Reader of Zemax sequential files (.zmx).
 
-A coordinate break shifts and then turns about x, y and z in this order, each about the axes that the turn before has
-made; with its order flag set it does the reverse: turns about z, y and x, then shifts. Turns are right-handed.
+A coordinate break shifts and then rotates about x, y and z in this order, each about the axes left by the rotation
+before; with its order flag set it does the reverse: rotations about z, y and x, then shifts. Rotations are
+right-handed.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from scenes.lens.statements import (
 UNITS = {"MM": 1e-3, "CM": 1e-2, "IN": 25.4e-3, "INCH": 25.4e-3, "ME": 1.0, "M": 1.0, "METER": 1.0}
 
 SHAPES = ("STANDARD", "EVENASPH", "ODDASPHE", "XPOLYNOM", "SZERNSAG", "COORDBRK")
-"""Kinds of surfaces that are read."""
+"""Kinds of surfaces that are supported."""
 
 OF_NO_EFFECT = frozenset(
     # the program's version and windows, drawings, solves whose values stand in the file, optimisation, tolerances,
@@ -61,12 +62,12 @@ _EDGES = {
     "SQOB": "blocked rectangle",
     "ELOB": "blocked ellipse",
 }
-"""Statement -> the edge that it gives."""
+"""Statement -> kind of edge."""
 
 
 @dataclass
 class _Surface:
-    """A surface while its statements are read."""
+    """State of a surface while its statements are read."""
 
     number: int
     line: int
@@ -88,7 +89,7 @@ class _Surface:
 
 @dataclass
 class _System:
-    """A file while it is read."""
+    """State of a file while it is read."""
 
     source: Source
     scale: float = 1e-3
@@ -111,15 +112,15 @@ def read_zemax(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
 
     Parameters
     ----------
-    path : str | Path
-        Of the file, UTF-16 of either order, UTF-8 or ISO 8859-1.
+    path : str or Path
+        Path of the file, in UTF-16 of either order, UTF-8 or ISO 8859-1.
     glasses : Glasses
-        That its surfaces may name.
+        Glasses that its surfaces may name.
 
     Raises
     ------
     InputError
-        The file is damaged, or says something that would be taken wrongly; with the line.
+        The file is damaged, or has a statement that would be misread; the message names the line.
     """
     source = Source(str(path))
     lines = read_lines(source)
@@ -136,7 +137,7 @@ def read_zemax(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
 
 
 def _take(system: _System, s: Statement) -> None:
-    """What one statement says."""
+    """Process one statement."""
     source = system.source
     if s.command == "SURF":
         number = source.whole(s, 0, "the surface's number", 0, MOST_SURFACES)
@@ -160,6 +161,7 @@ def _take(system: _System, s: Statement) -> None:
 
 
 def _take_system(system: _System, s: Statement) -> None:
+    """Process a statement about the system."""
     source = system.source
     match s.command:
         case "MODE":
@@ -208,6 +210,7 @@ def _take_system(system: _System, s: Statement) -> None:
 
 
 def _positive(source: Source, s: Statement, what: str) -> float:
+    """Return a number of a statement that must be positive."""
     value = source.finite(s, 0, what)
     if not value > 0.0:
         raise source.error(f"{what} is not greater than zero", s.line, s.text)
@@ -215,12 +218,14 @@ def _positive(source: Source, s: Statement, what: str) -> float:
 
 
 def _wave(source: Source, s: Statement, micrometres: float) -> float:
+    """Return a wavelength in metres of one in micrometres."""
     if not 0.1 <= micrometres <= 100.0:
         raise source.error("no wavelength of light", s.line, s.text, "0.1 to 100 um")
     return micrometres / 1e6
 
 
 def _take_surface(system: _System, surface: _Surface, s: Statement) -> None:
+    """Process a statement about a surface."""
     source = system.source
     match s.command:
         case "TYPE":
@@ -261,6 +266,7 @@ def _take_surface(system: _System, surface: _Surface, s: Statement) -> None:
 
 
 def _prescription(system: _System, glasses: Glasses) -> Prescription:
+    """Return the prescription of a file whose statements are read."""
     source, scale = system.source, system.scale
     waves = [system.waves[k] for k in sorted(system.waves) if not system.wave_count or k <= system.wave_count]
     if not waves:
@@ -310,12 +316,14 @@ def _prescription(system: _System, glasses: Glasses) -> Prescription:
 
 
 def _pairs(system: _System) -> tuple[tuple[float, float], ...]:
+    """Return the fields (x, y) of the file, missing numbers as 0."""
     count = system.field_count or max(len(system.x), len(system.y))
     x, y = ([*given, *[0.0] * count][:count] for given in (system.x, system.y))
     return tuple(zip(x, y, strict=True))
 
 
 def _fields(system: _System) -> tuple[tuple[float, float], ...]:
+    """Return the field angles, in radians."""
     for value in (value for pair in _pairs(system) for value in pair):
         if not abs(value) < 89.0:
             raise system.source.error("a field beyond 89 deg", system.field_line, value)
@@ -323,7 +331,7 @@ def _fields(system: _System) -> tuple[tuple[float, float], ...]:
 
 
 def _break(source: Source, chain: Chain, surface: _Surface, scale: float) -> None:
-    """A coordinate break."""
+    """Apply a coordinate break."""
     p = surface.parameters
     shift = (p.get(1, 0.0) * scale, p.get(2, 0.0) * scale, 0.0)
     turns = [about_axis(axis, math.radians(p.get(3 + axis, 0.0))) for axis in range(3)]
@@ -335,7 +343,7 @@ def _break(source: Source, chain: Chain, surface: _Surface, scale: float) -> Non
 
 
 def _behind(source: Source, surface: _Surface, wavelength: float, glasses: Glasses) -> tuple[float, str] | None:
-    """Index at the primary wavelength, and name, of what lies behind a surface; None for a mirror."""
+    """Return index at the primary wavelength, and name, of the medium behind a surface; None for a mirror."""
     words, line = surface.glass, surface.glass_line
     if not words:
         return 1.0, ""
@@ -349,7 +357,7 @@ def _behind(source: Source, surface: _Surface, wavelength: float, glasses: Glass
 
 
 def _shape(source: Source, surface: _Surface, scale: float) -> Surface:
-    """The surface's shape, metres."""
+    """Return the shape of a surface, in metres."""
     line = surface.kind_line or surface.line
     if surface.kind not in SHAPES:
         raise source.error("a kind of surface that is not known here", line, surface.kind, ", ".join(SHAPES))
@@ -387,7 +395,7 @@ def _shape(source: Source, surface: _Surface, scale: float) -> Surface:
 
 
 def _edges_of(surface: _Surface, scale: float) -> tuple[Aperture | None, tuple[Edge, ...]]:
-    """Clear aperture that the file states, and what it blocks; a semi-diameter alone is a drawing's."""
+    """Return the clear aperture of a surface, and its obscurations; a semi-diameter alone only serves drawings."""
     cx, cy = surface.centre
     centre = (cx * scale, cy * scale)
     sizes = {what: (first * scale, second * scale) for what, (_, first, second) in surface.edges.items()}

@@ -1,4 +1,4 @@
-"""From a camera's file and what is to be optimised to an optical prescription, and back to a camera's file."""
+"""Conversion between a camera's file, the prescription that an optimisation varies, and the file of its result."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 
 _RINGS = 5
 _ACROSS, _ALONG = (0.0, 0.5, 1.0), (-1.0, 0.0, 1.0)
-"""Fields, shares of the half angles; the others follow by symmetry."""
+"""Fields as fractions of the half angles; the others follow by symmetry."""
 
 
 class CameraDesignSetup(ExperimentSetup[CameraDesignSpec]):
@@ -47,7 +47,7 @@ class CameraDesignSetup(ExperimentSetup[CameraDesignSpec]):
 
 
 def prescription_of(camera: CameraSpec) -> Prescription:
-    """The prescription of a camera's file."""
+    """Return the optical prescription of a camera's file."""
     surfaces = {name: surface_of(mirror) for name, mirror in camera.mirrors.items()}
     image = VertexPose(camera.image.z, tilt=camera.image.tilt or 0.0)
     stands = {n: VertexPose(m.z) for n, m in camera.mirrors.items()}
@@ -55,13 +55,13 @@ def prescription_of(camera: CameraSpec) -> Prescription:
 
 
 def beams_of(camera: CameraSpec) -> Beams:
-    """Nine fields of one half of the camera's field."""
+    """Return nine fields of one half of the camera's field with their beams."""
     fields = [(x * camera.field.x, y * camera.field.y) for x in _ACROSS for y in _ALONG]
     return Beams(np.array(fields), camera.entrance_pupil, quadrature.disk(_RINGS))
 
 
 def operands_of(setup: CameraDesignSetup, principal_distance: float, envelope: float) -> Operands:
-    """What is asked for, given the start's principal distance and envelope, metres."""
+    """Return the operands of the merit function, given principal distance and envelope of the start, in metres."""
     test, camera = setup.test, setup.camera
     largest = None if test.envelope is None else test.envelope * envelope
     asked = camera.wavelength, principal_distance, largest, test.clearance, camera.edge_margin
@@ -69,7 +69,7 @@ def operands_of(setup: CameraDesignSetup, principal_distance: float, envelope: f
 
 
 def variables_of(spec: CameraDesignSpec) -> tuple[Variable, ...]:
-    """What varies; radii as curvatures."""
+    """Return the variables of an optimisation; radii vary as curvatures."""
     return tuple(
         Variable(name, "curvature" if quantity == "radius" else quantity)
         for name, quantities in spec.vary.items()
@@ -78,12 +78,12 @@ def variables_of(spec: CameraDesignSpec) -> tuple[Variable, ...]:
 
 
 def camera_of(start: CameraSpec, prescription: Prescription, name: str, description: str) -> CameraSpec:
-    """The camera of an optimised prescription: all that is not optics as in the start.
+    """Return the camera of an optimised prescription; everything but its optics is that of the start.
 
     Raises
     ------
     ValueError
-        Mirrors are tilted or surfaces decentred, which a camera's file cannot say.
+        Mirrors are tilted or surfaces decentred, which a camera's file cannot hold.
     """
     image = prescription.poses[IMAGE]
     if image.y or any(pose.y or pose.tilt for n, pose in prescription.poses.items() if n != IMAGE):
@@ -105,30 +105,30 @@ def camera_of(start: CameraSpec, prescription: Prescription, name: str, descript
 
 
 def with_plane(camera: CameraSpec, plane: FocalPlane) -> CameraSpec:
-    """The camera with another image plane; it remembers where it was read."""
+    """Return the camera with another image plane, keeping the location from which it was read."""
     image = ImageSpec.model_construct(z=plane.z, tilt=plane.tilt or None)
     return camera.model_copy(update={"image": image}).with_source(camera.source)
 
 
 def file_with_plane(camera: CameraSpec, plane: FocalPlane, name: str) -> str:
-    """Text of the camera's file with another image plane and name.
+    """Return the text of the camera's file with another image plane and name.
 
-    Data sheets that it names by a path relative to itself are named by their whole path, for the new file may pose
-    elsewhere. A camera that has no file of its own gets one without comments.
+    Data sheets that it names by a path relative to itself get their absolute path, since the new file may be stored
+    elsewhere. A camera without a file of its own gets one without comments.
 
     Parameters
     ----------
     camera : CameraSpec
-        As it was read.
+        The camera as it was read.
     plane : FocalPlane
-        Where its image is to be.
+        New image plane.
     name : str
-        Of the new camera.
+        Name of the new camera.
 
     Raises
     ------
     OSError
-        The camera's file is not there any more.
+        The camera's file no longer exists.
     """
     source = camera.source
     if source.prefix or not source.file:

@@ -1,19 +1,14 @@
-"""From a camera's prescription to bodies, elements and sequences, frame, apertures, stop and pivots.
+"""Cameras as traced: bodies, elements, sequences, frames, apertures, stop, pivots and paraxial data of a prescription.
 
 Frames. Prescription frame: z along the parent axis, light enters toward +z, y in the plane of symmetry, x along the
-line. A mirror's own frame stands at its vertex, turned as the file says. Camera frame: Z = line of sight toward the
+line. A mirror's own frame stands at its vertex, rotated as the file says. Camera frame: Z = line of sight toward the
 scene, Y = along the line CCD (= prescription x), X = Y x Z, the flight direction; its origin is the point where the
-centre's chief ray meets the first mirror. Focal-plane frame: origin at the line's centre, Y as the camera's, Z square
-to the image plane and toward the scene, X = Y x Z.
+chief ray of the field's centre meets the first mirror. Focal-plane frame: origin at the line's centre, Y as the
+camera's, Z square to the image plane and toward the scene, X = Y x Z.
 
-The axis of a camera: the ray that its paraxial data are about, the beam along it that the entrance pupil states, and
-what has no focus at all.
-
-Shared by the derivation of a camera and by whoever judges one in a state, where the same ray of the scene is traced
-through the bodies as they stand.
-
-Are the focal length and the entrance pupil that a camera's file states those of its surfaces, and if not, which
-number is wrong?
+The axis of a camera (``find_axis``) is the ray about which its paraxial data are taken; a system without a focus is
+refused (``AfocalError``). ``check_focal_length`` and ``check_entrance_pupil`` compare the focal length and the entrance
+pupil that a camera's file states with those of its surfaces, and name the number that is probably wrong.
 """
 
 from __future__ import annotations
@@ -57,32 +52,34 @@ from scenes.yaml.errors import InputError, KeyPath, key_text
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 
 LARGEST_DIFFERENCE = 0.1
-"""Share by which the traced focal length may differ from the stated one. The library's cameras need 0.5 % along the
-line and 8 % across it; a wrong sign or unit is seldom below a third.
+"""Largest relative difference allowed between the traced and the stated focal length. The library's cameras need 0.5 %
+along the line and 8 % across it; a wrong sign or unit seldom causes less than a third.
 """
 
 LARGEST_PUPIL_DIFFERENCE = 0.4
-"""Share by which the traced entrance pupil may differ from the stated one where the stop's diameter is stated as well.
-Of off-axis cameras the pupil of the axis is up to some 10 % from that of the field's middle, and the smallest mistake,
-a radius in place of a diameter, is a factor of two."""
+"""Largest relative difference allowed between the traced and the stated entrance pupil where the file states the stop's
+diameter as well. In off-axis cameras the pupil on the axis differs by up to some 10 % from that of the middle of the
+field; the smallest mistake, a radius in place of a diameter, is a factor of two.
+"""
 
 SAME_PUPIL = 0.01
-"""Share by which the beam that fills the stop may differ from the beam that made it: none about an axis; cameras with
-turned surfaces map one circle to another curve and back."""
+"""Largest relative difference between the beam that fills the stop and the beam from which the stop's size was
+computed. About an axis there is none; cameras with rotated surfaces map one circle to another curve and back.
+"""
 
 
 class TracedFocalLengths(NamedTuple):
-    """Focal lengths of a camera about the chief ray of its field's middle, metres.
+    """Focal lengths of a camera about the chief ray of the middle of its field, in metres.
 
     Attributes
     ----------
-    image : np.ndarray
-        Change of the image's place per angle, along the line and across it, (2,): on the plane that the file states, in
-        focus or not.
-    light : np.ndarray
-        Of parallel light, wherever its focus is: in the two principal directions about that ray, infinite without
-        power, and the effective focal length about the axis, (3,); negative where light diverges after the last
-        surface.
+    image : (2,) ndarray
+        Change of image position per angle, along the line and across it, on the plane that the file states, in focus or
+        not.
+    light : (3,) ndarray
+        Focal lengths for parallel light, wherever its focus is: in the two principal directions about that ray
+        (infinite without power), and the effective focal length about the axis; negative where light diverges after the
+        last surface.
     """
 
     image: np.ndarray
@@ -91,7 +88,7 @@ class TracedFocalLengths(NamedTuple):
 
 FocalLengths = Callable[[CameraSpec], TracedFocalLengths]
 
-_MOST_NAMED = 3  # causes in a message
+_MOST_NAMED = 3  # largest number of possible causes in a message
 
 _UNITS = ((1000.0, "m in place of mm"), (0.001, "mm in place of m"))
 
@@ -99,25 +96,25 @@ _NO_LIGHT = (AimError, BeamMissedError, ArithmeticError, np.linalg.LinAlgError, 
 
 
 def check_focal_length(spec: CameraSpec, traced: TracedFocalLengths, focal_lengths: FocalLengths) -> None:
-    """Check the stated focal length against the traced one.
+    """Raise InputError if the stated focal length differs from the traced one.
 
-    Either of the two directions will do, since cameras with surfaces off the axis differ in them. A camera that is only
-    out of focus is none of another focal length, unless a single number explains it: it can be refocused.
+    Agreement in one of the two directions is enough, since cameras with off-axis surfaces differ in them. A camera that
+    is merely out of focus passes, because it can be refocused, unless a single wrong number explains the difference.
 
     Parameters
     ----------
     spec : CameraSpec
         The camera.
     traced : TracedFocalLengths
-        Its focal lengths.
-    focal_lengths : FocalLengths
-        How those of a changed camera are traced; asked only to find out what is wrong.
+        Its traced focal lengths.
+    focal_lengths : callable
+        Function that traces the focal lengths of a changed camera; called only to find out which number is wrong.
 
     Raises
     ------
     InputError
-        They differ by more than ``LARGEST_DIFFERENCE``; with the number whose other sign or unit brings the focal
-        length to the stated one, where there is one.
+        The two differ by more than ``LARGEST_DIFFERENCE``. The error names the number whose other sign or unit brings
+        the focal length to the stated one, where there is one.
     """
     stated, real = spec.focal_length, bool(np.all(traced.light > 0.0))
     in_place, in_focus = (_difference(np.abs(one), stated) <= LARGEST_DIFFERENCE for one in traced)
@@ -127,43 +124,46 @@ def check_focal_length(spec: CameraSpec, traced: TracedFocalLengths, focal_lengt
     if suggestion is None and in_focus:
         return
     off = float(traced.light[-1] if in_place else traced.image[0])
-    problem = f"the focal length is stated as {stated:.4g} m, but light through the surfaces has one of {off:.4g} m"
+    problem = f"the stated focal length is {stated:.4g} m, but that of the surfaces is {off:.4g} m"
     allowed = f"the traced focal length within {100 * LARGEST_DIFFERENCE:.0f} %, or surfaces that have the stated one"
     raise spec.error(problem + cause, ("focal_length",), allowed=allowed, suggestion=suggestion)
 
 
 def check_entrance_pupil(spec: CameraSpec, traced: float) -> None:
-    """Check the stated entrance pupil of a camera against the traced diameter, metres.
+    """Raise InputError if the stated entrance pupil differs from the traced diameter, in metres.
 
     Raises
     ------
     InputError
-        They differ by more than ``LARGEST_PUPIL_DIFFERENCE`` where the stop is stated, else at all: other rays than
-        those of the stated beam meet the rim of the stop.
+        The two differ by more than ``LARGEST_PUPIL_DIFFERENCE`` where the file states the stop's diameter. Without a
+        stated stop: they differ by more than ``SAME_PUPIL``, because other rays than those of the stated beam meet the
+        rim of the stop.
     """
     off = abs(traced / spec.entrance_pupil - 1.0)
     if spec.stop_diameter is None and off > SAME_PUPIL:
-        problem = "rays of other heights than the stated beam's meet the rim of the stop, which stands near their focus"
-        raise spec.error(problem, ("stop",), allowed="a stop that rays of different heights meet in different places")
+        problem = "the rays at the rim of the stop are not those of the stated entrance pupil: the stop is near a focus"
+        raise spec.error(
+            problem, ("stop",), allowed="a stop away from a focus, which rays of each height meet elsewhere"
+        )
     if off > LARGEST_PUPIL_DIFFERENCE:
         stated, found = (format_quantity(float(f"{d:.4g}"), LENGTH) for d in (spec.entrance_pupil, traced))
-        problem = f"a stop of this size has an entrance pupil of {found} on the axis; the file states one of {stated}"
+        problem = f"a stop of this size has an entrance pupil of {found} on the axis, but the file states {stated}"
         allowed = f"both within {100 * LARGEST_PUPIL_DIFFERENCE:.0f} %, or the entrance pupil alone"
         raise spec.error(problem, ("stop_diameter",), allowed=allowed)
 
 
 def _difference(traced: np.ndarray, stated: float) -> float:
-    """Relative difference of the nearer direction."""
+    """Return the relative difference from the stated focal length in the direction that is nearer to it."""
     return float(np.min(np.abs(traced / stated - 1.0)))
 
 
 def _cause(spec: CameraSpec, traced: float, focal_lengths: FocalLengths, place: bool) -> tuple[str, str | None]:
-    """What is likely wrong, in words and as the line that would be right; nothing where no single number is."""
+    """Return the likely mistake, in words and as the corrected line of the file; empty if there is none."""
     for factor, what in _UNITS:
         if abs(factor * traced / spec.focal_length - 1.0) <= LARGEST_DIFFERENCE:
             right = format_quantity(spec.focal_length / factor, LENGTH)
-            return f"; the stated one is likely {what}", f"focal_length: {right}"
-    # surfaces that have the stated focal length are right: only where the image is taken may be wrong
+            return f"; the stated one is probably {what}", f"focal_length: {right}"
+    # Surfaces with the stated focal length are right: only the position of the image or the field may be wrong.
     for among in (_places(spec),) if place else (_single(spec), _places(spec), _together(spec)):
         fits = []
         for words, line, changed in among:
@@ -177,16 +177,16 @@ def _cause(spec: CameraSpec, traced: float, focal_lengths: FocalLengths, place: 
             fits.sort()
             others = ", ".join(words for _, words, _ in fits[1:_MOST_NAMED])
             also = f" (or {others})" if others else ""
-            return f"; the likely cause is {fits[0][1]}{also}", fits[0][2]
+            return f"; the probable cause is {fits[0][1]}{also}", fits[0][2]
     return "", None
 
 
 Candidates = Iterator[tuple[str, str, CameraSpec]]
-"""What may be wrong, the line that would be right, and the camera with it."""
+"""Possible mistakes: a description, the corrected line of the file, and the camera with the correction."""
 
 
 def _single(spec: CameraSpec) -> Candidates:
-    """One number of one surface."""
+    """Yield corrections of one number of one surface."""
     for name, mirror in spec.mirrors.items():
         for key, words, value, text in _changes(mirror):
             mirrors = {**spec.mirrors, name: mirror.model_copy(update={key: value})}
@@ -195,14 +195,14 @@ def _single(spec: CameraSpec) -> Candidates:
 
 
 def _together(spec: CameraSpec) -> Candidates:
-    """The sign of all radii, as another program has it."""
+    """Yield the camera with the opposite sign of all radii, the convention of some other programs."""
     turned = {name: mirror.model_copy(update={"radius": -mirror.radius}) for name, mirror in spec.mirrors.items()}
     line = "radius of every surface with the other sign: positive if its centre of curvature lies toward +z"
     yield "the sign of every radius", line, spec.model_copy(update={"mirrors": FrozenMap(turned)})
 
 
 def _places(spec: CameraSpec) -> Candidates:
-    """One number of the image or the field."""
+    """Yield corrections of one number of the image or of the field."""
     image = spec.image
     changes: list[tuple[KeyPath, str, dict[str, Any]]] = []
     for z, words in _lengths("z", image.z):
@@ -221,7 +221,7 @@ def _places(spec: CameraSpec) -> Candidates:
 
 
 def _changes(mirror: MirrorSpec) -> Iterator[tuple[str, str, Any, str]]:
-    """Key, what is wrong with it, its other value, and that as text."""
+    """Yield key, description of the mistake, corrected value, and that value as text, for every number of a mirror."""
     if math.isfinite(mirror.radius):
         for value, words in _lengths("radius", mirror.radius):
             yield "radius", words, value, format_quantity(value, LENGTH)
@@ -239,7 +239,7 @@ def _changes(mirror: MirrorSpec) -> Iterator[tuple[str, str, Any, str]]:
 
 
 def _lengths(what: str, value: float) -> Iterator[tuple[float, str]]:
-    """Other signs and units of a length."""
+    """Yield a length with the opposite sign and in other units, with a description of each mistake."""
     if value:
         yield -value, f"the sign of the {what}"
         for factor, words in _UNITS:
@@ -248,33 +248,34 @@ def _lengths(what: str, value: float) -> Iterator[tuple[float, str]]:
 
 PARENT_AXIS, LINE_AXIS = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
 LAUNCH_DISTANCE = 3.0
-"""How far before the prescription's origin beams from the scene are launched, metres."""
+"""Distance before the prescription's origin at which beams from the scene are launched, in metres."""
 AFOCAL = 1000.0
-"""Focal length, over the distance that light goes from the first surface to the image, from which on a system has no
-focus: the longest telescopes have some 20, and an afocal one whose spacing is rounded to 10 um some 10 000."""
+"""Ratio of focal length to the length of the light path from first surface to image above which a system counts as
+afocal. The longest telescopes have some 20, and an afocal one whose spacing is rounded to 10 um some 10 000.
+"""
 _RIM = 48
 
 
 class AfocalError(PhysicalError, ValueError):
-    """Parallel light leaves a system parallel: it has no focal length and makes no image."""
+    """Error of an afocal system, which leaves parallel light parallel: no focal length and no image."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraAxis:
-    """The light along the axis of a camera, in the prescription frame.
+    """Light along the axis of a camera, in the prescription frame.
 
     Attributes
     ----------
-    direction : np.ndarray
-        In which it travels, unit, (3,): along the parent axis, or along the light of the field's middle where none
-        comes through along that axis.
-    base : np.ndarray
-        Launch point of the ray that paraxial data are about, (3,), metres: on the parent axis where all mirrors and
-        lenses are about it, else that of the ray through the middle of the stop.
-    centre : np.ndarray
-        Launch point of the ray through the middle of the stop, (3,), metres.
+    direction : (3,) ndarray
+        Unit vector in which the light travels: along the parent axis, or along the light of the middle of the field
+        where no light comes through along that axis.
+    base : (3,) ndarray
+        Launch point of the ray about which paraxial data are taken, in metres: on the parent axis if all mirrors and
+        lenses are centred on it, otherwise that of the ray through the middle of the stop.
+    centre : (3,) ndarray
+        Launch point of the ray through the middle of the stop, in metres.
     on_axis : bool
-        Whether it travels along the parent axis.
+        Whether the light travels along the parent axis.
     """
 
     direction: np.ndarray
@@ -291,29 +292,29 @@ class CameraAxis:
 def find_axis(
     spec: CameraSpec, backend: Backend, to_stop: SystemBatch, imaging: SystemBatch, middle: np.ndarray
 ) -> tuple[CameraAxis, float]:
-    """Return the axis of a camera and the radius of its stop, metres.
+    """Return the axis of a camera and the radius of its stop, in metres.
 
-    The stop is as large as the file states, or as the beam along the axis makes it that has the diameter of the
-    entrance pupil before the first surface: its rays are traced to the stop, and the area that they enclose there is
-    the stop's.
+    The stop is as large as the file states. Without a stated diameter, rays along the axis that fill the diameter of
+    the entrance pupil before the first surface are traced to the stop, and the area that they enclose there is the
+    stop's.
 
     Parameters
     ----------
     spec : CameraSpec
         The camera.
     backend : Backend
-        Where to trace.
+        Backend that traces the rays.
     to_stop : SystemBatch
         One system, from the scene to the stop.
     imaging : SystemBatch
         One system, from the scene to the image.
-    middle : np.ndarray
-        Direction of the light of the field's middle, prescription frame, (3,).
+    middle : (3,) ndarray
+        Direction of the light of the middle of the field, in the prescription frame.
 
     Raises
     ------
     AimError, BeamMissedError
-        No light comes through, neither along the parent axis nor along the field's middle.
+        No light comes through, neither along the parent axis nor along that of the middle of the field.
     """
     try:
         return _along(spec, backend, to_stop, imaging, PARENT_AXIS)
@@ -324,7 +325,7 @@ def find_axis(
 def _along(
     spec: CameraSpec, backend: Backend, to_stop: SystemBatch, imaging: SystemBatch, direction: np.ndarray
 ) -> tuple[CameraAxis, float]:
-    """``find_axis`` along one direction. Raises AimError, BeamMissedError."""
+    """Return the axis along one direction and the radius of the stop. Raises AimError and BeamMissedError."""
     start, on_axis = -LAUNCH_DISTANCE * direction, np.array_equal(direction, PARENT_AXIS)
     centre = aim_collimated(backend, to_stop, direction[None], start[None], np.zeros((1, 2)))[0][0, 0]
     optics = [mirror for mirror in spec.mirrors.values() if mirror.light != "passes"]
@@ -338,12 +339,13 @@ def _along(
 
 
 def _ring() -> np.ndarray:
+    """Return the points of the rim of a unit circle, (_RIM, 2)."""
     turn = 2.0 * np.pi * np.arange(_RIM) / _RIM
     return np.stack([np.cos(turn), np.sin(turn)], axis=-1)
 
 
 def _require_light(backend: Backend, systems: SystemBatch, launch: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Return where rays from launch points (N, 3) end on the last surface, (N, 2). Raises BeamMissedError."""
+    """Return the points (N, 2) where rays from launch points (N, 3) end. Raises BeamMissedError."""
     place, _, _, valid = trace(backend, systems, make_rays(backend, launch, direction)).numpy()
     if not np.all(valid):
         raise BeamMissedError("the beam along the axis misses a surface")
@@ -351,19 +353,21 @@ def _require_light(backend: Backend, systems: SystemBatch, launch: np.ndarray, d
 
 
 def pupil_diameter(backend: Backend, to_stop: SystemBatch, axis: CameraAxis, radius: float) -> float:
-    """Return the diameter of the entrance pupil: that of the round beam along the axis with the area of the light,
-    before the first surface, that fills the stop, metres.
+    """Return the diameter of the entrance pupil, in metres.
+
+    It is the diameter of the round beam along the axis that has the same area, before the first surface, as the light
+    that fills the stop.
 
     Parameters
     ----------
     backend : Backend
-        Where to trace.
+        Backend that traces the rays.
     to_stop : SystemBatch
         One system, from the scene to the stop.
     axis : CameraAxis
-        In the same frame as the system.
+        Axis of the camera, in the same frame as the system.
     radius : float
-        Of the stop, metres.
+        Radius of the stop, in metres.
 
     Raises
     ------
@@ -382,15 +386,15 @@ def axis_data(
     Parameters
     ----------
     backend : Backend
-        Where to trace.
+        Backend that traces the rays.
     imaging : SystemBatch
         One system, from the scene to the image.
     spec : CameraSpec
         The camera.
     axis : CameraAxis
-        In the same frame as the system.
-    first : np.ndarray
-        Near this direction of that frame lies the first axis of the launch plane, (3,).
+        Axis of the camera, in the same frame as the system.
+    first : (3,) ndarray
+        Direction of that frame whose projection is the first axis of the launch plane.
 
     Raises
     ------
@@ -408,27 +412,27 @@ def axis_data(
     stop = list(spec.mirrors).index(spec.stop)
     matrix = ray_matrix(backend, imaging, stop, launch, direction, transverse_axes(direction, first[None]))
     data = paraxial(matrix, before, behind)
-    # what is no number is afocal as well
+    # A focal length that is not a number is afocal as well.
     if not data.focal_length < AFOCAL * (np.sum(steps) - before):
         raise AfocalError(
-            f"the system is afocal, with an angular magnification of {data.angular_magnification:.5g}: parallel light "
-            "leaves it parallel, so that it has no focal length and makes no image"
+            f"the system is afocal, with an angular magnification of {data.angular_magnification:.5g}: it has no focal "
+            "length and makes no image"
         )
     return data
 
 
 def focal_plane_body(root: str) -> str:
-    """Path of the focal-plane assembly of the camera at ``root``."""
+    """Return the path of the focal-plane assembly of the camera whose body is ``root``."""
     return f"{root}/focal_plane"
 
 
 def line_body(root: str) -> str:
-    """Path of the line CCDs on the focal-plane assembly of the camera at ``root``."""
+    """Return the path of the line CCD on the focal-plane assembly of the camera whose body is ``root``."""
     return f"{focal_plane_body(root)}/line"
 
 
 def camera_bodies(root: str, pose: Pose, model: CameraModel) -> list[Body]:
-    """The camera's structure at ``pose`` relative to its parent, mirrors, focal-plane assembly and line CCD."""
+    """Return the bodies of a camera: structure (at ``pose`` in its parent), mirrors, focal-plane assembly, line CCD."""
     into_camera = model.camera_frame.inverse()
     bodies = [Body(root, pose)]
     for mirror in model.mirrors:
@@ -445,7 +449,7 @@ def camera_bodies(root: str, pose: Pose, model: CameraModel) -> list[Body]:
 
 
 def camera_elements(name: str, root: str, model: CameraModel) -> dict[str, Element]:
-    """Mirrors and line CCD, by ``NAME/M1`` ... and ``NAME/line``."""
+    """Return the optical elements of a camera by name: ``NAME/M1`` ... and ``NAME/line``."""
     out = {}
     glass = lenses(model.spec)
     for mirror in model.mirrors:
@@ -461,7 +465,7 @@ def camera_elements(name: str, root: str, model: CameraModel) -> dict[str, Eleme
 
 
 def camera_sequences(name: str, model: CameraModel) -> dict[str, tuple[str, ...]]:
-    """Ways of the light: from the scene to the line CCD and to the stop, and back from the image."""
+    """Return the sequences of elements: scene to line CCD, scene to stop, image to stop, and image to scene."""
     forward = tuple(f"{name}/{m}" for m in model.mirrors)
     backward = forward[::-1]
     stop = f"{name}/{model.spec.stop}"
@@ -474,19 +478,20 @@ def camera_sequences(name: str, model: CameraModel) -> dict[str, tuple[str, ...]
 
 
 def shape_changes(model: CameraModel, root: str) -> dict[str, tuple[str, ...]]:
-    """What may change of the shapes and glasses of a camera's surfaces.
+    """Return the shape and glass parameters that may change on each surface of a camera.
 
     Parameters
     ----------
     model : CameraModel
-        Of the camera.
+        The camera.
     root : str
         Path of its body.
 
     Returns
     -------
     dict[str, tuple[str, ...]]
-        Body -> which of "figure", "radius", "conic", "index" and "abbe"; surfaces that light passes have none.
+        Path of each surface's body -> some of "figure", "radius", "conic", "index" and "abbe". Surfaces that light only
+        passes are not listed.
     """
     glass, dispersive = lenses(model.spec), above_d_line(model.spec)
     out = {}
@@ -502,7 +507,7 @@ ROOT = "camera"
 
 
 def camera_alone(model: CameraModel) -> Assembly:
-    """The camera by itself: bodies ``camera/M1`` ... ``camera/focal_plane``, sequences ``camera/imaging`` ..."""
+    """Return the assembly of one camera, with bodies ``camera/M1`` ... and sequences ``camera/imaging`` ..."""
     tree = RigidTree(tuple(camera_bodies(ROOT, Pose(), model)))
     index = {f"{ROOT}/{lens}": n for lens, n in glass_indices(model.spec).items()}
     above_d = {f"{ROOT}/{lens}": step for lens, step in above_d_line(model.spec).items()}
@@ -511,7 +516,7 @@ def camera_alone(model: CameraModel) -> Assembly:
 
 @dataclass(frozen=True, eq=False)
 class CameraUnderTest:
-    """A camera ready to be traced.
+    """Camera ready to be traced, with its departures from the prescription.
 
     Attributes
     ----------
@@ -520,7 +525,7 @@ class CameraUnderTest:
     assembly : Assembly
         Bodies ``camera/M1`` ... ``camera/focal_plane``, sequences ``camera/imaging`` ...
     as_built : State
-        How it departs from the prescription.
+        Departures of the camera from the prescription.
     """
 
     model: CameraModel
@@ -529,12 +534,12 @@ class CameraUnderTest:
 
 
 def build_camera_under_test(test: CameraUnderTestSpec, camera: CameraSpec, backend: Backend) -> CameraUnderTest:
-    """Build the camera and check what the test says of it.
+    """Build the camera of a test and check the test's statements about it.
 
     Raises
     ------
     InputError
-        ``as_built`` names what the camera does not have.
+        ``as_built`` names a part that the camera does not have.
     """
     camera.require_mirrors("a camera under test")
     model = derive_camera(camera, backend)
@@ -565,7 +570,7 @@ _RIM_POINTS = 24
 
 @dataclass(frozen=True, eq=False)
 class CameraModel:
-    """A camera's derived numbers; poses and points are in the prescription frame, metres and radians.
+    """Derived numbers of a camera; poses and points are in the prescription frame, in metres and radians.
 
     Attributes
     ----------
@@ -574,23 +579,23 @@ class CameraModel:
     surfaces : Mapping[str, Surface]
         Mirror name -> shape.
     apertures : Mapping[str, Aperture]
-        Mirror name -> clear aperture (the stop's is the stop itself).
+        Mirror name -> clear aperture; for the stop surface, the stop itself.
     camera_frame : Pose
         The camera frame in the prescription frame.
     focal_plane : Pose
         The focal-plane frame in the prescription frame.
     first_order : FirstOrder
-        Parabasal quantities about the centre's chief ray.
-    image_direction : np.ndarray
-        Direction of the centre's chief ray at the image.
-    rear_node : np.ndarray
+        Parabasal quantities about the chief ray of the field's centre.
+    image_direction : (3,) ndarray
+        Direction of that chief ray at the image.
+    rear_node : (3,) ndarray
         Point one principal distance (along the line) upstream of the line's centre along that ray.
     axis : CameraAxis
-        Light along its axis.
+        Light along the camera's axis.
     paraxial : Paraxial
         Paraxial data about that axis.
     entrance_pupil : float
-        Diameter of the entrance pupil, metres: of the beam along the axis that fills the stop.
+        Diameter of the entrance pupil, in metres: of the beam along the axis that fills the stop.
     """
 
     spec: CameraSpec
@@ -612,23 +617,24 @@ class CameraModel:
 
     @cached_property
     def edges(self) -> Mapping[str, tuple[Edge, ...]]:
-        """Mirror name -> what cuts light there beside the stop, of those that have it."""
+        """Mirror name -> edges that vignette light at that surface beside the stop, for the surfaces that have any."""
         given = {name: mirror.edges for name, mirror in self.spec.mirrors.items()}
         return {name: tuple(edge.to_edge() for edge in edges) for name, edges in given.items() if edges}
 
     def clear_aperture(self, mirror: str) -> Aperture:
-        """Return the outer edge of a surface's clear aperture, over which its figures are."""
+        """Return the outer edge of a surface's clear aperture, over which its figure terms are defined."""
         outer = outer_edge(self.apertures[mirror], self.edges.get(mirror, ()))
         assert outer is not None
         return outer
 
     def uncut(self, met: Callable[[str], np.ndarray]) -> np.ndarray | bool:
-        """Which rays all edges let through; True where there are none.
+        """Return a mask of the rays that pass all edges, or True if the camera has no edges.
 
         Parameters
         ----------
-        met : Callable[[str], np.ndarray]
-            Mirror name -> (..., 2 or 3) where rays meet it, in its own frame, metres of the nominal mirror.
+        met : callable
+            Function from a mirror's name to the points (..., 2 or 3) at which rays meet it, in the mirror's own frame,
+            in metres of the nominal mirror.
         """
         through: np.ndarray | bool = True
         for name, edges in self.edges.items():
@@ -639,94 +645,99 @@ class CameraModel:
 
     @property
     def line_principal_distance(self) -> float:
-        """Local principal distance along the line about the centre's chief ray, metres (the papers' f)."""
+        """Local principal distance along the line about the field's central chief ray, in metres (the papers' f)."""
         return float(abs(self.first_order.scale[0, 0, 0]))
 
     def vertex(self, mirror: str) -> np.ndarray:
-        """Vertex of a mirror's parent surface in the prescription frame, metres."""
+        """Return the vertex of a mirror's parent surface in the prescription frame, in metres."""
         return self.mirror_pose(mirror).translation
 
     def mirror_pose(self, mirror: str) -> Pose:
-        """Pose of a mirror's own frame in the prescription frame."""
+        """Return the pose of a mirror's own frame in the prescription frame."""
         return mirror_pose(self.spec.mirrors[mirror])
 
     @property
     def image_body(self) -> Pose:
-        """Pose of the image plane in the prescription frame: its origin is on the parent axis."""
+        """Pose of the image plane in the prescription frame, with its origin on the parent axis."""
         return image_pose(self.spec)
 
     def toward_optics(self, focal_plane: np.ndarray) -> np.ndarray:
-        """Direction from the line's centre along its chief ray, upstream, for rotations (..., 3, 3) of the focal plane
-        in the world.
+        """Return the unit vector from the line's centre along its chief ray, upstream, in the world.
+
+        Parameters
+        ----------
+        focal_plane : (..., 3, 3) ndarray
+            Rotations of the focal plane in the world.
         """
         return matvec(focal_plane, matvec(self.focal_plane.rotation.T, -self.image_direction))
 
     def bare_assembly(self, apertures: bool = True) -> Assembly:
-        """The camera alone, in the prescription frame: mirrors and image plane."""
+        """Return the assembly of mirrors and image plane alone, in the prescription frame."""
         return _bare(self.spec, self.surfaces, self.apertures if apertures else {})
 
 
 def field_direction(spec: CameraSpec, x: float, y: float) -> np.ndarray:
-    """Direction in which light of field (x, y) travels, prescription frame; y counts from the biased centre,
-    radians.
+    """Return the direction in which light of field (x, y) travels, in the prescription frame.
+
+    Angles are in radians; y counts from the biased centre of the field.
     """
     return direction_of((x, spec.field_bias + y))
 
 
 def mirror_pose(mirror: MirrorSpec) -> Pose:
-    """Pose of a mirror's own frame in the prescription frame: its vertex, and the axes of its shape."""
+    """Return the pose of a mirror's own frame, vertex and axes of its shape, in the prescription frame."""
     x, y = mirror.decentre or (0.0, 0.0)
     rotation = rotation_matrix(mirror.rotate) if mirror.rotate and any(mirror.rotate) else np.eye(3)
     return Pose(rotation, np.array([x, y, mirror.z]))
 
 
 def image_pose(spec: CameraSpec) -> Pose:
-    """Pose of the image plane's body in the prescription frame: on the parent axis, turned by the plane's tilt."""
+    """Return the pose of the image plane, tilted on the parent axis, in the prescription frame."""
     rotation = about_axis(0, spec.image.tilt) if spec.image.tilt else np.eye(3)
     return Pose(rotation, np.array([0.0, 0.0, spec.image.z]))
 
 
 def collimated(backend: Backend, to_stop: SystemBatch, directions: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Launch points of collimated beams that meet the stop at given points.
+    """Return launch points of collimated beams that meet the stop at given points.
 
     Parameters
     ----------
     backend : Backend
-        Where to trace.
+        Backend that traces the rays.
     to_stop : SystemBatch
         One system, from the scene to the stop.
-    directions : np.ndarray
-        (F, 3) beam directions.
-    targets : np.ndarray
-        (N, 2) stop coordinates, metres, the same for every beam.
+    directions : (F, 3) ndarray
+        Directions of the beams.
+    targets : (N, 2) ndarray
+        Stop coordinates, in metres, the same for every beam.
 
     Returns
     -------
-    np.ndarray
-        (F, N, 3) points on a plane before the first mirror, prescription frame.
+    (F, N, 3) ndarray
+        Points on a plane before the first mirror, in the prescription frame.
     """
     every = to_stop.take(np.zeros(len(directions), dtype=int))
     return aim_collimated(backend, every, directions, -LAUNCH_DISTANCE * directions, targets)[0]
 
 
 def derive_camera(spec: CameraSpec, backend: Backend, stated: bool = True) -> CameraModel:
-    """Trace a prescription and work out frames, stop, apertures and first-order numbers.
+    """Trace a prescription and derive frames, stop, apertures and first-order numbers from it.
 
     Parameters
     ----------
     spec : CameraSpec
         The prescription.
     backend : Backend
-        Where to trace.
+        Backend that traces the rays.
     stated : bool
-        Whether its focal length is held against the traced one; it is not while a file is made, whose focal length
+        Whether the stated focal length is compared with the traced one; False while a file is made, whose focal length
         follows from the trace.
 
     Raises
     ------
     InputError
-        The prescription does not bring the light of its field through the stop to the image, or has another focal
-        length than it states.
+        The prescription does not bring the light of its field through the stop to the image, or its focal length
+        differs from the stated one.
     """
     try:
         return _derived(spec, backend, stated)
@@ -734,13 +745,13 @@ def derive_camera(spec: CameraSpec, backend: Backend, stated: bool = True) -> Ca
         raise spec.error(str(error), ("mirrors",), allowed="surfaces that focus light on the image") from error
     except (AimError, BeamMissedError) as error:
         reason = str(error).partition(";")[0]
-        problem = f"no light of the whole field comes through the stop to the image: {reason}"
-        allowed = "mirrors, image, field and stop that belong together"
+        problem = f"light of the full field does not reach the image through the stop: {reason}"
+        allowed = "consistent mirrors, image, field and stop"
         raise spec.error(problem, ("mirrors",), allowed=allowed) from error
 
 
 def _focal_lengths(chief: RayMatrix, about_axis: Paraxial) -> TracedFocalLengths:
-    """About a chief ray, and the effective focal length about the axis."""
+    """Return the focal lengths about a chief ray together with the effective focal length about the axis."""
     power = np.linalg.svd(chief.direction_by_position[0], compute_uv=False)
     with np.errstate(divide="ignore"):
         light = np.copysign([*1.0 / power, about_axis.focal_length], about_axis.back_focal_length)
@@ -748,7 +759,7 @@ def _focal_lengths(chief: RayMatrix, about_axis: Paraxial) -> TracedFocalLengths
 
 
 def _traced_focal_lengths(spec: CameraSpec, backend: Backend) -> TracedFocalLengths:
-    """`_focal_lengths` of a prescription. Raises AimError, BeamMissedError, AfocalError."""
+    """Trace the focal lengths of a prescription. Raises AimError, BeamMissedError and AfocalError."""
     bare = _bare(spec, {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}, {})
     to_stop, imaging, _, matrix = _chief(spec, backend, bare)
     axis, _ = find_axis(spec, backend, to_stop, imaging, field_direction(spec, 0.0, 0.0))
@@ -758,9 +769,7 @@ def _traced_focal_lengths(spec: CameraSpec, backend: Backend) -> TracedFocalLeng
 def _chief(
     spec: CameraSpec, backend: Backend, bare: Assembly
 ) -> tuple[SystemBatch, SystemBatch, np.ndarray, RayMatrix]:
-    """Return the systems to the stop and to the image, the launch point (1, 3) of the centre's chief ray, and its
-    derivatives.
-    """
+    """Return the systems to stop and image, the launch point (1, 3) of the centre's chief ray, and its derivatives."""
     names = tuple(spec.mirrors)
     stop = names.index(spec.stop)
     centre = field_direction(spec, 0.0, 0.0)
@@ -771,7 +780,7 @@ def _chief(
 
 
 def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
-    """Return the model as `derive_camera` does. Raises AimError, BeamMissedError, AfocalError."""
+    """Return the model as `derive_camera` does. Raises AimError, BeamMissedError and AfocalError."""
     surfaces = {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}
     names = tuple(spec.mirrors)
     bare = _bare(spec, surfaces, {})
@@ -793,7 +802,7 @@ def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
 
     sight = -centre
     across = np.cross(LINE_AXIS, sight)
-    # baffles may stand before it
+    # Baffles may precede the first mirror.
     first = next(k for k, name in enumerate(names) if name == spec.stop or spec.mirrors[name].light != "passes")
     origin = mirror_pose(spec.mirrors[names[first]]).apply(traced.hit(first)[0, 0])
     camera_frame = Pose(np.stack([across, LINE_AXIS, sight], axis=-1), origin)
@@ -801,7 +810,7 @@ def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
     focal_plane = Pose(np.stack([np.cross(LINE_AXIS, normal), LINE_AXIS, normal], axis=-1), image_centre)
 
     apertures = _apertures(spec, backend, to_stop, imaging, stop_radius)
-    distance = float(abs(chief.scale[0, 0, 0]))  # along the line, as the papers use it
+    distance = float(abs(chief.scale[0, 0, 0]))  # along the line, as in the papers
     rear_node = image_centre - distance * image_direction
     if stated or spec.stop_diameter is None:
         check_entrance_pupil(spec, pupil)
@@ -810,7 +819,7 @@ def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
 
 
 def surface_of(mirror: MirrorSpec) -> Surface:
-    """The shape of a mirror of a camera's file; terms A4, A6, ... that stand between others and are not given are 0."""
+    """Return the shape of a mirror of a camera's file; even terms A4, A6, ... that the file skips are 0."""
     last = max((int(name[1:]) for name in mirror.aspheric), default=2)
     even = tuple(float(mirror.aspheric.get(f"A{n}", 0.0)) for n in range(4, last + 1, 2))
     return Surface(1.0 / mirror.radius, mirror.conic, even, terms=tuple((mirror.sag or {}).values()))
@@ -820,7 +829,7 @@ LIGHT = {None: Interaction.REFLECT, "refracts": Interaction.REFRACT, "passes": I
 
 
 def lenses(spec: CameraSpec) -> dict[str, str]:
-    """Face -> the lens that it is a face of, called by its first face; so light may go either way."""
+    """Return the lens of each refracting face, named by the lens's first face."""
     out, inside = {}, ""
     for name, mirror in spec.mirrors.items():
         if mirror.light == "refracts":
@@ -830,20 +839,20 @@ def lenses(spec: CameraSpec) -> dict[str, str]:
 
 
 def glass_indices(spec: CameraSpec, wavelength: float | None = None) -> dict[str, float]:
-    """Lens -> its refractive index at a wavelength, metres; at that of the design by default.
+    """Return the refractive index of each lens at a wavelength in metres, by default the design wavelength.
 
     Raises
     ------
     ValueError
-        a lens whose glass is not named, or not known there.
+        The glass of a lens is not named, or its index is not known at the wavelength.
     """
     return {name: spec.index_behind(name, wavelength) for name in dict.fromkeys(lenses(spec).values())}
 
 
 def above_d_line(spec: CameraSpec) -> dict[str, float]:
-    """Lens whose glass has an Abbe number -> its index at the design wavelength less that at the d line.
+    """Return index at the design wavelength minus index at the d line, of each lens with an Abbe number.
 
-    A glass has one where it is known at the lines d, F and C.
+    A glass has an Abbe number where its index is known at the lines d, F and C.
     """
     out = {}
     for name, index in glass_indices(spec).items():
@@ -854,39 +863,39 @@ def above_d_line(spec: CameraSpec) -> dict[str, float]:
 
 
 def coloured(spec: CameraSpec, root: str, state: State, wavelength: float) -> State:
-    """A state as light of another wavelength than the design's meets it: its lenses have other indices.
+    """Return a state for light of another wavelength than the design's, in which the lenses have other indices.
 
-    What the state itself says of an index, as heat does, is added to that of the wavelength.
+    Changes of index in the state itself, such as those of heat, are added to the change by the wavelength.
 
     Parameters
     ----------
     spec : CameraSpec
-        Of the camera.
+        The camera.
     root : str
         Path of its body; empty for a bare camera.
     state : State
         Body path -> motion.
     wavelength : float
-        metres.
+        Wavelength of the light, in metres.
 
     Returns
     -------
     State
-        The state, with the change of index of every lens; the same one for a camera without lenses, and at the design
+        The state with the change of index of every lens; unchanged for a camera without lenses, and at the design
         wavelength.
 
     Raises
     ------
     ValueError
-        As ``glass_indices``.
+        The glass of a lens is not named, or its index is not known at the wavelength.
     """
     return in_glass(state, glass_steps(spec, root, wavelength))
 
 
 def glass_steps(spec: CameraSpec, root: str, wavelength: float) -> dict[str, float]:
-    """Body of a lens -> its index at a wavelength less that of the design wavelength; empty for none.
+    """Return the index of each lens at a wavelength minus that at the design wavelength, by the lens's body.
 
-    Arguments and exceptions as of ``coloured``.
+    The result is empty if nothing changes. Arguments and exceptions are those of ``coloured``.
     """
     if wavelength == spec.wavelength or not lenses(spec):
         return {}
@@ -896,16 +905,16 @@ def glass_steps(spec: CameraSpec, root: str, wavelength: float) -> dict[str, flo
 
 
 def in_glass(state: State, steps: Mapping[str, float]) -> State:
-    """A state as light meets it whose indices are those of the design's wavelength and ``steps``.
+    """Return a state with changes of the lenses' indices added to it.
 
-    A glass with another Abbe number disperses more or less than the catalogue's.
+    A glass with another Abbe number disperses more or less than the catalogue's, by the state's ``dispersion``.
 
     Parameters
     ----------
     state : State
         Body path -> motion.
     steps : Mapping[str, float]
-        Of ``glass_steps``.
+        Changes of index as ``glass_steps`` returns them.
     """
     if not steps:
         return state
@@ -917,6 +926,7 @@ def in_glass(state: State, steps: Mapping[str, float]) -> State:
 
 
 def _bare(spec: CameraSpec, surfaces: Mapping[str, Surface], apertures: Mapping[str, Aperture]) -> Assembly:
+    """Return the assembly of mirrors and image plane with these surfaces and apertures."""
     bodies = [Body(name, mirror_pose(m)) for name, m in spec.mirrors.items()]
     bodies.append(Body(IMAGE, image_pose(spec)))
     glass = lenses(spec)
@@ -932,9 +942,11 @@ def _bare(spec: CameraSpec, surfaces: Mapping[str, Surface], apertures: Mapping[
 def _apertures(
     spec: CameraSpec, backend: Backend, to_stop: SystemBatch, imaging: SystemBatch, stop_radius: float
 ) -> dict[str, Aperture]:
-    """Return the clear apertures: the stop, and of the other surfaces the outline of the beams of the whole field with
-    the margin about them. A mirror or a lens about its own axis is round, as it is made: a circle about its vertex,
-    and an ellipse where it is flat, as a slanted flat is that light meets round. Others have a box.
+    """Return the clear apertures of all surfaces.
+
+    That of the stop surface is the stop. The others enclose the beams of the whole field with the edge margin around
+    them. A mirror or a lens centred on its own axis is round, as it is made: a circle about its vertex, or an ellipse
+    where it is flat, like a slanted flat in a round beam. The remaining ones are rectangles.
     """
     angle = 2.0 * np.pi * np.arange(_RIM_POINTS) / _RIM_POINTS
     rim = stop_radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -957,18 +969,19 @@ def _apertures(
         half, middle = 0.5 * (high - low), 0.5 * (high + low)
         box = Rectangle(float(half[0]), float(half[1]), (float(middle[0]), float(middle[1])))
         hits = np.where(valid[0, :, None], traced.hit(i)[0, :, :2], np.nan).reshape(len(fields), _RIM_POINTS, 2)
-        hits = hits[~np.isnan(hits).all(axis=(1, 2))]  # fields whose light is lost say nothing of an outline
+        hits = hits[~np.isnan(hits).all(axis=(1, 2))]  # fields without light do not determine an outline
         out[name] = box if spec.mirrors[name].light == "passes" else _made(box, hits, spec, name)
     return out
 
 
 _ABOUT_AXIS = 0.5
-"""Distance of the middle of all beams from a surface's vertex, of their half-width, up to which the surface is about
-its own axis: below 0.13 for mirrors of telescopes on their axis, above 1 for off-axis ones."""
+"""Largest distance of the middle of all beams from a surface's vertex, relative to their half-width, at which the
+surface counts as centred on its own axis. Mirrors of on-axis telescopes are below 0.13, off-axis ones above 1.
+"""
 
 
 def _made(box: Rectangle, hits: np.ndarray, spec: CameraSpec, name: str) -> Aperture:
-    """Return the outline of a surface as it is made for beams whose rims meet it at (F, N, 2), NaN for lost rays."""
+    """Return the outline of a manufactured surface for beams whose rims meet it at (F, N, 2), NaN for lost rays."""
     margin = spec.edge_margin
     if np.hypot(*box.centre) > _ABOUT_AXIS * min(box.half_x, box.half_y):
         return box
@@ -976,7 +989,7 @@ def _made(box: Rectangle, hits: np.ndarray, spec: CameraSpec, name: str) -> Aper
         half = np.array([box.half_x, box.half_y]) - margin
         half *= np.nanmax(np.hypot(*np.moveaxis((hits - box.centre) / half, -1, 0)))
         return Ellipse(float(half[0] + margin), float(half[1] + margin), box.centre)
-    # a rim between the traced points is no farther off than the beam's middle and radius together
+    # Between the traced points the rim is no farther away than the beam's middle and radius together.
     middle = np.nanmean(hits, axis=1)
     radius = np.nanmax(np.hypot(*np.moveaxis(hits - middle[:, None], -1, 0)), axis=1) + np.hypot(*middle.T)
     return Circle(float(np.nanmax(radius)) + margin)

@@ -1,8 +1,8 @@
-"""How sharp a camera is as designed, from a few hundred rays, and where its focal plane would be best.
+"""Sharpness of a camera as designed, from a few hundred rays, and the position of its best focal plane.
 
-Errors are as ``optics.waves.imaging`` has them: rms over the stop about the sphere that stands around the chief
-ray's image, piston and tilt taken out, in waves of the camera's own wavelength. The best focal plane has the least
-mean square of them over the field.
+Wavefront errors follow ``optics.waves.imaging``: rms over the stop about the sphere centred on the chief ray's image,
+piston and tilt removed, in waves of the camera's design wavelength. The best focal plane has the least mean square
+error over the field.
 """
 
 from __future__ import annotations
@@ -27,43 +27,46 @@ from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.spec import Spec
 
 BLURRED = 0.25
-"""Wavefront error beyond which a camera is told to be blurred, waves rms: a Strehl ratio of 0.08, and for the library's
-cameras next to no contrast at the Nyquist frequency. Marechal's limit of a sharp one is 1/14."""
+"""Wavefront error above which a camera is reported as blurred, waves rms. It is a Strehl ratio of 0.08, and for the
+library's cameras nearly no contrast at the Nyquist frequency. Marechal's limit of a sharp camera is 1/14.
+"""
 
 FIELDS = tuple((x, y) for x in (-1.0, -0.5, 0.0, 0.5, 1.0) for y in (-1.0, 0.0, 1.0))
-"""Shares of the half field along the line and along the track, at which a camera is judged and its focus sought."""
+"""Fields at which a camera is assessed and its focus sought, as fractions of the half field along the line and along
+the track.
+"""
 
 _RINGS = 3
 """Rings of the quadrature over the stop: exact for squares of wavefronts to fifth order."""
 
 EVEN = 10_000
-"""Rays of a beam that edges of surfaces cut, evenly over the stop. What they take is right to 0.1 %, and rms wavefront
-errors of what they leave to 0.2 %: of HSC at nine fields against a million rays. Rings of Gauss' rule, along which an
-edge may go, were wrong by up to a fifth.
+"""Number of rays, evenly over the stop, of a beam that edges of surfaces vignette. The vignetted share is then right to
+0.1 % and the rms wavefront error of the rest to 0.2 % (HSC at nine fields against a million rays). Rings of Gauss'
+rule, which an edge may follow, were wrong by up to a fifth.
 """
 
 _STEPS = 6
 _DIFFERENCE = 1e-4
-"""By which the focal plane is moved and turned for derivatives, metres and radians: far more than rounding, and the
-errors are linear over it."""
+"""Step of the focal plane for derivatives, metres and radians: far above rounding, and the errors are linear over it.
+"""
 
 _MOST_RAYS = 500_000
-"""Traced together."""
+"""Largest number of rays traced together, to limit memory."""
 
 _FEW_FIELDS = tuple((x, y) for x in (0.0, 1.0) for y in (-1.0, 0.0, 1.0))
-"""For a quick judgement: a camera of surfaces of revolution is the same on both sides of its plane of symmetry."""
+"""Fields of the quick check: a camera of surfaces of revolution is the same on both sides of its plane of symmetry."""
 
 
 @dataclass(frozen=True)
 class FocalPlane:
-    """Where a camera's image plane stands.
+    """Position and tilt of a camera's image plane.
 
     Attributes
     ----------
     z : float
-        Where it crosses the parent axis, metres.
+        Position at which it crosses the parent axis, in metres.
     tilt : float
-        About the prescription's x, at the parent axis, radians; 0 stands square to the axis.
+        Rotation about the prescription's x at the parent axis, in radians; 0 is square to the axis.
     """
 
     z: float
@@ -71,59 +74,62 @@ class FocalPlane:
 
     @classmethod
     def of(cls, camera: CameraSpec) -> FocalPlane:
-        """A camera's own."""
+        """Return the image plane that a camera's file states."""
         return cls(camera.image.z, camera.image.tilt or 0.0)
 
 
 MIN_ILLUMINATED = 20
-"""Of ``EVEN`` rays those that have to come through a field's edges: of fewer, two in a thousand, nothing is told."""
+"""Least number of the ``EVEN`` rays that must pass a field's edges; with fewer, two in a thousand, no error is
+computed.
+"""
 
 Cut = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""What bodies about a camera take of beams of fields (F, 2) at points (N, 2) of the stop, in units of its radius: True
-where they stop the light, (F, N).
+"""Function that returns which rays bodies about a camera block, (F, N) of bool, for fields (F, 2) and points (N, 2) of
+the stop in units of its radius.
 """
 
 
 def stop_nodes(model: CameraModel, rings: int, cut: bool = False) -> PupilNodes:
-    """Nodes of the stop at which every judgement of a camera's light is made.
+    """Return the nodes of the stop at which a camera's light is evaluated.
 
-    Where nothing but the stop limits a beam, Gauss' rule of ``rings``, exact for smooth wavefronts; where edges cut it,
-    ``EVEN`` points whatever the rings, so that all that is told of such a beam is of the same rays.
+    Where nothing but the stop limits a beam, these are Gauss' rule with ``rings`` rings, exact for smooth wavefronts.
+    Where edges vignette it they are ``EVEN`` points regardless of the rings, so that all results of such a beam use the
+    same rays.
 
     Parameters
     ----------
     model : CameraModel
-        Of the camera.
+        The camera.
     rings : int
-        Of Gauss' rule.
+        Number of rings of Gauss' rule.
     cut : bool
-        Whether bodies about the camera cut the beam, too.
+        Whether bodies about the camera vignette the beam, too.
     """
     return quadrature.even_disk(EVEN) if model.edges or cut else quadrature.disk(rings)
 
 
 @dataclass(frozen=True, eq=False)
 class FieldBeams:
-    """Beams of F fields near the image, in the prescription frame; of each the chief ray, then N of a quadrature.
+    """Beams of F fields near the image, in the prescription frame: the chief ray of each, then N rays of a quadrature.
 
     Attributes
     ----------
     camera : CameraSpec
-        whose.
-    fields : np.ndarray
-        Shares of the half field, (F, 2).
+        The camera.
+    fields : (F, 2) ndarray
+        Fields as fractions of the half field.
     nodes : PupilNodes
-        Of the stop, N.
-    position, direction : np.ndarray
-        (F, 1 + N, 3), metres and unit.
-    path : np.ndarray
-        Optical path from the incoming wavefront, (F, 1 + N), metres.
+        The N nodes of the stop.
+    position, direction : (F, 1 + N, 3) ndarray
+        Points on the rays, in metres, and unit vectors.
+    path : (F, 1 + N) ndarray
+        Optical path from the incoming wavefront, in metres.
     exit_pupil : float
-        From the camera's own image to its exit pupil, upstream, metres.
-    room : np.ndarray
-        From the last mirror along the chief ray to the camera's own image, (F,), metres.
-    lit : np.ndarray | None
-        Which of the N rays edges of surfaces let through, (F, N); None for all.
+        Distance from the stated image plane upstream to the exit pupil, in metres.
+    room : (F,) ndarray
+        Distance from the last mirror along the chief ray to the stated image plane, in metres.
+    lit : (F, N) ndarray of bool or None
+        Rays that are not vignetted; None if none is.
     """
 
     camera: CameraSpec
@@ -146,18 +152,19 @@ class FieldBeams:
         cut: Cut | None = None,
         wavelength: float | None = None,
     ) -> FieldBeams:
-        """Trace them through the camera as designed; nothing but the stop, edges of surfaces and ``cut`` limits them.
+        """Trace the beams through the camera as designed, limited by the stop, by edges of surfaces and by ``cut``.
 
-        ``wavelength`` is that of the light, metres; the design wavelength by default. Errors stay in waves of that.
+        ``wavelength`` is that of the light, in metres, by default the design wavelength. Errors stay in waves of the
+        design wavelength.
 
         Raises
         ------
         AimError, BeamMissedError
             Light of a field does not come through.
         InputError
-            Edges stop all of it.
+            Edges block all of it.
         ValueError
-            a glass is not known at the wavelength.
+            The index of a glass is not known at the wavelength.
         """
         spec, nodes = model.spec, stop_nodes(model, rings, cut is not None)
         bare = model.bare_assembly(apertures=False)
@@ -181,12 +188,10 @@ class FieldBeams:
             lit = valid.reshape(shape)[:, 1:]
             dark = np.flatnonzero(np.sum(lit, axis=-1) < MIN_ILLUMINATED)
             if dark.size:
-                found = (
-                    f"field {field_text(spec, fields[dark[0]])}, {dark.size} of {len(fields)} fields that were tried"
-                )
+                found = f"field {field_text(spec, fields[dark[0]])}, {dark.size} of {len(fields)} fields tested"
                 key = ("mirrors", next(iter(model.edges)), "edges")
                 raise spec.error(
-                    "edges leave no light to speak of", key, found=found, allowed="a smaller field, or wider edges"
+                    "edges block practically all light", key, found=found, allowed="a smaller field, or wider edges"
                 )
         if cut is not None:
             free = ~cut(np.array(fields), points[1:] / radius)
@@ -215,8 +220,11 @@ class FieldBeams:
         rings: int,
         cut: Cut | None = None,
     ) -> np.ndarray:
-        """Rms wavefront errors at many fields (F, 2) on the own focal plane, (F,), waves. Raises as ``trace``."""
-        # as many at once as the memory takes: some 100 MB
+        """Return the rms wavefront errors at many fields (F, 2) on the stated image plane, (F,), in waves.
+
+        Exceptions are those of ``trace``.
+        """
+        # Fields are traced in parts, which limits the memory to some 100 MB.
         step = max(1, _MOST_RAYS // stop_nodes(model, rings, cut is not None).count)
         parts = [tuple(fields[k : k + step]) for k in range(0, len(fields), step)]
         plane = FocalPlane.of(model.spec)
@@ -224,24 +232,24 @@ class FieldBeams:
 
     @property
     def share(self) -> np.ndarray:
-        """Share of each ray in the light that comes through, (N,), or (F, N) where edges stop some."""
+        """Fraction of the transmitted light that each ray carries, (N,), or (F, N) where some rays are vignetted."""
         if self.lit is None:
             return self.nodes.share
         share = self.nodes.share * self.lit
         return np.asarray(share / np.sum(share, axis=-1, keepdims=True))
 
     def _away(self, plane: FocalPlane) -> np.ndarray:
-        """From the camera's own image along each ray to a plane, (F, 1 + N), metres."""
+        """Return the distance from the stated image plane along each ray to another plane, (F, 1 + N), in metres."""
         point = np.array([0.0, 0.0, plane.z])
         normal = np.array([0.0, -np.sin(plane.tilt), np.cos(plane.tilt)])
         return np.asarray(((point - self.position) @ normal) / (self.direction @ normal))
 
     def reaches(self, plane: FocalPlane) -> bool:
-        """Whether the light meets the plane after its last mirror."""
+        """Return True if the light meets the plane after its last mirror."""
         return bool(np.all(self.room + self._away(plane)[:, 0] > 0.0))
 
     def wavefronts(self, plane: FocalPlane) -> np.ndarray:
-        """Wavefront errors about the images on a plane, piston and tilt out, (F, N), waves; 0 where no light comes."""
+        """Return wavefront errors (F, N), without piston and tilt, for a focal plane, in waves; 0 if vignetted."""
         away = self._away(plane)
         position, path = self.position + away[..., None] * self.direction, self.path + away
         to_sphere = path_to_sphere(position, self.direction, path, position[:, :1], self.exit_pupil)
@@ -249,23 +257,23 @@ class FieldBeams:
         error = (to_sphere[:, :1] - to_sphere)[:, 1:] / self.camera.wavelength
         if self.lit is not None:
             return np.stack([_levelled(one, basis, share) for one, share in zip(error, self.share, strict=True)])
-        # the first three terms are orthonormal over the disk, and the rule is exact for their products
+        # The first three terms are orthonormal over the disk, and the rule is exact for their products.
         return np.asarray(error - (error * self.nodes.share) @ basis @ basis.T)
 
     def errors(self, plane: FocalPlane) -> np.ndarray:
-        """Rms wavefront error at each field, (F,), waves."""
+        """Return the rms wavefront error at each field, (F,), in waves."""
         squares = self.wavefronts(plane) ** 2
         if self.lit is not None:
             return np.asarray(np.sqrt(np.sum(squares * self.share, axis=-1)))
         return np.asarray(np.sqrt(squares @ self.nodes.share))
 
     def best_plane(self, tilt: bool = False) -> FocalPlane:
-        """The plane with the least mean square error over the fields; turned about x as well, if asked for."""
+        """Return the plane (shifted, and tilted about x if ``tilt`` is set) with the least mean square error."""
         start, root = FocalPlane.of(self.camera), np.sqrt(self.share / len(self.fields))
         middle = float(np.mean(self.position[:, 0, 1]))
 
         def moved(step: np.ndarray) -> FocalPlane:
-            """The plane ``step[0]`` farther at the middle of the fields and turned by ``step[1]`` about there."""
+            """Return the plane shifted by ``step[0]`` and rotated by ``step[1]`` at the middle of the fields."""
             turn = start.tilt + (float(step[1]) if tilt else 0.0)
             there = start.z + middle * np.tan(start.tilt) + float(step[0])
             return FocalPlane(float(there - middle * np.tan(turn)), turn)
@@ -273,7 +281,7 @@ class FieldBeams:
         def residuals(step: np.ndarray) -> np.ndarray:
             return np.asarray((self.wavefronts(moved(step)) * root).ravel())
 
-        # errors are linear in a move of the plane but for where chief rays meet it: Gauss' steps find it at once
+        # Errors are nearly linear in a shift of the plane, so that Gauss-Newton steps converge at once.
         step = np.zeros(2 if tilt else 1)
         for _ in range(_STEPS):
             sides = [(residuals(step + h), residuals(step - h)) for h in _DIFFERENCE * np.eye(len(step))]
@@ -283,7 +291,7 @@ class FieldBeams:
 
 
 def _levelled(error: np.ndarray, basis: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Errors (N,) without the part of the basis (N, 3) by weighted least squares; 0 where the weight is."""
+    """Return errors (N,) minus their weighted least-squares fit by the basis (N, 3); 0 where the weight is 0."""
     lit = share > 0.0
     root = np.sqrt(share[lit])
     terms, *_ = np.linalg.lstsq(basis[lit] * root[:, None], error[lit] * root, rcond=None)
@@ -294,18 +302,18 @@ def _levelled(error: np.ndarray, basis: np.ndarray, share: np.ndarray) -> np.nda
 
 @dataclass(frozen=True)
 class Sharpness:
-    """A quick judgement of a camera as designed.
+    """Result of the quick check of a camera as designed.
 
     Attributes
     ----------
     worst : float
-        Largest wavefront error over the field, waves rms.
+        Largest wavefront error over the field, in waves rms.
     field : tuple[float, float]
-        Where, shares of the half field along the line and along the track.
-    plane : FocalPlane | None
+        Field of that error, as fractions of the half field along the line and along the track.
+    plane : FocalPlane or None
         The best focal plane; None for a sharp camera, and where light has no focus after its last mirror.
     refocused : float
-        The largest error on that plane, waves rms.
+        Largest error over the field on that plane, in waves rms.
     """
 
     worst: float
@@ -316,14 +324,14 @@ class Sharpness:
 
 @lru_cache(maxsize=64)
 def sharpness(camera: CameraSpec, backend: Backend) -> Sharpness:
-    """Judge a camera from 222 rays, once.
+    """Return the sharpness of a camera from 222 rays; repeated calls return the stored result.
 
     Raises
     ------
     InputError
         The prescription does not bring the light of its field through the stop to the image.
     AimError, BeamMissedError
-        The same of some of it.
+        Some of the light does not come through.
     """
     beams = FieldBeams.trace(derive_camera(camera, backend), backend, _FEW_FIELDS, _RINGS)
     own = FocalPlane.of(camera)
@@ -339,7 +347,7 @@ def sharpness(camera: CameraSpec, backend: Backend) -> Sharpness:
 
 
 def cameras_of(setup: Spec) -> Mapping[str, CameraSpec]:
-    """Cameras among what a job or test refers to, by the file or name that it gives; empty where it has none."""
+    """Return the cameras of a job or test, by the file or name in it; empty if it has none."""
     many, one = getattr(setup, "cameras", None), getattr(setup, "camera", None)
     if isinstance(one, CameraSpec):
         return {one.name: one}
@@ -347,9 +355,9 @@ def cameras_of(setup: Spec) -> Mapping[str, CameraSpec]:
 
 
 def blur_warnings(setup: Spec, backend: Backend) -> tuple[str, ...]:
-    """One warning for each camera of a job or test that is not sharp as designed.
+    """Return a warning for each camera of a job or test that is not sharp as designed.
 
-    A camera whose light does not come through at all has none: it is an error wherever it is traced.
+    A camera whose light does not come through at all gets none: it raises an error wherever it is traced.
     """
     out = []
     for camera in cameras_of(setup).values():
@@ -363,20 +371,22 @@ def blur_warnings(setup: Spec, backend: Backend) -> tuple[str, ...]:
 
 
 NO_CAMERA = 10.0
-"""Wavefront error at the best focus beyond which a prescription is none of a camera, waves rms: its rays spread over
-some hundred Airy disks, and beams miss what stands behind it because of that."""
+"""Wavefront error at the best focus above which a prescription is not that of a camera, in waves rms. Its rays spread
+over some hundred Airy disks, and beams miss the parts behind it because of that.
+"""
 
 
 def no_cameras(cameras: Iterable[CameraSpec], backend: Backend) -> tuple[Issue, ...]:
-    """One issue for each prescription that makes no image, wherever its image plane stands: the first cause of whatever
-    its light then misses.
+    """Return an issue for each prescription that makes no image, wherever its image plane stands.
+
+    It is the root cause of whatever its light misses afterwards.
 
     Parameters
     ----------
-    cameras : Iterable[CameraSpec]
+    cameras : iterable of CameraSpec
         Prescriptions whose light comes through.
     backend : Backend
-        Where to trace.
+        Backend that traces the rays.
     """
     out = []
     for camera in cameras:
@@ -387,34 +397,35 @@ def no_cameras(cameras: Iterable[CameraSpec], backend: Backend) -> tuple[Issue, 
         best = found.worst if np.isnan(found.refocused) else min(found.worst, found.refocused)
         if best > NO_CAMERA:
             problem = (
-                f"these surfaces make no image: {found.worst:.3g} waves rms of wavefront error at field "
+                f"these surfaces form no image: the wavefront error is {found.worst:.3g} waves rms at field "
                 f"{field_text(camera, found.field)}, {best:.3g} at the best focus"
             )
-            allowed = "radii, conics, terms and places that belong together; python -m twin.camera shows the beams"
+            allowed = "consistent radii, conics, terms and positions; python -m twin.camera shows the beams"
             out.append(camera.issue(problem, ("mirrors",), allowed=allowed))
     return tuple(dict.fromkeys(out))
 
 
 def _blurred(camera: CameraSpec, found: Sharpness) -> str:
+    """Return the warning for a blurred camera, with the command that refocuses it."""
     file, inside = camera.source.file, camera.source.prefix
-    # in a run's config.yaml a camera stands among others
+    # A run's config.yaml holds several cameras.
     chosen = f" --camera {inside[-1]}" if len(inside) > 1 else ""
     what = (
-        f"camera {camera.name}{f' ({file})' if file else ''} is blurred as designed: {found.worst:.3g} waves rms of "
-        f"wavefront error at field {field_text(camera, found.field)}, more than {BLURRED:g}"
+        f"camera {camera.name}{f' ({file})' if file else ''} is blurred as designed: its wavefront error is "
+        f"{found.worst:.3g} waves rms at field {field_text(camera, found.field)}, more than {BLURRED:g}"
     )
     if found.plane is None:
-        return f"{what}; refocusing cannot help: its light has no focus after the last mirror"
+        return f"{what}; refocusing does not help: its light has no focus after the last mirror"
     shift = 1e3 * (found.plane.z - camera.image.z)
     left = f"{found.refocused:.2g} waves"
     remedy = f"python -m twin.camera {file or camera.name}{chosen} --refocus moves image.z by {shift:+.4g} mm"
     if found.refocused <= BLURRED:
         return f"{what}; {remedy} and leaves {left}"
-    return f"{what}; {remedy}, but leaves {left}: it is not a matter of focus alone"
+    return f"{what}; {remedy}, but leaves {left}: defocus is not the only error"
 
 
 def field_text(camera: CameraSpec, field: tuple[float, float]) -> str:
-    """A field in degrees: along the line and along the track."""
+    """Return a field in degrees as text, along the line and along the track."""
     halves = (camera.field.x, camera.field.y)
     along, across = (np.degrees(share * half) for share, half in zip(field, halves, strict=True))
     return f"({along:.4g}, {across:.4g}) deg"

@@ -1,12 +1,10 @@
-"""Stated disturbances on the bodies of an instrument: their components one by one, how these go together, and states
-drawn from them.
+"""Prior of the disturbances of an instrument: components, correlations, laws of time, and states drawn from them.
 
-What stated motions may do over time: amounts drawn by the laws of their disturbances.
+Each law of time is sampled exactly at arbitrary times, without intermediate steps, so that times may be far apart: a
+drift is an Ornstein-Uhlenbeck process, a periodic motion the real part of a rotating random phasor.
 
-Each law is drawn exactly at any times, without steps between them, so that times may be as far apart as they like: a
-drift is an Ornstein-Uhlenbeck process, a period the real part of a turning random pointer.
-
-A covariance of components as a file of disturbances, such as what an estimate of an instrument's state leaves.
+``joint_disturbances`` goes the other way: it writes a covariance of components, such as that of an estimate of an
+instrument's state, as a file of disturbances.
 """
 
 from __future__ import annotations
@@ -48,7 +46,7 @@ from scenes.yaml.yaml_file import YamlFile
 
 AXES = "xyz"
 INDEFINITE = -1e-9
-"""Eigenvalue of a correlation matrix from which on downward it is no rounding."""
+"""Eigenvalue below which a correlation matrix is indefinite; values between it and 0 are rounding errors."""
 UNITS: Mapping[str, tuple[str, float]] = {
     "shift": ("um", 1e-6),
     "rotate": ("arcsec", parse_quantity("1 arcsec", ANGLE)),
@@ -62,16 +60,16 @@ UNITS: Mapping[str, tuple[str, float]] = {
     "gradient": ("mK/m", 1e-3),
     "index_gradient": ("ppm/m", 1e-6),
 }
-"""Kind of component -> the unit in which people read it, and that unit in SI."""
+"""Kind of component -> the unit in which it is printed, and that unit in SI."""
 HEAT = ("temperature", "gradient")
-"""Kinds that act through the thermal model."""
+"""Kinds of components that act through the thermal model."""
 SINGLE = ("scale", "radius", "conic", "index", "temperature")
-"""Kinds of which a body has one component."""
+"""Kinds of which a body has a single component, without an axis."""
 _NEEDS = {"gradient": "temperature"}
-"""What a node must allow, where that is not called as the kind is."""
+"""Kind -> permission that a node must have for it, where the two have different names."""
 
 _Where = Callable[[str, KeyPath, Problem], Issue]
-"""Makes an issue of what is wrong at a key of a cause."""
+"""Function that makes an issue from the name of a cause, a key of it and a problem."""
 
 
 @dataclass(frozen=True)
@@ -83,13 +81,13 @@ class Component:
     cause : str
         Name of its cause.
     body : str
-        path.
+        Path of the body.
     kind : str
-        One of UNITS.
+        Kind of the component, one of the keys of ``UNITS``.
     axis : int
-        0, 1, 2 of the body's own frame; the Noll index of a figure term; 0 where there is one only.
+        Axis 0, 1 or 2 of the body's own frame; Noll index of a figure term; 0 for kinds of a single component.
     pivot : str
-        Of turns and growth.
+        Pivot of rotations and of changes of scale.
     sigma : float
         Standard deviation, SI.
     """
@@ -103,19 +101,19 @@ class Component:
 
     @property
     def name(self) -> str:
-        """Name of the component, as ``correlations`` have it: ``base/forward/M2 shift z``."""
+        """Name of the component as in ``correlations``: ``base/forward/M2 shift z``."""
         return f"{self.body} {self.what}"
 
     @property
     def what(self) -> str:
-        """Without the body: ``shift z``."""
+        """Name of the component without the body: ``shift z``."""
         if self.kind in SINGLE:
             return self.kind
         return f"{self.kind} {f'Z{self.axis}' if self.kind == 'figure' else AXES[self.axis]}"
 
     @property
     def unit(self) -> str:
-        """For people."""
+        """Unit in which amounts are printed."""
         return UNITS[self.kind][0]
 
     @property
@@ -126,20 +124,20 @@ class Component:
 
 @dataclass(frozen=True, eq=False)
 class StatedMotions:
-    """What is stated of an instrument's M components.
+    """Prior of the M disturbance components of an instrument.
 
     Attributes
     ----------
     name : str
-        Of the disturbances file.
+        Name of the disturbances file.
     components : tuple[Component, ...]
-        Cause by cause, body by body.
-    correlation : np.ndarray
-        (M, M), positive semidefinite; zero between causes.
+        The components, cause by cause, body by body.
+    correlation : (M, M) ndarray
+        Correlation matrix, positive semidefinite; zero between causes.
     laws : tuple[TimeLawSpec, ...]
-        Of each component in time.
-    jump_false_alarm : float | None
-        Chance that a series without a jump has one reported; None for that of every other test.
+        Law of time of each component.
+    jump_false_alarm : float or None
+        Probability that a jump is reported in a series without one; None for the level of all other tests.
     """
 
     name: str
@@ -150,17 +148,17 @@ class StatedMotions:
 
     @property
     def sigma(self) -> np.ndarray:
-        """(M,) SI."""
+        """Standard deviations of the components, (M,), SI."""
         return np.array([c.sigma for c in self.components])
 
     @property
     def covariance(self) -> np.ndarray:
-        """(M, M) SI."""
+        """Covariance matrix of the components, (M, M), SI."""
         sigma = self.sigma
         return np.asarray(sigma[:, None] * self.correlation * sigma)
 
     def of_causes(self, names: Sequence[str]) -> StatedMotions:
-        """Some causes alone."""
+        """Return the prior of some causes alone."""
         own = [k for k, c in enumerate(self.components) if c.cause in names]
         return StatedMotions(
             self.name,
@@ -171,27 +169,27 @@ class StatedMotions:
         )
 
     def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Random amounts, (count, M), SI; one state after the other, in it one component after the other.
+        """Return random amounts, (count, M), SI; numbers are drawn state by state, and component by component in each.
 
         Parameters
         ----------
         rng : np.random.Generator
-            Their source.
+            Generator of the random numbers.
         count : int
-            How many states.
+            Number of states.
         """
         unit = rng.standard_normal((count, len(self.components)))
         return np.asarray(unit @ covariance_root(self.correlation) * self.sigma)
 
 
 def stated_motions(resolved: ResolvedJob, instrument: Instrument) -> StatedMotions | None:
-    """What a job states of its instrument; None for nothing.
+    """Return the disturbance prior of a job's instrument, or None if the job has none.
 
     Raises
     ------
     InputError
-        a body that the instrument does not have, or that does not move so; correlations that cannot be. One issue for
-        each fault.
+        The prior names a body that the instrument does not have or a motion that a body does not allow, or its
+        correlations are not positive semidefinite. There is one issue for each fault.
     """
     spec = resolved.disturbances
     if spec is None:
@@ -200,21 +198,21 @@ def stated_motions(resolved: ResolvedJob, instrument: Instrument) -> StatedMotio
 
 
 def motions_of_spec(spec: DisturbancesSpec, instrument: Instrument, at: _Where | None = None) -> StatedMotions:
-    """What a disturbances file says of an instrument.
+    """Return the prior that a disturbances file gives for an instrument.
 
     Parameters
     ----------
     spec : DisturbancesSpec
-        The file.
+        Content of the file.
     instrument : Instrument
-        On whose bodies.
-    at : _Where | None
-        Makes an issue of what is wrong at a key of a cause; by default one of the file itself.
+        Instrument whose bodies move.
+    at : callable or None
+        Function that makes an issue of a problem at a key of a cause; by default an issue of the file itself.
 
     Raises
     ------
     InputError
-        As ``stated_motions``.
+        The same faults as in ``stated_motions``.
     """
     spec = spec.with_tables()
     where = at or (lambda cause, key, wrong: spec.issue(wrong, ("causes", cause, *key)))
@@ -227,9 +225,9 @@ def motions_of_spec(spec: DisturbancesSpec, instrument: Instrument, at: _Where |
         bodies = [path for pattern in cause.bodies for path in nodes if _matches(pattern, path, instrument.cameras)]
         own, faults = _of_cause(spec, name, cause, list(dict.fromkeys(bodies)), instrument, glass, where)
         matrix, more = _correlation(name, cause, own, where)
-        # a correlation with what is not the same quantity tells nothing where the quantity itself was refused
+        # Where a component itself was refused, issues of its correlations would only repeat that.
         issues += faults or (more if bodies else [])
-        # what does not move is named by correlations all the same, so that one number can be set to zero
+        # Correlations may name components of zero sigma, so that a single number can be set to zero.
         moving = [k for k, c in enumerate(own) if c.sigma > 0.0]
         components += [own[k] for k in moving]
         laws += [cause.time] * len(moving)
@@ -246,21 +244,21 @@ def motions_of_spec(spec: DisturbancesSpec, instrument: Instrument, at: _Where |
 
 
 def check_heat(resolved: ResolvedJob, stated: StatedMotions, thermal: ThermalModel) -> None:
-    """Check that what is stated of temperatures can be worked out: that glasses have a dn/dT that is known there.
+    """Check that the effect of the prior's temperatures can be computed: that the dn/dT of heated glasses is known.
 
     Parameters
     ----------
     resolved : ResolvedJob
         The job.
     stated : StatedMotions
-        Of it.
+        Its prior.
     thermal : ThermalModel
-        Of its instrument.
+        Thermal model of its instrument.
 
     Raises
     ------
     InputError
-        It cannot.
+        The data of a material do not cover the temperatures.
     """
     cause_of = {c.body: c.cause for c in stated.components if c.kind in HEAT}
     warmer = {
@@ -277,18 +275,18 @@ def check_heat(resolved: ResolvedJob, stated: StatedMotions, thermal: ThermalMod
 def state_of(
     amounts: np.ndarray, components: Sequence[Component], thermal: ThermalModel, motions: State | None = None
 ) -> State:
-    """The state in which components have given amounts.
+    """Return the state in which the components have given amounts.
 
     Parameters
     ----------
-    amounts : np.ndarray
-        (M,), SI.
-    components : Sequence[Component]
-        M of them.
+    amounts : (M,) ndarray
+        Amounts of the components, SI.
+    components : sequence of Component
+        The M components.
     thermal : ThermalModel
-        Of the instrument.
-    motions : State | None
-        What else happens; it acts on top of the same body's motion.
+        Thermal model of the instrument.
+    motions : State or None
+        Further motions, which act on top of those of the same bodies.
     """
     return states_of(np.asarray(amounts)[None], components, thermal, motions)[0]
 
@@ -296,8 +294,9 @@ def state_of(
 def states_of(
     amounts: np.ndarray, components: Sequence[Component], thermal: ThermalModel, motions: State | None = None
 ) -> list[State]:
-    """The S states in which components have amounts (S, M), as ``state_of`` makes one: a state of many costs a third
-    of one alone.
+    """Return the S states in which components have amounts (S, M), as ``state_of`` does for one.
+
+    In a batch of many, a state takes a third of the time that it takes alone.
     """
     heat: dict[str, Temperatures] = {}
     moves: list[list[State]] = [[] for _ in amounts]
@@ -315,6 +314,7 @@ def states_of(
 
 
 def _groups(components: Sequence[Component]) -> Iterator[tuple[tuple[str, str, str], list[int]]]:
+    """Yield (cause, body, pivot) with the indices of the components that share them."""
     groups: dict[tuple[str, str, str], list[int]] = {}
     for k, c in enumerate(components):
         groups.setdefault((c.cause, c.body, c.pivot), []).append(k)
@@ -326,7 +326,7 @@ _Values = Mapping[tuple[str, int], np.ndarray]
 
 
 def _three(values: _Values, kind: str) -> np.ndarray:
-    """(S, 3) of the three axes."""
+    """Return the components of one kind along the three axes, (S, 3)."""
     out = np.zeros((len(next(iter(values.values()))), 3))
     for axis in range(3):
         if (kind, axis) in values:
@@ -335,6 +335,7 @@ def _three(values: _Values, kind: str) -> np.ndarray:
 
 
 def _field(values: _Values) -> Temperatures | None:
+    """Return the temperature fields of a body in S states, or None if no component heats it."""
     if not any(kind in HEAT for kind, _ in values):
         return None
     gradient = _three(values, "gradient")
@@ -342,7 +343,7 @@ def _field(values: _Values) -> Temperatures | None:
 
 
 def _motions(values: _Values, pivot: str) -> list[Motion]:
-    """Motions of a body in S states; none of one that only heat moves."""
+    """Return the motions of a body in S states; an empty list if only heat moves it."""
     if all(kind in HEAT for kind, _ in values):
         return []
     vectors = (map(tuple, _three(values, kind).tolist()) for kind in ("rotate", "shift", "index_gradient"))
@@ -362,19 +363,21 @@ def _motions(values: _Values, pivot: str) -> list[Motion]:
 
 
 CAMERA = "<camera>"
-"""Stands in a pattern for the name of any camera of the instrument, whatever they are called there."""
+"""Placeholder in a pattern for the name of any camera of the instrument."""
 
 
 def _matches(pattern: str, path: str, cameras: Iterable[str]) -> bool:
-    """Whether a path is of a pattern in which ``*`` and ``?`` stand for anything but ``/``, and CAMERA for a camera."""
+    """Return True if a path matches a pattern with ``*``, ``?`` (neither matches ``/``) and CAMERA for any camera."""
     any_of = {"*": "[^/]*", "?": "[^/]", CAMERA: f"(?:{'|'.join(map(re.escape, cameras))})"}
     parts = re.split(f"({CAMERA}|[*?])", pattern)
     return re.fullmatch("".join(any_of.get(part, re.escape(part)) for part in parts), path) is not None
 
 
 def _issue_at(resolved: ResolvedJob, cause: str, key: KeyPath, wrong: Problem) -> Issue:
-    """An issue at the line that said it: the job's where it changes the file, or names the bodies to which the file's
-    motions are now given.
+    """Return an issue at the line that caused it.
+
+    That is a line of the job where it changes the file or names the bodies to which the file's motions are applied,
+    else a line of the disturbances file.
     """
     changes = resolved.job.disturbances
     own = changes.causes.get(cause) if changes is not None else None
@@ -389,7 +392,7 @@ def _issue_at(resolved: ResolvedJob, cause: str, key: KeyPath, wrong: Problem) -
 
 
 def _strangers(spec: DisturbancesSpec, instrument: Instrument, where: _Where) -> list[Issue]:
-    """One issue for each pattern of which the instrument has no body, at the first cause that has it."""
+    """Return an issue for each pattern that matches no body of the instrument, at the first cause that has it."""
     first: dict[str, tuple[str, int]] = {}
     causes: dict[str, list[str]] = {}
     for name, cause in spec.causes.items():
@@ -407,7 +410,7 @@ def _strangers(spec: DisturbancesSpec, instrument: Instrument, where: _Where) ->
 
 
 def _nearest(pattern: str, nodes: Iterable[str]) -> str | None:
-    """What a pattern of no body was probably meant to be: with its stars, if that is the path of some body."""
+    """Return the most similar known pattern or path for a pattern without a body, with its stars if possible."""
     parts = pattern.split("/")
     alike = [path.split("/") for path in nodes if path.count("/") == pattern.count("/")]
     starred = ["/".join("*" if p == "*" else q for p, q in zip(parts, path, strict=True)) for path in alike]
@@ -423,7 +426,7 @@ def _of_cause(
     glass: set[str],
     where: _Where,
 ) -> tuple[list[Component], list[Issue]]:
-    """The components that a cause gives to bodies, also those of zero sigma; and what is wrong, one issue a key."""
+    """Return the components that a cause gives to bodies (zero sigmas included), and an issue per faulty key."""
     components: list[Component] = []
     turned: list[str] = []
     refused: dict[KeyPath, list[str]] = {}
@@ -449,16 +452,14 @@ def _of_cause(
 
 
 def usual_pivot(info: NodeInfo) -> str:
-    """What a body turns about where a file of disturbances does not say it: its centre if it has one, else its
-    origin.
-    """
+    """Return the pivot of a body where a file of disturbances names none: its centre if it has one, else its origin."""
     return "centre" if "centre" in info.pivots else ORIGIN
 
 
 def _of_joint(
     spec: DisturbancesSpec, joint: JointSpec, instrument: Instrument, glass: set[str]
 ) -> tuple[list[Component], np.ndarray, list[Issue]]:
-    """The components that go together and move, their correlations, and what is wrong with them."""
+    """Return the components of `joint` that move, their correlations, and the issues found."""
     components: list[Component] = []
     issues: list[Issue] = []
     said: dict[tuple[str, str, int], str] = {}
@@ -475,7 +476,7 @@ def _of_joint(
                 raise unknown(f"{path} has no such pivot", about, info.known_pivots)
             if (path, kind, axis) in said:
                 raise Problem(
-                    "a component is named twice", shown(name), f"once; it is {said[path, kind, axis]} as well"
+                    "a component is named twice", shown(name), f"once; it is the same as {said[path, kind, axis]}"
                 )
         except Problem as wrong:
             issues.append(spec.issue(wrong, (JOINT, "components", name)))
@@ -485,7 +486,7 @@ def _of_joint(
         components.append(Component(JOINT, path, kind, axis, pivot, sigma / spec.sigmas))
     matrix = np.eye(len(joint.components)) if joint.correlation is None else np.array(joint.correlation)
     if (least := _least(matrix)) < INDEFINITE:
-        text = f"these correlations cannot be: the matrix is not positive definite, an eigenvalue is {least:.3g}"
+        text = f"the correlation matrix is not positive definite: it has an eigenvalue of {least:.3g}"
         issues.append(spec.issue(Problem(text, allowed="correlations of real quantities"), (JOINT, "correlation")))
     if issues:
         return [], np.zeros((0, 0)), issues
@@ -494,15 +495,17 @@ def _of_joint(
 
 
 def _some(paths: Sequence[str]) -> str:
-    return paths[0] if len(paths) == 1 else f"{paths[0]}, as {len(paths) - 1} more,"
+    """Return a text that names the first path and the number of the others."""
+    return paths[0] if len(paths) == 1 else f"{paths[0]}, like {len(paths) - 1} more,"
 
 
 def _possible(info: NodeInfo, transparent: bool) -> set[str]:
+    """Return the kinds of changes that a node allows."""
     return {*info.allows, *(("index_gradient",) if transparent else ())}
 
 
 def _sigmas(cause: CauseSpec) -> Iterator[tuple[KeyPath, str, int, float]]:
-    """Key, kind, axis and value of every number of a cause."""
+    """Yield key, kind, axis and standard deviation of every number of a cause."""
     for kind in ("shift", "rotate", "index_gradient"):
         for axis, value in enumerate(getattr(cause, kind) or ()):
             yield (kind,), kind, axis, value
@@ -520,9 +523,9 @@ def _sigmas(cause: CauseSpec) -> Iterator[tuple[KeyPath, str, int, float]]:
 def _correlation(
     name: str, cause: CauseSpec, own: Sequence[Component], where: _Where
 ) -> tuple[np.ndarray, list[Issue]]:
-    """Correlation matrix of a cause's components, and what is wrong with it.
+    """Return the correlation matrix of a cause's components and the issues found in it.
 
-    ``correlations`` stand in place of ``together`` where both speak of the same two components.
+    ``correlations`` take precedence over ``together`` for a pair of components that both name.
     """
     matrix, issues = np.eye(len(own)), []
     if cause.together is not None:
@@ -533,7 +536,7 @@ def _correlation(
         if _least(matrix) < INDEFINITE:
             count = len({c.body for c in own})
             allowed = f"at least {-1.0 / (count - 1):.4g} between {count} bodies"
-            text = "bodies cannot all move against one another so much"
+            text = "bodies cannot all be so strongly anticorrelated"
             return matrix, [where(name, ("together",), Problem(text, shown(cause.together), allowed))]
     known = {c.name: k for k, c in enumerate(own)}
     said: dict[tuple[int, int], float] = {}
@@ -550,22 +553,22 @@ def _correlation(
             value = group.table[i][j]
             before = said.setdefault((min(at[i], at[j]), max(at[i], at[j])), value)
             if before != value:
-                text = f"{group.between[i]} and {group.between[j]} have a correlation already, {before:g}"
+                text = f"the correlation of {group.between[i]} and {group.between[j]} is already {before:g}"
                 issues.append(where(name, key, Problem(text, shown(value), "one of them")))
         matrix[np.ix_(at, at)] = np.array(group.table)
     least = _least(matrix)
     if not issues and least < INDEFINITE:
         text = (
-            "these correlations cannot be, alone or with those before them: the matrix is not positive definite, an "
-            f"eigenvalue is {least:.3g}"
+            "the correlation matrix, with these entries and those before them, is not positive definite: it has an "
+            f"eigenvalue of {least:.3g}"
         )
-        wrong = Problem(text, allowed="correlations of real quantities: smaller ones")
+        wrong = Problem(text, allowed="smaller correlations, as between real quantities")
         issues.append(where(name, ("correlations", _first_impossible(cause, known)), wrong))
     return matrix, issues
 
 
 def _first_impossible(cause: CauseSpec, known: Mapping[str, int]) -> int:
-    """The correlation from which on they cannot be, of some that cannot be together."""
+    """Return the index of the first entry of ``correlations`` with which the matrix becomes indefinite."""
     matrix, last = np.eye(len(known)), len(cause.correlations) - 1
     for n, group in enumerate(cause.correlations[:last]):
         at = [known[text] for text in group.between]
@@ -576,6 +579,7 @@ def _first_impossible(cause: CauseSpec, known: Mapping[str, int]) -> int:
 
 
 def _least(matrix: np.ndarray) -> float:
+    """Return the least eigenvalue of a symmetric matrix; 0 for an empty one."""
     return float(np.linalg.eigvalsh(matrix)[0]) if len(matrix) else 0.0
 
 
@@ -583,16 +587,17 @@ Array = NDArray[np.float64]
 
 
 def drawn_motions(stated: StatedMotions, seconds: Array, source: Callable[[int], np.random.Generator]) -> Array:
-    """Amounts (T, M) of all motions, SI, without jumps.
+    """Return random amounts (T, M) of all components over time, SI, without jumps.
 
     Parameters
     ----------
     stated : StatedMotions
-        The motions and their laws of time.
-    seconds : Array
-        (T,) rising, from which the laws count.
-    source : Callable[[int], np.random.Generator]
-        Number of a cause -> of what is drawn of it, so that no cause depends on the others.
+        Prior of the components with their laws of time.
+    seconds : (T,) ndarray
+        Increasing times in seconds, counted as the laws count them.
+    source : callable
+        Function from the number of a cause to its random generator, so that the draws of one cause do not depend on the
+        others.
     """
     out = np.zeros((len(seconds), len(stated.components)))
     for number, where in enumerate(causes_of(stated).values()):
@@ -602,18 +607,18 @@ def drawn_motions(stated: StatedMotions, seconds: Array, source: Callable[[int],
 
 
 def drawn_course(law: TimeLawSpec, seconds: Array, rng: np.random.Generator, count: int) -> Array:
-    """Independent courses (T, count) of unit standard deviation that have the covariance of a law of time.
+    """Return independent random courses (T, count) of unit standard deviation with the covariance of a law of time.
 
     Parameters
     ----------
     law : TimeLawSpec
-        Of all of them. A jump does nothing here: its times are drawn for a body.
-    seconds : Array
-        (T,) rising.
+        Law of time of all courses. A jump has no effect here: its times are drawn per body.
+    seconds : (T,) ndarray
+        Increasing times, in seconds.
     rng : np.random.Generator
-        Source of what is drawn.
+        Generator of the random numbers.
     count : int
-        How many.
+        Number of courses.
     """
     each = (len(seconds), count)
     if law.kind == "white":
@@ -623,7 +628,7 @@ def drawn_course(law: TimeLawSpec, seconds: Array, rng: np.random.Generator, cou
     if law.period is None:
         out = _drifting(law.drift, seconds, rng, count)
     else:
-        # the real part of a random pointer that turns once in a period, and forgets where it was if it drifts
+        # Real part of a random phasor that rotates once per period, and decorrelates if it drifts.
         turn = (2.0 * math.pi / law.period * seconds)[:, None]
         along = _drifting(law.drift, seconds, rng, count)
         out = along * np.cos(turn) + _drifting(law.drift, seconds, rng, count) * np.sin(turn)
@@ -638,7 +643,7 @@ def drawn_course(law: TimeLawSpec, seconds: Array, rng: np.random.Generator, cou
 
 
 def _drifting(drift: float | None, seconds: Array, rng: np.random.Generator, count: int) -> Array:
-    """(T, count) of unit variance that forget where they were in ``drift`` seconds; None for never."""
+    """Return unit-variance processes (T, count) of correlation time ``drift``, in seconds; constant if None."""
     unit = rng.standard_normal((len(seconds), count))
     if drift is None:
         return np.broadcast_to(unit[:1], unit.shape)
@@ -650,7 +655,7 @@ def _drifting(drift: float | None, seconds: Array, rng: np.random.Generator, cou
 
 
 def causes_of(stated: StatedMotions) -> dict[str, list[int]]:
-    """Cause -> numbers of its components."""
+    """Return the indices of the components of each cause."""
     out: dict[str, list[int]] = {}
     for k, one in enumerate(stated.components):
         out.setdefault(one.cause, []).append(k)
@@ -660,9 +665,9 @@ def causes_of(stated: StatedMotions) -> dict[str, list[int]]:
 ABOUT = ("shift", "rotate", "scale")
 """Kinds of components that have a pivot."""
 DIGITS = 12
-"""After the point of a correlation: less says nothing, and eigenvalues stay within ``INDEFINITE``."""
+"""Decimals of written correlations: enough that eigenvalues stay above ``INDEFINITE``."""
 FEW = 12
-"""Components up to which a file holds the matrix of their correlations itself."""
+"""Number of components up to which a file holds their correlation matrix itself."""
 
 
 def joint_disturbances(
@@ -674,50 +679,50 @@ def joint_disturbances(
     description: str = "",
     time: TimeLawSpec | None = None,
 ) -> DisturbancesSpec:
-    """The statement that components have a covariance, as `joint` of a file of disturbances.
+    """Return a disturbances specification, with `joint`, of components with a given covariance.
 
-    ``scenes.models.disturbances.motions_of_spec`` makes of it the components that move, in this order and with these
-    standard deviations, and states drawn from it have this covariance.
+    ``motions_of_spec`` makes of it the components that move, in this order and with these standard deviations, and
+    states drawn from it have this covariance.
 
     Parameters
     ----------
     name : str
-        Of the file.
-    components : Sequence[Component]
-        M of them, of different bodies, kinds or axes; their own standard deviations do not count.
-    covariance : np.ndarray
-        (M, M), SI. Components without any are left out.
+        Name of the file.
+    components : sequence of Component
+        M components of different bodies, kinds or axes; their own standard deviations are ignored.
+    covariance : (M, M) ndarray
+        Covariance matrix, SI. Components of zero variance are omitted.
     nodes : Mapping[str, NodeInfo]
-        Of the instrument.
+        Nodes of the instrument.
     reason : str
-        Where the numbers come from.
+        Origin of the numbers, written into the file.
     description : str
-        For people.
-    time : TimeLawSpec | None
-        How they go on in a series of measurements; constant by default.
+        Description written into the file.
+    time : TimeLawSpec or None
+        Law of time in a series of measurements; constant by default.
 
     Raises
     ------
     ValueError
-        It is no covariance of these components.
+        The matrix is not a covariance of these components.
     InputError
-        a component is there twice, or moves by more than a file can say.
+        A component is named twice, or moves by more than a file can express.
     """
     covariance = np.asarray(covariance, dtype=np.float64)
     if covariance.shape != (len(components),) * 2 or not np.all(np.isfinite(covariance)):
-        raise ValueError(f"a covariance of {len(components)} components has not the shape {covariance.shape}")
+        raise ValueError(f"a covariance of {len(components)} components cannot have the shape {covariance.shape}")
     if np.min(np.diagonal(covariance), initial=0.0) < 0.0:
         raise ValueError("a variance is negative")
     sigma = np.sqrt(np.diagonal(covariance))
     own = np.flatnonzero(sigma > 0.0).tolist()
     correlation = covariance[np.ix_(own, own)] / np.outer(sigma[own], sigma[own])
     if np.max(np.abs(correlation - correlation.T), initial=0.0) > -INDEFINITE:
-        raise ValueError("a covariance is symmetric")
+        raise ValueError("the covariance is not symmetric")
     correlation = np.clip(0.5 * (correlation + correlation.T), -1.0, 1.0)
     correlation = np.asarray(np.round(correlation, DIGITS), dtype=np.float64)
     np.fill_diagonal(correlation, 1.0)
     if len(own) and np.linalg.eigvalsh(correlation)[0] < INDEFINITE:
-        raise ValueError("a covariance has no negative eigenvalue")
+        raise ValueError("the covariance has a negative eigenvalue")
     names = [_name(components[k], nodes) for k in own]
     plain = {
         "name": name,
@@ -730,26 +735,26 @@ def joint_disturbances(
         },
     }
     if len(set(names)) < len(names):
-        raise ValueError("a component is there twice")
+        raise ValueError("a component is named twice")
     return validate(DisturbancesSpec, YamlFile(name, plain, {}))
 
 
 def joint_files(spec: DisturbancesSpec, stem: str, remark: str = "") -> dict[str, str]:
-    """Files that say a statement with `joint`: its own, and beside it a table of the correlations where there are many.
+    """Return the files of a specification with `joint`: a YAML, and a CSV of the correlations if there are many.
 
     Parameters
     ----------
     spec : DisturbancesSpec
-        The statement.
+        The specification.
     stem : str
-        Of the files' names.
+        Stem of the files' names.
     remark : str
-        At the top of the file, lines of comment.
+        Comment lines at the top of the YAML.
 
     Returns
     -------
     dict[str, str]
-        Name -> text.
+        File name -> text.
     """
     joint = spec.joint
     if joint is None or joint.correlation is None or len(joint.components) <= FEW:
@@ -763,7 +768,7 @@ def joint_files(spec: DisturbancesSpec, stem: str, remark: str = "") -> dict[str
 
 
 def _name(component: Component, nodes: Mapping[str, NodeInfo]) -> str:
-    """Name of a component, with its pivot where that is not the usual one."""
+    """Return the name of a component, with its pivot where that is not the default."""
     if component.kind in ABOUT and component.pivot != usual_pivot(nodes[component.body]):
         return f"{component.name} about {component.pivot}"
     return component.name

@@ -1,8 +1,4 @@
-"""From an instrument's YAML to the optical assembly: cameras in the base, monitor channels, the central prism's
-faces.
-
-The instrument that was built, of the one that was drawn.
-"""
+"""Construction of an instrument from its file: cameras, monitor channels, central prism, and departures as built."""
 
 from __future__ import annotations
 
@@ -50,12 +46,11 @@ from scenes.yaml.spec import Spec
 
 
 def as_built(drawn: Instrument) -> Instrument:
-    """An instrument whose bodies stand and are shaped as its file's `as_built` says; the same one where it says
-    nothing.
+    """Return an instrument with the departures from the drawing that its file's `as_built` lists, if any.
 
-    Poses of bodies, shapes of surfaces and indices of lenses have it in them, so that the state {} is the instrument
-    as built, and a state of it acts on top. What was worked out of the drawing (frames, apertures, first-order numbers,
-    the turns of the central prism's facets) stays that of the drawing.
+    Poses of bodies, shapes of surfaces and indices of lenses include them, so that the state {} is the instrument as
+    built, and a perturbed state acts on top. What was derived from the drawing (frames, apertures, first-order numbers,
+    orientations of the central prism's facets) stays that of the drawing.
 
     Parameters
     ----------
@@ -65,8 +60,7 @@ def as_built(drawn: Instrument) -> Instrument:
     Raises
     ------
     InputError
-        a node that the instrument does not have, or that does not move or change so; one issue for each fault, at the
-        file and line that says it.
+        A node does not exist, or does not allow the motion or change; one issue for each fault, at its file and line.
     """
     stated = drawn.spec.as_built
     if not stated:
@@ -80,28 +74,27 @@ def as_built(drawn: Instrument) -> Instrument:
 
 
 def squared_facets(instrument: Instrument, backend: Backend) -> State:
-    """How the facets of the central prism have to stand, beyond how they do, for the beams to return to the middle of
-    the area CCDs.
+    """Return the rotations of the central prism's facets that return the beams to the middles of the area CCDs.
 
-    Those of a drawing do. The facets of an instrument are turned so when its monitor is mounted, after its cameras were
-    aligned: ``compose`` this with ``as_built`` for the file of such an instrument.
+    On a drawing they are zero. The facets of a built instrument are rotated by them when its monitor is mounted, after
+    its cameras were aligned: ``compose`` them with ``as_built`` for the file of such an instrument.
 
     Parameters
     ----------
     instrument : Instrument
-        As built.
+        The instrument as built.
     backend : Backend
-        Where to trace.
+        Backend that traces the rays.
 
     Returns
     -------
     State
-        Body path of each facet -> its turn, about its own axes.
+        Body path of each facet -> its rotation about its own axes, relative to its present orientation.
 
     Raises
     ------
     MisplacedError
-        a beam misses a mirror or a prism.
+        A beam misses a mirror or a prism.
     """
     tree = instrument.assembly.tree
     square = square_facets(instrument.assembly, instrument.channels, instrument.cameras, backend).tree
@@ -132,20 +125,20 @@ def build_instrument(
     spec : InstrumentSpec
         The instrument.
     camera_specs : Mapping[str, object]
-        Camera file stem -> CameraSpec, for every stem the instrument names.
+        Camera file stem -> CameraSpec, for every stem that the instrument names.
     backend : Backend
-        Where to trace while the geometry is worked out.
+        Backend that traces the rays.
     free_beams : bool
-        Refuse bodies that stand in the monitor's beams; False for comparisons of layouts that nobody would build.
+        Refuse bodies that block monitor beams; False for comparisons of layouts that nobody would build.
     free_bodies : bool
-        Refuse bodies that stand in each other, and apertures that reach over their faces; False for derivatives of
-        layouts that are at such a limit.
+        Refuse bodies that overlap, and apertures that extend over the edges of their faces; False for derivatives of
+        layouts at such a limit.
 
     Raises
     ------
     InputError
-        Prisms or central prism cannot stand as the file says, the cameras are too different, or what was built is not
-        of this instrument.
+        The prisms cannot be placed as the file says, the cameras are too different, or ``as_built`` does not fit the
+        instrument.
     """
     named = tuple(camera_specs.items())
     read = tuple((one.source.file, one.source.lines) for one in (spec, *camera_specs.values()) if isinstance(one, Spec))
@@ -164,17 +157,17 @@ def build_instrument(
 
 @dataclass(frozen=True)
 class _Asked:
-    """What an instrument is built from.
+    """Arguments of ``build_instrument`` in a form that can be looked up in a cache.
 
     Attributes
     ----------
-    spec, cameras, backend, free_beams, free_bodies : InstrumentSpec
-        As of ``build_instrument``.
+    spec, cameras, backend, free_beams, free_bodies
+        Arguments of ``build_instrument``.
     text : str
-        Of the specifications, by which they are looked up; the order of parts is that of the results, and no part of
-        equality.
+        Text of the specifications, used as cache key: the order of their parts is that of the results, and equality
+        ignores it.
     read : tuple[tuple[str, Mapping[KeyPath, int]], ...]
-        File and lines of each specification, which errors name later; equal specifications may differ in them.
+        File and lines of each specification, named in later errors; equal specifications may differ in them.
     """
 
     spec: InstrumentSpec = field(hash=False)
@@ -188,18 +181,19 @@ class _Asked:
 
 @lru_cache(maxsize=8)
 def _built(asked: _Asked) -> Instrument:
-    """The instrument; commands and scripts build the same one again and again, so those built last are kept."""
+    """Return the instrument, from the cache of those built last where possible."""
     return _build(asked.spec, FrozenMap(asked.cameras), asked.backend, asked.free_beams, asked.free_bodies)
 
 
 def _no_cameras(camera_specs: Mapping[str, object], backend: Backend) -> tuple[Issue, ...]:
-    """What is wrong with the cameras themselves, if anything is; of an instrument that is refused."""
+    """Return issues of the cameras of a refused instrument that make no image."""
     return no_cameras([one for one in camera_specs.values() if isinstance(one, CameraSpec)], backend)
 
 
 def _build(
     spec: InstrumentSpec, camera_specs: Mapping[str, object], backend: Backend, free_beams: bool, free_bodies: bool
 ) -> Instrument:
+    """Build an instrument without the cache."""
     if spec.monitor is not None:
         monitor_chain.check_prisms(spec)
     derived: dict[str, CameraModel] = {}
@@ -285,7 +279,7 @@ def _build(
 
 
 def _check_room(instrument: Instrument, backend: Backend, free_beams: bool, free_bodies: bool) -> None:
-    """Refuse bodies that stand in each other or in beams, as far as that is asked."""
+    """Raise an error if bodies overlap or block beams, as far as these checks are requested."""
     if free_bodies:
         check_solids(instrument.assembly, instrument.solids)
         check_clearance(instrument)
@@ -294,16 +288,16 @@ def _check_room(instrument: Instrument, backend: Backend, free_beams: bool, free
 
 
 def _cannot_stand(spec: InstrumentSpec, error: MisplacedError | InputError) -> Issue:
-    """What is wrong with an instrument as built whose drawing could stand."""
-    told = error.issues[0].problem if isinstance(error, InputError) else str(error)
+    """Return the issue of an instrument that collides as built, though not as drawn."""
+    problem = error.issues[0].problem if isinstance(error, InputError) else str(error)
     first = next(iter((spec.as_built or {}).values()))
     return first.issue(
-        f"as drawn there is room, and as built {told}", allowed="bodies that stand nearer to the drawing"
+        f"the instrument fits as drawn, but as built {problem}", allowed="smaller departures from the drawing"
     )
 
 
 def _check_temperature(spec: InstrumentSpec, solids: Sequence[Solid]) -> None:
-    """Refuse an instrument that is at home where the data of its materials are not."""
+    """Raise InputError if the data of a material do not cover the instrument's reference temperature."""
     named = {name: f"materials.{name}" for name in type(spec.materials).model_fields}
     used = {material(getattr(spec.materials, name)): where for name, where in named.items()}
     used |= {material(solid.material): solid.path for solid in solids}
@@ -313,32 +307,32 @@ def _check_temperature(spec: InstrumentSpec, solids: Sequence[Solid]) -> None:
         ends = max(stuff.known.coldest for stuff in used), min(stuff.known.hottest for stuff in used)
         all_of_them = TemperatureRange(*ends, "all materials").text
         raise spec.error(
-            f"the expansion of {least.name} ({used[least]}) is known from {least.known.text} only"
+            f"the thermal expansion of {least.name} ({used[least]}) is known only for {least.known.text}"
             f" ({least.known.source})",
             ("temperature",),
             found=f"{spec.temperature:.6g} K",
-            allowed=f"{all_of_them} for all of its materials together, or other materials",
+            allowed=f"{all_of_them} with these materials, or other materials",
         )
 
 
 def _check_alike(spec: InstrumentSpec, assembly: Assembly) -> None:
-    """Refuse cameras that cannot be traced together: one batch holds them all."""
+    """Raise InputError if the cameras are too different to be traced in one batch."""
     try:
         for way in ("image_to_stop", "image_to_object"):
             assemble(assembly, [f"{name}/{way}" for name in spec.cameras], [{}])
     except ValueError as error:
-        text = f"these cameras are too different to stand in one instrument ({error})"
-        alike = "cameras with as many mirrors, planes and apertures of the same kinds in the same places"
+        text = f"these cameras are too different for one instrument ({error})"
+        alike = "cameras with the same sequence of mirrors, planes and kinds of apertures"
         raise spec.error(text, ("cameras",), allowed=alike) from error
 
 
 def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Channel]:
-    """Where the reticles and area CCDs stand: at f tan(field) along the line.
+    """Return the channels of a camera; reticles and area CCDs stand at f tan(field) along the line.
 
     Raises
     ------
     InputError
-        Two of them would stand in each other.
+        Two of them would overlap.
     """
     if spec.monitor is None:
         return []
@@ -356,22 +350,22 @@ def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Cha
         pinholes = [np.abs(np.subtract(a.pinhole, b.ccd)) < half + edge for a, b in permutations((first, second))]
         if not np.all(chips) and np.any(np.all(pinholes, axis=-1)) and edge > max(half):
             raise spec.error(
-                f"the pinholes are wider than the CCDs: that of {first.key} or {second.key} reaches to the other CCD",
+                f"the pinholes are wider than the CCDs: that of {first.key} or {second.key} overlaps the other CCD",
                 ("monitor", "reticle", "pinhole"),
                 allowed=f"less than {2e3 * max(half):.4g} mm",
             )
         if np.all(chips) or np.any(np.all(pinholes, axis=-1)):
             apart = 1e3 * abs(second.ccd[1] - first.ccd[1])
             raise spec.error(
-                f"the boards of {first.key} and {second.key} stand in each other: their CCDs are {apart:.4g} mm apart",
+                f"the boards of {first.key} and {second.key} overlap: their CCDs are only {apart:.4g} mm apart",
                 spec.key_of(camera, second.name, ("monitor", "field")),
-                allowed=f"field places at which CCDs of {2e3 * half[1]:.4g} mm, and pinholes beside them, have room",
+                allowed=f"fields that leave room for CCDs of {2e3 * half[1]:.4g} mm and the pinholes beside them",
             )
     return out
 
 
 def _monitor_bodies(plane_root: str, channels: list[Channel]) -> list[Body]:
-    """Boards at the ends of the line CCD, with their reticles and area CCDs."""
+    """Return the bodies of the boards at the ends of the line CCD, with their reticles and area CCDs."""
     bodies = []
     for channel in channels:
         bodies.append(Body(f"{plane_root}/{channel.name}", Pose(np.eye(3), np.array([*channel.ccd, 0.0]))))
@@ -382,17 +376,18 @@ def _monitor_bodies(plane_root: str, channels: list[Channel]) -> list[Body]:
 
 
 def _ccd_elements(channels: list[Channel]) -> dict[str, Element]:
+    """Return the optical elements of the area CCDs, by name."""
     keys = {channel: f"{channel.key}/area_ccd" for channel in channels}
     return {key: Element(key, channel.ccd_body, plane(), Interaction.PASS) for channel, key in keys.items()}
 
 
 def _baffles(spec: InstrumentSpec, tree: RigidTree) -> tuple[Plate, ...]:
-    """Plates of all baffles.
+    """Return the plates of all baffles.
 
     Raises
     ------
     InputError
-        a baffle stands on a body that does not exist.
+        A baffle is mounted on a body that does not exist.
     """
     out: list[Plate] = []
     for name, baffle in spec.baffles.items():
@@ -403,8 +398,8 @@ def _baffles(spec: InstrumentSpec, tree: RigidTree) -> tuple[Plate, ...]:
 
 
 def _nodes(assembly: Assembly, cameras: Mapping[str, CameraModel], solids: tuple[Solid, ...]) -> dict[str, NodeInfo]:
-    """What may be done to each body; the base itself is the frame of everything and is not moved."""
-    # a figure belongs to the element's own body: a face that the beam meets twice has one for each passage
+    """Return the motions and changes that each body allows; the base is the reference frame and does not move."""
+    # A figure belongs to the element's own body: a face that the beam meets twice has one for each passage.
     shaped = {e.body for e in assembly.elements.values() if e.interaction is not Interaction.PASS}
     roots = {f"{BASE}/{name}" for name in cameras}
     cold = _without_heat(cameras)
@@ -429,9 +424,10 @@ def _nodes(assembly: Assembly, cameras: Mapping[str, CameraModel], solids: tuple
 
 
 def _without_heat(cameras: Mapping[str, CameraModel]) -> dict[str, str]:
-    """Bodies that have no temperature of their own -> why: further faces of a lens, which has that of its first one,
-    planes that light passes, which are of the structure, lenses of which nothing says what heat does to them, and what
-    carries such a lens.
+    """Return the bodies that have no temperature of their own, each with the reason.
+
+    These are further faces of a lens, which have the temperature of the first; planes that light passes, which belong
+    to the structure; lenses whose glass has no thermal data; and the bodies that carry such a lens.
     """
     out: dict[str, str] = {}
     for name, model in cameras.items():
@@ -441,7 +437,7 @@ def _without_heat(cameras: Mapping[str, CameraModel]) -> dict[str, str]:
                 out[f"{root}/{face}"] = f"it is part of the structure, {root}"
         for face, lens in faces.items():
             if face != lens:
-                out[f"{root}/{face}"] = f"it is a face of the lens that {root}/{lens} stands for"
+                out[f"{root}/{face}"] = f"it is a face of the lens {root}/{lens}"
                 continue
             try:
                 model.spec.warm_glass(lens)

@@ -1,4 +1,4 @@
-"""An instrument ready to be perturbed and traced: its assembly, cameras, monitor channels and solids."""
+"""Instrument ready to be perturbed and traced: its assembly, cameras, monitor channels and solids."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from scenes.yaml.errors import KeyPath
 
 @dataclass(frozen=True, eq=False)
 class Instrument:
-    """An instrument ready to be perturbed and traced.
+    """Instrument ready to be perturbed and traced.
 
     Attributes
     ----------
     spec : InstrumentSpec
-        What the YAML says.
+        Content of the instrument's file.
     assembly : Assembly
         Bodies, elements, sequences.
     cameras : Mapping[str, CameraModel]
@@ -34,16 +34,16 @@ class Instrument:
     channels : tuple[Channel, ...]
         All monitor channels, camera by camera, left before right.
     nodes : Mapping[str, NodeInfo]
-        Body path -> what may be done to it.
+        Body path -> motions and changes that the body allows.
     solids : tuple[Solid, ...]
         The prisms of all channels, camera by camera, and the central prism.
     glass_path : Mapping[str, Mapping[str, float]]
-        Channel key -> prism -> length of the beam inside its glass, one way, metres.
+        Channel key -> prism -> length of the beam inside its glass, one way, in metres.
     baffles : tuple[Plate, ...]
-        Black plates that only the path tracer and pictures know.
+        Black plates, used by the path tracer, the shadows and the pictures.
     as_built : State
-        How it stands and is shaped against the drawing; the assembly has it in it, so that nominal and the state {} are
-        the instrument as built.
+        Departures of positions and shapes from the drawing. The assembly includes them, so that the nominal state, {},
+        is the instrument as built.
     """
 
     spec: InstrumentSpec
@@ -57,20 +57,21 @@ class Instrument:
     as_built: State = field(default_factory=FrozenMap)
 
     def camera_axes(self, camera: str) -> np.ndarray:
-        """Nominal camera X, Y, Z in the base frame as columns, (3, 3)."""
+        """Return the nominal X, Y, Z of a camera in the base frame as columns, (3, 3)."""
         return self.assembly.nominal_pose(f"{BASE}/{camera}").rotation
 
     def toward_optics(self, placed: PlacedBodies, camera: str) -> np.ndarray:
-        """Direction from the line's centre along its chief ray, upstream, in each state, world, (S, 3).
+        """Return unit vectors (S, 3) in the world from the line's centre along its chief ray, upstream, in each state.
 
-        Where rays that start at the focal plane are first sent; it rides on the focal plane.
+        Rays that start at the focal plane are first sent along it; it moves with the focal plane.
         """
         model = self.cameras[camera]
         return model.toward_optics(placed.rotation[:, placed.index[f"{BASE}/{camera}/focal_plane"]].real)
 
     @property
     def separation(self) -> Mapping[str, float]:
-        """Camera -> distance of its pair of area CCDs (the papers' L), metres; without a pair the largest of two.
+        """Distance of each camera's pair of area CCDs (the papers' L), in metres; without a pair, the largest distance.
+
         Empty without a monitor.
         """
         out: dict[str, float] = {}
@@ -81,25 +82,25 @@ class Instrument:
         return out
 
     def channels_of(self, camera: str) -> tuple[int, ...]:
-        """Numbers of a camera's channels among ``channels``."""
+        """Return the indices of a camera's channels in ``channels``."""
         return tuple(i for i, channel in enumerate(self.channels) if channel.camera == camera)
 
     def coordinates_of(self, camera: str) -> list[int]:
-        """Numbers of the rows and columns of a camera's spots among the coordinates of all."""
+        """Return the indices of a camera's spot coordinates, row and column of each, among those of all spots."""
         return [2 * i + axis for i in self.channels_of(camera) for axis in (0, 1)]
 
 
 class MisplacedError(PhysicalError, ValueError):
-    """A part of the monitor cannot stand as the instrument's file says.
+    """Error of a monitor part that cannot stand as the instrument's file says.
 
     Attributes
     ----------
     key
-        Of the file, what to change, as it is for all channels.
+        Key of the file to change, in its form for all channels.
     remedy
         What to choose there.
     channel
-        Camera and name of the channel that it is about, which may say it itself; None for none.
+        Camera and name of the channel concerned, whose own key takes precedence; None if no single channel is.
     """
 
     def __init__(self, problem: str, key: KeyPath, remedy: str, channel: tuple[str, str] | None = None) -> None:
@@ -108,7 +109,7 @@ class MisplacedError(PhysicalError, ValueError):
 
 
 def key_of(path: str) -> KeyPath:
-    """Key of the instrument's file that a body comes from, as it is for all channels."""
+    """Return the key of the instrument's file that defines a body, in its form for all channels."""
     if path.startswith(CENTRAL_PRISM):
         return (CENTRAL_KEY,)
     prism = prism_of(path)

@@ -1,12 +1,10 @@
-"""The perturbed state that a job describes, and what of it moves beyond what is stated to move.
+"""Perturbed state of a job, including tables at nodes, and the part of it that exceeds the disturbance prior.
 
-Tables of nodes that jobs name: mirrors and faces that finite-element programs deformed, and bodies that tables of
-temperatures warm: what is linear of such a table, and what the rest does to mirrors and glass.
-
-The linear part, nearest over the body's volume, goes the way of every linear temperature (``ThermalModel``): the body
-grows, bends and changes its index with it, and what it carries follows. What is left deforms the body's own finite
-elements, whose optical faces move and bend; on bodies without finite elements, and for the index of glass, it cannot be
-followed, and a table that has more of it than does not matter is refused.
+Jobs may name tables at nodes: displacements of mirrors and faces from a finite-element program, and temperatures of
+bodies. A table of temperatures is split. Its linear part, the best fit over the body's volume, acts like every linear
+temperature (``ThermalModel``): the body expands, bends and changes its index, and what it carries follows. The residual
+deforms the body's own finite elements, whose optical faces move and bend. It cannot be followed on bodies without
+finite elements, nor for the index of glass; a table with a residual there that matters is refused.
 """
 
 from __future__ import annotations
@@ -33,38 +31,40 @@ from scenes.yaml.errors import KeyPath, unknown
 from scenes.yaml.node_table import read_nodes, read_temperatures
 
 COARSE_CELLS, FINE_CELLS = 12, 16
-"""Finite elements across a mirror for what is not linear; the difference of the two says how well they follow it."""
+"""Finite elements across a mirror for nonlinear temperatures; the difference of both results is the mesh error."""
 PER_SIDE = (4, 6)
 """Finite elements along the longest side of a prism, coarse and fine."""
 LINEAR_TO = 1e-4
-"""Kelvin by which nodes on a body without finite elements may depart from a linear field: a metre of aluminium grows by
-2 nm."""
+"""Largest departure from a linear field, in kelvin, allowed at nodes of a body without finite elements: a metre of
+aluminium expands by 2 nm.
+"""
 ROUNDING = 1e-9
-"""Kelvin below which nothing is left of a field."""
+"""Residual of a field, in kelvin, below which it is zero."""
 LEAST_INSIDE = 0.5
-"""Share of the body's volume that the nodes must cover; with less they are of another body, frame or unit."""
+"""Least fraction of the body's volume that the nodes must cover; with less they belong to another body, frame or unit.
+"""
 SHOWN_OUTSIDE = 1e-3
-"""Share of the body's volume beyond the nodes above which is warned."""
+"""Fraction of the body's volume outside the nodes above which a warning is given."""
 SEEN_HEAT = 1e-3
-"""Kelvin rms below which nothing is said of what a table does not know between its nodes."""
+"""Interpolation error between nodes, in kelvin rms, below which no warning is given."""
 MESHED_TO = 0.1
-"""Share of the change of a face by which coarser finite elements may differ."""
+"""Relative difference of a face's change with coarser finite elements above which a warning is given."""
 INDEX_WAVES = 0.01
-"""Waves of optical path through the glass that the index of what is not linear may be worth."""
+"""Largest optical path through the glass, in waves, that the index change of the nonlinear residual may cause."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeatedFace:
-    """What a table does to an optical face beyond its linear part.
+    """Change of an optical face by the nonlinear part of a temperature table.
 
     Attributes
     ----------
     motion : Motion
-        Of the face's body: rigid, Zernike terms and, of a mirror, a grid with the rest.
+        Motion of the face's body: rigid, Zernike terms and, for a mirror, a grid with the rest.
     lost : float
-        What is not carried, metres rms of sag.
+        Part of the change that the motion does not represent, in metres rms of sag.
     unmeshed : float
-        By how much coarser finite elements differ, metres rms of sag.
+        Difference from the result of coarser finite elements, in metres rms of sag.
     """
 
     motion: Motion
@@ -73,32 +73,33 @@ class HeatedFace:
 
     @property
     def figure_rms(self) -> float:
-        """Figure from Z4 on, metres rms over the disk of the terms."""
+        """Figure from Z4 on, in metres rms over the disk of the terms."""
         return float(np.sqrt(sum(a * a for j, a in self.motion.figure.items() if j > 3)))
 
 
 @dataclass(frozen=True, eq=False)
 class HeatedBody:
-    """What a table of temperatures is for its body.
+    """Temperature table of a body, split into a linear field and the effects of the residual.
 
     Attributes
     ----------
     nodes : int
-        How many there are.
+        Number of nodes.
     spacing : float
-        Of the nodes, metres.
+        Spacing of the nodes, in metres.
     linear : Temperature
-        The nearest linear field, in the body's frame.
+        Best linear fit, in the body's frame.
     left : tuple[float, float]
-        What it leaves, over the body's volume: rms and largest, kelvin.
+        Residual of that fit over the body's volume: rms and largest absolute value, in kelvin.
     between : float
-        Rms of the error at nodes that are left out, kelvin.
-    coverage : Coverage | None
-        Of the body by the nodes, None for a body without finite elements.
+        Leave-one-out error of the interpolation at the nodes, in kelvin rms.
+    coverage : Coverage or None
+        Coverage of the body by the nodes; None for a body without finite elements.
     faces : Mapping[str, HeatedFace]
-        Body of a face -> what the rest does to it.
+        Body of each optical face -> change by the residual.
     index_path : float
-        Largest optical path that the index of the rest may be worth, metres; 0 for what is not glass.
+        Largest optical path that the index change of the residual may cause, in metres; 0 for bodies that are not
+        glass.
     """
 
     nodes: int
@@ -111,12 +112,12 @@ class HeatedBody:
     index_path: float
 
     def state(self, gridded: State | None = None) -> State:
-        """What the rest does, beyond the linear field.
+        """Return the state that the residual causes, beyond the linear field.
 
         Parameters
         ----------
-        gridded : State | None
-            Motions of the same bodies whose grids these are to be added to.
+        gridded : State or None
+            Motions of the same bodies to whose grids these grids are resampled, so that they can be added.
         """
         out = {}
         for path, face in self.faces.items():
@@ -128,59 +129,59 @@ class HeatedBody:
         return out
 
     def warnings(self, path: str) -> tuple[str, ...]:
-        """What the user should know of the table of the body ``path``."""
+        """Return warnings about the table of the body ``path``."""
         out = []
         if self.coverage is not None and self.coverage.outside > SHOWN_OUTSIDE:
             out.append(
                 f"{path}: {100.0 * self.coverage.outside:.2g} % of its volume lie outside of the table's nodes, up to "
-                f"{1e3 * self.coverage.farthest:.3g} mm from the nearest; there its departure from the linear part "
-                "is taken: give nodes all through the body"
+                f"{1e3 * self.coverage.farthest:.3g} mm from the nearest node, whose departure from the linear part "
+                "is used there; provide nodes throughout the body"
             )
         if self.between > max(SEEN_HEAT, PRINTED * self.left[0]):
             out.append(
-                f"{path}: the table is coarser than its field: nodes left out are foretold to {self.between:.3g} K "
-                f"rms only, of {self.left[0]:.3g} K that are not linear ({1e3 * self.spacing:.3g} mm between nodes); "
-                "refine the mesh, or doubt what it does to images"
+                f"{path}: the table is too coarse for its field: the leave-one-out error at its nodes is "
+                f"{self.between:.3g} K rms, and the nonlinear part {self.left[0]:.3g} K rms "
+                f"({1e3 * self.spacing:.3g} mm between nodes); refine the mesh, or expect wrong effects on the images"
             )
         for face, change in self.faces.items():
             size = change.figure_rms
             if change.unmeshed > max(SEEN, MESHED_TO * size):
                 out.append(
-                    f"{face}: finite elements here follow the table to {1e9 * change.unmeshed:.3g} nm rms only, of "
-                    f"{1e9 * size:.3g} nm; give the displacements of the structural program (deformation)"
+                    f"{face}: the finite elements represent the effect of the table to {1e9 * change.unmeshed:.3g} nm "
+                    f"rms only, of {1e9 * size:.3g} nm; provide displacements of a structural program (deformation)"
                 )
             if change.lost > max(SEEN, PRINTED * size):
                 out.append(
-                    f"{face}: {1e9 * change.lost:.3g} nm rms of its change by the table are finer than "
-                    f"Z{TERMS} and not carried; give displacements (deformation)"
+                    f"{face}: {1e9 * change.lost:.3g} nm rms of its change by the table are beyond "
+                    f"Z{TERMS} and omitted; provide displacements (deformation)"
                 )
         if self.index_path > SEEN:
             out.append(
-                f"{path}: the index of glass follows the linear part of the table; the rest is worth up to "
-                f"{1e9 * self.index_path:.2g} nm of path and not carried"
+                f"{path}: the index of its glass follows the linear part of the table only; the residual causes up to "
+                f"{1e9 * self.index_path:.2g} nm of optical path and is omitted"
             )
         return tuple(out)
 
 
 def heated_body(thermal: ThermalModel, job: JobSpec, path: str, spec: TableTemperatureSpec) -> HeatedBody:
-    """What a job's table of temperatures does to one body.
+    """Return the effect of a job's temperature table on one body.
 
     Parameters
     ----------
     thermal : ThermalModel
-        Of the instrument.
+        Thermal model of the instrument.
     job : JobSpec
-        That names the table, for what is wrong.
+        The job that names the table, for error messages.
     path : str
-        Of the body.
+        Path of the body.
     spec : TableTemperatureSpec
-        The table, as ``scenes.specs.job.with_tables`` has left it.
+        The table, as ``scenes.specs.job.with_tables`` returns it.
 
     Raises
     ------
     InputError
-        No such frame; nodes that do not cover the body, are too cold, or have more that is not linear than this body
-        can follow.
+        The frame does not exist; the nodes do not cover the body or are too cold; or the residual from a linear field
+        is larger than this body can follow.
     """
     key = ("perturb", path, "temperature")
     assert spec.table is not None
@@ -206,15 +207,16 @@ def heated_body(thermal: ThermalModel, job: JobSpec, path: str, spec: TableTempe
 
 
 def _heated(thermal: ThermalModel, path: str, nodes: NodalTemperature) -> HeatedBody:
+    """Split a temperature table of a body. Raises NodesError."""
     if nodes.flat:
-        allowed = "nodes all through the body: across a plane they do not tell the gradient"
+        allowed = "nodes throughout the body: a plane of nodes does not determine the gradient across it"
         raise NodesError("the nodes lie in a plane or on a line", allowed)
     coarse, fine = _elastic(thermal, path)
     if coarse is None or fine is None:
         if nodes.departure() > LINEAR_TO:
-            kind = "consists of several pieces" if path in thermal.solids else "has no shape here"
+            kind = "consists of several pieces" if path in thermal.solids else "has no finite elements"
             raise NodesError(
-                f"it {kind} and can follow a linear field only, from which the nodes depart by up to "
+                f"the body {kind} and can follow a linear field only, from which the nodes depart by up to "
                 f"{nodes.departure():.3g} K",
                 f"the nearest linear field, {_in_words(nodes.linear)}, and displacements of the structural program",
             )
@@ -230,7 +232,7 @@ def _heated(thermal: ThermalModel, path: str, nodes: NodalTemperature) -> Heated
             f"{100.0 * coverage.outside:.0f} % of its volume lie outside of the nodes, whose x, y, z are "
             + ", ".join(f"{a:.4g} .. {b:.4g}" for a, b in theirs)
             + " mm",
-            f"nodes all through the body, in {body} mm of its frame: check frame and unit",
+            f"nodes throughout the body, in {body} mm of its frame: check frame and unit",
         )
     linear, rest = linear_part(elastic.places, nodes.at(elastic.places), elastic.volumes)
     largest = float(np.max(np.abs(rest)))
@@ -238,8 +240,8 @@ def _heated(thermal: ThermalModel, path: str, nodes: NodalTemperature) -> Heated
     index_path = thermal.index_path(path, linear, largest)
     if index_path > INDEX_WAVES * thermal.instrument.spec.autocollimator.wavelength:
         raise NodesError(
-            f"the rays through its glass follow a linear index only; what the table has beyond, up to {largest:.3g} K, "
-            f"is worth up to {1e9 * index_path:.3g} nm of path",
+            f"rays through its glass follow a linear index only; the residual of the table, up to {largest:.3g} K, "
+            f"causes up to {1e9 * index_path:.3g} nm of optical path",
             f"the nearest linear field, {_in_words(linear)}, or a table that departs from it by less",
         )
     faces: dict[str, HeatedFace] = {}
@@ -261,7 +263,7 @@ def _heated(thermal: ThermalModel, path: str, nodes: NodalTemperature) -> Heated
 
 
 def _at_nodes(thermal: ThermalModel, path: str, moved: Displacement) -> NodalDeformation:
-    """A mirror's displacement at its face's nodes, as those of another program's table are taken apart."""
+    """Return a mirror's displacement at the nodes of its face, decomposed like a table of another program."""
     ((aperture, _),) = thermal.faces_of(path).values()
     surface = thermal.surface(path)
     x, y, z = moved.nodes.T
@@ -270,7 +272,7 @@ def _at_nodes(thermal: ThermalModel, path: str, moved: Displacement) -> NodalDef
 
 
 def _elastic(thermal: ThermalModel, path: str) -> tuple[Held | None, Held | None]:
-    """Coarse and fine finite elements of a body with what holds them."""
+    """Return coarse and fine finite elements of a body with their supports."""
     if path in thermal.mirrors:
         return thermal.elastic(path, cells=COARSE_CELLS), thermal.elastic(path, cells=FINE_CELLS)
     if path not in thermal.solids:
@@ -281,7 +283,7 @@ def _elastic(thermal: ThermalModel, path: str) -> tuple[Held | None, Held | None
 
 
 def _apart(one: FaceChange, other: FaceChange, radius: float) -> float:
-    """Difference of two changes of a face, metres rms of sag over the disk of their terms."""
+    """Return the difference of two changes of a face, in metres rms of sag over the disk of their terms."""
     piston = one.shift[2] - other.shift[2]
     # a tilt t of a disk of radius R is t R / 2 rms
     tilts = [0.5 * radius * (a - b) for a, b in zip(one.rotate[:2], other.rotate[:2], strict=True)]
@@ -290,45 +292,46 @@ def _apart(one: FaceChange, other: FaceChange, radius: float) -> float:
 
 
 def _in_words(field: Temperature) -> str:
+    """Return a linear field as text of a job's file."""
     slope = ", ".join(f"{g:.6g} K/m" for g in field.gradient)
     return f"temperature: {{change: {field.change:.6g} K, gradient: [{slope}]}}"
 
 
 def heated_bodies(job: JobSpec, thermal: ThermalModel) -> dict[str, HeatedBody]:
-    """Body -> what the table of temperatures is that warms it.
+    """Return the temperature tables of a job by the body that they heat.
 
     Raises
     ------
     InputError
-        a table that does not describe its body.
+        A table does not describe its body.
     """
     named = {path: what.heat for path, what in job.perturb.items() if what.heat.table is not None}
     return {path: heated_body(thermal, job, path, spec) for path, spec in named.items()}
 
 
 def with_heat(fields: Mapping[str, Temperature], heated: Mapping[str, HeatedBody]) -> dict[str, Temperature]:
-    """The linear fields of bodies with those of their tables added."""
+    """Return the linear fields of bodies plus the linear parts of their tables."""
     return {**fields, **{path: fields.get(path, Temperature()) + body.linear for path, body in heated.items()}}
 
 
 def deformed_face(instrument: Instrument, job: JobSpec, path: str, spec: DeformationSpec) -> NodalDeformation:
-    """What a job's table does to one body.
+    """Return the deformation of one body by a job's table of nodes.
 
     Parameters
     ----------
     instrument : Instrument
         The instrument.
     job : JobSpec
-        That names the table, for what is wrong.
+        The job that names the table, for error messages.
     path : str
-        Of the body, which has a reflecting or refracting surface.
+        Path of the body, which has a reflecting or refracting surface.
     spec : DeformationSpec
-        The table, as ``scenes.specs.job.with_tables`` has left it.
+        The table, as ``scenes.specs.job.with_tables`` returns it.
 
     Raises
     ------
     InputError
-        No such frame; nodes that are not on the surface or do not cover it.
+        The frame does not exist; nodes are not on the surface or do not cover it.
     """
     key = ("perturb", path, "deformation")
     face = instrument.assembly.face(path)
@@ -344,25 +347,25 @@ def deformed_face(instrument: Instrument, job: JobSpec, path: str, spec: Deforma
 
 
 def pose_of_frame(instrument: Instrument, job: JobSpec, key: KeyPath, path: str, frame: str | None) -> Pose:
-    """Where the nominal frame in which a table is told stands in that of the body.
+    """Return the pose of the nominal frame of a table relative to that of the body.
 
     Parameters
     ----------
     instrument : Instrument
         The instrument.
     job : JobSpec
-        That names the table, for what is wrong.
+        The job that names the table, for error messages.
     key : KeyPath
-        Of the table's specification in there.
+        Key of the table's specification in the job.
     path : str
-        Of the body.
-    frame : str | None
-        Path of the body in whose frame the nodes are told, None for its own.
+        Path of the body.
+    frame : str or None
+        Path of the body in whose frame the nodes are given, None for the body's own.
 
     Raises
     ------
     InputError
-        No such frame.
+        The frame does not exist.
     """
     if frame is None:
         return Pose()
@@ -380,26 +383,26 @@ def job_state(
     moved: State | None = None,
     heated: Mapping[str, HeatedBody] | None = None,
 ) -> State:
-    """The perturbed state that a job describes.
+    """Return the perturbed state that a job describes.
 
     Parameters
     ----------
     job : JobSpec
-        Its perturbation, checked by ``scenes.specs.job.checked_nodes``.
+        The job, its perturbation checked by ``scenes.specs.job.checked_nodes``.
     thermal : ThermalModel
-        Of its instrument.
-    progress : Callable[[str], None]
-        Called with the path of each body whose thermo-elastic solution begins.
-    moved : State | None
-        The state without its linear temperatures, where it is known; None for all that the job says.
-    heated : Mapping[str, HeatedBody] | None
-        What its tables of temperatures are, where it is known.
+        Thermal model of its instrument.
+    progress : callable
+        Function called with the path of each body whose thermo-elastic solution begins.
+    moved : State or None
+        The state without its linear temperatures if it is known; None to derive it from the job.
+    heated : Mapping[str, HeatedBody] or None
+        Its temperature tables as ``heated_bodies`` returns them, if they are known.
 
     Raises
     ------
     InputError
-        a temperature at or below 0 K, or one at which a glass's index is not known; a table of nodes that does not
-        describe its body.
+        A temperature is at or below 0 K, or outside the data of a glass's index; or a table of nodes does not describe
+        its body.
     """
     heated = heated_bodies(job, thermal) if heated is None else heated
     fields = with_heat(job.fields(), heated)
@@ -414,12 +417,12 @@ def job_state(
 
 
 def deformations_of(job: JobSpec, instrument: Instrument) -> dict[str, NodalDeformation]:
-    """Body -> what the table of nodes is that a job deforms it by.
+    """Return the deformations by tables of nodes that a job lists, by body.
 
     Raises
     ------
     InputError
-        a table that does not describe its body.
+        A table does not describe its body.
     """
     named = {path: what.deformation for path, what in job.perturb.items() if what.deformation is not None}
     return {path: deformed_face(instrument, job, path, table) for path, table in named.items()}
@@ -431,8 +434,9 @@ def on_deformed(
     moved: State,
     heated: Mapping[str, HeatedBody] | None = None,
 ) -> State:
-    """The motions of a state on top of its bodies' deformations, by tables of nodes and by what is not linear of tables
-    of temperatures.
+    """Return the motions of a state on top of its bodies' deformations.
+
+    The deformations are those of tables of nodes and of the residuals of temperature tables.
     """
     bodies = {body.path: body for body in instrument.assembly.tree.bodies}
     own = {path: face.motion() for path, face in deformed.items()}
@@ -442,14 +446,14 @@ def on_deformed(
 
 
 def motions_of(job: JobSpec, time: int | None = None) -> State:
-    """The rigid motions, scales and shapes of surfaces that a job asks for; its temperatures come on top of them.
+    """Return the rigid motions, scales and shapes of surfaces that a job lists; its temperatures act on top of them.
 
     Parameters
     ----------
     job : JobSpec
-        Its perturbation.
-    time : int | None
-        Number of a time of its course, whose motions are added; None for none.
+        The job with its perturbation.
+    time : int or None
+        Index of a time of its course, whose motions are added; None to add none.
     """
     out = {path: what.motion() for path, what in job.perturb.items()}
     if job.course is not None and time is not None:
@@ -462,25 +466,27 @@ def motions_of(job: JobSpec, time: int | None = None) -> State:
 
 
 LIKELY = 4.0
-"""Standard deviations up to which an amount is what was stated: a normal number is larger once in 16 000."""
+"""Number of standard deviations up to which an amount agrees with the prior: a normal variable exceeds it once in 16
+000.
+"""
 
 
 @dataclass(frozen=True)
 class Excess:
-    """A component of a job's perturbation that its statement does not hold.
+    """Component of a job's perturbation that exceeds the disturbance prior.
 
     Attributes
     ----------
     body : str
-        path.
+        Path of the body.
     what : str
-        ``shift z``, ``figure Z7``, ``temperature``.
+        Name of the component, such as ``shift z``, ``figure Z7``, ``temperature``.
     kind : str
-        Of `scenes.models.disturbances.UNITS`; ``table`` for what files of nodes say.
+        Key of ``scenes.models.disturbances.UNITS``; ``table`` for tables at nodes.
     amount : float
-        SI; 0 for a table.
+        Amount, SI; 0 for a table.
     sigma : float
-        Stated of that component, SI; 0 for one that is not stated.
+        Standard deviation of that component in the prior, SI; 0 if the prior does not include it.
     """
 
     body: str
@@ -491,7 +497,7 @@ class Excess:
 
     @property
     def text(self) -> str:
-        """In words: ``base/forward/M2 shift z (3 um, stated 0.3 um)``."""
+        """Text for messages: ``base/forward/M2 shift z (3 um, stated 0.3 um)``."""
         if self.kind == "table":
             return f"{self.body} {self.what} (not stated)"
         unit, size = UNITS[self.kind]
@@ -500,21 +506,22 @@ class Excess:
 
 
 def beyond_statement(resolved: ResolvedJob, stated: StatedMotions | None) -> tuple[Excess, ...]:
-    """Components of a job's perturbation that are larger than `LIKELY` times what is stated of them, body by body.
+    """Return the components of a job's perturbation above `LIKELY` standard deviations of the prior, body by body.
 
-    Pivots are left aside: of a turn about another point its angle counts.
+    Pivots are ignored: for a rotation about another point the angle counts.
 
     Parameters
     ----------
     resolved : ResolvedJob
         The job.
-    stated : StatedMotions | None
-        Of it; None for nothing.
+    stated : StatedMotions or None
+        Its prior; None if it has none.
     """
     return tuple(_excesses(resolved.job, _variances(stated)))
 
 
 def _variances(stated: StatedMotions | None) -> Mapping[tuple[str, str], float]:
+    """Return the prior variance of each component, by body and name."""
     out: dict[tuple[str, str], float] = {}
     for c in stated.components if stated is not None else ():
         out[c.body, c.what] = out.get((c.body, c.what), 0.0) + c.sigma**2
@@ -522,6 +529,7 @@ def _variances(stated: StatedMotions | None) -> Mapping[tuple[str, str], float]:
 
 
 def _excesses(job: JobSpec, variance: Mapping[tuple[str, str], float]) -> Iterator[Excess]:
+    """Yield the components that exceed the prior."""
     for body, what in job.perturb.items():
         for kind, name, amount in _components(what):
             sigma = variance.get((body, name), 0.0) ** 0.5
@@ -530,7 +538,7 @@ def _excesses(job: JobSpec, variance: Mapping[tuple[str, str], float]) -> Iterat
 
 
 def _components(what: PerturbationSpec) -> Iterator[tuple[str, str, float]]:
-    """Kind, name and amount of all that is done to a body."""
+    """Yield kind, name and amount of each perturbation of a body."""
     vectors = {"shift": what.shift, "rotate": what.rotate, "gradient": what.heat.gradient}
     for kind, vector in vectors.items():
         yield from ((kind, f"{kind} {axis}", value) for axis, value in zip("xyz", vector, strict=True) if value)

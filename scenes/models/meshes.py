@@ -1,6 +1,6 @@
-"""Triangles: mirrors and boards as solid bodies, and surfaces that paths hit.
+"""Triangle meshes of mirrors and boards as solid bodies, and of surfaces for the path tracer.
 
-Prescriptions say nothing about substrates; these have a thickness that is usual for light mirrors.
+Prescriptions do not describe substrates; these have a thickness that is usual for lightweight mirrors.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ GRID = 24
 """Cells across a mirror: the mesh departs from the surface by less than a millimetre."""
 
 THICKNESS = 0.08
-"""Least thickness of a mirror behind its surface, share of its longer side."""
+"""Least thickness of a mirror behind its surface, as a fraction of its longer side."""
 
 BOARD = 0.010
-"""Thickness of the focal plane's board, metres; it stands behind the detectors."""
+"""Thickness of the focal plane's board, in metres; it stands behind the detectors."""
 
 BOARD_EDGE = 0.020
-"""How far the board reaches beyond the outermost of what it carries, metres."""
+"""Margin of the board beyond the outermost part that it carries, in metres."""
 
 CHIP = 0.0005
-"""Thickness of chips, metres."""
+"""Thickness of chips, in metres."""
 
 
 def mirror_mesh(surface: Surface, aperture: Aperture, back: float) -> trimesh.Trimesh:
-    """Watertight mesh of a mirror, ``mirror_triangles`` for who draws it."""
+    """Return the watertight mesh of ``mirror_triangles`` as a trimesh object, for drawing."""
     import trimesh
 
     return trimesh.Trimesh(*mirror_triangles(surface, aperture, back), process=False)
@@ -43,23 +43,25 @@ def mirror_mesh(surface: Surface, aperture: Aperture, back: float) -> trimesh.Tr
 def mirror_triangles(
     surface: Surface, aperture: Aperture, back: float, cells: int = GRID
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A mirror as a closed surface: its optical surface over the clear aperture, a flat back and an edge.
+    """Return a mirror as a closed surface: its optical surface over the clear aperture, a flat back and an edge.
 
     Parameters
     ----------
     surface : Surface
-        Shape, metres.
+        Shape, in metres.
     aperture : Aperture
         Clear aperture.
     back : float
-        +1 when the substrate is on the surface's +z side, -1 when on its -z side.
+        +1 if the substrate is on the surface's +z side, -1 if it is on its -z side.
     cells : int
-        Across the mirror.
+        Number of cells across the mirror.
 
     Returns
     -------
-    tuple[np.ndarray, np.ndarray]
-        Vertices (V, 3) in the mirror's frame, metres; triangles (T, 3) with outward winding.
+    vertices : (V, 3) ndarray
+        Vertices in the mirror's frame, in metres.
+    triangles : (T, 3) ndarray of int
+        Vertex numbers, with outward winding.
     """
     x0, x1, y0, y1 = aperture.bounds
     x, y, face = _grid(aperture, 0.5 * (x1 - x0), 0.5 * (y1 - y0), cells)
@@ -80,8 +82,9 @@ def mirror_triangles(
 
 
 def _grid(aperture: Aperture, half_x: float, half_y: float, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places x, y of a grid about the middle of an aperture, and the triangles between them, (T, 3). The grid has the
-    outline of the aperture's mesh: a disk, ring by ring, or a box.
+    """Return points x, y of a grid about the middle of an aperture, and the triangles between them, (T, 3).
+
+    The grid has the outline of the aperture's mesh: a disk, ring by ring, or a box.
     """
     x0, x1, y0, y1 = aperture.bounds
     s, n = np.linspace(-1.0, 1.0, cells + 1), cells + 1
@@ -100,9 +103,9 @@ def _grid(aperture: Aperture, half_x: float, half_y: float, cells: int) -> tuple
 
 
 def behind(model: CameraModel, mirror: str) -> float:
-    """Side of a mirror's surface on which its substrate lies: +1 toward +z, -1 toward -z.
+    """Return the side of a mirror's surface on which its substrate lies: +1 toward +z, -1 toward -z.
 
-    That is where the light would go on to.
+    It is the side on which the light would continue.
     """
     k = model.mirrors.index(mirror)
     own = model.mirror_pose(mirror)
@@ -111,14 +114,14 @@ def behind(model: CameraModel, mirror: str) -> float:
 
 
 def board_size(model: CameraModel, pinholes: list[tuple[float, float]]) -> tuple[float, float]:
-    """Size of a focal plane's board along its X and Y, metres, centred on the line.
+    """Return the size of a focal plane's board along its X and Y, in metres; it is centred on the line.
 
     Parameters
     ----------
     model : CameraModel
         The camera.
     pinholes : list[tuple[float, float]]
-        X, Y of its channels' pinholes and area CCDs in the focal plane, metres.
+        X, Y of its channels' pinholes and area CCDs in the focal plane, in metres.
     """
     line = 0.5 * model.spec.line.pixels * model.spec.line.pitch
     x = max((abs(p[0]) for p in pinholes), default=0.0)
@@ -127,30 +130,36 @@ def board_size(model: CameraModel, pinholes: list[tuple[float, float]]) -> tuple
 
 
 CELLS = 10
-"""Cells across a curved surface: few, because Mitsuba's search costs most. The triangles of a metre-sized mirror are
-then up to a millimetre off; the refinement does not mind."""
+"""Cells across a curved surface: few, because Mitsuba's search takes most of the time. The triangles of a metre-sized
+mirror are then up to a millimetre off, which the refinement of intersections corrects.
+"""
 
 MARGIN = 0.01
 LEAST_MARGIN = 2e-4
-"""How far the triangles reach beyond the clear aperture: share of its half-size, and at least so much, metres. The
-chords of the outline and of the surface must not cut a ray off that meets the surface inside its edge."""
+"""Margin of the triangles beyond the clear aperture: ``MARGIN`` as a fraction of its half-size, and at least
+``LEAST_MARGIN`` metres. The chords of outline and surface must not exclude a ray that meets the surface inside its
+edge.
+"""
 
 
 def sheet_mesh(surface: Surface, aperture: Aperture) -> tuple[np.ndarray, np.ndarray, float]:
-    """Triangles over a clear aperture and a little more.
+    """Return triangles over a clear aperture and a small margin.
 
     Parameters
     ----------
     surface : Surface
-        Shape, metres.
+        Shape, in metres.
     aperture : Aperture
         Clear aperture; a hole in it is covered, too.
 
     Returns
     -------
-    tuple[np.ndarray, np.ndarray, float]
-        Vertices (V, 3) in the surface's frame, metres; triangles (T, 3); largest distance between the triangles and the
-        surface, metres.
+    vertices : (V, 3) ndarray
+        Vertices in the surface's frame, in metres.
+    triangles : (T, 3) ndarray of int
+        Vertex numbers.
+    distance : float
+        Largest distance between the triangles and the surface, in metres.
     """
     cells = 2 if surface.is_plane and not isinstance(aperture, Circle) else CELLS
     x0, x1, y0, y1 = aperture.bounds
@@ -167,6 +176,6 @@ def sheet_mesh(surface: Surface, aperture: Aperture) -> tuple[np.ndarray, np.nda
 
 
 def polygon_mesh(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A convex polygon (K, 3) as a fan: vertices and triangles."""
+    """Return a convex polygon (K, 3) as a fan of triangles: vertices and vertex numbers."""
     k = np.arange(1, len(corners) - 1)
     return np.asarray(corners), np.stack([np.zeros_like(k), k, k + 1], axis=1)

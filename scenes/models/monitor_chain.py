@@ -1,9 +1,8 @@
-"""Where the monitor's prisms stand: from the beam that leaves a camera, over both prisms, to a facet of the central
-prism.
+"""Placement of the monitor's prisms, from a camera's leaving beam to a facet of the central prism.
 
-The beam leaves the camera through a part of the pupil. The 180-deg prism takes it at a given distance, turns it back
-and over to the central prism's side; the rhomboid displaces it by a given amount in the same direction; how far the
-180-deg prism has to transfer it follows from where the facet is. The facet stands square to the beam.
+The beam leaves the camera through a part of the pupil. The 180-deg prism receives it at a given distance, returns it
+and transfers it to the central prism's side; the rhomboid displaces it by a given amount in the same direction. The
+transfer of the 180-deg prism follows from the position of the facet, which is perpendicular to the beam.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from optics.geometry.solid import Solid
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, RigidTree
 from optics.materials.glass import glass
-from optics.numerics.array_math import inner, norm, matvec
+from optics.numerics.array_math import inner, matvec, norm
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.aim import AimError, RayFan, aim, surviving_rays, transverse_axes
@@ -43,22 +42,22 @@ from scenes.specs.instrument import (
 )
 from scenes.yaml.errors import KeyPath
 
-_CARRIED = "a field and a pupil_offset whose beam all mirrors of the camera carry"
-_FACET = "a position to which the prisms, with their angle_errors, lead the beam"
+_CARRIED = "a field and a pupil_offset whose beam passes all mirrors of the camera"
+_FACET = "a position to which the prisms, with their angle_errors, direct the beam"
 _OUTLINE = 2000  # points of a clear aperture's edge: a few millimetres apart at most
 
 
 @dataclass(frozen=True, eq=False)
 class LeavingBeam:
-    """A channel's beam in front of its camera, base frame.
+    """Beam of a channel in front of its camera, in the base frame.
 
     Attributes
     ----------
-    middle : np.ndarray
-        Where it meets the 180-deg prism's window, metres.
-    direction : np.ndarray
-        Of its middle ray, halfway between the beam from the pinhole and the one that would come from the middle of the
-        area CCD; unit vector.
+    middle : (3,) ndarray
+        Point at which it meets the 180-deg prism's window, in metres.
+    direction : (3,) ndarray
+        Unit vector of its middle ray, halfway between the beam from the pinhole and the one that would come from the
+        middle of the area CCD.
     """
 
     middle: np.ndarray
@@ -67,18 +66,18 @@ class LeavingBeam:
 
 @dataclass(frozen=True, eq=False)
 class MonitorChain:
-    """What a channel's beam meets outside the camera.
+    """Parts that a channel's beam meets outside the camera.
 
     Attributes
     ----------
     bodies : tuple[Body, ...]
-        Of the prisms and their faces, and of the facet.
+        Bodies of the prisms and their faces, and of the facet.
     elements : tuple[Element, ...]
-        In the order in which the leaving beam meets them; the last one is the return face.
+        Optical elements in the order in which the leaving beam meets them; the last one is the return face.
     solids : tuple[Solid, ...]
-        Of the two prisms, or of what stands in their place.
+        Solids of the two prisms, or of the reflectors in their place.
     glass : Mapping[str, float]
-        Prism -> length of the beam inside it, one way, metres.
+        Prism -> length of the beam inside it, one way, in metres.
     """
 
     bodies: tuple[Body, ...]
@@ -92,18 +91,19 @@ def leaving_beams(
 ) -> dict[Channel, LeavingBeam]:
     """Trace the channels' beams out of a camera.
 
-    The beam's middle is where the pinhole's chief ray passes, displaced by the sub-aperture's offset in the pupil.
+    The middle of a beam is the point at which the pinhole's chief ray passes, displaced by the sub-aperture's offset in
+    the pupil.
 
     Parameters
     ----------
     model : CameraModel
         The camera.
     distances : Mapping[Channel, float]
-        Channel -> from the camera's origin to its 180-deg prism's window, metres.
+        Channel -> distance from the camera's origin to its 180-deg prism's window, in metres.
     to_base : Pose
-        The camera's pose in the base.
+        Pose of the camera in the base.
     backend : Backend
-        Where to trace.
+        Backend that traces the rays.
 
     Raises
     ------
@@ -120,7 +120,7 @@ def leaving_beams(
 def _leaving(
     model: CameraModel, channels: Sequence[Channel], distance: float, to_base: Pose, backend: Backend
 ) -> list[LeavingBeam]:
-    """Beams of channels whose windows stand at one distance, metres; an error is about the first that has none."""
+    """Return the beams of channels with windows at one distance, in metres; an error names the first without one."""
     try:
         return _traced_out(model, channels, distance, to_base, backend)
     except MisplacedError:
@@ -135,7 +135,7 @@ def _leaving(
 def _traced_out(
     model: CameraModel, channels: Sequence[Channel], distance: float, to_base: Pose, backend: Backend
 ) -> list[LeavingBeam]:
-    """Trace the beams of ``_leaving``; an error is about all channels."""
+    """Trace the beams of ``_leaving`` together; an error names all channels."""
     frame = model.camera_frame
     reference = Pose(frame.rotation, frame.apply(np.array([0.0, 0.0, distance])))
     bare = model.bare_assembly(apertures=False)
@@ -173,24 +173,24 @@ def _traced_out(
 
 
 def facet_places(spec: InstrumentSpec, beams: Mapping[Channel, LeavingBeam]) -> dict[Channel, np.ndarray]:
-    """Middles of the facets that a camera's beams meet, base frame, metres.
+    """Return the middles of the facets that a camera's beams meet, in the base frame, in metres.
 
-    The first facet of each corner of the block leans to where its beam comes from and contains the apex, so that it is
+    The first facet of each corner of the block leans toward the origin of its beam and contains the apex, so that it is
     the lowest of all such planes there. Further facets of the same corner, whose beams come from nearly the same
-    direction, meet it halfway between the middles of both.
+    direction, intersect it halfway between the middles of both.
 
     Parameters
     ----------
     spec : InstrumentSpec
         The instrument.
     beams : Mapping[Channel, LeavingBeam]
-        Of one camera.
+        Beams of one camera.
 
     Raises
     ------
     InputError
-        Two beams share a facet, or a facet would lie under its neighbour: of two in one corner the one that leans more
-        has to stand farther out.
+        Two beams share a facet, or a facet would lie under its neighbour: of two in one corner the steeper one has to
+        be farther out.
     """
     apex = np.array(spec.reference_prism.position)
     corners: dict[tuple[float, float], list[tuple[Channel, np.ndarray, np.ndarray, float]]] = {}
@@ -205,17 +205,17 @@ def facet_places(spec: InstrumentSpec, beams: Mapping[Channel, LeavingBeam]) -> 
             if apart < least:
                 raise spec.error(
                     f"the facets of {channel.key} and {other.key} overlap: their beams meet the block only "
-                    f"{1e3 * apart:.4g} mm from each other",
+                    f"{1e3 * apart:.4g} mm apart",
                     spec.key_of(channel.camera, channel.name, (CENTRAL_KEY, "spread")),
-                    allowed=f"a place at least {1e3 * least:.4g} mm from that of {other.key}",
+                    allowed=f"a position at least {1e3 * least:.4g} mm from that of {other.key}",
                 )
             across = float(inner(lean - slope, offset - place))
             if across < 0.0:
                 raise spec.error(
-                    f"the facets of {channel.key} and {other.key} hide one another: the one that leans more has to "
-                    "stand farther out",
+                    f"the facets of {channel.key} and {other.key} obstruct one another: the steeper one has to be "
+                    "farther out",
                     spec.key_of(channel.camera, channel.name, (CENTRAL_KEY, "spread")),
-                    allowed=f"a place on the other side of that of {other.key}",
+                    allowed=f"a position on the other side of that of {other.key}",
                 )
             level = top + float(inner(lean - slope, 0.5 * (offset + place)))
             height = level if n == 0 else min(height, level)
@@ -234,21 +234,21 @@ def monitor_chain(
     spec : InstrumentSpec
         The instrument.
     channel : Channel
-        which.
+        The channel.
     given : ChannelParts
-        What the file says of it, with nothing left out.
+        Its parts as the file describes them, with all defaults filled in.
     beam : LeavingBeam
-        As it leaves the camera.
-    centre : np.ndarray
-        Of its facet, base frame, metres.
+        Its beam as it leaves the camera.
+    centre : (3,) ndarray
+        Centre of its facet, in the base frame, in metres.
     to_base : Pose
-        The camera's pose in the base.
+        Pose of the camera in the base.
 
     Raises
     ------
     InputError
-        The central prism is too near the camera's beam for the rhomboid's displacement, or that is too small for the
-        rhomboid's width.
+        The central prism is too near the camera's beam for the rhomboid's displacement, or that displacement is too
+        small for the rhomboid's width.
     """
     up, made, small = beam.direction, given.prism_180, given.prism_0
     apex = np.array(spec.reference_prism.position)
@@ -261,15 +261,15 @@ def monitor_chain(
     shortest = 2.0 * off + made.width
     if transfer < shortest:
         raise spec.error(
-            f"the beam of {channel.key} passes only {1e3 * whole:.4g} mm from its facet of the central prism; less the "
-            f"rhomboid's displacement this leaves {1e3 * transfer:.4g} mm for the 180-deg prism",
+            f"the beam of {channel.key} passes only {1e3 * whole:.4g} mm from its facet of the central prism, which "
+            f"leaves {1e3 * transfer:.4g} mm for the 180-deg prism after the rhomboid's displacement",
             (CENTRAL_KEY, "position"),
-            allowed=f"places that leave it at least {1e3 * shortest:.4g} mm",
+            allowed=f"positions that leave it at least {1e3 * shortest:.4g} mm",
         )
     into_camera = to_base.inverse()
     length = sqrt(transfer**2 - (2.0 * off) ** 2)
     turned = np.cross(up, toward)
-    # of the two mirror-image prisms the one that lies more nearly across the line
+    # Of the two mirror-image prisms, choose the one that lies more nearly across the line.
     x_axes = {hand: (length * toward + hand * 2.0 * off * turned) / transfer for hand in (1.0, -1.0)}
     hand = min(x_axes, key=lambda h: abs(x_axes[h][1]))
     pose = Pose(_columns(x_axes[hand], up), beam.middle + 0.5 * transfer * toward)
@@ -299,29 +299,31 @@ def monitor_chain(
 def _made(
     spec: InstrumentSpec, channel: Channel, prism: str, key: str, reflector: Reflector, mount: Mount
 ) -> ReflectorParts:
-    """A reflector; InputError at a key of the prism where it cannot be made."""
+    """Return the parts of a reflector. Raises InputError at a key of the prism if it cannot be made."""
     try:
         return reflector.parts(mount)
     except ValueError as error:
         problem, _, least = str(error).partition("; ")
         where = spec.key_of(channel.camera, channel.name, ("monitor", prism, key))
-        raise spec.error(problem, where, allowed=least or "measures with which the prism can be made") from error
+        raise spec.error(problem, where, allowed=least or "dimensions with which the prism can be made") from error
 
 
 def _turn(tilt: tuple[float, float], about: tuple[float, float, float]) -> Pose:
-    """A turn about x and y that leaves a point in place."""
+    """Return a rotation about x and y that leaves a point in place."""
     turn = rotation_matrix(np.array([*tilt, 0.0]))
     return Pose(turn, np.array(about) - matvec(turn, np.array(about)))
 
 
 def check_prisms(spec: InstrumentSpec) -> None:
-    """Check that the prisms' glasses have an index at the monitor's wavelength, that they let the beam pass, and that
-    all channels have the same kinds.
+    """Check the monitor's prisms.
+
+    Their glasses must have an index at the monitor's wavelength, they must be wide enough for the beam, and all
+    channels must have the same kinds.
 
     Raises
     ------
     InputError
-        One of them does not.
+        One of these conditions is not met.
     """
     wavelength = spec.autocollimator.wavelength
     kinds: dict[str, Reflector] = {}
@@ -330,10 +332,10 @@ def check_prisms(spec: InstrumentSpec) -> None:
             for name, prism in given.prisms.items():
                 if kinds.setdefault(name, prism.reflector) is not prism.reflector:
                     raise spec.error(
-                        f"{camera}/{channel} has another kind of reflector than the channels before it",
+                        f"{camera}/{channel} has a different kind of reflector than the channels before it",
                         spec.key_of(camera, channel, ("monitor", name, "kind")),
                         found=prism.kind,
-                        allowed="the same kind in all channels of an instrument, whose light is traced together",
+                        allowed="the same kind in all channels of an instrument, which are traced together",
                     )
             face = given.return_face.aperture
             for name, prism in given.prisms.items():
@@ -360,15 +362,15 @@ def check_prisms(spec: InstrumentSpec) -> None:
 def square_facets(
     assembly: Assembly, channels: Sequence[Channel], cameras: Mapping[str, CameraModel], backend: Backend
 ) -> Assembly:
-    """Turn every facet so that it sends the pinhole's beam to the middle of its area CCD, as found by tracing.
+    """Return an assembly with every facet rotated so that it sends the pinhole's beam to the middle of its area CCD.
 
-    The normal halves the angle between the beam that arrives and the one that would come from the CCD's middle, both
-    through the facet's centre, after all prisms with their angle errors.
+    The normal, found by tracing, bisects the angle between the beam that arrives and the one that would come from the
+    CCD's middle, both through the facet's centre, after all prisms with their angle errors.
 
     Raises
     ------
     MisplacedError
-        a beam misses a mirror or a prism; the message names the element.
+        A beam misses a mirror or a prism; the message names the element.
     """
     poses = {}
     placed = assembly.place()
@@ -406,19 +408,19 @@ def _aimed(
     key: KeyPath,
     start: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Parameters of ``aim``; MisplacedError at ``key`` when it finds no ray."""
+    """Return the ray parameters of ``aim``. Raises MisplacedError at ``key`` if there is no such ray."""
     try:
         return aim(backend, systems, fan, target, start)[0]
     except (AimError, np.linalg.LinAlgError) as error:
         why = f": {error}" if isinstance(error, AimError) else ""
         choice = _CARRIED if key[0] == "monitor" else _FACET
-        raise MisplacedError(f"no light of {channels} gets to where it has to go{why}", key, choice) from error
+        raise MisplacedError(f"the light of {channels} does not reach its target{why}", key, choice) from error
 
 
 def _missed(
     assembly: Assembly, channel: Channel, backend: Backend, position: np.ndarray, direction: np.ndarray
 ) -> MisplacedError:
-    """Which element of a channel's way out rays (1, N, 3) from the pinhole and from the CCD miss first."""
+    """Return an error that names the first element of a channel's outgoing sequence that rays (1, N, 3) miss."""
     names = assembly.sequences[f"{channel.key}/outgoing"]
     for count, (element, alive) in enumerate(surviving_rays(backend, assembly, names, position, direction), 1):
         if alive.all():
@@ -429,7 +431,7 @@ def _missed(
             what += f": it passes {1e3 * off:.3g} mm beside the clear aperture"
         elif element.interaction is Interaction.TOTAL:
             what += ", or is not totally reflected there"
-        choice = "a pupil_offset, monitor.field and angle_errors of the prisms with which it passes"
+        choice = "a pupil_offset, monitor.field and angle_errors of the prisms that let it pass"
         if prism_of(element.body) is None and element.body != channel.face_body:
             choice = f"{_CARRIED}, or a camera with another {element.body.rpartition('/')[2]}"
         return MisplacedError(what, key_of(element.body), choice, (channel.camera, channel.name))
@@ -445,27 +447,27 @@ def beside(
     direction: np.ndarray,
     lost: np.ndarray,
 ) -> float | None:
-    """How far beside the clear aperture of the last of some elements lost rays pass at most, metres.
+    """Return the largest distance of lost rays outside the clear aperture of the last of some elements, in metres.
 
     Parameters
     ----------
     assembly : Assembly
-        With the elements.
+        Assembly with the elements.
     backend : Backend
-        Where to trace.
-    names : Sequence[str]
-        Of the elements, in the order of the light.
-    position : np.ndarray
-        Of rays, world, metres, broadcastable to (1, N, 3).
-    direction : np.ndarray
-        Unit vectors, likewise.
-    lost : np.ndarray
-        Which of them get lost at the last element, (N,).
+        Backend that traces the rays.
+    names : sequence of str
+        Names of the elements, in the order of the light.
+    position : ndarray
+        Start points of the rays, in the world, in metres, broadcastable to (1, N, 3).
+    direction : ndarray
+        Unit vectors of the rays, likewise.
+    lost : (N,) ndarray of bool
+        Rays that are lost at the last element.
 
     Returns
     -------
-    float | None
-        None where they do not meet its surface, or where it has no edge.
+    float or None
+        None where the rays do not meet its surface, or where it has no edge.
     """
     element = assembly.elements[names[-1]]
     bare = assembly.with_element(replace(element, aperture=None))
@@ -477,11 +479,11 @@ def beside(
 
 
 def _columns(x: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Rotation with these x and z axes."""
+    """Return the rotation with these x and z axes."""
     return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
 def _facet_axes(normal: np.ndarray) -> np.ndarray:
-    """Frame of a facet: z along its normal, x along the line (against the camera's Y)."""
+    """Return the frame of a facet: z along its normal, x along the line (against the camera's Y)."""
     x_axis = transverse_axes(normal, np.array([0.0, -1.0, 0.0]))[0]
     return _columns(x_axis, normal)

@@ -1,7 +1,6 @@
-"""Layouts of a monitor: the beams of a design, the instrument's file that has them, and what they take of mass, pupil
-and glass.
+"""Layouts of a monitor: the beams of a design, the instrument that has them, and their mass, pupil share and glass.
 
-A beam stands four times in a pair: at both ends of both cameras' lines, mirrored. Its pupil offset counts toward the
+Each beam exists four times in a pair, mirrored: at both ends of both cameras' lines. Its pupil offset counts toward the
 central prism, and along the line toward the beam's own end.
 """
 
@@ -29,25 +28,25 @@ from scenes.yaml.errors import KeyPath
 from scenes.yaml.spec import Paths, Spec
 
 RAYS = 2000
-"""Rays of an imaging beam by which shares of the pupil are told: to about a thousandth."""
+"""Rays of an imaging beam from which pupil shares are computed: accurate to about a thousandth."""
 AS_STARTED = "start"
-"""Name of the prisms of the instrument that a design starts from."""
+"""Name of the prisms and area CCD of the instrument that a design starts from."""
 
 
 class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
-    """A design with all it refers to.
+    """Monitor design with all the files that it refers to.
 
     Attributes
     ----------
-    instrument : instruments.InstrumentSpec
-        To start from.
-    cameras : Paths[CameraSpec]
-        By the name that the instrument gives them.
+    instrument : InstrumentSpec
+        Instrument that the design starts from.
+    cameras : Mapping[str, CameraSpec]
+        Cameras by the instrument's names for them.
     detector : DetectorSpec
         Data sheet of the area CCDs.
-    disturbances : Paths[DisturbancesSpec]
-        By the name that the design, or the instrument, gives them.
-    detectors : Paths[DetectorSpec]
+    disturbances : Mapping[str, DisturbancesSpec]
+        Disturbance priors by the names that the design, or the instrument, gives them.
+    detectors : Mapping[str, DetectorSpec]
         Data sheets of the area CCDs that the design may choose from, by its names for them.
     """
 
@@ -59,10 +58,10 @@ class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
 
     @classmethod
     def parts(cls, test: MonitorDesignSpec) -> dict[str, Any]:
-        """Return the instrument with all that belongs to it, and what the design may choose from."""
+        """Return the instrument with all that belongs to it, and the parts that the design may choose from."""
         start = load.load_instrument(test.instrument, test, ("instrument",))
         if start.as_built:
-            problem = f"{start.name} is an instrument as built, and a layout is drawn"
+            problem = f"{start.name} is an instrument as built; a layout starts from a drawing"
             allowed = "the drawing that its file names as its design"
             raise test.error(problem, ("instrument",), found=test.instrument, allowed=allowed)
         owner: Spec = test
@@ -70,7 +69,7 @@ class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
         if references is None:
             owner, references = start, () if start.disturbances in (None, NONE) else (start.disturbances,)
         if not references:
-            problem = f"there is no prior on disturbances in {start.name}"
+            problem = f"{start.name} names no disturbance prior"
             raise test.error(problem, ("disturbances",), allowed="disturbances files, by name or path")
         stated = {}
         for k, reference in enumerate(references):
@@ -89,7 +88,7 @@ class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
         }
 
     def checked(self) -> Self:
-        """Check that the instrument is one that can be designed so."""
+        """Check that the design can start from this instrument."""
         test, start = self.test, self.instrument
         if len(start.cameras) != 2:
             raise test.error("a layout is designed for a pair", ("instrument",), found=f"{len(start.cameras)} cameras")
@@ -106,25 +105,25 @@ class Beam:
     Attributes
     ----------
     pupil_x, pupil_y : float
-        Middle in the entrance pupil, toward the central prism and toward its own end of the line, m.
+        Middle in the entrance pupil, toward the central prism and toward its own end of the line, in metres.
     width : float
-        Diameter of its return face, m.
+        Diameter of its return face, in metres.
     field : float
-        Angle of its area CCD from the visual axis, rad.
+        Angle of its area CCD from the visual axis, in radians.
     prism_180_distance : float
-        From the camera's origin, m.
+        Distance of its 180-deg prism from the camera's origin, in metres.
     prism_0_distance : float
-        From its return face, m.
+        Distance of its rhomboid from the return face, in metres.
     shift : float
-        Of its rhomboid, m.
+        Displacement by its rhomboid, in metres.
     spread_x, spread_y : float
-        Of its facet from the apex, m.
+        Position of its facet relative to the apex, in metres.
     prisms : str
-        By their name in the design.
-    photons : float | None
-        Of its spot, per frame; None for the monitor's.
+        Name of its prisms in the design.
+    photons : float or None
+        Photons of its spot per frame; None for the monitor's number.
     area_ccd : str
-        Of all channels, by its name in the design.
+        Name in the design of the area CCD, the same for all channels.
     """
 
     pupil_x: float
@@ -141,23 +140,23 @@ class Beam:
     area_ccd: str = AS_STARTED
 
     def changed(self, numbers: Mapping[str, float]) -> Beam:
-        """Return the beam with other continuous numbers, by their names."""
+        """Return the beam with some of its continuous numbers replaced, by name."""
         values: Mapping[str, Any] = numbers
         return replace(self, **values)
 
 
 CONTINUOUS = tuple(item.name for item in fields(Beam) if item.name not in {"prisms", "area_ccd"})
-"""Names of what varies continuously."""
+"""Names of the continuous numbers of a beam."""
 Layout = tuple[Beam, ...]
 
 
 def start_beams(setup: MonitorDesignSetup) -> Layout:
-    """The beams of the instrument that a design starts from.
+    """Return the beams of the instrument that a design starts from.
 
     Raises
     ------
     InputError
-        They do not stand mirrored at both ends of both lines.
+        The beams are not mirrored at both ends of both lines.
     """
     start, first = setup.instrument, next(iter(setup.instrument.cameras))
     sign, beams = _toward(start, start.cameras[first]), []
@@ -173,13 +172,13 @@ def start_beams(setup: MonitorDesignSetup) -> Layout:
         own, made_again = start.channels_of(camera), again.channels_of(camera)
         places = [sorted((c.field, c.pupil_offset, c.spread) for c in them.values()) for them in (own, made_again)]
         if len(own) != len(made_again) or not np.allclose(_flat(places[0]), _flat(places[1]), atol=1e-12):
-            problem = f"the channels of {camera} are not those of {first}, mirrored"
+            problem = f"the channels of {camera} do not mirror those of {first}"
             raise setup.test.error(problem, ("instrument",), found=start.name, allowed="the same beams, mirrored")
     return tuple(beams)
 
 
 def _prisms_of(setup: MonitorDesignSetup, one: instruments.ChannelParts) -> str:
-    """Name of the prisms that a channel of the start has."""
+    """Return the design's name for the prisms of a channel of the start."""
     monitor = setup.instrument.autocollimator
     has = [(prism.material, prism.kind) for prism in (one.prism_180, one.prism_0)]
     known = {AS_STARTED: [(prism.material, prism.kind) for prism in (monitor.prism_180, monitor.prism_0)]}
@@ -189,12 +188,12 @@ def _prisms_of(setup: MonitorDesignSetup, one: instruments.ChannelParts) -> str:
         if parts == has:
             return name
     problem = f"the channels of {setup.instrument.name} have prisms that the design does not name"
-    allowed = "these, under a name of one's own"
+    allowed = "an entry of prisms with these"
     raise setup.test.error(problem, ("prisms",), found=f"{has[0]}, {has[1]}", allowed=allowed)
 
 
 def _ccd_of(setup: MonitorDesignSetup) -> str:
-    """Name of the area CCD that the start has."""
+    """Return the design's name for the area CCD of the start."""
     own = setup.instrument.autocollimator.area_ccd
     for name, one in (setup.test.area_ccds or {}).items():
         if (one.detector, one.pitch, one.rows, one.columns) == (own.detector, own.pitch, own.rows, own.columns):
@@ -203,24 +202,28 @@ def _ccd_of(setup: MonitorDesignSetup) -> str:
 
 
 def _flat(places: Sequence[tuple[float, tuple[float, float], tuple[float, float]]]) -> np.ndarray:
+    """Return fields, offsets and spreads of channels as one array, a row each."""
     return np.array([[field, *offset, *spread] for field, offset, spread in places])
 
 
 def _toward(spec: instruments.InstrumentSpec, site: instruments.MountedCameraSpec) -> float:
-    """+1 where the central prism lies on the camera's +X side, else -1."""
+    """Return +1 if the central prism lies on the camera's +X side, else -1."""
     return 1.0 if spec.reference_prism.position[0] > site.position[0] else -1.0
 
 
 def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> instruments.InstrumentSpec:
-    """The instrument that has these beams; all else as in the start, but for its name, light, frames, area CCDs and the
-    central prism's material.
+    """Return the instrument that has these beams.
+
+    Everything else is that of the start, except name, light, number of frames, area CCDs and the central prism's
+    material.
 
     Parameters
     ----------
     setup : MonitorDesignSetup
         The design.
     beams : Layout
-        Each becomes a channel at both ends of both lines: ``left`` and ``right``, ``left_2`` and ``right_2``.
+        Beams, each of which becomes a channel at both ends of both lines: ``left`` and ``right``, ``left_2`` and
+        ``right_2``.
     """
     start, test = setup.instrument, setup.test
     monitor = start.autocollimator
@@ -251,18 +254,19 @@ def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> instruments.Instrum
 
 
 def _light(setup: MonitorDesignSetup) -> float:
-    """Photons of a spot and frame where a beam has none of its own."""
+    """Return the photons per spot and frame of beams that have no number of their own."""
     return setup.test.photons_per_frame or setup.instrument.autocollimator.reticle.photons_per_frame
 
 
 def channel_name(side: str, number: int) -> str:
-    """Name of a beam's channel at one of ``SIDES``; beams are counted from 0."""
+    """Return the name of a beam's channel at one of ``SIDES``; beams are counted from 0."""
     return side if number == 0 else f"{side}_{number + 1}"
 
 
 def _channel(
     setup: MonitorDesignSetup, beam: Beam, field: float, offset: tuple[float, float]
 ) -> instruments.ChannelSpec:
+    """Return the specification of one channel of a beam."""
     monitor = setup.instrument.autocollimator
     rim = monitor.prism_180.width - monitor.return_face.aperture, monitor.prism_0.width - monitor.return_face.aperture
     chosen = (setup.test.prisms or {}).get(beam.prisms)
@@ -281,38 +285,38 @@ def _channel(
 
 
 def _parts(chosen: PrismChoiceSpec | None) -> Iterator[Mapping[str, object]]:
-    """Material and kind of both prisms, as updates."""
+    """Yield material and kind of both prisms, as updates of their specifications."""
     for one in (None, None) if chosen is None else (chosen.prism_180, chosen.prism_0):
         yield {} if one is None else {"material": one.material, "kind": one.kind}
 
 
 def kinds_of(setup: MonitorDesignSetup, beam: Beam) -> tuple[str | None, str | None]:
-    """Kinds of a beam's two reflectors; None for the prism itself."""
+    """Return the kinds of a beam's two reflectors; None for a glass prism."""
     monitor, chosen = setup.instrument.autocollimator, (setup.test.prisms or {}).get(beam.prisms)
     own = (monitor.prism_180.kind, monitor.prism_0.kind)
     return own if chosen is None else (chosen.prism_180.kind, chosen.prism_0.kind)
 
 
 def drawn_beam(setup: MonitorDesignSetup, rng: np.random.Generator) -> Beam:
-    """A beam at random, evenly in all that may vary."""
+    """Return a random beam, uniform in all numbers that may vary."""
     start = start_beams(setup)[0]
     numbers = {name: float(rng.uniform(*ends)) for name, ends in ranges(setup).items()}
     return replace(start.changed(numbers), prisms=_chosen(setup, rng), area_ccd=_chosen_ccd(setup, start, rng))
 
 
 def changed_beam(setup: MonitorDesignSetup, beam: Beam, step: float, rng: np.random.Generator) -> Beam:
-    """A beam near another one.
+    """Return a random beam near another one.
 
     Parameters
     ----------
     setup : MonitorDesignSetup
         The design.
     beam : Beam
-        That is changed.
+        Beam to change.
     step : float
-        Standard deviation of the change of each number, relative to its range; its ends throw back.
+        Standard deviation of the change of each number, relative to its range; numbers are reflected at the ends of it.
     rng : np.random.Generator
-        Source of all that is drawn. About half of the numbers stay, so that single ones are tried, too.
+        Generator of the random numbers. About half of the numbers stay, so that changes of single ones are tried, too.
     """
     numbers = {}
     for name, (low, high) in ranges(setup).items():
@@ -325,28 +329,30 @@ def changed_beam(setup: MonitorDesignSetup, beam: Beam, step: float, rng: np.ran
 
 
 def number_of(setup: MonitorDesignSetup, beam: Beam, name: str) -> float:
-    """One of a beam's continuous numbers."""
+    """Return one of a beam's continuous numbers."""
     value = getattr(beam, name)
     return _light(setup) if value is None else float(value)
 
 
 def ranges(setup: MonitorDesignSetup) -> dict[str, tuple[float, float]]:
-    """What of each beam varies continuously, from and to, SI."""
+    """Return the range of each continuous number of a beam that varies, SI."""
     return {name: ends for name in CONTINUOUS if (ends := getattr(setup.test.vary, name)) is not None}
 
 
 def _chosen(setup: MonitorDesignSetup, rng: np.random.Generator) -> str:
+    """Return the name of random prisms of the design."""
     names = tuple(setup.test.prisms or (AS_STARTED,))
     return names[int(rng.integers(len(names)))]
 
 
 def _chosen_ccd(setup: MonitorDesignSetup, start: Beam, rng: np.random.Generator) -> str:
+    """Return the name of a random area CCD of the design."""
     names = tuple(setup.test.area_ccds or ())
     return names[int(rng.integers(len(names)))] if names else start.area_ccd
 
 
 def prism_mass(instrument: Instrument) -> float:
-    """Mass of all prisms and of what stands in their place, kg, without the central prism."""
+    """Return the mass of all prisms, or of the reflectors in their place, in kg, without the central prism."""
     placed, total = instrument.assembly.place(), 0.0
     for solid in instrument.solids:
         if solid.path != instruments.CENTRAL_PRISM:
@@ -356,23 +362,23 @@ def prism_mass(instrument: Instrument) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ImagingBeams:
-    """Imaging beams of an instrument's cameras, of which prisms take their part.
+    """Imaging beams of an instrument's cameras, for the share that prisms block.
 
     Attributes
     ----------
     segments : Mapping[str, Sequence[np.ndarray]]
-        Camera -> rays to both ends and the middle of the line, three of (RAYS, K, 2, 3), base frame, metres.
+        Camera -> rays to both ends and the middle of the line, three of (RAYS, K, 2, 3), in the base frame, in metres.
     """
 
     segments: Mapping[str, Sequence[np.ndarray]]
 
     @classmethod
     def of(cls, instrument: Instrument, backend: Backend) -> ImagingBeams:
-        """Those of an instrument; every layout on the same cameras has the same."""
+        """Return the imaging beams of an instrument; all layouts on the same cameras share them."""
         return cls({name: imaging_segments(instrument, backend, name, RAYS) for name in instrument.cameras})
 
     def taken(self, instrument: Instrument) -> np.ndarray:
-        """Which rays some prism of an instrument takes, (cameras, 3, RAYS)."""
+        """Return a mask of the rays that prisms of an instrument block, (cameras, 3, RAYS)."""
         placed, out = instrument.assembly.place(), np.zeros((len(self.segments), 3, RAYS), dtype=bool)
         for solid in instrument.solids:
             corners = placed.pose(solid.path).apply(solid_mesh(solid, placed).vertices)
@@ -384,5 +390,5 @@ class ImagingBeams:
 
 
 def pupil_share(taken: np.ndarray) -> float:
-    """Largest share of a camera's pupil along its line, by what ``ImagingBeams.taken`` gives."""
+    """Return the largest blocked share of a camera's pupil along its line, from the mask of ``ImagingBeams.taken``."""
     return float(taken.mean(axis=-1).max())

@@ -1,13 +1,12 @@
-"""Which prisms stand in the way of light: of the imaging beams, and of monitor beams that are not their own.
+"""Bodies that block light, and bodies that overlap: clearances of an instrument.
 
-A 180-deg prism has to stand before its camera, since its channel uses a part of the pupil; what it takes of the imaging
-beam is reported, and how much of that its channel uses. A monitor beam has to get to its area CCD whole: an instrument
-in which a body or the edge of a clear aperture takes a part of one is refused.
+Obstruction. A 180-deg prism stands in front of its camera, since its channel uses a part of the pupil; the share of the
+imaging beam that it blocks is reported, with the part of it that its channel uses. A monitor beam has to reach its area
+CCD whole: an instrument in which a body or the edge of a clear aperture vignettes one is refused.
 
-Whether the bodies of an instrument leave each other room: prisms, mirrors and focal-plane boards, as convex bodies.
-
-Two convex bodies meet where their Minkowski difference contains the origin; how deep tells how far one of them has to
-move. Parts of one camera are not compared with each other: the prescription gives them no substrates.
+Overlap. Prisms, mirrors and focal-plane boards are convex bodies. Two of them overlap where their Minkowski difference
+contains the origin; its depth is the distance by which one of them has to move. Parts of one camera are not compared
+with each other, because the prescription does not describe substrates.
 """
 
 from __future__ import annotations
@@ -41,27 +40,28 @@ if TYPE_CHECKING:
     from scipy.spatial import ConvexHull
 
 LEAST_GAP = 20e-6
-"""Bodies nearer than this count as touching, metres: what the path tracer needs between two of them."""
+"""Gap between bodies below which they count as touching, in metres: the path tracer needs it between two surfaces."""
 
 PARALLEL = 1e-9
 """Sine of the angle between planes below which they have no common edge."""
 
-_CELLS = 12  # across a mirror: the hull lies within a few tenths of a millimetre of the surface
+_CELLS = 12  # cells across a mirror: the hull is within a few tenths of a millimetre of the surface
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """Two bodies that stand in each other, or touch.
+    """Two bodies that overlap or touch.
 
     Attributes
     ----------
     first, second : str
-        Their paths.
+        Paths of the bodies.
     depth : float
-        How far one of them has to move for them to touch only; negative for a gap below ``LEAST_GAP``; metres.
-    way : tuple[int, float] | None
-        Along which axis of the base, 0 to 2, and how far, metres with its sign, the second one is moved to leave
-        ``LEAST_GAP``: of the three axes the shortest way. None where nobody asked.
+        Distance by which one of them has to move so that they just touch, in metres; negative for a gap below
+        ``LEAST_GAP``.
+    way : tuple[int, float] or None
+        Axis of the base (0 to 2) and signed distance in metres by which the second body has to move to leave
+        ``LEAST_GAP``, the shortest of the three axes; None if it was not computed.
     """
 
     first: str
@@ -71,16 +71,16 @@ class Overlap:
 
 
 def convex_hull(points: np.ndarray) -> ConvexHull:
-    """The hull of points (N, 3); SciPy is imported when the first is made, since who only reads a file makes none."""
+    """Return the convex hull of points (N, 3). SciPy is imported here, since reading a file needs no hull."""
     from scipy.spatial import ConvexHull
 
     return ConvexHull(points)
 
 
 def separation(first: np.ndarray, second: np.ndarray) -> float:
-    """Distance of the convex hulls of two sets of points, (P, 3) and (Q, 3), metres.
+    """Return the distance between the convex hulls of two sets of points, (P, 3) and (Q, 3), in metres.
 
-    Negative when they overlap: the shortest displacement that takes them apart, with a minus sign.
+    It is negative for hulls that overlap: minus the length of the shortest displacement that separates them.
     """
     difference = convex_hull((first[:, None] - second[None]).reshape(-1, 3))
     deepest = float(np.max(difference.equations[:, 3]))  # of the origin, relative to every face
@@ -90,7 +90,7 @@ def separation(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def _distances(triangles: np.ndarray) -> np.ndarray:
-    """Of the origin from triangles (T, 3, 3), which may have no area; (T,)."""
+    """Return the distances (T,) of the origin from triangles (T, 3, 3), which may be degenerate."""
     after = np.roll(triangles, -1, axis=1)
     edges = after - triangles
     square = np.maximum(np.einsum("tki,tki->tk", edges, edges), np.finfo(np.float64).tiny)
@@ -98,28 +98,28 @@ def _distances(triangles: np.ndarray) -> np.ndarray:
     to_edges = np.min(np.linalg.norm(triangles + along[..., None] * edges, axis=-1), axis=1)
     normal = np.cross(edges[:, 0], edges[:, 1])
     area = np.linalg.norm(normal, axis=-1)
-    # the foot of the perpendicular lies in the triangle where it is on the inner side of every edge
+    # The foot of the perpendicular lies in the triangle if it is on the inner side of every edge.
     inside = (area > 0.0) & np.all(np.einsum("tki,ti->tk", np.cross(triangles, after), normal) >= 0.0, axis=1)
     above = np.abs(np.einsum("ti,ti->t", triangles[:, 0], normal))
     return np.where(inside, above / np.where(inside, area, 1.0), to_edges)
 
 
 def way_apart(first: np.ndarray, second: np.ndarray, room: float = LEAST_GAP) -> tuple[int, float]:
-    """Shortest way along an axis that takes the convex hull of one set of points away from that of another.
+    """Return the shortest move along an axis that separates the convex hull of one set of points from that of another.
 
     Parameters
     ----------
-    first : np.ndarray
-        (P, 3), metres.
-    second : np.ndarray
-        Of the body that is moved, (Q, 3), metres.
+    first : (P, 3) ndarray
+        Points of the body that stays, in metres.
+    second : (Q, 3) ndarray
+        Points of the body that is moved, in metres.
     room : float
-        That is left at the end, metres.
+        Gap that remains after the move, in metres.
 
     Returns
     -------
     tuple[int, float]
-        The axis, 0 to 2, and how far the second is moved along it, metres with its sign.
+        Axis (0 to 2) and signed distance along it, in metres.
     """
     faces = convex_hull((first[:, None] - second[None]).reshape(-1, 3)).equations
     ways = []
@@ -133,14 +133,14 @@ def way_apart(first: np.ndarray, second: np.ndarray, room: float = LEAST_GAP) ->
 
 
 def convex_bodies(instrument: Instrument, placed: PlacedBodies | None = None) -> Mapping[str, np.ndarray]:
-    """Path -> corners of the body in the base frame, (P, 3), metres.
+    """Return the corners of each body in the base frame, (P, 3), in metres, by path.
 
     Parameters
     ----------
     instrument : Instrument
         The instrument.
-    placed : PlacedBodies | None
-        Where its bodies stand; by default as designed.
+    placed : PlacedBodies or None
+        Positions of its bodies; by default the nominal ones.
     """
     placed = instrument.assembly.place() if placed is None else placed
     out = {s.path: placed.pose(s.path).apply(solid_mesh(s, placed).vertices) for s in instrument.solids}
@@ -161,7 +161,7 @@ def convex_bodies(instrument: Instrument, placed: PlacedBodies | None = None) ->
 
 
 def find_overlaps(instrument: Instrument) -> tuple[Overlap, ...]:
-    """All pairs of bodies that stand in each other or nearer than ``LEAST_GAP``, as designed; deepest first."""
+    """Return all pairs of bodies that overlap or are nearer than ``LEAST_GAP`` in the nominal state, deepest first."""
     known = Clearances.of(instrument)
     found = [(*pair, gap) for pair, gap in zip(known.pairs, known.gaps, strict=True) if gap < LEAST_GAP]
     out = []
@@ -172,7 +172,7 @@ def find_overlaps(instrument: Instrument) -> tuple[Overlap, ...]:
 
 
 def _pairs(instrument: Instrument, bodies: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Those that must not stand in each other; mirrors and board of one camera are its prescription's business."""
+    """Yield pairs of bodies that must not overlap; mirrors and board of the same camera are not compared."""
     prisms = {solid.path for solid in instrument.solids}
     for first, second in combinations(bodies, 2):
         if prisms & {first, second} or _camera(first) != _camera(second):
@@ -180,7 +180,7 @@ def _pairs(instrument: Instrument, bodies: Iterable[str]) -> Iterator[tuple[str,
 
 
 def _between_boxes(first: np.ndarray, second: np.ndarray) -> float:
-    """Largest gap along an axis between the boxes around two sets of points, metres; negative where they overlap."""
+    """Return the largest gap along an axis between the boxes of two sets of points, in metres; negative if none."""
     low = np.maximum(first.min(axis=0), second.min(axis=0))
     high = np.minimum(first.max(axis=0), second.max(axis=0))
     return float(np.max(low - high))
@@ -188,14 +188,20 @@ def _between_boxes(first: np.ndarray, second: np.ndarray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Clearances:
-    """How far bodies may move before they can touch, for many states one after the other.
+    """Clearances of bodies in the nominal state, from which overlaps in many other states are found quickly.
 
     Attributes
     ----------
     paths : tuple[str, ...]
-        Of the bodies; corners: of each in its own frame, (P, 3), metres; poses: where each stands as designed.
-    pairs : np.ndarray
-        Numbers of two bodies each, (Q, 2); gaps: (Q,) metres, no more than there is between them as designed.
+        Paths of the bodies.
+    corners : tuple[np.ndarray, ...]
+        Corners of each body in its own frame, (P, 3), in metres.
+    poses : tuple[Pose, ...]
+        Nominal pose of each body.
+    pairs : (Q, 2) ndarray of int
+        Numbers of the two bodies of each pair.
+    gaps : (Q,) ndarray
+        Lower limit of the nominal gap of each pair, in metres.
     """
 
     paths: tuple[str, ...]
@@ -206,7 +212,7 @@ class Clearances:
 
     @classmethod
     def of(cls, instrument: Instrument) -> Clearances:
-        """Those of an instrument as designed."""
+        """Return the nominal clearances of an instrument."""
         placed = instrument.assembly.place()
         bodies = convex_bodies(instrument, placed)
         paths = tuple(bodies)
@@ -222,12 +228,12 @@ class Clearances:
         return cls(paths, corners, poses, pairs, np.array(gaps))
 
     def overlaps(self, placed: PlacedBodies) -> tuple[Overlap, ...]:
-        """Pairs of bodies that stand in each other, deepest first.
+        """Return the pairs of bodies that overlap, deepest first.
 
         Parameters
         ----------
         placed : PlacedBodies
-            Where the bodies stand, in one state; how they have grown is left out.
+            Positions of the bodies in one state; their thermal expansion is ignored.
         """
         poses = [placed.pose(path) for path in self.paths]
         moved = np.array(
@@ -247,12 +253,12 @@ class Clearances:
 
 
 def check_clearance(instrument: Instrument) -> None:
-    """Check that no two bodies stand in each other.
+    """Check that no two bodies overlap.
 
     Raises
     ------
     InputError
-        Some do; one issue for each pair, at the key that moves the more movable of the two.
+        Bodies overlap; one issue for each pair, at the key that moves the more movable of the two.
     """
     issues = [_issue(instrument, overlap) for overlap in find_overlaps(instrument)]
     if issues:
@@ -260,13 +266,14 @@ def check_clearance(instrument: Instrument) -> None:
 
 
 def _issue(instrument: Instrument, overlap: Overlap) -> Issue:
-    # of equals the later one: first cameras lead
+    """Return the issue of an overlap, with the key and the distance that resolve it."""
+    # Of two equally movable bodies the later one is moved, so that the first camera stays.
     path = min((overlap.second, overlap.first), key=lambda path: _remedy(path)[0])
     key, allowed = remedy(instrument, path)
     mm = 1e3 * overlap.depth
-    how = f"reaches {mm:.3g} mm into" if mm > 0.0 else f"is only {-1e3 * mm:.2g} um from"
+    how = f"extends {mm:.3g} mm into" if mm > 0.0 else f"is only {-1e3 * mm:.2g} um from"
     problem = f"{overlap.first} {how} {overlap.second}"
-    allowed = f"{allowed} that leaves at least {1e6 * LEAST_GAP:.3g} um of room"
+    allowed = f"{allowed} that leaves a gap of at least {1e6 * LEAST_GAP:.3g} um"
     if overlap.way is not None:
         axis, way = overlap.way
         allowed += f": move it by {_move_text(axis, way if path == overlap.second else -way)} of the base"
@@ -274,20 +281,20 @@ def _issue(instrument: Instrument, overlap: Overlap) -> Issue:
 
 
 def _move_text(axis: int, way: float) -> str:
-    """A way in words, ``+x 135 mm``, rounded up so that it is far enough."""
+    """Return a move as text, ``+x 135 mm``, rounded up so that it is far enough."""
     digits = 10.0 ** (np.floor(np.log10(abs(1e3 * way))) - 2)
     return f"{'+' if way > 0.0 else '-'}{'xyz'[axis]} {np.ceil(abs(1e3 * way) / digits) * digits:.3g} mm"
 
 
 def remedy(instrument: Instrument, path: str) -> tuple[KeyPath, str]:
-    """Which key of the file moves a body, and what to choose there."""
+    """Return the key of the file that moves a body, and what to choose there."""
     _, key, choice = _remedy(path)
     channel = channel_of(path)
     return key if channel is None else instrument.spec.key_of(*channel, key), choice
 
 
 def _remedy(path: str) -> tuple[int, KeyPath, str]:
-    """How willingly a body is moved (the first first), which key moves it, and what to choose there."""
+    """Return the rank of a body (the lowest is moved first), the key that moves it, and what to choose there."""
     kind = prism_of(path)
     if path == CENTRAL_PRISM:
         return 2, (CENTRAL_KEY, "position"), "a position"
@@ -298,11 +305,11 @@ def _remedy(path: str) -> tuple[int, KeyPath, str]:
     return 3, ("cameras", _camera(path), "position"), "a position"
 
 
-_CLOSED = "measures and angle_errors with which its faces enclose a body, each with a part of its own"
+_CLOSED = "dimensions and angle_errors with which its faces, each with some area, enclose a body"
 
 
 def _camera(path: str) -> str:
-    """Name of the camera that a body belongs to; "" for the central prism."""
+    """Return the name of the camera that a body belongs to; "" for the central prism."""
     return "" if path == CENTRAL_PRISM else path.split("/")[1]
 
 
@@ -312,7 +319,7 @@ def check_solids(assembly: Assembly, solids: Sequence[Solid]) -> None:
     Raises
     ------
     MisplacedError
-        Names the body and the face.
+        A solid is open, or an aperture extends over the edge of its face; the message names both.
     """
     placed = assembly.place()
     for solid in solids:
@@ -327,8 +334,9 @@ def check_solids(assembly: Assembly, solids: Sequence[Solid]) -> None:
 
 
 def _check_inside(element: Element, face: Face, solid: Solid, placed: PlacedBodies) -> None:
-    """Check that an element's clear aperture lies on its face: behind the planes of all others, whatever the length of
-    the edges that they have in common.
+    """Check that an element's clear aperture lies on its face.
+
+    It has to be behind the planes of all other faces, however short the edges are that they have in common.
     """
     assert element.aperture is not None
     rim = element.aperture.outline()
@@ -344,18 +352,19 @@ def _check_inside(element: Element, face: Face, solid: Solid, placed: PlacedBodi
         if beyond > over:
             over, across = beyond, other.name
     if over > 0.0:
-        what = f"the clear aperture of {element.name} reaches {1e3 * over:.3g} mm over the edge of its face"
+        what = f"the clear aperture of {element.name} extends {1e3 * over:.3g} mm over the edge of its face"
         camera, side = element.name.split("/")[:2]
         key, choice = _way_to_edge(solid.path, across, over, 2.0 * element.aperture.inscribed)
         raise MisplacedError(f"{solid.path}: {what}, beyond {across}", key, choice, (camera, side))
 
 
 def _way_to_edge(path: str, across: str, over: float, wide: float) -> tuple[KeyPath, str]:
-    """What to change when a clear aperture of a width reaches over a face's edge to the face named ``across``, by so
-    many metres, and what to choose there.
+    """Return the key to change, and what to choose there, when an aperture extends over the edge of its face.
+
+    ``across`` names the neighbouring face, ``over`` is the excess and ``wide`` the aperture's width, in metres.
     """
     if path != CENTRAL_PRISM:
-        return key_of(path), "a width, shift and angle_errors with faces that hold their clear apertures"
+        return key_of(path), "a width, shift and angle_errors with faces that contain their clear apertures"
     if across == "bottom":
         return (CENTRAL_KEY, "height"), f"a height that is at least {1e3 * over:.3g} mm larger"
     if 2.0 * over >= wide:
@@ -365,28 +374,28 @@ def _way_to_edge(path: str, across: str, over: float, wide: float) -> tuple[KeyP
 
 
 RAYS = 400
-"""Rays in a beam, spread evenly over its cross-section: shares are good to about half a percent."""
+"""Rays in a beam, spread evenly over its cross-section: shares are accurate to about half a percent."""
 
 _TOUCHING = 1e-6  # length inside a body below which a ray only touches it, metres
-_TOUCHING_MOVED = 1e-3  # the same in a perturbed state, whose faces are not where flat meshes have them
-_AIM = 1e-6  # how well rays meet their places on a stop or face, metres
+_TOUCHING_MOVED = 1e-3  # the same in a perturbed state, whose faces depart from the flat meshes
+_AIM = 1e-6  # tolerance of aiming at points of a stop or face, metres
 _RINGS, _AROUND = 6, 24
 
 
 @dataclass(frozen=True)
 class Obstruction:
-    """A prism in a beam.
+    """Prism that blocks part of a beam.
 
     Attributes
     ----------
     body : str
         Path of the prism.
     beam : str
-        e.g. ``forward/imaging`` or ``forward/left``.
+        Name of the beam, such as ``forward/imaging`` or ``forward/left``.
     share : float
-        Of the beam's cross-section that it takes; for imaging the largest along the line.
+        Blocked share of the beam's cross-section; for imaging the largest along the line.
     used : float
-        Part of ``share`` that its own channel's clear aperture uses; 0 for beams that it has no business in.
+        Part of ``share`` that the clear aperture of the prism's own channel uses; 0 for beams of other channels.
     """
 
     body: str
@@ -396,9 +405,9 @@ class Obstruction:
 
 
 def find_obstructions(instrument: Instrument, backend: Backend) -> tuple[Obstruction, ...]:
-    """All prisms, the central one included, that take a part of a beam; by beam, then by body.
+    """Return all prisms, the central one included, that block part of a beam; sorted by beam, then by body.
 
-    Faces that a monitor beam means to meet, and the glass between them, are not in its way.
+    Faces that belong to a monitor beam's sequence, and the glass between them, do not count as blocking it.
     """
     placed = instrument.assembly.place()
     solids = {}
@@ -425,8 +434,16 @@ def find_obstructions(instrument: Instrument, backend: Backend) -> tuple[Obstruc
 
 
 def rays_taken(segments: np.ndarray, planes: np.ndarray, touching: float = _TOUCHING) -> np.ndarray:
-    """Which rays, segments (N, K, 2, 3), go through the body ``planes`` . (x, 1) <= 0, (F, 4), for more than
-    ``touching`` metres; (N,).
+    """Return a mask (N,) of the rays that a convex body blocks.
+
+    Parameters
+    ----------
+    segments : (N, K, 2, 3) ndarray
+        Segments of the rays.
+    planes : (F, 4) ndarray
+        Faces of the body, which is where ``planes`` . (x, 1) <= 0.
+    touching : float
+        Length inside the body, in metres, below which a ray only touches it.
     """
     start, way = segments[:, :, 0], segments[:, :, 1] - segments[:, :, 0]
     height = start @ planes[:, :3].T + planes[:, 3]
@@ -441,13 +458,13 @@ def rays_taken(segments: np.ndarray, planes: np.ndarray, touching: float = _TOUC
 
 
 def _disk(rays: int = RAYS) -> np.ndarray:
-    """Points spread evenly over the unit disk, (rays, 2)."""
+    """Return points spread evenly over the unit disk, (rays, 2)."""
     nodes = even_disk(rays)
     return np.stack([nodes.x, nodes.y], axis=-1)
 
 
 def _whole() -> np.ndarray:
-    """Points over a unit disk out to its edge, but for what aiming leaves open, (N, 2)."""
+    """Return points over a unit disk up to just inside its edge, by the tolerance of aiming, (N, 2)."""
     angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return np.concatenate([np.zeros((1, 2)), *((k + 1) / _RINGS * (1.0 - 1e-3) * ring for k in range(_RINGS))])
@@ -457,18 +474,18 @@ _WHOLE = _whole()
 
 
 def imaging_segments(instrument: Instrument, backend: Backend, camera: str, rays: int = RAYS) -> list[np.ndarray]:
-    """Rays from the scene to both ends and the middle of the line, (N, K, 2, 3) each, world.
+    """Return rays from the scene to both ends and the middle of the line, (N, K, 2, 3) each, in the world.
 
     Parameters
     ----------
     instrument : Instrument
         The instrument.
     backend : Backend
-        Where to trace.
+        Backend that traces the rays.
     camera : str
-        whose.
+        Name of the camera.
     rays : int
-        N, in each of the three beams.
+        Number N of rays in each of the three beams.
     """
     assembly, model, placed = instrument.assembly, instrument.cameras[camera], instrument.assembly.place()
     half = 0.5 * model.spec.line.pixels * model.spec.line.pitch
@@ -496,20 +513,20 @@ def imaging_segments(instrument: Instrument, backend: Backend, camera: str, rays
 
 @dataclass(frozen=True, eq=False)
 class MonitorBeam:
-    """A channel's light from the pinhole to the area CCD.
+    """Light of a channel from the pinhole to the area CCD.
 
     Attributes
     ----------
     channel : Channel
-        whose.
-    segments : np.ndarray
-        Of its N rays, (N, K, 2, 3), world.
-    inside : tuple[str | None, ...]
+        The channel.
+    segments : (N, K, 2, 3) ndarray
+        Segments of its N rays, in the world.
+    inside : tuple[str or None, ...]
         The solid around each segment.
-    position, direction : np.ndarray
-        Of the rays at the pinhole, (N, 3) each, world.
-    valid : np.ndarray
-        Which rays get there, (N,).
+    position, direction : (N, 3) ndarray
+        Points and unit vectors of the rays at the pinhole, in the world.
+    valid : (N,) ndarray of bool
+        Rays that reach the area CCD.
     """
 
     channel: Channel
@@ -520,7 +537,7 @@ class MonitorBeam:
     valid: np.ndarray
 
     def outside(self, path: str) -> np.ndarray:
-        """Segments that are not inside a solid, (N, K', 2, 3)."""
+        """Return the segments that are not inside a solid, (N, K', 2, 3)."""
         return self.segments[:, [medium != path for medium in self.inside]]
 
 
@@ -534,16 +551,16 @@ def monitor_beams(
     instrument : Instrument
         The instrument.
     backend : Backend
-        Where to trace.
-    points : np.ndarray
-        Of the return faces that the rays meet, (N, 2), the faces' radius being 1.
-    state : State | None
-        Of the instrument; as designed unless one is given.
+        Backend that traces the rays.
+    points : (N, 2) ndarray
+        Points of the return faces that the rays meet, in units of the faces' radius.
+    state : State or None
+        State of the instrument; nominal by default.
 
     Raises
     ------
     AimError
-        No such rays.
+        There are no such rays.
     """
     states = [state or {}]
     assembly, channels, placed = instrument.assembly, instrument.channels, instrument.assembly.place(states)
@@ -569,50 +586,51 @@ def monitor_beams(
 
 
 def check_beams(instrument: Instrument, backend: Backend) -> None:
-    """Check that every monitor beam gets to its area CCD whole.
+    """Check that every monitor beam reaches its area CCD whole.
 
     Raises
     ------
     InputError
-        The edge of a clear aperture or a body takes a part of one; one issue for each.
+        The edge of a clear aperture or a body vignettes a beam; one issue for each.
     MisplacedError
-        Light of a channel does not get to its return face.
+        Light of a channel does not reach its return face.
     """
     try:
         beams = monitor_beams(instrument, backend, _WHOLE)
     except AimError as error:
-        problem = f"light of the monitor does not get to its return faces: {error}"
-        choice = "a field, prisms and a pupil_offset with which the mirrors of both cameras carry the whole beam"
+        problem = f"light of the monitor does not reach its return faces: {error}"
+        choice = "a field, prisms and a pupil_offset with which the whole beam passes the mirrors of both cameras"
         raise MisplacedError(problem, ("monitor",), choice) from error
     issues = [_cut(instrument, backend, beam) for beam in beams if not beam.valid.all()]
     for beam, what, plate, taken in _standing_in(instrument, beams, instrument.assembly.place(), _TOUCHING):
-        text = f"{what} stands in the beam {beam.channel.key} and takes {_count(taken)}"
+        text = f"{what} blocks {_count(taken)} of the beam {beam.channel.key}"
         if plate is None:
             where, choice = _way_out(instrument, beam.channel, what)
         else:
             where = ("baffles", plate.name) if plate.name in instrument.spec.baffles else ("baffles",)
-            choice = "a size and place beside the beam"
+            choice = "a size and position beside the beam"
         issues.append(instrument.spec.issue(text, where, allowed=choice))
     if issues:
         raise InputError(*dict.fromkeys(issues))
 
 
 def moved_into_beams(instrument: Instrument, backend: Backend, state: State) -> tuple[str, ...]:
-    """What stands in beams of the monitor in a perturbed state, sentences without their end. Edges of clear apertures
-    cut the spots' light by themselves; bodies do not.
+    """Return warnings about bodies that block monitor beams in a perturbed state, without a full stop.
+
+    Edges of clear apertures vignette the simulated spots; bodies do not.
     """
     if not instrument.channels or not state:
         return ()
     try:
         beams = monitor_beams(instrument, backend, _WHOLE, state)
     except AimError:
-        return ()  # the spots themselves are lost, which is said with its cause
+        return ()  # The spots themselves are lost; that is reported elsewhere with its cause.
     together: dict[tuple[str, str], np.ndarray] = {}
     for beam, what, _, taken in _standing_in(instrument, beams, instrument.assembly.place([state]), _TOUCHING_MOVED):
-        # a baffle has several plates
+        # A baffle has several plates.
         together[beam.channel.key, what] = taken | together.get((beam.channel.key, what), False)
     return tuple(
-        f"{key}: {what} has moved into the beam and would take {_count(taken)}; the spot is that of the whole beam"
+        f"{key}: {what} has moved into the beam and would block {_count(taken)}; the spot is that of the whole beam"
         for (key, what), taken in together.items()
     )
 
@@ -620,16 +638,16 @@ def moved_into_beams(instrument: Instrument, backend: Backend, state: State) -> 
 def _standing_in(
     instrument: Instrument, beams: list[MonitorBeam], placed: PlacedBodies, touching: float
 ) -> Iterator[tuple[MonitorBeam, str, Plate | None, np.ndarray]]:
-    """Beam, body or plate in words, the plate if it is one, and which of the beam's rays it takes, (N,)."""
+    """Yield beam, name of the blocking body or plate, the plate if it is one, and a mask (N,) of blocked rays."""
     bodies = convex_bodies(instrument, placed)
     hulls = {path: convex_hull(corners).equations for path, corners in bodies.items()}
     for beam in beams:
         camera = instrument.cameras[beam.channel.camera]
-        within = len(camera.mirrors)  # segments inside the camera, on the way out and on the way back
+        within = len(camera.mirrors)  # segments inside the camera, at each end of the beam
         for path, planes in hulls.items():
             segments = beam.outside(path)
             if path.rpartition("/")[0] == f"{BASE}/{beam.channel.camera}":
-                # the prescription gives its own parts no substrates there, and its first mirror's hull holds its light
+                # Substrates of the camera's own parts are unknown; the hull of its first mirror contains its light.
                 first = int(path.endswith(f"/{camera.mirrors[0]}"))
                 segments = beam.segments[:, within + first : -within - first]
             low, high = segments.min(axis=(0, 2)), segments.max(axis=(0, 2))
@@ -646,20 +664,24 @@ def _standing_in(
 
 
 def _way_out(instrument: Instrument, channel: Channel, path: str) -> tuple[KeyPath, str]:
-    """Which key takes a body out of a channel's beam, and what to choose there: that of a prism, else the beam's."""
+    """Return the key that takes a body out of a channel's beam, and what to choose there.
+
+    It is that of a prism if the body is one, else that of the beam.
+    """
     if path in {solid.path for solid in instrument.solids}:
         where, choice = remedy(instrument, path)
         return where, f"{choice} beside the beam"
     where = instrument.spec.key_of(channel.camera, channel.name, ("monitor", PRISM_0, "shift"))
-    return where, "a shift (or prism distance, or place on the central prism) that leads the beam past it"
+    return where, "a shift (or prism distance, or position on the central prism) that takes the beam past it"
 
 
 def _count(taken: np.ndarray) -> str:
-    return f"{np.sum(taken)} of its {len(taken)} rays"
+    """Return the number of blocked rays as text."""
+    return f"{np.sum(taken)} of {len(taken)} rays"
 
 
 def _crossing(segments: np.ndarray, plate: Plate, placed: PlacedBodies) -> np.ndarray:
-    """Which rays, segments (N, K, 2, 3), go through a plate, (N,)."""
+    """Return a mask (N,) of the rays, segments (N, K, 2, 3), that cross a plate."""
     into = (placed.pose(plate.body) @ plate.pose).inverse()
     start, end = into.apply(segments[:, :, 0]), into.apply(segments[:, :, 1])
     through = start[..., 2] * end[..., 2] < 0.0
@@ -669,13 +691,13 @@ def _crossing(segments: np.ndarray, plate: Plate, placed: PlacedBodies) -> np.nd
 
 
 def _cut(instrument: Instrument, backend: Backend, beam: MonitorBeam) -> Issue:
-    """At which element a beam loses its first rays, and by how much."""
+    """Return the issue of a vignetted beam: the element at which it loses its first rays, and by how much."""
     assembly, channel = instrument.assembly, beam.channel
     names = assembly.sequences[f"{channel.key}/monitor"]
     steps = enumerate(surviving_rays(backend, assembly, names, beam.position, beam.direction), 1)
     count, element, alive = next((n, element, alive) for n, (element, alive) in steps if not alive.all())
     off = beside(assembly, backend, names[:count], beam.position, beam.direction, ~alive)
-    how = "" if off is None else f": it reaches {1e3 * off:.3g} mm beyond the clear aperture"
+    how = "" if off is None else f": it extends {1e3 * off:.3g} mm beyond the clear aperture"
     key = key_of(element.body)
     if element.body == channel.face_body:
         key = ("monitor", "return_face", "aperture")
@@ -683,14 +705,14 @@ def _cut(instrument: Instrument, backend: Backend, beam: MonitorBeam) -> Issue:
         key = (*key, "width")
     key = instrument.spec.key_of(channel.camera, channel.name, key)
     return instrument.spec.issue(
-        f"the beam {channel.key} is cut at {element.name} on {element.body}{how}",
+        f"the beam {channel.key} is vignetted at {element.name} on {element.body}{how}",
         key,
-        allowed="a place in the pupil, prism widths and a return face with which the whole beam passes twice",
+        allowed="a position in the pupil, prism widths and a return face with which the whole beam passes twice",
     )
 
 
 def _segments(places: list[np.ndarray]) -> np.ndarray:
-    """Segments (N, K, 2, 3) between consecutive places of N rays."""
+    """Return the segments (N, K, 2, 3) between consecutive points of N rays."""
     way = np.stack(places, axis=1)
     return np.stack([way[:, :-1], way[:, 1:]], axis=2)
 
@@ -698,7 +720,7 @@ def _segments(places: list[np.ndarray]) -> np.ndarray:
 def _aimed(
     instrument: Instrument, backend: Backend, camera: str, sequence: str, start: np.ndarray, target: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rays from points (1, N, 3) of a focal plane through targets (N, 2) of a sequence's last element."""
+    """Return rays from points (1, N, 3) of a focal plane through targets (N, 2) of a sequence's last element."""
     guess = instrument.toward_optics(instrument.assembly.place(), camera)[0]
     return _through(backend, assemble(instrument.assembly, [sequence]), start, guess, target[None])
 
@@ -706,7 +728,7 @@ def _aimed(
 def _through(
     backend: Backend, systems: SystemBatch, start: np.ndarray, guess: np.ndarray, target: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rays from points (B, N or 1, 3), first sent along ``guess``, through targets (B, N, 2) of the last element."""
+    """Return rays from points (B, N or 1, 3) near ``guess`` through targets (B, N, 2) of the last element."""
     start, guess = (np.broadcast_to(a, (*target.shape[:2], 3)) for a in (start, guess))
     fan = RayFan(start, guess, transverse_axes(guess, np.broadcast_to([0.0, 1.0, 0.0], guess.shape)))
     q, _ = aim(backend, systems, fan, target, tolerance=_AIM)
@@ -714,7 +736,7 @@ def _through(
 
 
 def _used(instrument: Instrument, path: str, segments: np.ndarray) -> np.ndarray:
-    """Which imaging rays (N, K, 2, 3) pass the clear aperture through which a channel's beam enters a prism, (N,)."""
+    """Return a mask (N,) of imaging rays (N, K, 2, 3) that pass the entrance aperture of a prism's own channel."""
     assembly, placed = instrument.assembly, instrument.assembly.place()
     for channel in instrument.channels:
         prism = channel.prism_body(PRISM_180)

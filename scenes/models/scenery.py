@@ -1,11 +1,9 @@
-"""What stands where for the path tracer: every surface of an instrument in one perturbed state, with its finish.
+"""Scene of the path tracer: every surface of an instrument in one perturbed state, with its finish.
 
-Figure errors of mirrors and gradients of the refractive index are left out: they turn a ray by less than a microradian
-and decide nothing about stray light. So are motions of single footprints on a glass face. Bodies must stay 20 um apart
-from each other.
-
-Surfaces of a scene in one perturbed state: mirrors, faces of glass bodies, plates and detectors, each with its exact
-shape, its finish, and triangles that decide what a path hits.
+The surfaces are mirrors, faces of glass bodies, plates and detectors, each with its exact shape, its finish, and
+triangles for the search of intersections. Figure errors of mirrors and gradients of the refractive index are omitted:
+they deflect a ray by less than a microradian and do not matter for stray light. So are motions of single footprints on
+a glass face. Bodies must stay 20 um apart from each other.
 """
 
 from __future__ import annotations
@@ -43,11 +41,12 @@ from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.finish_files import MeasuredScatter, read_bsdf, read_coating
 
 LEAST_CLEARANCE = 1e-5
-"""How far beyond a surface that it leaves a path looks for the next one, metres: some twenty roundings of float32 at
-4 m; for curved surfaces so much more as the triangles depart from them."""
+"""Distance beyond a surface at which a leaving path starts to look for the next one, in metres: some twenty roundings
+of float32 at 4 m. For curved surfaces the departure of the triangles is added.
+"""
 
 IN_PLANE = 1e-9
-"""How well an element lies in a face when it is taken to be on it, metres and radians."""
+"""Tolerance, in metres and radians, within which an element lies in a face."""
 
 
 @dataclass(frozen=True)
@@ -57,15 +56,19 @@ class Finishes:
     Attributes
     ----------
     mirror : Finish
-        Optical side of the mirrors; mirror_back: their back.
-    metallised : Finish | None
-        Mirror faces of glass bodies, None for that of the mirrors.
+        Optical side of the mirrors.
+    mirror_back : Finish
+        Back of the mirrors.
     coated, bare, ground : Finish
         Faces of glass bodies, see ``Coating``.
     detector : Finish
-        Light-sensitive faces; board: what carries them.
-    baffle : Finish | None
-        Of baffles, None for each one's own.
+        Light-sensitive faces.
+    board : Finish
+        Boards that carry the detectors.
+    baffle : Finish or None
+        Finish of all baffles; None for each one's own.
+    metallised : Finish or None
+        Mirror faces of glass bodies; None for the finish of the mirrors.
     """
 
     mirror: Finish = MIRROR
@@ -79,7 +82,7 @@ class Finishes:
     metallised: Finish | None = None
 
     def of(self, coating: Coating) -> Finish:
-        """The finish of a glass face."""
+        """Return the finish of a glass face."""
         return {
             Coating.MIRROR: self.mirror if self.metallised is None else self.metallised,
             Coating.TRANSMITTING: self.coated,
@@ -90,16 +93,16 @@ class Finishes:
 
 @dataclass(frozen=True)
 class Detector:
-    """A pixel grid in the frame of its surface: columns along x, rows along y, centred.
+    """Pixel grid in the frame of its surface: columns along x, rows along y, centred.
 
     Attributes
     ----------
     name : str
-        Of the surface and, where there is one, of the element.
+        Name of the surface and, where there is one, of the element.
     columns, rows : int
         Number of pixels.
     pitch : tuple[float, float]
-        Along x and y, metres.
+        Pixel pitch along x and y, in metres.
     """
 
     name: str
@@ -109,7 +112,7 @@ class Detector:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows, columns."""
+        """Number of rows and columns."""
         return self.rows, self.columns
 
 
@@ -120,27 +123,33 @@ class SceneSurface:
     Attributes
     ----------
     name : str
-        Unique; part: what it is called in the results (plates of one baffle share it).
+        Unique name.
+    part : str
+        Name in the results (plates of one baffle share it).
     elements : tuple[str, ...]
         Names of the assembly's elements on it.
     pose : Pose
-        Of its frame in the world, float64.
+        Pose of its frame in the world.
     surface : Surface
-        Shape, grown as the state says.
-    vertices, triangles : np.ndarray
-        (V, 3) in its frame, metres, and (T, 3).
+        Shape, expanded as in the state.
+    vertices : (V, 3) ndarray
+        Vertices of its triangles in its frame, in metres.
+    triangles : (T, 3) ndarray of int
+        Vertex numbers.
     front, back, outside : Finish
         Finish met from +z, from -z, and outside the clear apertures.
     apertures : tuple[Aperture, ...]
-        None, one or two clear apertures.
+        Up to two clear apertures.
     ends : bool
-        Nothing is there outside the clear apertures (else ``outside`` is).
-    solid : str | None
-        Path of the glass body behind it (-z side), and ``index``, that body's refractive index.
-    detector : str | None
-        Name of the detector on its front, None for none.
+        Whether the surface ends at the clear apertures; otherwise ``outside`` is the finish beyond them.
+    solid : str or None
+        Path of the glass body behind it (-z side).
+    index : float
+        Refractive index of that body.
+    detector : str or None
+        Name of the detector on its front, if there is one.
     clearance : float
-        How far beyond it a leaving path looks for the next surface, metres.
+        Distance beyond it at which a leaving path starts to look for the next surface, in metres.
     """
 
     name: str
@@ -164,28 +173,28 @@ class SceneSurface:
 def mirror_surface(
     element: Element, placed: PlacedBodies, finishes: Finishes, lit_side: float = 1.0, motion: Motion = AT_REST
 ) -> SceneSurface:
-    """The surface of a reflecting element that is not a face of a solid.
+    """Return the surface of a reflecting element that is not a face of a solid.
 
     Parameters
     ----------
     element : Element
-        With a clear aperture.
+        Element with a clear aperture.
     placed : PlacedBodies
         Bodies of one state.
     finishes : Finishes
-        What surfaces do with light.
+        Finishes of all kinds of surfaces.
     lit_side : float
-        +1 when the optical side is +z, -1 when it is -z; the other one is the substrate's back.
+        +1 if the optical side is +z, -1 if it is -z; the other one is the substrate's back.
     motion : Motion
-        Of the mirror's body in that state; only what it adds to the figure is taken from it.
+        Motion of the mirror's body in that state, of which only the change of figure is used here.
 
     Raises
     ------
     ValueError
-        No clear aperture, or a figure that cannot be added (``Element.figured``).
+        The element has no clear aperture, or a figure that cannot be added (``Element.figured``).
     """
     if element.aperture is None:
-        raise ValueError(f"{element.name}: a mirror without a clear aperture cannot stand in a scene")
+        raise ValueError(f"{element.name}: a mirror of a scene needs a clear aperture")
     size = float(placed.size(element.body)[0])
     surface, aperture = element.figured(motion).scaled(size), element.aperture.scaled(size)
     vertices, triangles, apart = sheet_mesh(surface, aperture)
@@ -208,15 +217,15 @@ def mirror_surface(
 def solid_surfaces(
     solid: Solid, assembly: Assembly, placed: PlacedBodies, state: State, finishes: Finishes
 ) -> list[SceneSurface]:
-    """The faces of a glass body, named ``<solid>/<face>``.
+    """Return the faces of a glass body, named ``<solid>/<face>``.
 
-    Outside its elements' clear apertures a face has the same coating, but the path counts as another one than the
-    nominal; a body that light does not enter is ground there.
+    Outside its elements' clear apertures a face has the same coating, but paths there are not counted as nominal; a
+    body that light does not enter is ground there.
 
     Raises
     ------
     ValueError
-        a face carries more than two elements with apertures.
+        A face carries more than two elements with apertures.
     """
     mesh = solid_mesh(solid, placed)
     own = placed.pose(solid.path)
@@ -230,7 +239,7 @@ def solid_surfaces(
         scale = float(placed.size(face.body)[0])
         apertures = tuple(dict.fromkeys(aperture.scaled(scale) for _, aperture in on_it if aperture is not None))
         if len(apertures) > 2:
-            raise ValueError(f"{solid.path}: face {face.name!r} has {len(apertures)} clear apertures; at most two")
+            raise ValueError(f"{solid.path}: face {face.name!r} has {len(apertures)} clear apertures, not at most 2")
         pose = placed.pose(face.body) @ Pose(face.pose.rotation, scale * face.pose.translation)
         vertices, triangles = polygon_mesh(pose.inverse().apply(own.apply(polygon)))
         finish = finishes.of(face.coating)
@@ -259,9 +268,9 @@ def solid_surfaces(
 def _elements_on(
     face: Face, solid: Solid, assembly: Assembly, nominal: PlacedBodies
 ) -> list[tuple[str, Aperture | None]]:
-    """Elements that lie in a face, with their clear apertures in the face's frame.
+    """Return the elements that lie in a face, with their clear apertures in the face's frame.
 
-    An element may stand on a body of its own that the face carries; its own small motions are left out.
+    An element may belong to a separate body that the face carries; the small motions of that body are ignored.
     """
     frame = (nominal.pose(face.body) @ face.pose).inverse()
     out: list[tuple[str, Aperture | None]] = []
@@ -279,7 +288,7 @@ def _elements_on(
         aperture = element.aperture
         if aperture is not None:
             if abs(pose.rotation[0, 1]) > IN_PLANE and not isinstance(aperture, Circle):
-                raise ValueError(f"{element.name}: its clear aperture is turned against the face {face.name!r}")
+                raise ValueError(f"{element.name}: its clear aperture is rotated relative to the face {face.name!r}")
             x, y, _ = pose.apply(np.array([*aperture.centre, 0.0]))
             aperture = replace(aperture, centre=(float(x), float(y)))
         out.append((element.name, aperture))
@@ -287,7 +296,7 @@ def _elements_on(
 
 
 def plate_surfaces(plates: Iterable[Plate], placed: PlacedBodies, baffle: Finish | None = None) -> list[SceneSurface]:
-    """The surfaces of baffles, named ``<name>/<number>``, with a finish for all or each its own."""
+    """Return the surfaces of baffles, named ``<name>/<number>``, with one finish for all or each its own."""
     out = []
     for number, plate in enumerate(plates):
         vertices, triangles, _ = sheet_mesh(plane(), plate.outline)
@@ -311,7 +320,7 @@ def plate_surfaces(plates: Iterable[Plate], placed: PlacedBodies, baffle: Finish
 def detector_surface(
     detector: Detector, pose: Pose, finishes: Finishes, elements: tuple[str, ...] = ()
 ) -> SceneSurface:
-    """The light-sensitive face of a detector, which looks along its +z; its back is the board's."""
+    """Return the light-sensitive face of a detector, which looks along its +z; its back has the board's finish."""
     half_x, half_y = 0.5 * detector.columns * detector.pitch[0], 0.5 * detector.rows * detector.pitch[1]
     outline = Rectangle(half_x, half_y)
     vertices, triangles, _ = sheet_mesh(plane(), outline)
@@ -331,17 +340,17 @@ def detector_surface(
 
 
 RECIPROCAL_TO = 0.3
-"""Rms of the relative difference of a BSDF with its directions exchanged above which is warned."""
+"""Rms of the relative change of a BSDF on exchange of its directions above which a warning is given."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredFinishes:
-    """Measured finishes.
+    """Finishes of a job that has measured ones.
 
     Attributes
     ----------
     finishes : Finishes
-        Of all surfaces, the measured ones among them.
+        Finishes of all surfaces, measured ones included.
     scatter : Mapping[str, MeasuredScatter]
         Kind of surface -> its table of scattering.
     coatings : Mapping[str, CoatingTable]
@@ -353,7 +362,7 @@ class MeasuredFinishes:
     coatings: Mapping[str, CoatingTable]
 
     def to_dict(self) -> dict[str, Any]:
-        """What the tables are, for stray.json: kind of surface -> numbers."""
+        """Return a summary of the tables for stray.json: kind of surface -> numbers."""
         out: dict[str, dict[str, Any]] = {}
         for kind, scatter in self.scatter.items():
             angles = scatter.table.incidence
@@ -374,25 +383,25 @@ class MeasuredFinishes:
         return out
 
     def warnings(self) -> tuple[str, ...]:
-        """What the user should know of the tables."""
+        """Return warnings about the tables."""
         out = []
         for kind, scatter in self.scatter.items():
             rms = scatter.table.reciprocity()
             if rms > RECIPROCAL_TO:
                 out.append(
                     f"the BSDF of {kind} surfaces is not reciprocal: with its directions exchanged it differs by "
-                    f"{100.0 * rms:.0f} % rms; paths take it as measured, for light that arrives as it was lit"
+                    f"{100.0 * rms:.0f} % rms; it is used as measured, with the incident light of the measurement"
                 )
         return tuple(out)
 
 
 def measured_finishes(resolved: ResolvedJob) -> MeasuredFinishes | None:
-    """The finishes that a job has measured; None where there are none.
+    """Return the finishes of a job with measured ones, or None if it has none.
 
     Raises
     ------
     InputError
-        a coating that does not hold the monitor's wavelength, or a table that scatters more than is reflected.
+        A coating's table does not include the monitor's wavelength, or a table scatters more than is reflected.
     """
     stray = resolved.job.render.stray
     if stray is None or stray.finishes is None:
@@ -415,11 +424,11 @@ def measured_finishes(resolved: ResolvedJob) -> MeasuredFinishes | None:
         try:
             changed[kind] = _finish(base, spec, kind, scatter.get(kind), coatings.get(kind))
         except ValueError as error:
-            allowed = "shares of the incident light, together at most what is reflected"
+            allowed = "fractions of the incident light that add up to at most the reflectance"
             raise resolved.job.error(str(error), key, allowed=allowed) from None
     finishes = built_in
     if "mirror" in changed:
-        # glass keeps its own: its light arrives from inside, where nobody measures
+        # Glass keeps its built-in finish: its light arrives from inside, where finishes are not measured.
         finishes = replace(finishes, mirror=changed["mirror"], metallised=built_in.mirror)
     if "black" in changed:
         black = changed["black"]
@@ -433,7 +442,7 @@ def measured_finishes(resolved: ResolvedJob) -> MeasuredFinishes | None:
 def _finish(
     base: Finish, spec: FinishSpec, kind: str, scatter: MeasuredScatter | None, coating: CoatingTable | None
 ) -> Finish:
-    """A built-in finish with what was measured in its place."""
+    """Return a built-in finish with measured values in place of its own."""
     if kind == "black":
         assert scatter is not None
         return Finish(table=scatter.table, scattered_only=True)
@@ -446,10 +455,10 @@ def _finish(
 
 BOARD = 0.002
 BOARD_EDGE = 0.02
-"""How far the board stands behind the detectors, and how far it reaches beyond them, metres."""
+"""Distance of the board behind the detectors (``BOARD``), and its margin beyond them (``BOARD_EDGE``), in metres."""
 
 FACING_THE_LIGHT = Pose(np.diag([-1.0, 1.0, -1.0]))
-"""From a focal plane's frame, along whose +Z light arrives, to that of a detector that faces it."""
+"""Pose of a detector that faces the light, in a focal plane's frame, along whose +Z light arrives."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -465,7 +474,7 @@ class Scenery:
         names = [s.name for s in self.surfaces]
         twice = sorted({n for n in names if names.count(n) > 1})
         if twice:
-            raise ValueError(f"surfaces of the same name: {', '.join(twice)}")
+            raise ValueError(f"several surfaces have the same name: {', '.join(twice)}")
         known = {d.name for d in self.detectors}
         unknown = sorted({s.detector for s in self.surfaces if s.detector is not None} - known)
         if unknown:
@@ -479,7 +488,7 @@ class Scenery:
         return tuple(dict.fromkeys(s.part for s in self.surfaces))
 
     def of_element(self, element: str) -> int:
-        """Number of the surface on which an element lies; KeyError when there is none."""
+        """Return the number of the surface on which an element lies. Raises KeyError if there is none."""
         return self._by_element[element]
 
 
@@ -490,21 +499,21 @@ def build_scenery(
     baffles: Iterable[Plate] = (),
     whole_focal_planes: bool = False,
 ) -> Scenery:
-    """Surfaces of an instrument in one state.
+    """Return the surfaces of an instrument in one state.
 
     Parameters
     ----------
     instrument : Instrument
         The instrument.
     state : State
-        What is perturbed.
-    finishes : Finishes | None
-        What surfaces do with light; by default those of ``Finishes``.
-    baffles : Iterable[Plate]
-        More parts than the instrument's own.
+        Perturbed state.
+    finishes : Finishes or None
+        Finishes of the surfaces; by default those of ``Finishes``.
+    baffles : iterable of Plate
+        Plates in addition to the instrument's own.
     whole_focal_planes : bool
-        Make each focal plane one large detector, named ``CAMERA/focal_plane``, in the place of its CCDs and its board:
-        for light from the scene.
+        Replace CCDs and board of each focal plane by one large detector, named ``CAMERA/focal_plane``, for light from
+        the scene.
     """
     finishes = finishes or Finishes()
     assembly = instrument.assembly
@@ -529,7 +538,7 @@ def build_scenery(
 
 
 def _lit_side(instrument: Instrument, element: Element) -> float:
-    """+1 when light meets a mirror from its +z side, -1 from its -z side: where the neighbours in a sequence stand."""
+    """Return +1 if light meets a mirror from its +z side, -1 if from its -z side, by its neighbours in a sequence."""
     nominal = instrument.assembly.place()
     own = nominal.pose(element.body).inverse()
     for names in instrument.assembly.sequences.values():
@@ -541,13 +550,13 @@ def _lit_side(instrument: Instrument, element: Element) -> float:
 
 
 def _middle(element: Element) -> np.ndarray:
-    """Where the middle of an element's clear aperture lies on its surface, in its own frame, (3,), metres."""
+    """Return the surface point at the middle of an element's clear aperture, in its own frame, (3,), in metres."""
     x, y = (0.0, 0.0) if element.aperture is None else element.aperture.centre
     return np.array([x, y, float(element.surface.sag(x, y))])
 
 
 def _reach(instrument: Instrument, camera: str) -> tuple[float, float]:
-    """Half the size of a focal plane's board, metres."""
+    """Return half the size of a focal plane's board, in metres."""
     line = instrument.cameras[camera].spec.line
     channels = [c for c in instrument.channels if c.camera == camera]
     half_line = 0.5 * line.pixels * line.pitch
@@ -558,7 +567,7 @@ def _reach(instrument: Instrument, camera: str) -> tuple[float, float]:
 def _focal_plane(
     instrument: Instrument, camera: str, placed: PlacedBodies, finishes: Finishes, whole: bool
 ) -> tuple[list[SceneSurface], list[Detector]]:
-    """Detectors of one focal plane and the board behind them."""
+    """Return the surfaces of one focal plane, detectors and the board behind them, and its detectors."""
     model = instrument.cameras[camera]
     body = f"{BASE}/{camera}/focal_plane"
     line, element = model.spec.line, f"{camera}/line"

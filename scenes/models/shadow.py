@@ -1,10 +1,9 @@
-"""Shadows that bodies of an instrument throw into the pupils of its cameras: prisms, baffles, parts of other cameras.
+"""Shadows of an instrument's bodies in the pupils of its cameras: of prisms, baffles, and parts of other cameras.
 
-A convex body takes from a beam the rays that go through it; over the stop these fill the convex outline of its corners,
-each of them at the ray that passes through it, with straight sides (on the stop they bend by the aberrations of the
-pupil, some 1e-4 of its radius). The bodies stand where the state puts them and are as large as it makes them, with the
-shape they have as designed. A camera's own mirrors and board throw no shadow into its beam, as its prescription gives
-them no substrates.
+A convex body blocks the rays that pass through it; over the stop these fill the convex outline of its corners, each
+mapped to the ray that passes through it, with straight sides (on the stop they are bent by the aberrations of the
+pupil, some 1e-4 of its radius). The bodies have the position and size of the state and their nominal shape. A camera's
+own mirrors and board cast no shadow into its beam, as its prescription does not describe substrates.
 """
 
 from __future__ import annotations
@@ -38,38 +37,39 @@ from scenes.specs.baffle import Plate
 from scenes.specs.instrument import BASE
 
 RING_SIDES = 48
-"""Flat pieces of round plates."""
+"""Number of flat segments of round plates."""
 
 DEGREE = 6
-"""Degree of the polynomials for the rays over the stop: mirrors' rays follow them to nanometres."""
+"""Degree of the polynomials that map the stop to rays: they follow the rays of mirrors to nanometres."""
 
 _ROOM = 5e-3
-"""How near a body has to come to the light between the mirrors, as designed, to be looked at in every state, metres."""
+"""Nominal distance from the light between the mirrors, in metres, within which a body is considered in every state."""
 
 _LAST = 0.999
-"""Share of the way to the image up to which bodies count: at its end all rays meet."""
+"""Fraction of the path to the image up to which bodies count: at its end all rays meet."""
 
 _WINDOW, _WINDOW_SIDES = 1.05, 8
-"""Polygon about the stop's disk to which outlines are cut before they are followed to their rays exactly."""
+"""Relative radius and sides of the polygon around the stop's disk to which outlines are clipped before their rays are
+found exactly."""
 
 _STEPS = 4
 
 _NODES = 5
-"""Along each side of a shadow's box, for squares of wavefronts."""
+"""Quadrature nodes along each side of a shadow's box, enough for squares of wavefronts."""
 
 
 @dataclass(frozen=True, eq=False)
 class Caster:
-    """A convex body that may stand in a beam.
+    """Convex body that may cast a shadow into a beam.
 
     Attributes
     ----------
     name : str
-        Of the prism, mirror or board (its path) or of the baffle.
+        Path of the prism, mirror or board, or name of the baffle.
     body : str
         Path of the body that carries it.
-    corners : np.ndarray
-        In that body's frame, (C, 3), metres.
+    corners : (C, 3) ndarray
+        Corners in that body's frame, in metres.
     """
 
     name: str
@@ -83,18 +83,18 @@ class Shadows:
 
     Attributes
     ----------
-    pieces : np.ndarray
-        Convex polygons that do not overlap, (B, K, V, 2); K may be 0. They reach a little beyond the disk.
+    pieces : (B, K, V, 2) ndarray
+        Convex polygons that do not overlap; K may be 0. They extend slightly beyond the disk.
     owners : tuple[str, ...]
-        The body that throws each piece; of several the one that was found first.
-    points : np.ndarray
-        Nodes of a quadrature over all of them within the disk, complex, (B, Q).
-    weights : np.ndarray
-        Of the area, (B, Q).
-    areas : np.ndarray
-        Of each within the disk, (B, K).
-    known : Mapping[str, np.ndarray] | None
-        Name -> share of the stop's area, (B,), where the pieces alone do not say it; None where they do.
+        Name of the body that casts each piece; if several do, the first.
+    points : (B, Q) ndarray of complex
+        Quadrature nodes over all pieces within the disk.
+    weights : (B, Q) ndarray
+        Weights of the nodes, areas.
+    areas : (B, K) ndarray
+        Area of each piece within the disk.
+    known : Mapping[str, np.ndarray] or None
+        Name -> blocked share of the stop's area, (B,), where the pieces alone do not determine it; None where they do.
     """
 
     pieces: np.ndarray
@@ -106,7 +106,7 @@ class Shadows:
 
     @classmethod
     def of(cls, outlines: list[tuple[str, np.ndarray]], count: int) -> Shadows:
-        """Shadows of bodies with their outlines (B, V, 2) on ``count`` stops."""
+        """Return the shadows of bodies with outlines (B, V, 2) on ``count`` stops."""
         lit = [(name, outline) for name, outline in outlines if np.any(area(outline) > SMALLEST)]
         pieces, numbers = separate([outline for _, outline in lit])
         pieces = pieces if lit else np.zeros((count, 0, 3, 2))
@@ -114,33 +114,33 @@ class Shadows:
 
     @classmethod
     def within(cls, pieces: np.ndarray, owners: tuple[str, ...]) -> Shadows:
-        """Shadows of convex polygons (B, K, V, 2) that do not overlap, with the K names of what throws them."""
+        """Return the shadows of convex polygons (B, K, V, 2) that do not overlap, with the names of the K bodies."""
         return cls(pieces, owners, *nodes_in_shadows(pieces, _NODES))
 
     def and_edges(self, outlines: Callable[[int], StopOutlines], name: str) -> Shadows:
-        """These shadows together with those of edges of surfaces.
+        """Return these shadows together with those of edges of surfaces.
 
         Parameters
         ----------
-        outlines : Callable[[int], StopOutlines]
-            Of the edges, as ``SeenEdges.outlines`` gives them.
+        outlines : callable
+            Outlines of the edges, as ``SeenEdges.outlines`` returns them.
         name : str
-            Under which ``shares`` tells what the edges take beside all bodies.
+            Name under which ``shares`` lists the share that the edges block in addition to all bodies.
 
         Raises
         ------
         UnphysicalError
-            They cut a pupil into too many pieces.
+            The edges divide a pupil into too many pieces.
         """
         pieces, _ = converged_shadows(outlines, len(self.pieces), tuple(np.moveaxis(self.pieces, 1, 0)))
         whole = Shadows.within(pieces, (name,) * pieces.shape[1])
         bodies = self.shares()
         rest = np.sum(whole.areas, axis=-1) / np.pi - sum(bodies.values())
-        # by rounding a little less than nothing where a body stands in the shadow of an edge
+        # Rounding makes it slightly negative where a body is in the shadow of an edge.
         return replace(whole, known={**bodies, name: np.maximum(rest, 0.0)})
 
     def shares(self) -> dict[str, np.ndarray]:
-        """Share of the stop's area that each body takes, (B,)."""
+        """Return the share of the stop's area that each body blocks, (B,)."""
         if self.known is not None:
             return dict(self.known)
         out: dict[str, np.ndarray] = {}
@@ -150,7 +150,7 @@ class Shadows:
 
 
 def casters(instrument: Instrument, camera: str) -> tuple[Caster, ...]:
-    """All bodies that may stand in a camera's beam."""
+    """Return all bodies that may cast a shadow into a camera's beam."""
     placed = instrument.assembly.place()
     root = f"{BASE}/{camera}"
     own = {f"{root}/focal_plane", *(f"{root}/{mirror}" for mirror in instrument.cameras[camera].mirrors)}
@@ -163,7 +163,7 @@ def casters(instrument: Instrument, camera: str) -> tuple[Caster, ...]:
 
 
 def _plate(plate: Plate) -> list[Caster]:
-    """A plate as one convex polygon, or a ring as several."""
+    """Return a plate as one convex polygon, or a ring as several."""
     match plate.outline:
         case Circle() as disk:
             angle = 2.0 * np.pi * np.arange(RING_SIDES + 1) / RING_SIDES
@@ -183,24 +183,24 @@ def _plate(plate: Plate) -> list[Caster]:
 
 @dataclass(frozen=True, eq=False)
 class TracedBeams:
-    """Beams of B images, as traced.
+    """Traced beams of B images.
 
     Attributes
     ----------
     assembly : Assembly
-        With the camera's elements.
+        Assembly with the camera's elements.
     placed : PlacedBodies
         Bodies in all states.
-    owner : np.ndarray
-        Which state each image belongs to, (B,).
+    owner : (B,) ndarray of int
+        Number of the state that each image belongs to.
     systems : SystemBatch
-        On the way to the image, B.
+        Systems from the scene to the image, B.
     rays : ImagingRays
-        Of the images.
-    heading : np.ndarray
-        Of their light, world, unit, (3,) or (B, 3).
+        Rays of the images.
+    heading : (3,) or (B, 3) ndarray
+        Unit vectors of their light in the world.
     nodes : PupilNodes
-        At which the rays meet the stop.
+        Nodes at which the rays meet the stop.
     """
 
     assembly: Assembly
@@ -213,16 +213,16 @@ class TracedBeams:
 
 
 class ImagingShadows:
-    """What throws shadows into the imaging beams of one camera.
+    """Bodies that cast shadows into the imaging beams of one camera.
 
     Parameters
     ----------
     instrument
-        With the camera.
+        Instrument with the camera.
     camera
-        Its name.
+        Name of the camera.
     backend
-        Where to trace.
+        Backend that traces the rays.
     """
 
     def __init__(self, instrument: Instrument, camera: str, backend: Backend) -> None:
@@ -240,7 +240,7 @@ class ImagingShadows:
         self._inner = _between_mirrors(self.casters, instrument, backend, camera)
 
     def cast(self, beams: TracedBeams) -> Shadows:
-        """Shadows in B pupils."""
+        """Return the shadows in B pupils."""
         found: list[tuple[str, np.ndarray]] = []
         launched = beams.rays.launched
         bundle = _Bundle.parallel(launched, beams.heading, self._end(beams), beams.nodes)
@@ -256,7 +256,7 @@ class ImagingShadows:
         return Shadows.of(found, len(launched))
 
     def _spheres(self, placed: PlacedBodies) -> tuple[np.ndarray, np.ndarray]:
-        """Middles (S, C, 3) and radii (S, C) of spheres about all C casters, world."""
+        """Return middles (S, C, 3) and radii (S, C) of spheres around all C casters, in the world."""
         count = len(placed.scale)
         centre, size = np.empty((count, len(self.casters), 3)), np.empty((count, len(self.casters)))
         for body, which in self._on.items():
@@ -265,12 +265,12 @@ class ImagingShadows:
         return centre, size
 
     def _end(self, beams: TracedBeams) -> np.ndarray:
-        """How far it is from the launch points to the first mirror's middle, (B,)."""
+        """Return the distances from the launch points to the first mirror's middle, (B,)."""
         middle = points_to_world(beams.placed, self._first, np.array([self._centre])).real[:, 0]
         return np.asarray(np.sum((middle[beams.owner] - beams.rays.launched.mean(axis=1)) * beams.heading, axis=-1))
 
     def _hits(self, beams: TracedBeams) -> list[np.ndarray]:
-        """Where the rays meet every element, world, (B, N, 3) each."""
+        """Return the points at which the rays meet every element, in the world, (B, N, 3) each."""
         placed, launched = beams.placed, beams.rays.launched
         chain = beams.assembly.sequences[f"{self.camera}/imaging"]
         way = np.broadcast_to(np.broadcast_to(beams.heading, (len(launched), 3))[:, None], launched.shape)
@@ -284,27 +284,27 @@ class ImagingShadows:
 
 
 def no_shadows(count: int) -> Shadows:
-    """Those in the ``count`` pupils of free beams."""
+    """Return the empty shadows of ``count`` unobstructed pupils."""
     return Shadows.within(np.zeros((count, 0, 3, 2)), ())
 
 
 class SeenEdges(SurfaceEdges):
-    """Edges of a camera's surfaces as B images see them, in a state of its assembly."""
+    """Edges of a camera's surfaces in the pupils of B images, in a state of its assembly."""
 
     @classmethod
     def of(cls, beams: TracedBeams, model: CameraModel, camera: str, backend: Backend) -> SeenEdges:
-        """Those of a camera.
+        """Return the edges of a camera.
 
         Parameters
         ----------
         beams : TracedBeams
-            To the images.
+            Beams of the images.
         model : CameraModel
-            Of the camera.
+            The camera.
         camera : str
-            Its name in the assembly, that its elements' names begin with.
+            Name of the camera in the assembly, with which its elements' names begin.
         backend : Backend
-            Where to trace.
+            Backend that traces the rays.
         """
         cut = {name: model.mirrors.index(name) for name in model.edges}
         launched = beams.rays.launched
@@ -321,17 +321,17 @@ class SeenEdges(SurfaceEdges):
 
 @lru_cache(maxsize=8)
 def imaging_shadows(instrument: Instrument, camera: str, backend: Backend) -> ImagingShadows:
-    """``ImagingShadows``, which takes some 0.1 s to find the bodies, kept for instruments used last."""
+    """Return ``ImagingShadows``, cached for the last instruments because finding the bodies takes some 0.1 s."""
     return ImagingShadows(instrument, camera, backend)
 
 
 def _between_mirrors(
     every: Sequence[Caster], instrument: Instrument, backend: Backend, camera: str
 ) -> dict[int, list[Caster]]:
-    """Bodies near the light between mirrors (0: from the first to the second) or before the image, as designed."""
+    """Return the bodies near the nominal light from mirror to mirror (0: first to second) and to the image."""
     placed = instrument.assembly.place()
     backward = np.concatenate(imaging_segments(instrument, backend, camera))
-    inner = backward[:, :-1][:, ::-1]  # without the way from the scene, in the order of the light
+    inner = backward[:, :-1][:, ::-1]  # without the path from the scene, in the order of the light
     cube = _ROOM * np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
     out: dict[int, list[Caster]] = {}
     for caster in every:
@@ -344,26 +344,26 @@ def _between_mirrors(
 
 
 def _corners(caster: Caster, beams: TracedBeams) -> np.ndarray:
-    """Corners of a body for every image, world, (B, C, 3)."""
+    """Return the corners of a body for every image, in the world, (B, C, 3)."""
     return np.asarray(points_to_world(beams.placed, caster.body, caster.corners).real[beams.owner])
 
 
 @dataclass(frozen=True, eq=False)
 class _Bundle:
-    """Rays from one surface to the next in B beams, over the stop.
+    """Rays from one surface to the next in B beams, as functions of the stop coordinates.
 
     Attributes
     ----------
-    start, end : np.ndarray
-        Coefficients of the rays' points at both, (B, K, 3), for ``products``.
-    middle : np.ndarray
-        Of both, (B, 2, 3).
-    spread : np.ndarray
-        Their derivatives by the stop's x and y in the mean, (B, 2, 3, 2).
-    along : np.ndarray
-        Mean direction, (B, 3).
-    axes : np.ndarray
-        Square to it, (B, 2, 3).
+    start, end : (B, K, 3) ndarray
+        Coefficients of the rays' points at both surfaces, for ``products``.
+    middle : (B, 2, 3) ndarray
+        Mean points at both.
+    spread : (B, 2, 3, 2) ndarray
+        Mean derivatives of the points with respect to the stop's x and y.
+    along : (B, 3) ndarray
+        Mean direction.
+    axes : (B, 2, 3) ndarray
+        Axes perpendicular to it.
     """
 
     start: np.ndarray
@@ -375,11 +375,11 @@ class _Bundle:
 
     @classmethod
     def between(cls, start: np.ndarray, end: np.ndarray, nodes: PupilNodes) -> _Bundle:
-        """From points (B, N, 3) to points (B, N, 3), for nodes of the stop."""
+        """Return the bundle from points (B, N, 3) to points (B, N, 3), for nodes of the stop."""
         both = np.stack([start, end], axis=1)
         weight = nodes.share
         middle = np.einsum("n,bknx->bkx", weight, both)
-        # x and y are orthogonal over the disk, their squares 1/4 in the mean
+        # Over the disk x and y are orthogonal, and the means of their squares are 1/4.
         spread = 4.0 * np.einsum("n,ni,bknx->bkxi", weight, np.stack([nodes.x, nodes.y], axis=-1), both)
         way = middle[:, 1] - middle[:, 0]
         along = way / np.linalg.norm(way, axis=-1, keepdims=True)
@@ -389,19 +389,19 @@ class _Bundle:
 
     @classmethod
     def parallel(cls, launched: np.ndarray, heading: np.ndarray, end: np.ndarray, nodes: PupilNodes) -> _Bundle:
-        """Light from far away up to a distance (B,) beyond the points (B, N, 3) of a wavefront."""
+        """Return light from far away up to a distance (B,) beyond the points (B, N, 3) of a wavefront."""
         heading = np.broadcast_to(heading, (len(launched), 3))
         far = launched - _FAR * heading[:, None]
         return cls.between(far, launched + (end[:, None] * heading)[:, None], nodes)
 
     def may_meet(self, centre: np.ndarray, size: np.ndarray) -> np.ndarray:
-        """Which of the spheres with middles (B, C, 3) and radii (B, C) meet any of the beams, which are parallel."""
+        """Return a mask (C,) of the spheres, middles (B, C, 3) and radii (B, C), that may meet a parallel beam."""
         off = (centre - self.middle[:, :1]) @ self.axes.swapaxes(1, 2)
         radius = np.linalg.norm(self.axes @ self.spread[:, 0], axis=(1, 2))
         return np.asarray(np.any(np.hypot(off[..., 0], off[..., 1]) < 1.1 * radius[:, None] + size, axis=0))
 
     def outline(self, corners: np.ndarray) -> np.ndarray:
-        """Outline of a convex body (B, C, 3) on the stop's unit disk, (B, V, 2); empty where it takes nothing."""
+        """Return the outline (B, V, 2) of a convex body (B, C, 3) on the stop's unit disk; empty if off the beam."""
         corners = self._inside(corners)
         packed = np.concatenate([self._guess(corners)[0], corners], axis=-1)
         angle = 2.0 * np.pi * (np.arange(_WINDOW_SIDES) + 0.5) / _WINDOW_SIDES
@@ -423,7 +423,7 @@ class _Bundle:
         return np.where(empty[:, None, None], out[:, :1], out)
 
     def _guess(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Stop coordinates (B, C, 2) of rays through points in the mean, and d(transverse)/d(stop), (B, C, 2, 2)."""
+        """Return approximate stop coordinates (B, C, 2) of rays through points, and their Jacobian (B, C, 2, 2)."""
         first, way = self.middle[:, :1], (self.middle[:, 1:] - self.middle[:, :1])
         ahead = self._ahead(place)[..., None]
         off = np.einsum("bix,bcx->bci", self.axes, place - first - ahead * way)
@@ -432,17 +432,17 @@ class _Bundle:
         return _solved(slope, off), slope
 
     def _ahead(self, place: np.ndarray) -> np.ndarray:
-        """Share of the way at which points lie, (B, C)."""
+        """Return the fraction of the path at which points lie, (B, C)."""
         way = np.einsum("bx,bx->b", self.middle[:, 1] - self.middle[:, 0], self.along)
         return np.asarray(np.einsum("bcx,bx->bc", place - self.middle[:, :1], self.along) / way[:, None])
 
     def _inside(self, corners: np.ndarray) -> np.ndarray:
-        """Corners of the part of a body between both ends of the way, (B, D, 3)."""
+        """Return the corners of the part of a body between both ends of the path, (B, D, 3)."""
         for low, sign in ((0.0, 1.0), (-_LAST, -1.0)):
             depth = sign * self._ahead(corners) - low
             if np.all(depth >= 0.0):
                 continue
-            # where lines between corners on both sides cross the end; those that do not cross give a corner
+            # Add the points where lines between corners cross the end; for lines that do not cross it, repeat a corner.
             i, j = np.triu_indices(corners.shape[1], 1)
             crossing = (depth[:, i] >= 0.0) != (depth[:, j] >= 0.0)
             share = depth[:, i] / np.where(crossing, depth[:, i] - depth[:, j], 1.0)
@@ -456,11 +456,11 @@ class _Bundle:
 
 
 def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solutions of systems (..., 2, 2) for (..., 2); many at once are quicker so than one by one."""
+    """Return solutions of 2 x 2 systems (..., 2, 2) for (..., 2), by Cramer's rule, which is fast for many at once."""
     (a, b), (c, d) = (np.moveaxis(row, -1, 0) for row in np.moveaxis(matrix, -2, 0))
     x, y = np.moveaxis(right, -1, 0)
     return np.asarray(np.stack([d * x - b * y, a * y - c * x], axis=-1) / (a * d - b * c)[..., None])
 
 
 _FAR = 100.0
-"""How far before the first mirror bodies are looked for, metres."""
+"""Distance before the first mirror within which bodies are considered, in metres."""

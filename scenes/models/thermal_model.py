@@ -1,16 +1,14 @@
-"""Heat: from temperatures of bodies to motions, deformed faces and refractive indices.
+"""Thermal model: from temperatures of bodies to motions, deformed faces and refractive indices.
 
-A body without a temperature of its own has the field of the body that carries it. Every body is held at its mount
-(the pivot ``centre`` if there is one, else the origin) and expands freely about it; structures carry the mounts of
-what stands on them. Mirrors and prisms deform by a finite-element solution for a unit gradient along each axis, held
-at three points; the solution is linear, so that one factorisation serves all temperatures. Mirrors on a frame of the
-same material are one free body with it, whose exact deformation is known. A lens is held at its middle and deforms as
-a free body (``scenes.models.thermal_model``). Glass changes its index by dn/dT.
+A body without a temperature of its own has the field of the body that carries it. Every body is held at its mount (the
+pivot ``centre`` if there is one, else the origin) and expands freely about it; structures carry the mounts of the
+bodies on them. Mirrors and prisms deform by a finite-element solution for a unit gradient along each axis, held at
+three points; the solution is linear, so that one factorisation serves all temperatures. Mirrors on a frame of the same
+material form one free body with it, whose exact deformation is known. Glass changes its index by dn/dT.
 
-A lens in heat: its faces are bodies of their own, and move as the one piece of glass between them.
-
-The lens is called by its first face, whose temperature it has. It is held at its middle, half way between the centres
-of its faces, and expands freely about it; nothing bends it, so that a linear field deforms it by a formula.
+The faces of a lens are separate bodies, which move as the one piece of glass between them. The lens is named by its
+first face, whose temperature it has. It is held at its middle, half way between the centres of its faces, and expands
+freely about it; nothing bends it, so that a linear field deforms it by a formula.
 """
 
 from __future__ import annotations
@@ -56,17 +54,17 @@ class Lens:
     Attributes
     ----------
     path : str
-        Of the body of its first face, by which it is called.
+        Path of the body of its first face, which names the lens.
     faces : Mapping[str, Pose]
         Body of each face -> its pose in the frame of the first.
     parent : Pose
         Pose of the first face in the frame of the body that carries it.
-    middle : np.ndarray
-        Where it is held, (3,), in the frame of the first face, metres.
-    glass : WarmGlass | None
-        What heat does to it; None where nothing says it.
+    middle : (3,) ndarray
+        Point at which it is held, in the frame of the first face, in metres.
+    glass : WarmGlass or None
+        Thermal data of its glass; None if there are none.
     unknown : str
-        What is not said, empty where all is.
+        Description of missing data; empty if they are complete.
     """
 
     path: str
@@ -78,28 +76,32 @@ class Lens:
 
     @property
     def mount(self) -> np.ndarray:
-        """Where it is held, (3,), in the frame of the body that carries it, metres."""
+        """Point at which it is held, (3,), in the frame of the body that carries it, in metres."""
         return np.asarray(self.parent.apply(self.middle))
 
     def grown(self, stretch: float) -> dict[str, Motion]:
-        """What a relative growth of the lens about its middle does to its faces."""
+        """Return the motions of the faces by a relative expansion of the lens about its middle."""
         return {
-            face: Motion(shift=triple(stretch * (pose.rotation.T @ (pose.translation - self.middle))), expansion=stretch)
+            face: Motion(
+                shift=triple(stretch * (pose.rotation.T @ (pose.translation - self.middle))), expansion=stretch
+            )
             for face, pose in self.faces.items()
         }
 
     def carried(self, turn: np.ndarray, move: np.ndarray, stretch: float) -> dict[str, Motion]:
-        """What the body that carries the lens does to its faces.
+        """Return the motions of the faces by the body that carries the lens.
+
+        All arguments are in the frame of the carrier.
 
         Parameters
         ----------
-        turn : np.ndarray
-            Rotation vector of the lens about where it is held, (3,), radians.
-        move : np.ndarray
-            Of where it is held, (3,), metres, beside what the carrier's growth does.
+        turn : (3,) ndarray
+            Rotation vector of the lens about the point at which it is held, in radians.
+        move : (3,) ndarray
+            Displacement of that point, in metres, without that by the carrier's uniform expansion.
         stretch : float
-            Growth of the carrier, which moves the origins of the faces in the tree; the lens goes where that moves its
-            middle. All in the frame of the carrier.
+            Relative expansion of the carrier, which moves the origins of the faces in the tree; the lens follows the
+            displacement of its middle.
         """
         out = {}
         for face, pose in self.faces.items():
@@ -112,16 +114,16 @@ class Lens:
 
 
 def lenses_of(name: str, model: CameraModel, bodies: Mapping[str, Body]) -> list[Lens]:
-    """All lenses of a camera.
+    """Return all lenses of a camera.
 
     Parameters
     ----------
     name : str
-        Of the camera in its instrument.
+        Name of the camera in its instrument.
     model : CameraModel
-        Its numbers.
+        Derived numbers of the camera.
     bodies : Mapping[str, Body]
-        Of the instrument, by path.
+        Bodies of the instrument, by path.
     """
     root, groups = f"{BASE}/{name}", dict[str, list[str]]()
     for face, first in lenses(model.spec).items():
@@ -141,23 +143,24 @@ def lenses_of(name: str, model: CameraModel, bodies: Mapping[str, Body]) -> list
 
 
 SPACING = 0.25
-"""Longest edge of the finite elements in a prism, metres. A linear field is met exactly by any mesh."""
+"""Longest edge of the finite elements in a prism, in metres. Any mesh represents a linear field exactly."""
 CELLS = 8
-"""Finite elements across a mirror."""
+"""Number of finite elements across a mirror."""
 TERMS = 15
-"""Zernike terms that hold a deformed face, to fourth order."""
+"""Number of Zernike terms of a deformed face, to fourth order."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Response:
-    """What gradients of 1 K/m along x, y and z of a body do to its F faces.
+    """Response of a body's F faces to gradients of 1 K/m along its x, y and z.
 
     Attributes
     ----------
     terms : Mapping[str, tuple[int, ...]]
-        Body of each face -> Noll indices of its figures.
-    numbers : np.ndarray
-        Rotation vector, shift and figures of one face after the other, radians and metres, a column for each gradient.
+        Body of each face -> Noll indices of its figure terms.
+    numbers : ndarray
+        Rotation vector, shift and figure terms of one face after the other, in radians and metres; a column per
+        gradient.
     """
 
     terms: Mapping[str, tuple[int, ...]]
@@ -165,7 +168,7 @@ class _Response:
 
     @classmethod
     def of(cls, units: Sequence[Mapping[str, FaceChange]]) -> _Response:
-        """From the changes of all faces by the three gradients."""
+        """Return the response from the changes of all faces by the three unit gradients."""
         terms = {face: tuple(sorted({j for unit in units for j in unit[face].figure})) for face in units[0]}
         numbers = [
             [
@@ -178,7 +181,7 @@ class _Response:
         return cls(terms, np.array(numbers).T)
 
     def to(self, gradient: np.ndarray) -> dict[str, list[Motion | None]]:
-        """The motions of the faces by gradients (S, 3), K/m; none in a state without one."""
+        """Return the motions of the faces by gradients (S, 3), K/m; None in a state without a gradient."""
         rows, bent = matvec(self.numbers, gradient).tolist(), np.any(gradient, axis=1).tolist()
         out: dict[str, list[Motion | None]] = {}
         start = 0
@@ -195,21 +198,21 @@ class _Response:
 
 
 Held = tuple[ElasticBody, Kinematic]
-"""Finite elements and what holds them."""
+"""Finite elements of a body and their support."""
 _Field = TypeVar("_Field", Temperature, Temperatures)
 _Moves = Mapping[str, Sequence[Motion | None]]
 """Body path -> its motion in each state, None where it has none."""
 
 
 class TemperatureError(PhysicalError, ValueError):
-    """A temperature that cannot be.
+    """Error of a temperature that is impossible or outside the data of a material.
 
     Attributes
     ----------
     origin
-        Path of the body that was given it (bodies that it carries inherit it).
+        Path of the body whose temperature was specified (bodies that it carries inherit it).
     allowed
-        In words.
+        Allowed values, in words.
     """
 
     def __init__(self, problem: str, origin: str, allowed: str) -> None:
@@ -219,16 +222,20 @@ class TemperatureError(PhysicalError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class _Carried:
-    """What stands on a body: lenses, and N other bodies.
+    """Bodies mounted on a body: lenses, and N other bodies.
 
     Attributes
     ----------
-    lenses, bodies : tuple[Lens, ...]
-        they.
-    mount : np.ndarray
-        Where the bodies are held, in their own frames, (N, 3), metres; place: the same in the carrier's.
-    inward : np.ndarray
-        Rotations from the carrier's frame to theirs, (N, 3, 3).
+    lenses : tuple[Lens, ...]
+        The lenses.
+    bodies : tuple[Body, ...]
+        The other bodies.
+    mount : (N, 3) ndarray
+        Mounts of those bodies in their own frames, in metres.
+    place : (N, 3) ndarray
+        Mounts in the carrier's frame, in metres.
+    inward : (N, 3, 3) ndarray
+        Rotations from the carrier's frame to theirs.
     """
 
     lenses: tuple[Lens, ...]
@@ -239,7 +246,7 @@ class _Carried:
 
 
 class ThermalModel:
-    """Temperatures of an instrument's bodies turned into a perturbed state.
+    """Conversion of temperatures of an instrument's bodies into a perturbed state.
 
     Parameters
     ----------
@@ -270,9 +277,7 @@ class ThermalModel:
 
     @cached_property
     def materials(self) -> Mapping[str, Material | WarmGlass]:
-        """Body path -> what it is made of, for all bodies but the faces of solids and lenses of which nothing says what
-        heat does to them.
-        """
+        """Body path -> its material, for all bodies except faces of solids and lenses without thermal data."""
         named = self.instrument.spec.materials
         out: dict[str, Material | WarmGlass] = {}
         for path in self._bodies:
@@ -295,8 +300,9 @@ class ThermalModel:
         return out
 
     def _owner(self, path: str) -> str | None:
-        """The solid that a body belongs to, itself or a parent: the outermost, whose pieces the others are; of a lens's
-        face the first face, which stands for the lens.
+        """Return the solid or lens that a body belongs to, or None.
+
+        Of nested solids it is the outermost, whose pieces the others are; a lens is represented by its first face.
         """
         if path not in self._owners:
             outermost = next((p for p in reversed(list(_upward(path))) if p in self.solids), None)
@@ -304,18 +310,18 @@ class ThermalModel:
         return self._owners[path]
 
     def _pieces(self, path: str) -> list[Solid]:
-        """A solid and those that are pieces of it."""
+        """Return a solid and the solids that are pieces of it."""
         return [solid for piece, solid in self.solids.items() if self._owner(piece) == path]
 
     def fields(self, temperatures: Mapping[str, _Field], pieces: bool = True) -> dict[str, _Field]:
-        """Every warmed body's field in its own frame, its own or inherited.
+        """Return every heated body's field in its own frame, specified or inherited.
 
         Parameters
         ----------
-        temperatures : Mapping[str, _Field]
-            Of the bodies that have one of their own.
+        temperatures : Mapping[str, Temperature or Temperatures]
+            Fields of the bodies that have one of their own.
         pieces : bool
-            Also of the bodies that are pieces of a solid or a lens.
+            Whether bodies that are pieces of a solid or a lens are included.
         """
         out: dict[str, _Field] = {}
         for path, body in self._bodies.items():
@@ -331,12 +337,12 @@ class ThermalModel:
         return out
 
     def check(self, temperatures: Mapping[str, Temperature]) -> None:
-        """Check that no body gets to where its material's expansion or its glass's index is not known.
+        """Check that all temperatures lie within the data of the bodies' materials: expansion and, for glass, index.
 
         Raises
         ------
         TemperatureError
-            Names the body.
+            A temperature is outside the data; the message names the body.
         """
         for path, field in self.fields(temperatures).items():
             if self._owner(path) not in (None, path):
@@ -346,11 +352,11 @@ class ThermalModel:
                 raise TemperatureError(
                     f"{path} would be at {self.coldest(path, field):.4g} K, which is not above absolute zero",
                     origin,
-                    f"changes from the instrument's {self.reference:.6g} K that stay above 0 K everywhere on the body",
+                    f"changes from the instrument's {self.reference:.6g} K to above 0 K everywhere on the body",
                 )
             if path in self.lenses and self.lenses[path].unknown and field != Temperature():
                 remedy = (
-                    "what a catalogue of glasses says of it in the camera's file, or `temperature: 0 K` of this lens"
+                    "its thermal data of a glass catalogue in the camera's file, or `temperature: 0 K` of this lens"
                 )
                 raise TemperatureError(f"{path}: {self.lenses[path].unknown}", origin, remedy)
             self._check_known(path, field, origin)
@@ -361,6 +367,7 @@ class ThermalModel:
                     raise TemperatureError(f"{path}: {error}", origin, "a glass with known dn/dT") from error
 
     def _check_known(self, path: str, field: Temperature, origin: str) -> None:
+        """Raise TemperatureError if a field is outside the temperatures for which a body's material is known."""
         if field == Temperature():
             return
         coldest, hottest, known = self.coldest(path, field), self.hottest(path, field), self.known(path)
@@ -373,7 +380,7 @@ class ThermalModel:
             )
 
     def known(self, path: str) -> TemperatureRange:
-        """Temperatures at which the data of a body's material may be used: expansion, and index where it is glass."""
+        """Return the temperatures for which the data of a body's material hold: expansion and, for glass, index."""
         stuff = self.materials[path].known
         if path in self.solids and self.solids[path].transparent:
             thermal = glass(self.solids[path].material).thermal
@@ -384,17 +391,18 @@ class ThermalModel:
         return stuff
 
     def coldest(self, path: str, field: Temperature) -> float:
-        """Lowest absolute temperature that a field makes on a body, kelvin: at its corners for optics, else at its
-        origin.
+        """Return the lowest absolute temperature of a field on a body, in kelvin.
+
+        It is evaluated at the corners of optics, and at the origin of other bodies.
         """
         return float(self.reference + field.change + np.min(self.extent(path) @ np.array(field.gradient)))
 
     def hottest(self, path: str, field: Temperature) -> float:
-        """Highest, likewise."""
+        """Return the highest absolute temperature of a field on a body, in kelvin, as ``coldest`` does the lowest."""
         return float(self.reference + field.change + np.max(self.extent(path) @ np.array(field.gradient)))
 
     def extent(self, path: str) -> np.ndarray:
-        """Points of a body between which its temperature lies, (P, 3), metres; kept, since a series asks often."""
+        """Return points that enclose a body, (P, 3), in metres, cached because a series needs them often."""
         if path not in self._extents:
             if path in self.solids:
                 own = self._placed.pose(path).inverse()
@@ -416,16 +424,16 @@ class ThermalModel:
         motions: State | None = None,
         progress: Callable[[str], None] = lambda path: None,
     ) -> State:
-        """The perturbed state: thermal motions under the given other motions.
+        """Return the perturbed state: thermal motions, with the given other motions on top.
 
         Parameters
         ----------
         temperatures : Mapping[str, Temperature]
             Body path -> field in its own frame.
-        motions : State | None
-            What else happens; it acts on top of the thermal motion of the same body.
-        progress : Callable[[str], None]
-            Called with the path of each body whose finite-element solution begins.
+        motions : State or None
+            Other motions, which act on top of the thermal motion of the same body.
+        progress : callable
+            Function called with the path of each body whose finite-element solution begins.
         """
         one = {path: Temperatures.of([field]) for path, field in temperatures.items()}
         return self.states(one, [motions or {}], progress)[0]
@@ -436,16 +444,16 @@ class ThermalModel:
         motions: Sequence[State],
         progress: Callable[[str], None] = lambda path: None,
     ) -> list[State]:
-        """S perturbed states together, as ``state`` makes one.
+        """Return S perturbed states at once, as ``state`` returns one.
 
         Parameters
         ----------
         temperatures : Mapping[str, Temperatures]
             Body path -> its fields in the S states, in its own frame.
-        motions : Sequence[State]
-            What else happens in each.
-        progress : Callable[[str], None]
-            As for one.
+        motions : sequence of State
+            Other motions in each state.
+        progress : callable
+            Function called with the path of each body whose finite-element solution begins.
         """
         fields = self.fields(temperatures, pieces=False)
         change, gradient = (np.array([getattr(f, n) for f in fields.values()]) for n in ("change", "gradient"))
@@ -459,7 +467,7 @@ class ThermalModel:
         return compose_each([[*heat, more] for heat, more in zip(thermal, motions, strict=True)], self._bodies)
 
     def _warmed(self, path: str, field: Temperatures, progress: Callable[[str], None]) -> list[_Moves]:
-        """What a body's fields do to the body itself, to its faces and to what it carries: the last one first."""
+        """Return the motions by a body's fields: of its faces, then of the body itself and of what it carries."""
         if path in self.lenses:
             return self._warmed_lens(self.lenses[path], field, progress)
         body, stuff = self._bodies[path], self.materials[path]
@@ -476,7 +484,7 @@ class ThermalModel:
             ]
         }
         if path in self.solids or path in self.mirrors:
-            # the tree's stretch carries what stands on a body and does not enlarge it; faces and footprints are its own
+            # An expansion in the tree moves carried bodies without enlarging them; faces and footprints expand as well.
             inside = tuple(Motion(expansion=grown) for grown in stretches)
             out.update(dict.fromkeys(self._within(path), inside))
             return [*self._bent(path, field.gradient, progress), out]
@@ -486,7 +494,7 @@ class ThermalModel:
             faces = [lens.carried(*each) for each in moves]
             out.update({face: [own.get(face) for own in faces] for face in lens.faces})
         turn, move = carried_motion(stuff.expansion, field.gradient[:, None], carried.place - about)
-        # the tree's stretch carries the child's origin, but what moves with this body is the child's mount
+        # The expansion in the tree moves the child's origin, but it is the child's mount that moves with this body.
         rotate = matvec(carried.inward, turn)
         shift = matvec(carried.inward, move) + stretch[:, None, None] * carried.mount
         moved = np.any(turn, axis=2) | np.any(shift, axis=2)
@@ -496,6 +504,7 @@ class ThermalModel:
         return [out]
 
     def _carried_by(self, path: str) -> _Carried:
+        """Return the bodies mounted on a body, cached."""
         if path not in self._carried:
             bodies = [body for body in self._bodies.values() if body.parent == path]
             lenses = [self.lenses[body.path] for body in bodies if body.path in self.lenses]
@@ -507,13 +516,13 @@ class ThermalModel:
         return self._carried[path]
 
     def _within(self, path: str) -> tuple[str, ...]:
-        """Bodies that a body carries, and those that they carry."""
+        """Return the bodies that a body carries, directly or through others."""
         if path not in self._inside:
             self._inside[path] = tuple(other for other in self._bodies if other.startswith(f"{path}/"))
         return self._inside[path]
 
     def _warmed_lens(self, lens: Lens, field: Temperatures, progress: Callable[[str], None]) -> list[_Moves]:
-        """What a lens's fields do to its faces and to its index."""
+        """Return the motions and index changes that a lens's fields cause."""
         assert lens.glass is not None
         here = (self.reference + field.change).tolist()
         grown = [lens.grown(stretch) for stretch in (lens.glass.expansion * field.at(lens.middle)).tolist()]
@@ -526,7 +535,7 @@ class ThermalModel:
         ]
 
     def _indices(self, path: str, field: Temperatures) -> Iterator[tuple[float, tuple[float, float, float]]]:
-        """Changes of index at a solid's origin, and their gradients, 1/m."""
+        """Yield changes of index at a solid's origin, and their gradients, in 1/m."""
         kind, wavelength = glass(self.solids[path].material), self.instrument.spec.autocollimator.wavelength
         at_rest = kind.vacuum_index(wavelength, self.reference)
         for here, gradient in zip((self.reference + field.change).tolist(), field.gradient, strict=True):
@@ -534,7 +543,7 @@ class ThermalModel:
             yield kind.vacuum_index(wavelength, here) - at_rest, triple(slope * gradient)
 
     def _bent(self, path: str, gradient: np.ndarray, progress: Callable[[str], None]) -> list[_Moves]:
-        """What gradients (S, 3), K/m, do to the faces of a body; nothing where none bends it."""
+        """Return the motions of a body's faces by gradients (S, 3), K/m; an empty list if nothing bends it."""
         if self.materials[path].expansion == 0.0 or not np.any(gradient):
             return []
         if path not in self._responses:
@@ -543,16 +552,17 @@ class ThermalModel:
         return [self._responses[path].to(gradient)]
 
     def surface(self, face: str) -> Surface:
-        """Nominal shape of the optical face of a body."""
+        """Return the nominal shape of the optical face of a body."""
         return next(e.surface for e in self.instrument.assembly.elements.values() if e.body == face)
 
     def face_radii(self, path: str) -> dict[str, float]:
-        """Body of an optical face of a mirror or a solid -> radius of the disk of its figure's terms, metres."""
+        """Return the radius of the disk of the figure terms of each optical face of a body, in metres."""
         return {face: self.surface(face).figure_disk(own).radius for face, (own, _) in self.faces_of(path).items()}
 
     def index_path(self, path: str, field: Temperature, rest: float) -> float:
-        """Largest optical path that a temperature of ``rest`` kelvin beside a linear field may be worth in a body's
-        glass, metres: there and back along its longest side; 0 for what is not glass.
+        """Return the largest optical path by ``rest`` kelvin beside a linear field in a body's glass, in metres.
+
+        The path goes there and back along the body's longest side; it is 0 for bodies that are not glass.
         """
         if path not in self.solids or not self.solids[path].transparent:
             return 0.0
@@ -561,7 +571,7 @@ class ThermalModel:
         return float(abs(slope) * rest * 2.0 * np.max(np.ptp(self.extent(path), axis=0)))
 
     def faces_of(self, path: str) -> Mapping[str, tuple[Aperture, Pose]]:
-        """Body of an optical face -> its aperture and its nominal place in the frame of a mirror or a solid."""
+        """Return aperture and nominal pose, in the frame of a mirror or a solid, of each of its optical faces."""
         if path in self.mirrors:
             return {path: (self._aperture(path), Pose())}
         if path in self.lenses:
@@ -573,21 +583,21 @@ class ThermalModel:
         }
 
     def elastic(self, path: str, cells: int = CELLS, spacing: float = SPACING) -> Held | None:
-        """Finite elements of a mirror or a solid in its own frame, and the three points that hold it.
+        """Return finite elements of a mirror or a solid in its own frame, and its three-point support.
 
         Parameters
         ----------
         path : str
-            Of the body.
+            Path of the body.
         cells : int
-            Across a mirror.
+            Number of elements across a mirror.
         spacing : float
-            Longest edge in a solid, metres.
+            Longest edge in a solid, in metres.
 
         Returns
         -------
-        Held | None
-            None for a body that has none: one without a shape, or of several pieces.
+        tuple[ElasticBody, Kinematic] or None
+            None for a body without finite elements: one without a shape, or of several pieces.
         """
         if path in self.mirrors:
             camera, name = self.mirrors[path]
@@ -608,25 +618,27 @@ class ThermalModel:
         corners = solid_mesh(self.solids[path], self._placed).vertices
         low, high = corners.min(axis=0), corners.max(axis=0)
         middle, half = corners.mean(axis=0), 0.5 * (high - low)
-        # three points around the middle, 120 deg apart in the plane of the two longest sides
+        # Three points around the middle, 120 deg apart in the plane of the two longest sides.
         a, b = np.argsort(half)[:0:-1][:2]
         arms = np.array([0.5 * half[a] * np.eye(3)[a] * c + 0.5 * half[b] * np.eye(3)[b] * s for c, s in _THREE])
         support = middle + _within(corners, middle, arms) * arms
         return ElasticBody(polyhedron_mesh(corners, spacing), self._elastic_material(path)), Kinematic(support)
 
     def _elastic_material(self, path: str) -> Material:
+        """Return the elastic material of a body."""
         stuff = self.materials[path]
         assert isinstance(stuff, Material)
         return stuff
 
     def unit_displacements(self, path: str) -> Sequence[Displaced]:
-        """Displacements of the material of a mirror or a solid, in its frame, by a gradient of 1 K/m along x, y and z
-        of it, the temperature being zero at its middle.
+        """Return the displacements of a body's material by gradients of 1 K/m along its x, y and z, in its frame.
+
+        The temperature is zero at its middle.
 
         Parameters
         ----------
         path : str
-            Of the body.
+            Path of a mirror or a solid.
         """
         held = self.elastic(path)
         if held is None:
@@ -635,21 +647,21 @@ class ThermalModel:
         return held[0].solve_many([_unit_load(axis, about) for axis in range(3)], held[1])
 
     def _free(self, path: str, axis: int) -> Formula:
-        """A body that nothing holds, in a gradient of 1 K/m: it stays and does not turn where its mount is."""
+        """Return the displacement of a free body by a gradient of 1 K/m, zero and irrotational at its mount."""
         about = self._bodies[path].pivots[_mount(self._bodies[path])]
         if path in self.lenses:
             about = triple(self.lenses[path].middle)
         return Formula(free_linear_field(self.materials[path].expansion, 0.0, np.eye(3)[axis], about))
 
     def changes(self, path: str, displaced: Displaced, terms: int = TERMS) -> dict[str, FaceChange]:
-        """What a displacement of a mirror's or a solid's material does to its optical faces.
+        """Return the changes of a mirror's or a solid's optical faces by a displacement of its material.
 
         Parameters
         ----------
         path : str
-            Of the body.
+            Path of the body.
         displaced : Displaced
-            In its frame.
+            Displacement in its frame.
         terms : int
             Highest Noll index of the figures.
         """
@@ -659,11 +671,12 @@ class ThermalModel:
         }
 
     def _aperture(self, path: str) -> Aperture:
-        """Clear aperture of a mirror or a face of a lens."""
+        """Return the clear aperture of a mirror or a face of a lens."""
         _, camera, name = path.split("/")
         return self.instrument.cameras[camera].clear_aperture(name)
 
     def _mirror_outline(self, path: str) -> np.ndarray:
+        """Return points of the rim of a mirror's or face's clear aperture, (P, 3), in metres."""
         _, camera, name = path.split("/")
         model = self.instrument.cameras[camera]
         xy = model.clear_aperture(name).outline()
@@ -674,7 +687,7 @@ _THREE = tuple((float(np.cos(t)), float(np.sin(t))) for t in np.radians([90.0, 2
 
 
 def _within(corners: np.ndarray, middle: np.ndarray, arms: np.ndarray) -> float:
-    """By how much arms (N, 3) from the middle have to be shortened to end in a convex body, 1 where they do."""
+    """Return the factor by which arms (N, 3) from the middle must shrink to end in a convex body; at most 1."""
     sides = ConvexHull(corners).equations
     room, reach = -(sides[:, :3] @ middle + sides[:, 3]), arms @ sides[:, :3].T
     longest = np.min(np.where(reach > 0.0, room / np.where(reach > 0.0, reach, 1.0), np.inf))
@@ -682,17 +695,17 @@ def _within(corners: np.ndarray, middle: np.ndarray, arms: np.ndarray) -> float:
 
 
 def _mount(body: Body) -> str:
-    """Name of the pivot at which a body is held."""
+    """Return the name of the pivot at which a body is held."""
     return "centre" if "centre" in body.pivots else ORIGIN
 
 
 def _upward(path: str) -> Iterator[str]:
-    """The path itself, its parent, and so on."""
+    """Yield the path itself, its parent, and so on."""
     while path:
         yield path
         path = path.rpartition("/")[0]
 
 
 def _unit_load(axis: int, about: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    # zero at the point about which the uniform part, the body's stretch, is taken
+    # The load is zero at the point about which the uniform part, the body's expansion, is taken.
     return lambda points: points[:, axis] - about[axis]

@@ -93,7 +93,7 @@ def test_beams_wider_than_the_optics_can_lead_are_refused(instrument, backend, m
     pair = instrument("gf7_pair")
     obstruction.check_beams(pair, backend)
     monkeypatch.setattr(obstruction, "_WHOLE", 1e3 * obstruction._WHOLE)
-    with pytest.raises(MisplacedError, match="light of the monitor does not get to its return faces") as caught:
+    with pytest.raises(MisplacedError, match="light of the monitor does not reach its return faces") as caught:
         obstruction.check_beams(pair, backend)
     assert caught.value.key == ("monitor",)
 

@@ -233,5 +233,5 @@ def test_names_are_unique_and_detectors_known() -> None:
         Scenery((mirror, mirror))
     with pytest.raises(ValueError, match="unknown detectors: e"):
         Scenery((replace(mirror, detector="e"),), (grid,))
-    with pytest.raises(ValueError, match="without a clear aperture"):
+    with pytest.raises(ValueError, match="needs a clear aperture"):
         mirror_surface(replace(element, aperture=None), placed, Finishes())

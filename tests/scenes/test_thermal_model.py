@@ -164,7 +164,7 @@ def test_a_quadratic_field_in_glass(silica, tmp_path) -> None:
     assert set(body.faces) == set(silica.faces_of(PRISM))
     assert max(abs(a) for face in body.faces.values() for a in face.motion.figure.values()) > 1e-13
     assert 0.0 < body.index_path < 6.5e-9
-    assert [text for text in body.warnings(PRISM) if "index of glass follows the linear part" in text]
+    assert [text for text in body.warnings(PRISM) if "index of its glass follows the linear part" in text]
     linear = warmed(silica, tmp_path, PRISM, points, 0.1 + points @ SLOPE)
     assert linear.warnings(PRISM) == ()
     with pytest.raises(InputError, match="rays through its glass") as caught:
@@ -180,7 +180,7 @@ def test_bodies_without_finite_elements_follow_linear_fields_only(silica, tmp_pa
     points = np.random.default_rng(1).uniform(-0.5, 0.5, (80, 3))
     for body in ("base", "base/forward", "base/forward/focal_plane"):
         assert warmed(silica, tmp_path, body, points, 1.0 + points @ SLOPE).faces == {}
-        with pytest.raises(InputError, match="has no shape here") as caught:
+        with pytest.raises(InputError, match="has no finite elements") as caught:
             warmed(silica, tmp_path, body, points, quadratic(points))
         assert "the nearest linear field" in str(caught.value)
 

@@ -165,10 +165,19 @@ def test_what_a_table_of_temperatures_does_not_tell_is_said() -> None:
     assert good.warnings("b") == ()
     for changed, words in (
         ({"coverage": Coverage(0.02, 0.013)}, "b: 2 % of its volume lie outside of the table's nodes, up to 13 mm"),
-        ({"between": 4e-3}, "b: the table is coarser than its field: nodes left out are foretold to 0.004 K rms only"),
-        ({"faces": {"f": replace(face, unmeshed=2e-9)}}, "f: finite elements here follow the table to 2 nm rms only"),
-        ({"faces": {"f": replace(face, lost=4e-9)}}, "f: 4 nm rms of its change by the table are finer than Z"),
-        ({"index_path": 3e-9}, "b: the index of glass follows the linear part of the table; the rest is worth"),
+        (
+            {"between": 4e-3},
+            "b: the table is too coarse for its field: the leave-one-out error at its nodes is 0.004 K rms",
+        ),
+        (
+            {"faces": {"f": replace(face, unmeshed=2e-9)}},
+            "f: the finite elements represent the effect of the table to 2 nm rms only",
+        ),
+        ({"faces": {"f": replace(face, lost=4e-9)}}, "f: 4 nm rms of its change by the table are beyond Z"),
+        (
+            {"index_path": 3e-9},
+            "b: the index of its glass follows the linear part of the table only; the residual causes",
+        ),
     ):
         (text,) = replace(good, **changed).warnings("b")
         assert text.startswith(words)

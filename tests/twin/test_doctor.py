@@ -54,7 +54,7 @@ ABORTS = "import os, sys; sys.stderr.write('LLVM ERROR: Cannot select: fmaximum\
         (("-c", "import os; os.abort()"), "crashed with SIGABRT"),
         (("-c", ABORTS), "needs LLVM 17 or newer.*Cannot select"),
         (("-c", "import time; time.sleep(60)"), "no answer after 1 s"),
-        (("-c", "raise SystemExit(3)"), "exit code 3 and no answer"),
+        (("-c", "raise SystemExit(3)"), "exit code 3 without a result"),
         (("-m", "twin.framework.doctor_probe", "render", "no_such_variant"), "no_such_variant"),
     ],
 )

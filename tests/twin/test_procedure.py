@@ -252,16 +252,16 @@ def test_a_blurred_camera_is_told_wherever_a_test_has_one(monkeypatch: pytest.Mo
     assert done.exit_code == 0, done.stderr
     told = json.loads((out / "manifest.json").read_text("utf-8"))["warnings"]
     assert len(told) == 2
-    assert "is blurred as designed: 6.85 waves rms" in told[0]
+    assert "is blurred as designed: its wavefront error is 6.85 waves rms" in told[0]
     assert told[1] == "a toy"
     assert f"warning: {told[0]}" in done.stdout
-    assert "is blurred as designed: 6.85 waves rms" in (out / "report.html").read_text("utf-8")
+    assert "is blurred as designed: its wavefront error is 6.85 waves rms" in (out / "report.html").read_text("utf-8")
     path.write_text(FILE.replace("readings: 5", "readings: 500"), "utf-8")
     failed = invoke(app, "level", path, "--out", tmp_path / "none")
     assert failed.exit_code == 2
     text = " ".join(failed.stderr.split())
     assert "the memory of the level is full" in text
-    assert "is blurred as designed: 6.85 waves rms" in text
+    assert "is blurred as designed: its wavefront error is 6.85 waves rms" in text
 
 
 def test_base_of_studies(backend: Backend, tmp_path: Path) -> None:

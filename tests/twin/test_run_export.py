@@ -181,7 +181,10 @@ def test_files_that_are_no_frames_of_a_run_are_refused(tmp_path) -> None:
     colours = np.zeros((8, 8, 3), np.uint8)
     tifffile.imwrite(tmp_path / "a.tiff", colours, photometric="rgb", description="{}", metadata=None)
     tifffile.imwrite(tmp_path / "b.tiff", colours[..., 0], description="[1]", metadata=None)
-    for name, told in (("a", "pages of uint8 with 3 axes are no recorded frames"), ("b", "what no page of a run does")):
+    for name, told in (
+        ("a", "pages of uint8 with 3 axes are not recorded frames"),
+        ("b", "the description of a page is not that of a run's frame"),
+    ):
         with pytest.raises(ValueError, match=told):
             read_frames(tmp_path / f"{name}.tiff")
 
@@ -220,7 +223,7 @@ def test_frames_that_do_not_come_back_are_not_handed_out(tmp_path, monkeypatch) 
         "twin.export.export_run.frames_fits",
         lambda recorded, cards: frames_fits(replace(recorded, frames=other), cards),
     )
-    with pytest.raises(RuntimeError, match=r"images/a\.fits does not hold what was put into it"):
+    with pytest.raises(RuntimeError, match=r"images/a\.fits does not contain the frames written to it"):
         invoke(app, tmp_path / "run", *options, tmp_path / "bad")
     assert not (tmp_path / "bad").exists()
 
@@ -237,7 +240,7 @@ def test_a_file_that_was_changed_since_is_told(run, tmp_path) -> None:
     picture.write_bytes(tiff(frames + np.uint16(1), replace(FrameFacts(), camera="forward, left area CCD")))
     done = invoke(app, copy, "--tables", "none", "--out", tmp_path / "out")
     assert done.exit_code == 0
-    assert "images/forward_left_after.tiff is not as its run wrote it" in " ".join(done.stdout.split())
+    assert "images/forward_left_after.tiff has changed since its run" in " ".join(done.stdout.split())
     np.testing.assert_array_equal(fits.getdata(tmp_path / "out/images/forward_left_after.fits"), frames + 1)
 
 
@@ -250,7 +253,7 @@ def test_a_file_that_was_changed_since_is_told(run, tmp_path) -> None:
         (lambda run: (run / "truth.json").unlink(), (), "truth.json: file of the run is missing"),
         (lambda run: (run / "truth.json").write_text('{"cameras": '), (), "truth.json:1: not JSON"),
         (lambda run: (run / "truth.json").write_bytes(b"\xff\xfe"), (), "truth.json:1: not UTF-8 text"),
-        (lambda run: (run / "artefacts/points.csv").write_text("a,b\n1\n"), (), "rows of several lengths"),
+        (lambda run: (run / "artefacts/points.csv").write_text("a,b\n1\n"), (), "rows of different lengths"),
         (
             lambda run: (run / "images/forward_left_after.tiff").write_bytes(b"II*\0"),
             (),
@@ -259,7 +262,7 @@ def test_a_file_that_was_changed_since_is_told(run, tmp_path) -> None:
         (lambda run: (run / "irradiance.nc").write_bytes(b"CDF"), (), "irradiance.nc: cannot be read"),
         (lambda run: None, ("--tables", "parket"), "did you mean 'parquet'"),
         (lambda run: None, ("--frames", "tiff"), "--frames: no such format"),
-        (lambda run: None, ("--frames", "none", "--tables", "none"), "nothing to export"),
+        (lambda run: None, ("--frames", "none", "--tables", "none"), "exports nothing"),
     ],
 )
 def test_what_cannot_be_exported_is_refused(run, tmp_path, spoil, options, said) -> None:
@@ -279,5 +282,5 @@ def test_a_run_without_what_is_asked_for_is_told(tmp_path) -> None:
         write_manifest(folder, "twin.lab", 0.0, 1.0, test="focus")
     done = invoke(app, tmp_path / "empty", "--out", tmp_path / "out")
     assert done.exit_code == 2
-    assert "nothing to export of this run" in done.stderr
+    assert "this run has nothing to export" in done.stderr
     assert "twin.lab focus" in done.stderr

@@ -183,7 +183,9 @@ def test_a_baffle_in_the_way_stops_the_light(experiment, backend):
     plate = {"shape": "plate", "body": channel.face_body, "position": ["0 mm", "0 mm", "50 mm"]}
     lid = BaffleSpec.model_validate({**plate, "width": "80 mm", "height": "80 mm"})
     spec = resolved.instrument.model_copy(update={"baffles": {"lid": lid}})
-    with pytest.raises(InputError, match=r"baffles\.lid: a plate of lid stands in the beam forward/left and takes 145"):
+    with pytest.raises(
+        InputError, match=r"baffles\.lid: a plate of lid blocks 145 of 145 rays of the beam forward/left"
+    ):
         build_instrument(spec, resolved.cameras, backend)
     free, lids = experiment("gf7_pair").instrument, lid.plates("lid")
     with pytest.raises(NominalPathLost, match="forward/left"):

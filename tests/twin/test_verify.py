@@ -23,8 +23,8 @@ from twin.compare.folder_difference import file_difference
 from twin.compare.folder_state import folder_state
 from twin.compare.verification import (
     DIFFERENT,
+    EXCLUDED,
     GONE,
-    LEFT_OUT,
     NEW,
     REDRAWN,
     ROUNDED,
@@ -294,7 +294,7 @@ def test_tables_pictures_and_texts(tmp_path) -> None:
     assert pair(tmp_path, "svg", named[0].encode(), named[1].encode()).state == ROUNDED
     assert pair(tmp_path, "svg", drawing.encode(), drawing.replace("2.5", "2.6").encode()).state == DIFFERENT
     assert pair(tmp_path, "svg", drawing.encode(), drawing.replace(">f<", ">g<").encode()).state == DIFFERENT
-    assert pair(tmp_path, "html", b"made on Monday", b"made on Tuesday").state == LEFT_OUT
+    assert pair(tmp_path, "html", b"made on Monday", b"made on Tuesday").state == EXCLUDED
     assert file_state("a.json", tmp_path / "old", tmp_path / "none", False).state == GONE
     assert file_state("a.json", tmp_path / "none", tmp_path / "old", False).state == NEW
 
@@ -323,8 +323,8 @@ def test_what_is_no_run_folder_is_refused(tmp_path, folder) -> None:
 
 def test_options_that_do_not_go_together_are_refused(folder) -> None:
     for words, said in (
-        (("--files", "--all"), "--files makes nothing again"),
-        (("--files", "--keep", folder / "x"), "--files makes nothing again"),
+        (("--files", "--all"), "--files repeats nothing"),
+        (("--files", "--keep", folder / "x"), "--files repeats nothing"),
         (("--all",), "--all is for studies"),
         (("--keep", folder), "exists; choose another folder"),
     ):
@@ -335,7 +335,7 @@ def test_options_that_do_not_go_together_are_refused(folder) -> None:
 
 def test_the_files_alone_take_no_computing(folder) -> None:
     result = invoke(app, folder, "--files")
-    assert (result.exit_code, result.stdout) == (0, "All 3 files are as the run wrote them. It was not made again.\n")
+    assert (result.exit_code, result.stdout) == (0, "All 3 files are as the run wrote them. The run was not repeated.\n")
     flip(folder / "numbers.json", 12)
     result = invoke(app, folder, "--files", "--json")
     assert result.exit_code == 1

@@ -242,7 +242,7 @@ def test_another_verdict_than_the_expected_one_fails_the_command(fake, tmp_path)
     assert result.exit_code == 1
     told = json.loads(result.stdout)["unexpected"]
     assert told == [{"id": "001.eq5", "verdict": CONFIRMED, "expected": CORRECTED}]
-    assert "001.eq5 is confirmed, not confirmed with correction as expected: Right as printed." in result.stderr
+    assert "001.eq5 is confirmed, expected confirmed with correction: Right as printed." in result.stderr
     assert "earlier work found" in (tmp_path / "run/validation.html").read_text("utf-8")
     assert run("--json", "--only", "001.eq7").exit_code == 0
 

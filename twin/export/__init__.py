@@ -1,1 +1,1 @@
-"""Frames and tables of a run folder in formats of other programs: the command ``python -m twin.export``."""
+"""Command ``python -m twin.export``: frames and tables of a run folder in the formats of other programs."""

@@ -1,4 +1,4 @@
-"""``python -m twin.export``: frames and tables of a run folder in formats of other programs."""
+"""Command ``python -m twin.export``: frames and tables of a run folder in the formats of other programs."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ def main(
     frames: Annotated[str, typer.Option(help="Recorded frames and expected images: fits or none.")] = "fits",
     tables: Annotated[str, typer.Option(help="Tables: csv, parquet, fits or none.")] = "csv",
 ) -> None:
-    """Write frames and results of a run folder as files that other programs read: FITS, CSV and Parquet.
+    """Write frames and results of a run folder as files for other programs: FITS, CSV and Parquet.
 
     Frames become FITS cubes, images/NAME.fits, whose headers name every quantity with its unit (pixel pitch, exposure,
-    gain, noise, saturation) and hold no world coordinates; expected images become expected_photons.fits.
-    `python -m twin.recover` reads the frames and finds the same numbers as in the run's own.
+    gain, noise, saturation) and hold no world coordinates; expected images become expected_photons.fits. `python -m
+    twin.recover` reads these frames and recovers the same numbers as from the run's own.
 
-    Tables stand in tables/: spots, readings by camera and estimator, true changes, matched points, every table of the
-    run, and numbers, with every number of its JSON files. Every column has its unit and says what it holds: in the head
-    of CSV, in the metadata of Parquet's fields, as TUNITn and TCOMMn of FITS.
+    Tables are written into tables/: spots, readings by camera and estimator, true changes, matched points, every table
+    of the run, and numbers, with every number of its JSON files. Every column has a unit and a description: in the head
+    of a CSV, in the metadata of Parquet's fields, as TUNITn and TCOMMn in FITS.
 
     For example:
 
@@ -59,7 +59,7 @@ def main(
         for option, value, allowed in (("--frames", frames, FRAMES), ("--tables", tables, (*TABLE_FORMATS, NONE))):
             cli.require_one_of(option, value, allowed)
         if frames == tables == NONE:
-            raise cli.InputErrorText("with --frames none and --tables none there is nothing to export")
+            raise cli.InputErrorText("--frames none with --tables none exports nothing")
         return read_source(run)
 
     def work(manifest: Manifest, session: Session) -> Result:

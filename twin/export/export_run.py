@@ -1,10 +1,9 @@
-"""What is exported of a run folder, and the report of it.
+"""Export of a run folder to FITS and tables, and its report.
 
-Recorded frames and expected images as FITS, whose header names every quantity with its unit and has no WCS.
-
-A file has the frames as one cube, columns, rows, frames. Row 0 of the CCD is the first row that is stored (NAXIS2 = 1),
-column 0 the first pixel in it: places are those of docs/conventions.md. Grey values are unsigned 16-bit integers as
-recorded, by FITS' own way of storing them (BZERO 32768).
+Recorded frames and expected images become FITS files whose headers name every quantity with its unit and have no WCS. A
+file has the frames as one cube: columns, rows, frames. Row 0 of the CCD is the first row stored (NAXIS2 = 1), column 0
+the first pixel in it: positions are those of docs/conventions.md. Grey values are unsigned 16-bit integers as recorded,
+in FITS' usual encoding (BZERO 32768).
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from twin.framework.report import Report, Section
 from twin.framework.run_folder import Manifest, RunFolder, altered, finished_manifest
 
 Card = tuple[str, str | int | float, str]
-"""Keyword, value, and what it is with its unit in brackets."""
+"""Keyword, value, and comment with the unit in brackets."""
 _SCALE, _TIE, _KEYS = 33550, 33922, 34735
 _GEODETIC_3D = 4979
 _CHECKED = "of the file as it was written"
@@ -46,16 +45,16 @@ _PLACES = (
 
 @dataclass(frozen=True, eq=False)
 class RecordedFrames:
-    """What a TIFF file of a run holds.
+    """Content of a TIFF file of a run.
 
     Attributes
     ----------
-    frames : np.ndarray
-        (N, H, W) grey values as recorded.
+    frames : (N, H, W) ndarray
+        Grey values as recorded.
     pages : tuple[Mapping[str, Any], ...]
-        What each page says of itself (``FrameFacts.page``).
-    place : tuple[float, float, float, float] | None
-        Of a map, (longitude, latitude, per column, per row) of its first pixel's centre in degrees; else None.
+        Metadata of each page (``FrameFacts.page``).
+    place : tuple[float, float, float, float] or None
+        For a map, (longitude, latitude, per column, per row) of its first pixel's centre in degrees; else None.
     heights : bool
         Whether the values are heights in metres.
     """
@@ -67,21 +66,21 @@ class RecordedFrames:
 
 
 def read_frames(path: Path) -> RecordedFrames:
-    """Frames of a TIFF file that a run has written.
+    """Return the frames of a TIFF file that a run has written.
 
     Raises
     ------
     ValueError, KeyError
-        It is not such a file.
+        The file is not one that a run writes.
     """
     with tifffile.TiffFile(path) as file:
         frames = np.stack([page.asarray() for page in file.pages])
         pages = tuple(json.loads(page.description) for page in file.pages)
         tags = {tag.code: tag.value for tag in file.pages[0].tags.values()}
     if frames.ndim != 3 or frames.dtype.kind not in "uif":
-        raise ValueError(f"pages of {frames.dtype.name} with {frames.ndim - 1} axes are no recorded frames")
+        raise ValueError(f"pages of {frames.dtype.name} with {frames.ndim - 1} axes are not recorded frames")
     if not all(isinstance(page, Mapping) for page in pages):
-        raise ValueError("a page says of itself what no page of a run does")
+        raise ValueError("the description of a page is not that of a run's frame")
     if _SCALE not in tags:
         return RecordedFrames(frames, pages)
     across, down, _ = tags[_SCALE]
@@ -91,17 +90,17 @@ def read_frames(path: Path) -> RecordedFrames:
 
 
 def run_cards(program: str, seed: int) -> list[Card]:
-    """What made the run."""
+    """Return header cards that identify the run."""
     writer = f"{WRITER} {importlib.metadata.version(WRITER)}"
     return [
         ("CREATOR", writer, "program that wrote this file"),
         ("PROGRAM", program, "command that made the run"),
-        ("SEED", seed, "of everything that was drawn"),
+        ("SEED", seed, "of all random numbers"),
     ]
 
 
 def detector_cards(job: ResolvedJob) -> list[Card]:
-    """The monitor's area CCD by its data sheet (EMVA 1288), and its light."""
+    """Return header cards of the monitor's area CCD, by its data sheet (EMVA 1288), and of its light."""
     detector, light = job.area_detector, job.instrument.autocollimator
     return [
         ("INSTRUME", ascii_text(job.instrument.name), "instrument"),
@@ -112,23 +111,23 @@ def detector_cards(job: ResolvedJob) -> list[Card]:
         ("RDNOISE", detector.dark_noise_e, "[electron] temporal noise in the dark, rms"),
         ("DARKCUR", detector.dark_current_e_per_s, "[electron/s] mean dark current"),
         ("FULLWELL", detector.full_well_e, "[electron] saturation capacity"),
-        ("SATURATE", detector.saturation_dn, "[adu] where the response ends"),
-        ("PEDESTAL", detector.offset_dn, "[adu] grey value of no signal"),
-        ("BITDEPTH", detector.bit_depth, "[bit] of the converter"),
+        ("SATURATE", detector.saturation_dn, "[adu] saturation level"),
+        ("PEDESTAL", detector.offset_dn, "[adu] grey value without signal"),
+        ("BITDEPTH", detector.bit_depth, "[bit] resolution of the converter"),
         ("PRNU", detector.prnu, "[1] relative response of pixels, rms"),
         ("DSNU", detector.dsnu_e, "[electron] dark signal of pixels, rms"),
     ]
 
 
 def frames_fits(recorded: RecordedFrames, cards: Iterable[Card]) -> bytes:
-    """A FITS file of recorded frames; the same frames give the same bytes.
+    """Return a FITS file of recorded frames; equal frames give equal bytes.
 
     Parameters
     ----------
     recorded : RecordedFrames
         The frames.
-    cards : Iterable[Card]
-        Of the header, beside those that the frames give.
+    cards : iterable of Card
+        Header cards in addition to those that the frames provide.
     """
     from astropy.io import fits
 
@@ -146,9 +145,9 @@ def frames_fits(recorded: RecordedFrames, cards: Iterable[Card]) -> bytes:
         ("AXIS3", "frame", "what axis 3 counts"),
     ]
     if "camera" in first:
-        own.append(("CAMERA", ascii_text(first["camera"]), "whose CCD it is"))
+        own.append(("CAMERA", ascii_text(first["camera"]), "camera of the CCD"))
     if "note" in first:
-        own.append(("NOTE", ascii_text(first["note"]), "what else is to be known"))
+        own.append(("NOTE", ascii_text(first["note"]), "remark on the frames"))
     if "pitch_um" in first:
         own.append(("XPIXSZ", first["pitch_um"], "[um] pixel pitch along a row"))
         own.append(("YPIXSZ", first["pitch_um"], "[um] pixel pitch along a column"))
@@ -159,8 +158,8 @@ def frames_fits(recorded: RecordedFrames, cards: Iterable[Card]) -> bytes:
         own += [
             ("LON0", longitude, "[deg] longitude of the first pixel's centre"),
             ("LAT0", latitude, "[deg] latitude of the first pixel's centre"),
-            ("DLON", across, "[deg] of longitude per column"),
-            ("DLAT", down, "[deg] of latitude per row"),
+            ("DLON", across, "[deg] step of longitude per column"),
+            ("DLAT", down, "[deg] step of latitude per row"),
         ]
     _put_cards(unit, [*own, *cards])
     units = [unit]
@@ -170,14 +169,14 @@ def frames_fits(recorded: RecordedFrames, cards: Iterable[Card]) -> bytes:
 
 
 def expected_fits(data: xr.Dataset, cards: Sequence[Card]) -> bytes:
-    """A FITS file of expected images, photons per pixel and frame: of each channel an extension with all its states.
+    """Return a FITS file of expected images, in photons per pixel and frame, with an extension per channel.
 
     Parameters
     ----------
     data : xr.Dataset
-        As irradiance.nc and course.nc hold it, (state or time, channel, row, column).
-    cards : Sequence[Card]
-        Of the first header.
+        Content of irradiance.nc or course.nc, (state or time, channel, row, column).
+    cards : sequence of Card
+        Cards of the primary header.
     """
     from astropy.io import fits
 
@@ -208,7 +207,7 @@ def expected_fits(data: xr.Dataset, cards: Sequence[Card]) -> bytes:
 
 
 def _times(name: str, counted: str, times: Sequence[float]) -> Any:
-    """Times of frames or planes."""
+    """Return a table of the times of frames or planes."""
     from astropy.io import fits
 
     columns = [
@@ -222,6 +221,7 @@ def _times(name: str, counted: str, times: Sequence[float]) -> Any:
 
 
 def _put_cards(unit: Any, cards: Sequence[Card]) -> None:
+    """Write cards, and for images the pixel convention, into a header."""
     for keyword, value, about in cards:
         unit.header[keyword] = (value, about)
     if unit.data is not None:
@@ -230,10 +230,11 @@ def _put_cards(unit: Any, cards: Sequence[Card]) -> None:
 
 
 def _bytes(units: Sequence[Any]) -> bytes:
+    """Return the bytes of a FITS file."""
     from astropy.io import fits
 
     for unit in units:
-        # a text of our own in place of astropy's, which is the time of the day
+        # Replace astropy's comment, which is the time of day, so that equal data give equal bytes.
         unit.add_checksum(when=_CHECKED)
     out = io.BytesIO()
     fits.HDUList(list(units)).writeto(out)
@@ -243,28 +244,28 @@ def _bytes(units: Sequence[Any]) -> bytes:
 KIND = "files"
 NONE = "none"
 FRAMES = ("fits", NONE)
-"""What may become of frames."""
+"""Formats of frames."""
 EXPECTED = {"irradiance.nc": "expected_photons", "course.nc": "expected_photons_course"}
-"""Expected images of a run -> name of their file."""
+"""File of expected images in a run -> stem of the exported file."""
 _IMAGES = "images/"
 
 
 @dataclass(frozen=True)
 class ExportedFile:
-    """A file that was written.
+    """File that was written.
 
     Attributes
     ----------
     file : str
-        In the export's folder.
+        Path in the export's folder.
     source : str
-        File, or files, of the run that it was made of.
+        File, or files, of the run from which it was made.
     what : str
-        Is in it.
+        Description of its content.
     items : int
-        Frames of images, rows of a table.
+        Number of frames, or of rows of a table.
     bytes : int
-        Its size.
+        Size of the file.
     """
 
     file: str
@@ -276,22 +277,22 @@ class ExportedFile:
 
 @dataclass(frozen=True, eq=False)
 class Exported:
-    """All that was written.
+    """All files that were written.
 
     Attributes
     ----------
     run : Path
         The run's folder.
     manifest : Manifest
-        Of the run.
+        Manifest of the run.
     frames, tables : str
-        Formats that were asked for.
+        Requested formats.
     files : tuple[ExportedFile, ...]
-        That were written.
+        Files that were written.
     described : tuple[DataTable, ...]
-        The tables, for what their columns say.
+        The tables, for the descriptions of their columns.
     changed : tuple[str, ...]
-        Files of the run that are not as their manifest says.
+        Files of the run that differ from their checksum in the manifest.
     """
 
     run: Path
@@ -303,7 +304,7 @@ class Exported:
     changed: tuple[str, ...]
 
     def numbers(self) -> dict[str, Any]:
-        """Contents of files.json."""
+        """Return the contents of files.json."""
         tables = {
             table.name: {one.name: {"unit": one.unit, "description": one.description} for one in table.columns}
             for table in self.described
@@ -319,12 +320,12 @@ class Exported:
 
 
 def read_source(folder: Path) -> Manifest:
-    """The manifest of a run folder, all files of which are there.
+    """Return the manifest of a run folder after checking that its files exist.
 
     Raises
     ------
     InputError
-        No run folder, or files of it are missing.
+        The folder is not a run folder, or files of it are missing.
     """
     manifest = finished_manifest(folder)
     missing = [name for name in manifest.sha256 if not is_file(folder / name)]
@@ -334,27 +335,27 @@ def read_source(folder: Path) -> Manifest:
 
 
 def export(source: Path, manifest: Manifest, frames: str, tables: str, folder: RunFolder, advance: Advance) -> Exported:
-    """Write everything that is asked for.
+    """Write everything that is requested.
 
     Parameters
     ----------
     source : Path
         The run's folder.
     manifest : Manifest
-        Of it.
+        Manifest of the run.
     frames : str
-        One of ``FRAMES``.
+        Format of frames, one of ``FRAMES``.
     tables : str
-        Of ``TABLE_FORMATS``, or none.
+        Format of tables, one of ``TABLE_FORMATS``, or none.
     folder : RunFolder
-        open.
+        Open folder to write into.
     advance : Advance
-        Shows how far it is.
+        Callback that shows the progress.
 
     Raises
     ------
     InputError
-        The run has nothing of what is asked for, a file of it cannot be read, or a package is missing.
+        The run has nothing of what is requested, a file of it cannot be read, or a package is missing.
     """
     changed = tuple(altered(source, manifest))
     files: list[ExportedFile] = []
@@ -373,30 +374,31 @@ def export(source: Path, manifest: Manifest, frames: str, tables: str, folder: R
             files.append(_put(folder, f"tables/{table.name}.{tables}", content, made_of, table.title, table.rows))
             advance("tables", k + 1, len(described))
     if not files:
-        raise InputError(Issue("nothing to export of this run", str(source), found=manifest.kind))
+        raise InputError(Issue("this run has nothing to export", str(source), found=manifest.kind))
     return Exported(source, manifest, frames, tables, tuple(files), tuple(described), changed)
 
 
 @contextmanager
 def _told(place: Path) -> Iterator[None]:
-    """What cannot be read in a run folder is bad input."""
+    """Raise InputError for any failure to read a file of a run folder."""
     try:
         yield
     except InputError:
         raise
-    # readers of spoilt files fail in ways that cannot be foreseen
+    # Readers of corrupted files fail with arbitrary exceptions.
     except Exception as error:
         problem = f"cannot be read as a file of a run: {why_unreadable(error)}"
         raise InputError(Issue(problem, str(place), allowed="the file as the run wrote it")) from None
 
 
 def _put(folder: RunFolder, file: str, content: bytes, source: str, what: str, items: int) -> ExportedFile:
+    """Write a file and return its entry."""
     folder.write_bytes(file, content)
     return ExportedFile(file, source, what, items, len(content))
 
 
 def _frames(source: Path, manifest: Manifest, folder: RunFolder, advance: Advance) -> Iterator[ExportedFile]:
-    """Recorded frames, then expected images; every file of frames is read back and compared."""
+    """Write recorded frames, then expected images; every file of frames is read back and compared."""
     cards = run_cards(manifest.program, manifest.seed)
     about = _detector(source, manifest)
     pictures = [name for name in manifest.sha256 if name.startswith(_IMAGES) and name.endswith(".tiff")]
@@ -409,7 +411,7 @@ def _frames(source: Path, manifest: Manifest, folder: RunFolder, advance: Advanc
         yield _put(folder, file, content, name, _what(recorded.pages[0]), len(recorded.frames))
         real = recorded.frames.dtype.kind == "f"
         if not np.array_equal(ImageFile.open(folder.path / file).frames(), recorded.frames, equal_nan=real):
-            raise RuntimeError(f"{file} does not hold what was put into it")
+            raise RuntimeError(f"{file} does not contain the frames written to it")
         advance("frames", k + 1, len(pictures))
     for name, stem in EXPECTED.items():
         if name in manifest.sha256:
@@ -421,11 +423,12 @@ def _frames(source: Path, manifest: Manifest, folder: RunFolder, advance: Advanc
 
 
 def _what(page: Mapping[str, Any]) -> str:
+    """Return a description of frames from the metadata of a page."""
     return ", ".join(filter(None, (page.get("camera"), page.get("note")))) or "recorded frames"
 
 
 def _detector(source: Path, manifest: Manifest) -> list[Card]:
-    """FITS cards of the monitor's area CCDs, if the run is a job of the monitor."""
+    """Return FITS cards of the monitor's area CCDs if the run is a job of the monitor, else none."""
     config = source / "config.yaml"
     if manifest.program != "twin.render" or "config.yaml" not in manifest.sha256:
         return []
@@ -434,20 +437,18 @@ def _detector(source: Path, manifest: Manifest) -> list[Card]:
 
 
 def export_report(done: Exported) -> Report:
-    """What was written, and what the tables' columns say."""
+    """Return the report: the files written, and the descriptions of the tables' columns."""
     images = [one for one in done.files if not one.file.startswith("tables/")]
     tables = [one for one in done.files if one.file.startswith("tables/")]
     said = []
     if images:
         count = sum(one.items for one in images)
-        said.append(
-            f"{len(images)} files with {count} images as {done.frames.upper()}, read back and the same to the bit"
-        )
+        said.append(f"{len(images)} files with {count} images as {done.frames.upper()}, identical when read back")
     if tables:
         kind = {"parquet": "Parquet"}.get(done.tables, done.tables.upper())
         said.append(f"{len(tables)} tables with {sum(one.items for one in tables)} rows as {kind}")
     rows: list[list[Cell]] = [[one.file, one.source, one.what, one.items, 1e-3 * one.bytes] for one in done.files]
-    heads = ("file", "of", "what", "images or rows", "size [kB]")
+    heads = ("file", "source", "content", "images or rows", "size [kB]")
     columns: list[list[Cell]] = [
         [table.name, column.name, column.unit, column.description]
         for table in done.described
@@ -456,15 +457,15 @@ def export_report(done: Exported) -> Report:
     sections = []
     if columns:
         told = Table(
-            "columns", "Columns of the tables", "As the files say.", ("table", "column", "unit", "holds"), columns
+            "columns", "Columns of the tables", "As in the files.", ("table", "column", "unit", "description"), columns
         )
         sections.append(Section("Columns", (), (told,), folded=1))
     warnings = [
-        f"{name} is not as its run wrote it: it has another checksum than the manifest says" for name in done.changed
+        f"{name} has changed since its run: its checksum differs from that in the manifest" for name in done.changed
     ]
     return Report(
-        title=f"Files of {done.run}",
-        verdict=f"Of the run of {done.manifest.kind} in {done.run}: {'; '.join(said)}.",
+        title=f"Export of {done.run}",
+        verdict=f"Exported the run of {done.manifest.kind} in {done.run}: {'; '.join(said)}.",
         lead=(),
         facts=(
             ("run", str(done.run)),
@@ -473,7 +474,7 @@ def export_report(done: Exported) -> Report:
             ("tables", done.tables),
         ),
         summary=Table(
-            "files", "Files", "Of the export, and what of the run each was made of.", heads, rows, (None,) * 4 + (1,)
+            "files", "Files", "Files of the export, and their sources in the run.", heads, rows, (None,) * 4 + (1,)
         ),
         sections=tuple(sections),
         warnings=tuple(warnings),

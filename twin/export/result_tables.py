@@ -1,5 +1,7 @@
-"""Tables of a run's results: spots, readings and truth by camera, matched points, every number of its JSON files, and
-every table that the run itself keeps as CSV; each column with its unit and what it holds.
+"""Tables of a run's results, every column with its unit and description.
+
+They are spots, readings and truth by camera, matched points, every number of the JSON files, and every table that the
+run itself stores as CSV.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from twin.framework.owned_files import MANIFEST
 
 POINTS = "artefacts/points.csv"
 NUMBERS = "numbers"
-"""Table of every number of the run."""
+"""Name of the table of every number of the run."""
 _HEADS = ("schema", "reference_frames")
 _OTHER_FILES = (MANIFEST,)
 _HEAD = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]+)\]")
@@ -32,20 +34,20 @@ _HEAD = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]+)\]")
 
 @dataclass(frozen=True)
 class Nested:
-    """A table within a JSON file: mappings by name, one within the other, and at the bottom numbers.
+    """Table within a JSON file: nested mappings by name, with numbers at the innermost level.
 
     Attributes
     ----------
     name : str
-        Of the table.
+        Name of the table.
     file : str
-        Of the run folder.
+        File of the run folder.
     key : str
-        Where the mappings begin.
+        Key at which the mappings begin.
     levels : tuple[str, ...]
-        What the names of each mapping are.
+        Meaning of the names of each mapping.
     title : str
-        Of the table.
+        Title of the table.
     """
 
     name: str
@@ -57,91 +59,88 @@ class Nested:
 
 NESTED = (
     Nested("spots", "recovered.json", "spots", ("camera", "channel", "state"), "Centres of the spots in the frames"),
-    Nested("readings", "recovered.json", "cameras", ("camera", "estimator"), "What every estimator reads of a camera"),
+    Nested("readings", "recovered.json", "cameras", ("camera", "estimator"), "Readings of each camera by estimator"),
     Nested(
         "angle_readings",
         "recovered.json",
         "intersection_angle",
         ("estimator",),
-        "What every estimator reads of the angle between two cameras",
+        "Readings of the angle between two cameras by estimator",
     ),
     Nested(
-        "ground_readings",
-        "recovered.json",
-        "ground",
-        ("estimator",),
-        "What every estimator reads of errors on the ground",
+        "ground_readings", "recovered.json", "ground", ("estimator",), "Readings of errors on the ground by estimator"
     ),
     Nested("true_changes", "truth.json", "cameras", ("camera",), "True changes of the cameras, by the exact trace"),
 )
-"""Tables that runs keep within a file; a new one is added here."""
+"""Tables within JSON files of runs; new ones are added here."""
 
 DESCRIPTIONS: Mapping[str, tuple[str, str]] = FrozenMap(
     {
         "camera": ("", "name of the camera in the instrument"),
         "channel": ("", "end of the line at which the area CCD stands: left is +Y of the focal plane"),
         "state": ("", "before the disturbance or after it"),
-        "estimator": ("", "by which the number is read"),
+        "estimator": ("", "estimator of the reading"),
         "row": ("px", "row of the spot's centre on the area CCD; 0 is the centre of the first"),
         "column": ("px", "column of the spot's centre on the area CCD; 0 is the centre of the first"),
         "row_sigma": ("px", "standard deviation of row"),
         "column_sigma": ("px", "standard deviation of column"),
-        "reduced_chi_square": ("", "of the fit of the spot's shape to all pixels; 1 for a spot as calibrated"),
-        "core_chi_square": ("", "the same of the pixels of the spot's core"),
+        "reduced_chi_square": ("", "reduced chi-square of the fit of the spot's shape to all pixels; 1 as calibrated"),
+        "core_chi_square": ("", "reduced chi-square of the same fit over the pixels of the spot's core"),
         "sigma_widened": ("", "factor by which the fit widened the standard deviations; 1 for a spot that fits"),
         "principal_distance_mm": ("mm", "principal distance of the nominal camera"),
-        "left_plan_rms_m": ("m", "rms error in plan that is left when the reading is corrected for"),
-        "left_height_rms_m": ("m", "rms error in height that is left when the reading is corrected for"),
-        "sort": ("", "what the point was chosen for: control by the map, tie between the lines"),
-        "point": ("", "number of the point within its sort"),
-        "line_name": ("", "line CCD in whose image it is"),
+        "left_plan_rms_m": ("m", "rms error in plan that remains after correction by the reading"),
+        "left_height_rms_m": ("m", "rms error in height that remains after correction by the reading"),
+        "sort": ("", "kind of the point: control point by the map, or tie point between the lines"),
+        "point": ("", "number of the point within its kind"),
+        "line_name": ("", "line CCD whose image contains the point"),
         "longitude_deg": ("deg", "longitude of the ground point on WGS 84, east positive"),
         "latitude_deg": ("deg", "geodetic latitude of the ground point on WGS 84"),
         "x_itrs_m": ("m", "X of the ground point, ITRS"),
         "y_itrs_m": ("m", "Y of the ground point, ITRS"),
         "z_itrs_m": ("m", "Z of the ground point, ITRS"),
-        "predicted_line": ("px", "line at which camera and platform have the point"),
-        "predicted_pixel": ("px", "pixel at which camera and platform have the point"),
+        "predicted_line": ("px", "line of the point, predicted by camera and platform"),
+        "predicted_pixel": ("px", "pixel of the point, predicted by camera and platform"),
         "line": (
             "px",
-            "line at which it was found; 0 is the centre of the pass's first, an image file may begin later",
+            "measured line of the point; 0 is the centre of the pass's first line, an image file may begin later",
         ),
-        "pixel": ("px", "pixel of the line CCD at which it was found; 0 is the centre of the first"),
+        "pixel": ("px", "measured pixel of the line CCD; 0 is the centre of the first pixel"),
         "line_sigma": ("px", "standard deviation of line"),
         "pixel_sigma": ("px", "standard deviation of pixel"),
         "correlation_of_sigmas": ("", "correlation of the errors of line and pixel"),
         "template_correlation": ("", "correlation of the two windows after matching"),
-        "accepted": ("", "1: matched and in agreement with the others"),
-        "status": ("", "empty where it is accepted, else why it is not"),
+        "accepted": ("", "1 for a point that is matched and consistent with the others"),
+        "status": ("", "reason of a rejection; empty for an accepted point"),
     }
 )
-"""Column -> unit and what it holds, beside those of `analysis.monitor.parameters`; other columns say both in their own
-names."""
+"""Column -> unit and description, in addition to those of `analysis.monitor.parameters`; other columns have both in
+their names.
+"""
 TITLES: Mapping[str, str] = FrozenMap({POINTS: "Points measured in the images", "study.csv": "Every run of the study"})
-"""File of a table that the run keeps -> what it is; others are known by their file."""
+"""File of a table that the run stores -> title; others are named by their file."""
 _POINT_HEIGHT = ("m", "height of the ground point above the ellipsoid of WGS 84")
 _SIGMAS = {
-    "_sigma": "standard deviation of {}, by noise and by what is stated to move",
-    "_sigma_noise": "standard deviation of {}, by the noise of the images alone",
+    "_sigma": "standard deviation of {}, from noise and the disturbance prior",
+    "_sigma_noise": "standard deviation of {}, from the noise of the images alone",
 }
 
 
 def result_tables(folder: Path, files: Sequence[str]) -> list[DataTable]:
-    """All tables of a run.
+    """Return all tables of a run.
 
     Parameters
     ----------
     folder : Path
-        Of the run.
-    files : Sequence[str]
-        Of it, relative to it, as its manifest lists them.
+        Folder of the run.
+    files : sequence of str
+        Its files, relative to it, as its manifest lists them.
 
     Raises
     ------
     InputError
-        a JSON file cannot be read.
+        A JSON file cannot be read.
     ValueError
-        a JSON or CSV file is not what runs write.
+        A JSON or CSV file is not one that runs write.
     """
     json_files = [name for name in files if name.endswith(".json") and name not in _OTHER_FILES]
     data = {name: read_json(folder / name) for name in json_files}
@@ -159,7 +158,7 @@ def result_tables(folder: Path, files: Sequence[str]) -> list[DataTable]:
 
 
 def _frames_of(data: Any) -> dict[str, str]:
-    """What a file says that its numbers refer to."""
+    """Return the reference frames that a file states for its numbers."""
     frames = data.get("reference_frames", {}) if isinstance(data, Mapping) else {}
     return {f"frame of {quantity}": str(text) for quantity, text in frames.items()}
 
@@ -168,7 +167,7 @@ def _frames_of(data: Any) -> dict[str, str]:
 
 
 def _numbers(data: Mapping[str, Any]) -> DataTable | None:
-    """Every number and word of the JSON files, with its key and sigma."""
+    """Return a table of every number and text of the JSON files, with key and sigma."""
     rows: list[tuple[str, str, float | None, float | None, str, str | None]] = []
     for file, content in data.items():
         for key, sigma, value in _leaves(content):
@@ -182,11 +181,11 @@ def _numbers(data: Mapping[str, Any]) -> DataTable | None:
     names = ("file", "key", "value", "sigma", "unit", "text")
     told = (
         "file of the run folder",
-        "key in the file, from the outermost in; [k] is the k-th of a list",
-        "number, in the unit of its row; of true and false 1 and 0",
+        "path of keys in the file, outermost first; [k] is item k of a list",
+        "number, in the unit of its row; 1 for true, 0 for false",
         "standard deviation that the file states beside it (key_sigma), in the same unit",
-        "unit of the number, as its key says; empty for pure numbers",
-        "words, true, false and null",
+        "unit of the number, from its key; empty for dimensionless numbers",
+        "texts, true, false and null",
     )
     columns = zip(names, zip(*rows, strict=True), told, strict=True)
     return DataTable(
@@ -197,13 +196,14 @@ def _numbers(data: Mapping[str, Any]) -> DataTable | None:
 
 
 def _typed(name: str, values: list[Any], about: str, numbers: bool) -> DataColumn:
+    """Return a column, an empty one of numbers as NaN."""
     if numbers and all(value is None for value in values):
         values = [float("nan")] * len(values)
     return DataColumn.of(name, values, "", about)
 
 
 def _leaves(data: Any, key: str = "") -> Iterator[tuple[str, float | None, Any]]:
-    """(key, sigma, value) of everything in nested data; a sigma beside its number is no row of its own."""
+    """Yield (key, sigma, value) of everything in nested data; a sigma beside its number gets no row."""
     if isinstance(data, Mapping):
         for name, value in data.items():
             number = name.removesuffix("_sigma")
@@ -223,6 +223,7 @@ def _leaves(data: Any, key: str = "") -> Iterator[tuple[str, float | None, Any]]
 
 
 def _is_number(value: Any) -> bool:
+    """Return True for a number that is not a bool."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -230,6 +231,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _nested(nested: Nested, content: Mapping[str, Any]) -> DataTable | None:
+    """Return a table within a JSON file; None if it is empty."""
     rows = list(_rows(content.get(nested.key), len(nested.levels)))
     if not rows:
         return None
@@ -240,7 +242,7 @@ def _nested(nested: Nested, content: Mapping[str, Any]) -> DataTable | None:
 
 
 def _rows(data: Any, depth: int, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], dict[str, Any]]]:
-    """(names, numbers) at the bottom of mappings."""
+    """Yield (names, numbers) of the innermost mappings."""
     if not isinstance(data, Mapping):
         return
     if depth == 0:
@@ -251,7 +253,7 @@ def _rows(data: Any, depth: int, above: tuple[str, ...] = ()) -> Iterator[tuple[
 
 
 def _column(name: str, values: Sequence[Any], named: Mapping[str, str] = FrozenMap()) -> DataColumn:
-    """A column with the unit and the description that its name has."""
+    """Return a column with the unit and the description of its name."""
     head = _HEAD.fullmatch(name)
     own, unit = (head["name"], head["unit"]) if head is not None else (name, "")
     if own in named:
@@ -271,12 +273,12 @@ def _column(name: str, values: Sequence[Any], named: Mapping[str, str] = FrozenM
 
 
 def _kept(name: str, file: str, text: str, named: Mapping[str, str]) -> DataTable | None:
-    """A CSV file of the run; None for one without rows."""
+    """Return the table of a CSV file of the run; None for one without rows."""
     heads, *rows = list(csv.reader(io.StringIO(text))) or [[]]
     if not rows:
         return None
     if any(len(row) != len(heads) for row in rows):
-        raise ValueError(f"{file} has rows of several lengths")
+        raise ValueError(f"{file} has rows of different lengths")
     columns: list[DataColumn] = []
     for k, head in enumerate(heads):
         one = _column(head, _cells([row[k] for row in rows]), named)
@@ -287,13 +289,13 @@ def _kept(name: str, file: str, text: str, named: Mapping[str, str]) -> DataTabl
 
 
 def _free(name: str, taken: Sequence[str]) -> str:
-    """The name, with a number behind it where others have it."""
+    """Return the name, with a number behind it if it is taken."""
     names = (name, *(f"{name} ({k})" for k in range(2, len(taken) + 2)))
     return next(one for one in names if one not in taken)
 
 
 def _cells(cells: Sequence[str]) -> list[Any]:
-    """Numbers, whole ones as such, where all that is there is one; else texts. An empty cell is None."""
+    """Return cells as whole numbers or numbers if all of them are, else as texts; an empty cell is None."""
     for sort in (int, float):
         try:
             return [None if cell == "" else sort(cell) for cell in cells]
@@ -303,7 +305,7 @@ def _cells(cells: Sequence[str]) -> list[Any]:
 
 
 def _told_names(folder: Path, name: str, files: Sequence[str]) -> dict[str, str]:
-    """Column -> what it holds, where the same table stands in a netCDF file beside it."""
+    """Return the descriptions of columns from a netCDF file with the same table, if there is one."""
     beside = f"{name.removesuffix('.csv')}.nc"
     if beside not in files:
         return {}

@@ -1,1 +1,1 @@
-"""The twin as a library: what ``import twin`` offers."""
+"""Library interface of the twin: implementation of the names that ``import twin`` offers."""

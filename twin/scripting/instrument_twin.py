@@ -1,6 +1,6 @@
-"""An instrument in a script: load it, perturb it, render it, recover what happened from the images.
+"""Instruments and cameras in a script: load, perturb, render, and recover the changes from the images.
 
-A camera in a script: looked at as optical designers do, and perturbed as the instrument that it is or belongs to.
+A camera can be examined as optical designers do, and perturbed as the instrument that it is or belongs to.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from twin.sensors.area_detector import coarse_warnings
 
 
 class Twin(Protocol):
-    """The instrument that a camera belongs to, as `twin.load` gives it."""
+    """Instrument that a camera belongs to, as `twin.load` returns it."""
 
     @property
     def experiment(self) -> MonitorExperiment:
@@ -57,21 +57,21 @@ class Twin(Protocol):
         """Body -> motion."""
 
     def perturbed(self, *perturb: Mapping[str, Mapping[str, Any]] | str) -> Self:
-        """The instrument with these bodies perturbed. Raises InputError where that cannot be."""
+        """Return the instrument with these bodies perturbed. Raises InputError if that is impossible."""
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class CameraTwin(CameraView):
-    """A camera of an instrument in one state. Made by `load_camera` and `InstrumentTwin.camera`.
+    """Camera of an instrument in one state, made by `load_camera` and `InstrumentTwin.camera`.
 
     Attributes
     ----------
     twin : Twin
-        The instrument, of which this may be all.
+        The instrument; it may consist of this camera alone.
     name : str
-        Of the camera in it.
+        Name of the camera in it.
     obstruction : bool
-        Whether what other bodies take of its beam is missing.
+        Whether light that other bodies block is removed from its beam.
     """
 
     twin: Twin = field(repr=False)
@@ -80,64 +80,68 @@ class CameraTwin(CameraView):
 
     @classmethod
     def of(cls, twin: Twin, name: str, obstruction: bool = True) -> CameraTwin:
-        """A camera of an instrument, in the instrument's state.
+        """Return a camera of an instrument, in the instrument's state.
 
         Parameters
         ----------
         twin : Twin
             The instrument.
         name : str
-            Of the camera in it.
+            Name of the camera in it.
         obstruction : bool
-            Whether what other bodies take of its beam is missing.
+            Whether light that other bodies block is removed from its beam.
         """
         experiment = twin.experiment
         seen = CameraView.within(experiment.instrument, name, experiment.backend, twin.state, obstruction)
         return cls(seen.path, seen.state, twin=twin, name=name, obstruction=obstruction)
 
     def perturbed(self, *perturb: Mapping[str, Mapping[str, Any]] | str) -> CameraTwin:
-        """The same camera with bodies of its instrument perturbed; arguments and errors as `InstrumentTwin.perturbed`.
+        """Return the same camera with bodies of its instrument perturbed.
+
+        Arguments and errors are those of `InstrumentTwin.perturbed`.
 
         Parameters
         ----------
-        perturb : Mapping[str, Mapping[str, Any]] | str
+        perturb : Mapping[str, Mapping[str, Any]] or str
             Motions in words, such as ``"M2 shift z 20 um"``, or node -> keys of `perturb:` in a job's YAML.
         """
         return CameraTwin.of(self.twin.perturbed(*perturb), self.name, self.obstruction)
 
 
 class _Bench:
-    """An instrument that is built once, whatever is then done to it."""
+    """Instrument that is built once and shared by its perturbed copies."""
 
     def __init__(self, resolved: ResolvedJob, backend: str, like: _Bench | None = None) -> None:
         self._resolved, self._name, self._like = resolved, backend, like
 
     @cached_property
     def backend(self) -> Backend:
+        """Backend that traces the rays."""
         return load_backend(self._name) if self._like is None else self._like.backend
 
     @cached_property
     def experiment(self) -> MonitorExperiment:
+        """The modelled instrument."""
         if self._like is not None:
             return self._like.experiment.stating(self._resolved)
         return MonitorExperiment(self._resolved, self.backend)
 
     def stating(self, resolved: ResolvedJob) -> _Bench:
-        """Bench of the same instrument under another prior."""
+        """Return the bench of the same instrument with another prior."""
         return _Bench(resolved, self._name, self)
 
 
 @dataclass(frozen=True, eq=False)
 class InstrumentTwin:
-    """An instrument with its cameras, detectors and autocollimation monitor, perturbed or not. Immutable.
+    """Instrument with its cameras, detectors and autocollimation monitor, nominal or perturbed; immutable.
 
-    Made by `load` and by `perturbed`. Copies share what was built and calibrated, so that a loop over perturbations
-    pays for the instrument once.
+    Instances are made by `load` and by `perturbed`. Copies share what was built and calibrated, so that a loop over
+    perturbations builds the instrument once.
 
     Attributes
     ----------
     resolved : ResolvedJob
-        The job that it stands for, with everything that it names.
+        The job that the instance represents, with everything that it names.
     """
 
     resolved: ResolvedJob
@@ -145,21 +149,21 @@ class InstrumentTwin:
 
     @classmethod
     def of(cls, resolved: ResolvedJob, backend: str = "llvm", like: InstrumentTwin | None = None) -> InstrumentTwin:
-        """The twin of a job that has been read.
+        """Return the twin of a job that has been read.
 
         Parameters
         ----------
         resolved : ResolvedJob
             The job.
         backend : str
-            Where to trace, ``llvm`` or ``cuda``.
-        like : InstrumentTwin | None
-            One of the same instrument, cameras and detector, which is then not built again.
+            Backend that traces the rays, ``llvm`` or ``cuda``.
+        like : InstrumentTwin or None
+            Twin of the same instrument, cameras and detector, whose built instrument is reused.
 
         Raises
         ------
         BackendUnavailable
-            This machine does not have it.
+            This machine does not have the backend.
         """
         return cls(resolved, _Bench(resolved, backend) if like is None else like._bench.stating(resolved))
 
@@ -175,7 +179,7 @@ class InstrumentTwin:
 
     @property
     def perturbations(self) -> Mapping[str, Any]:
-        """Node -> what happens to it, with the keys and unit strings of the YAML."""
+        """Node -> its perturbation, with the keys and unit strings of the YAML."""
         plain = self._plain.get("perturb", {})
         return {
             node: {key: plain[node][key] for key in (*what.uses(), *_pivot(what.uses(), plain[node]))}
@@ -184,7 +188,7 @@ class InstrumentTwin:
 
     @property
     def nodes(self) -> pd.DataFrame:
-        """Every body that can be perturbed: what may be done to it, and its pivots."""
+        """Table of all bodies that can be perturbed, with the motions that they allow and their pivots."""
         rows = {
             path: {"allows": ", ".join(sorted(info.allows)), "pivots": ", ".join(info.pivots)}
             for path, info in self._nodes.items()
@@ -193,21 +197,22 @@ class InstrumentTwin:
 
     @property
     def _nodes(self) -> Mapping[str, NodeInfo]:
+        """Path -> properties of each node."""
         return self._bench.experiment.instrument.nodes
 
     @property
     def experiment(self) -> MonitorExperiment:
-        """The modelled instrument itself, for what this class does not offer."""
+        """The modelled instrument, for what this class does not offer."""
         return self._bench.experiment
 
     @cached_property
     def state(self) -> State:
-        """Body -> motion, SI: what the perturbations come to, deformations by heat included.
+        """Motion of each body, SI, by all perturbations, thermal deformations included.
 
         Raises
         ------
         InputError
-            a temperature for which the materials have no data.
+            The materials have no data for a temperature.
         """
         return self._bench.experiment.state(self.resolved.job)
 
@@ -216,16 +221,16 @@ class InstrumentTwin:
 
         Parameters
         ----------
-        perturb : Mapping[str, Mapping[str, Any]] | str
+        perturb : Mapping[str, Mapping[str, Any]] or str
             Motions in words, such as ``"M2 shift z 3 um"``, or node -> keys and unit strings of `perturb:` in a job's
             YAML, such as ``{"base/forward/M2": {"shift": "0 0 3 um"}}``. The last parts of a node's path are enough
-            where only one node ends so. A node that is perturbed already gets this in place of what it had; others keep
-            theirs.
+            where only one node ends with them. The perturbation of a node that already has one is replaced; other nodes
+            keep theirs.
 
         Raises
         ------
         InputError
-            No such node, or nothing that can be done to it.
+            No such node, or a motion that it does not allow.
         """
         plain = {**self._plain, "perturb": {**self._plain.get("perturb", {}), **self._given(perturb)}}
         twin = self._with_job(plain)
@@ -233,7 +238,7 @@ class InstrumentTwin:
         return InstrumentTwin(twin.resolved.with_job(job), twin._bench)
 
     def _given(self, perturb: Sequence[Mapping[str, Mapping[str, Any]] | str]) -> dict[str, Any]:
-        """What is asked for, by the nodes' paths; a name of no node stays, to be told with the others."""
+        """Return the requested perturbations by the nodes' paths; unknown names stay and are reported later."""
         try:
             said: dict[str, Any] = perturbation_in_words(one for one in perturb if isinstance(one, str))
             for one in perturb:
@@ -247,13 +252,14 @@ class InstrumentTwin:
             raise InputError(problem.at("", key=("perturb",))) from None
 
     def with_disturbances(self, disturbances: str | Mapping[str, Any]) -> InstrumentTwin:
-        """Return this instrument with another prior, on which `posterior` and all total sigmas rest.
+        """Return this instrument with another disturbance prior, on which `posterior` and all total sigmas are based.
 
         Parameters
         ----------
-        disturbances : str | Mapping[str, Any]
-            As `disturbances:` in a job's YAML: name of a file of the library (``launch``), path of one's own, ``none``
-            for nothing, or ``{"file": ..., "causes": {...}, "without": [...]}``. It replaces what was stated before.
+        disturbances : str or Mapping[str, Any]
+            Value of `disturbances:` in a job's YAML: name of a file of the library (``launch``), path of a file,
+            ``none`` for no prior, or ``{"file": ..., "causes": {...}, "without": [...]}``. It replaces the previous
+            prior.
 
         Raises
         ------
@@ -266,7 +272,7 @@ class InstrumentTwin:
         stated = find_disturbances(job, self.resolved.instrument)
         resolved = self.resolved.model_copy(update={"job": job, "disturbances": stated})
         twin = InstrumentTwin(resolved, self._bench.stating(resolved))
-        twin.experiment.stated  # noqa: B018 - a body that the instrument lacks is told now
+        twin.experiment.stated  # noqa: B018 - raises now if the instrument lacks a body
         return twin
 
     def render(self, frames: int | None = None, seed: int | None = None, **render: Any) -> Shot:
@@ -274,10 +280,10 @@ class InstrumentTwin:
 
         Parameters
         ----------
-        frames : int | None
-            Of each exposure; the job's or the instrument's own number if not given.
-        seed : int | None
-            Of all noise; the job's (1 unless it says otherwise) if not given.
+        frames : int or None
+            Number of frames of each exposure; by default that of the job or the instrument.
+        seed : int or None
+            Seed of all noise; by default that of the job (1 unless it sets another).
         render : Any
             Further keys of `render:` in a job's YAML, such as ``stray=True``, ``quality=True`` or ``images=["spots",
             "knife_edge"]``.
@@ -285,7 +291,7 @@ class InstrumentTwin:
         Raises
         ------
         InputError
-            a wrong key, or a perturbation so large that light misses the mirrors or a spot its CCD.
+            A key is wrong, or a perturbation is so large that light misses the mirrors or a spot its CCD.
         """
         given = {"frames": frames, "seed": seed}
         own = {key: value for key, value in given.items() if value is not None}
@@ -294,8 +300,9 @@ class InstrumentTwin:
         return _shot_of(render_job(job, backend, experiment=self._bench.experiment), backend, started)
 
     def recover(self, before: Any, after: Any, centroid: str | None = None) -> Found:
-        """What every estimator reads from images, given the calibration of the unperturbed instrument and what is
-        stated to move.
+        """Return the readings of all estimators from images.
+
+        They use the calibration of the unperturbed instrument and its disturbance prior.
 
         Parameters
         ----------
@@ -303,16 +310,16 @@ class InstrumentTwin:
             Frames of the unperturbed instrument, grey values, (channel, frame, row, column) in the order of
             ``shot.before.channel``; a DataArray or an array.
         after : Any
-            Of the perturbed one.
-        centroid : str | None
-            Name of a method of `analysis.spots.CENTROIDS`; the job's if not given.
+            Frames of the perturbed one.
+        centroid : str or None
+            Name of a method of `analysis.spots.CENTROIDS`; by default that of the job.
 
         Raises
         ------
         ValueError
-            Frames of another shape, or no such centroid.
+            Frames have another shape, or there is no such centroid.
         SpotError
-            a spot cannot be measured.
+            A spot cannot be measured.
         """
         method = self.resolved.job.analysis.centroid if centroid is None else centroid
         experiment = self._bench.experiment
@@ -339,20 +346,21 @@ class InstrumentTwin:
         return found_table(reading, given)
 
     def jacobian(self, motions: Sequence[str]) -> xr.Dataset:
-        """Exact derivatives by elementary motions, about the unperturbed instrument.
+        """Return exact derivatives with respect to elementary motions, about the unperturbed instrument.
 
         Parameters
         ----------
-        motions : Sequence[str]
-            Such as ``base/forward/M2 shift z``, ``base/backward/focal_plane rotate x about rear_node``, ``base/forward
-            scale`` or ``base/forward/M1 figure Z5``.
+        motions : sequence of str
+            Motions such as ``base/forward/M2 shift z``, ``base/backward/focal_plane rotate x about rear_node``,
+            ``base/forward scale`` or ``base/forward/M1 figure Z5``.
 
         Returns
         -------
         xr.Dataset
-            Per um, arcsec, ppm or nm of each motion (coordinate ``per``): ``spots`` (channel, axis, motion), px;
-            ``true`` (camera, parameter, motion), the traced change; ``readings`` (camera, estimator, parameter,
-            motion), what each estimator makes of the spots. Parameters are in arcsec and um, as their names end.
+            Derivatives per um, arcsec, ppm or nm of each motion (coordinate ``per``): ``spots`` (channel, axis,
+            motion), px; ``true`` (camera, parameter, motion), the traced change; ``readings`` (camera, estimator,
+            parameter, motion), the estimators' response to the spots. Parameters are in arcsec and um, as their names
+            end.
 
         Raises
         ------
@@ -393,37 +401,36 @@ class InstrumentTwin:
         )
 
     def camera(self, name: str = "", obstruction: bool = True) -> CameraTwin:
-        """One of its cameras as optical designers look at it, in this state.
+        """Return one of its cameras in this state, with the methods of an optical designer.
 
         Parameters
         ----------
         name : str
-            Of the camera; may be left out where there is one.
+            Name of the camera; optional if there is only one.
         obstruction : bool
-            Whether what prisms and other bodies take of its beam is missing.
+            Whether light that prisms and other bodies block is removed from its beam.
 
         Raises
         ------
         InputError
-            No camera of that name.
+            There is no camera of that name.
         """
-        # it draws
-
         name = name or (self.cameras[0] if len(self.cameras) == 1 else "")
         if name not in self.cameras:
             raise InputError(unknown("no such camera", name, self.cameras).at())
         return CameraTwin.of(self, name, obstruction)
 
     def to_yaml(self) -> str:
-        """A job file that stands for this instrument and needs no other file; `load` and the commands read it."""
+        """Return the text of a self-contained job file for this instrument, for `load` and the commands."""
         return self.resolved.to_yaml()
 
     @cached_property
     def _plain(self) -> Mapping[str, Any]:
-        """The job as its file would have it."""
+        """The job as its file has it."""
         return self.resolved.job.plain()
 
     def _with_job(self, plain: Mapping[str, Any]) -> InstrumentTwin:
+        """Return the same instrument with another job, from its plain data."""
         source = self.resolved.job.source
         job = validate(JobSpec, YamlFile("", dict(plain), {})).with_source(source)
         assert isinstance(job, JobSpec)
@@ -441,37 +448,38 @@ class InstrumentTwin:
 
 
 def _pivot(uses: Sequence[str], plain: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the pivot's key if a perturbation uses it."""
     return ("pivot",) if {"rotate", "scale"} & set(uses) and "pivot" in plain else ()
 
 
 def load(
     what: str | Path, backend: str = "llvm", disturbances: str | Mapping[str, Any] | None = None
 ) -> InstrumentTwin:
-    """An instrument to work with.
+    """Load an instrument.
 
     Parameters
     ----------
-    what : str | Path
+    what : str or Path
         Name of an instrument in the library (``gf7_pair``), or path of an instrument's file, of a job, or of the
-        config.yaml of a run; a job's perturbations come with it.
+        config.yaml of a run; a job's perturbations are applied.
     backend : str
-        Where to trace, ``llvm`` or ``cuda``.
-    disturbances : str | Mapping[str, Any] | None
-        What is stated to move, as `InstrumentTwin.with_disturbances` takes it; the job's or the instrument's own if not
-        given.
+        Backend that traces the rays, ``llvm`` or ``cuda``.
+    disturbances : str or Mapping[str, Any] or None
+        Disturbance prior, as for `InstrumentTwin.with_disturbances`; by default that of the job or the instrument.
 
     Raises
     ------
     InputError
         No such name, or a file that cannot be read or is not valid, with line and key.
     BackendUnavailable
-        This machine does not have it.
+        This machine does not have the backend.
     """
     loaded = _load(what, backend)
     return loaded if disturbances is None else loaded.with_disturbances(disturbances)
 
 
 def _load(what: str | Path, backend: str) -> InstrumentTwin:
+    """Load an instrument with its own prior."""
     text = str(what)
     if text not in library_names(INSTRUMENTS) or isinstance(what, Path):
         data = read_yaml(what).data if isinstance(what, Path) or "/" in text or text.endswith((".yaml", ".yml")) else {}
@@ -484,14 +492,14 @@ def _load(what: str | Path, backend: str) -> InstrumentTwin:
 
 
 def load_camera(what: str | Path, backend: str = "llvm") -> CameraTwin:
-    """A camera by itself, as optical designers look at it; its ``perturbed`` moves and warms its parts.
+    """Load a single camera, with the methods of an optical designer; its ``perturbed`` moves and heats its parts.
 
     Parameters
     ----------
-    what : str | Path
+    what : str or Path
         Name of a camera in the library (``gf7``), or path of a camera's file.
     backend : str
-        Where to trace, ``llvm`` or ``cuda``.
+        Backend that traces the rays, ``llvm`` or ``cuda``.
 
     Raises
     ------
@@ -499,24 +507,24 @@ def load_camera(what: str | Path, backend: str = "llvm") -> CameraTwin:
         No such name, a file that cannot be read or is not valid, or a prescription that brings no light through the
         stop to the image.
     """
-    camera = read_camera(what)  # what is no camera is told as that
+    camera = read_camera(what)  # raises an error about cameras if it is not one
     return _load(Path(what) if is_path(what) else str(what), backend).camera(camera.name)
 
 
 RIGID = ("shift", "rotate", "scale", "figure")
-"""Kinds of motions by which there are derivatives."""
-_FORMS = "NODE shift x|y|z, NODE rotate x|y|z, NODE scale, NODE figure Z5; 'about PIVOT' may follow a turn or a scale"
+"""Kinds of motions with derivatives."""
+_FORMS = "NODE shift x|y|z, NODE rotate x|y|z, NODE scale, NODE figure Z5; rotate and scale may end in 'about PIVOT'"
 
 
 def _motion_named(text: str, nodes: Mapping[str, NodeInfo]) -> ElementaryMotion:
-    """The elementary motion that a text names.
+    """Return the elementary motion that a text names.
 
     Parameters
     ----------
     text : str
-        ``NODE shift x``, ``NODE rotate x``, ``NODE scale`` or ``NODE figure Z5``, then perhaps ``about PIVOT``.
+        ``NODE shift x``, ``NODE rotate x``, ``NODE scale`` or ``NODE figure Z5``, optionally with ``about PIVOT``.
     nodes : Mapping[str, NodeInfo]
-        Path -> what may be done to it, for all bodies of the instrument.
+        Path -> properties, for all bodies of the instrument.
 
     Returns
     -------
@@ -526,7 +534,7 @@ def _motion_named(text: str, nodes: Mapping[str, NodeInfo]) -> ElementaryMotion:
     Raises
     ------
     InputError
-        Not of this form, no such node or pivot, or a motion that the node does not have.
+        The text has another form, or names an unknown node or pivot, or a motion that the node does not allow.
     """
     try:
         name, kind, axis, amount, pivot = motion_of(text)
@@ -538,7 +546,7 @@ def _motion_named(text: str, nodes: Mapping[str, NodeInfo]) -> ElementaryMotion:
     info, pivot = nodes[node], pivot or ORIGIN
     rigid = tuple(kind for kind in RIGID if kind in info.allows)
     if kind not in rigid:
-        raise _wrong(f"{node} cannot be differentiated by this", kind, names_text(rigid), nearest(kind, rigid))
+        raise _wrong(f"{node} has no derivative with respect to this", kind, names_text(rigid), nearest(kind, rigid))
     known = tuple(dict.fromkeys((ORIGIN, *info.pivots)))
     if pivot not in known:
         raise _wrong(f"{node} has no such pivot", pivot, names_text(known), nearest(pivot, known))
@@ -547,4 +555,5 @@ def _motion_named(text: str, nodes: Mapping[str, NodeInfo]) -> ElementaryMotion:
 
 
 def _wrong(problem: str, found: str, allowed: str, suggestion: str | None = None) -> InputError:
+    """Return an error about a motion's text."""
     return InputError(Issue(problem, found=repr(found), allowed=allowed, suggestion=suggestion))

@@ -1,4 +1,4 @@
-"""Commands in a script: the same runs with their numbers at hand."""
+"""Commands run from a script, with their numbers as Python objects."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from twin.framework.run_folder import RunFolder
 @shows("name", "report.verdict", "report.warnings")
 @dataclass(frozen=True, eq=False)
 class TestResult:
-    """A finished test.
+    """Result of a finished test.
 
     Attributes
     ----------
     name : str
-        As it was called, ``lab focus``.
+        Name as called, such as ``lab focus``.
     numbers : Mapping[str, Any]
-        What KIND.json of a run folder holds, keys ending in their unit.
+        Content of KIND.json of a run folder; keys end in their unit.
     report : Report
-        Verdict, tables and figures, for a reader.
+        Verdict, tables and figures.
     setup : Spec
         The test with all it refers to.
     run : Any
-        Everything that was computed; its class depends on the test.
+        All computed results; the class depends on the test.
     """
 
     name: str
@@ -55,7 +55,7 @@ class TestResult:
 
     @property
     def summary(self) -> pd.DataFrame:
-        """The main table of the report."""
+        """Main table of the report."""
         table = self.report.summary
         return pd.DataFrame([[cell_text(cell) for cell in row] for row in table.shown()], columns=list(table.heads))
 
@@ -64,15 +64,15 @@ class TestResult:
 
         Parameters
         ----------
-        folder : str | Path
-            To be made.
+        folder : str or Path
+            Folder to create.
         force : bool
-            Replace it if it is a run folder.
+            Whether an existing run folder is replaced.
 
         Raises
         ------
         RunFolderError
-            It is there already, or cannot be written.
+            The folder exists or cannot be written.
         """
         with RunFolder(Path(folder), force) as target:
             write_test(self._kind, self.numbers, self.report, self._facts, target)
@@ -87,21 +87,21 @@ class TestResult:
 def perform(
     name: str, file: str | Path, *, seed: int | None = None, backend: str = "llvm", **changes: Any
 ) -> TestResult:
-    """Run what a command runs on its file.
+    """Run the procedure of a command on its file.
 
     Parameters
     ----------
     name : str
-        ``camera``, ``recover``, ``tolerance``, ``uncertainty``; or any of ``lab``, ``orbit`` (but export), ``design``
-        and ``asbuilt`` with its subcommand, such as ``lab focus``.
-    file : str | Path
-        Of the test, or its name in the library.
-    seed : int | None
-        Of all that is drawn; the file's own if not given.
+        ``camera``, ``recover``, ``tolerance``, ``uncertainty``; or any of ``lab``, ``orbit`` (except export),
+        ``design`` and ``asbuilt`` with its subcommand, such as ``lab focus``.
+    file : str or Path
+        Path of the test's file, or its name in the library.
+    seed : int or None
+        Seed of all random numbers; by default that of the file.
     backend : str
-        Where to trace, ``llvm`` or ``cuda``.
+        Backend that traces the rays, ``llvm`` or ``cuda``.
     changes : Any
-        Keys of the test's file with other values, of ``camera`` and ``uncertainty`` those of the run's config.yaml; a
+        Keys of the test's file with other values, for ``camera`` and ``uncertainty`` those of the run's config.yaml; a
         mapping replaces single keys of a mapping.
 
     Raises
@@ -132,7 +132,7 @@ def perform(
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain data with other values."""
+    """Return plain data with some values replaced, mapping by mapping."""
     out = dict(base)
     for key, value in changes.items():
         inner = out.get(key)

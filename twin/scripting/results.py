@@ -1,4 +1,4 @@
-"""What a script gets back: frames and truth of an exposure, and what the estimators read from it."""
+"""Results of scripts: frames and truth of an exposure, and the estimators' readings of them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from twin.targets.target_measurement import PlaceTargets
 @shows("verdict", "truth", "before [DN]", "after [DN]", "warnings")
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """An exposure of the nominal and of the perturbed instrument.
+    """Exposure of the nominal and of the perturbed instrument.
 
     Attributes
     ----------
@@ -43,15 +43,15 @@ class Shot:
         Expected photons per pixel and frame, (state, channel, row, column), as in irradiance.nc; empty without a
         monitor.
     truth : xr.Dataset
-        True changes of every camera, by exact tracing: parameters of each ``camera``; of two cameras
+        True changes of every camera, by exact tracing: parameters of each ``camera``; for two cameras also
         ``angle_change_arcsec``, and ``ground_along_m``, ``ground_across_m``, ``ground_height_m``, errors of points on
-        the ground that are located as if nothing had changed.
+        the ground that are located without correcting for the changes.
     verdict : str
-        What was recovered, how well, and what limits it.
+        Result, its accuracy, and what limits it.
     warnings : tuple[str, ...]
-        What one should know before using the numbers.
+        Warnings to read before using the numbers.
     run : JobRun
-        Everything that the command ``twin.render`` would write: image quality, targets, stray light, course.
+        All results that the command ``twin.render`` would write: image quality, targets, stray light, course.
     """
 
     before: xr.DataArray
@@ -70,17 +70,17 @@ class Shot:
 
         Parameters
         ----------
-        folder : str | Path
-            To be made.
+        folder : str or Path
+            Folder to create.
         force : bool
-            Replace it if it is a run folder.
+            Whether an existing run folder is replaced.
 
         Raises
         ------
         RunFolderError
-            It is there already, or cannot be written.
+            The folder exists or cannot be written.
         """
-        # what draws waits until it is asked for
+        # Imported here, because scripts need the plotting libraries only for this.
         from twin.main_job.render_folder import write_run
 
         with RunFolder(Path(folder), force) as target:
@@ -90,8 +90,10 @@ class Shot:
 
     @property
     def mtf(self) -> pd.DataFrame:
-        """MTF at the Nyquist frequency from the images of knife edges, before and after, with sigma and beside it the
-        true one; a row for every camera, place and direction. Empty unless ``knife_edge`` was among the images.
+        """MTF at the Nyquist frequency measured in the images of knife edges, before and after.
+
+        Sigmas and the true values are in further columns. There is a row for every camera, place and direction; the
+        table is empty unless ``knife_edge`` is among the images.
         """
         cameras = self.run.targets.cameras if self.run.targets is not None else {}
         rows = {
@@ -107,9 +109,11 @@ class Shot:
 
     @property
     def quality(self) -> pd.DataFrame:
-        """Image quality before and after: wavefront errors (waves rms), best focus less line CCD (um), MTF at Nyquist
-        and light lost; a row for every camera, state and field. Empty unless ``quality=True`` was asked for, or the
-        instrument has no monitor.
+        """Image quality before and after.
+
+        Columns are wavefront errors (waves rms), best focus relative to the line CCD (um), MTF at Nyquist and vignetted
+        light; there is a row for every camera, state and field. The table is empty unless ``quality=True`` was set and
+        the instrument has a monitor.
         """
         found = self.run.quality
         rows = {
@@ -131,33 +135,34 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What every estimator reads from images.
+    """Readings of all estimators from images.
 
     Attributes
     ----------
     values : xr.DataArray
         Readings, (camera, estimator, parameter), in arcsec and um as the parameters' names end.
     covariance : xr.DataArray
-        Of the whole error, (camera, estimator, parameter, parameter_2), products of these units: by noise and by what
-        is stated to move; where nothing is stated, by noise alone.
+        Covariance of the total error, (camera, estimator, parameter, parameter_2), in products of these units: from
+        noise and from the prior's disturbances; without a prior from noise alone.
     covariance_noise : xr.DataArray
-        Of that what the noise of the images does, likewise.
+        Part of that covariance from the noise of the images.
     angle : xr.Dataset
-        Of two cameras, ``change_arcsec`` with ``change_arcsec_sigma`` (total) and ``change_arcsec_sigma_noise`` by
+        For two cameras, ``change_arcsec`` with ``change_arcsec_sigma`` (total) and ``change_arcsec_sigma_noise`` by
         estimator; empty otherwise.
     ground : xr.Dataset
-        Of two cameras of known altitude, ``along_m``, ``across_m``, ``height_m`` with their sigmas, likewise.
-    disturbances : str
-        Name of what is stated to move, on which the total sigmas rest; empty for nothing.
+        For two cameras of known altitude, ``along_m``, ``across_m``, ``height_m`` with their sigmas, by estimator;
+        empty otherwise.
     spots : xr.Dataset
         ``before`` and ``after`` (channel, axis), px, with ``before_sigma`` and ``after_sigma``.
+    disturbances : str
+        Name of the disturbance prior on which the total sigmas are based; empty for none.
     sigma_holds : bool
-        Whether nothing that was measured contradicts the sigmas.
+        Whether all measurements are consistent with the sigmas.
     warnings : tuple[str, ...]
-        Why they do not, and what else one should know before using the numbers.
+        Reasons why they are not, and other warnings to read before using the numbers.
     from_statement : pd.Series
-        Share of the ``posterior``'s variance of each reading that no spot constrains: that part of sigma is from the
-        statement, not from the spots; (row) with levels camera and parameter, empty where nothing is stated.
+        Fraction of the ``posterior``'s variance of each reading that the spots do not reduce: this part of sigma comes
+        from the prior, not from the spots; (row) with levels camera and parameter, empty without a prior.
     """
 
     values: xr.DataArray
@@ -173,7 +178,7 @@ class Found:
 
     @property
     def sigma(self) -> xr.DataArray:
-        """Standard deviations of the whole errors of ``values``; see ``covariance``."""
+        """Standard deviations of the total errors of ``values``; see ``covariance``."""
         return self._root(self.covariance).rename("sigma")
 
     @property
@@ -183,28 +188,27 @@ class Found:
 
     @property
     def judged(self) -> str:
-        """The estimator whose sigma and error ``compare`` tells: ``posterior`` where disturbances are stated, else
-        ``model``.
-        """
+        """Estimator whose sigma and error ``compare`` lists: ``posterior`` with a prior, else ``model``."""
         return preferred_estimator(self.values.estimator.values.tolist())
 
     def _root(self, covariance: xr.DataArray) -> xr.DataArray:
+        """Return the standard deviations of a covariance, labelled like ``values``."""
         return self.values.copy(data=np.sqrt(np.diagonal(covariance.values, axis1=-2, axis2=-1)))
 
     def compare(self, truth: xr.Dataset) -> pd.DataFrame:
-        """Readings beside the truth.
+        """Return a table of readings and true values.
 
         Parameters
         ----------
         truth : xr.Dataset
-            Of the exposure, ``shot.truth``.
+            True changes of the exposure, ``shot.truth``.
 
         Returns
         -------
         pd.DataFrame
-            A row for every camera and parameter, for the angle between two cameras and for errors on the ground: what
-            is ``true``, each estimator's reading, and of the ``judged`` one ``sigma`` (total), ``sigma_noise``,
-            ``error`` = reading - true and ``in_sigma`` = error / sigma.
+            A row for every camera and parameter, for the angle between two cameras and for errors on the ground.
+            Columns: ``true``, each estimator's reading, and for the ``judged`` estimator ``sigma`` (total),
+            ``sigma_noise``, ``error`` = reading - true and ``in_sigma`` = error / sigma.
         """
         sigma, noise = self.sigma, self.sigma_noise
         rows = {}
@@ -225,6 +229,7 @@ class Found:
         return table
 
     def _row(self, true: float, readings: xr.DataArray, sigma: xr.DataArray, noise: xr.DataArray) -> dict[str, float]:
+        """Return a row of ``compare``."""
         own = {str(name): float(readings.sel(estimator=name)) for name in readings.estimator.values}
         spread, error = float(sigma.sel(estimator=self.judged)), own[self.judged] - true
         by_noise = float(noise.sel(estimator=self.judged))
@@ -241,6 +246,7 @@ class Found:
 
 
 def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:
+    """Return a row of ``Shot.mtf``."""
     out: dict[str, float] = {}
     for when, shots in place.shots.items():
         edge = shots.edges[direction]
@@ -250,7 +256,7 @@ def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:
 
 
 def _reading_frame(found: Found) -> pd.DataFrame:
-    """Readings by camera and parameter, a column for each estimator, with the judged one's sigmas."""
+    """Return readings by camera and parameter, a column for each estimator, with sigmas of the judged one."""
     values = found.values.stack(row=("camera", "parameter")).transpose("row", "estimator").to_pandas()
     values.columns.name = None
     sigmas = {"sigma": found.sigma, "sigma_noise": found.sigma_noise}
@@ -259,12 +265,12 @@ def _reading_frame(found: Found) -> pd.DataFrame:
 
 
 def _truth_frame(truth: xr.Dataset) -> pd.DataFrame:
-    """True parameters, a row for each camera."""
+    """Return the true parameters, a row for each camera."""
     return truth[[one.key for one in parameters.CAMERA_PARAMETERS.values()]].to_dataframe()
 
 
 def shot_of(run: JobRun, backend: Backend, started: float) -> Shot:
-    """What a script sees of a run that was traced there and begun then, seconds since the epoch."""
+    """Return the exposure of a run, traced on a backend and started at a time in seconds since the epoch."""
     keys = [channel.key for channel in run.experiment.instrument.channels]
     about: dict[str, Any] = {"units": "DN", "instrument": run.resolved.instrument.name}
     before = after = np.zeros((0, run.frames, 0, 0), np.uint16)
@@ -293,6 +299,7 @@ def shot_of(run: JobRun, backend: Backend, started: float) -> Shot:
 
 
 def _truth(run: JobRun) -> xr.Dataset:
+    """Return the true changes of a run."""
     true = run.truth_dict()
     cameras = true["cameras"]
     keys = list(next(iter(cameras.values())))
@@ -304,14 +311,14 @@ def _truth(run: JobRun) -> xr.Dataset:
 
 
 def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
-    """What a script sees of the reading of one state.
+    """Return the readings of one state for a script.
 
     Parameters
     ----------
     reading : MonitorReading
-        Of it.
-    warnings : Sequence[str]
-        Of the instrument; those of the reading are added.
+        Reading of the state.
+    warnings : sequence of str
+        Warnings about the instrument; those of the reading are appended.
     """
     recovery, cameras = reading.recovery, list(reading.cameras)
     channels = ["/".join(channel) for channel in reading.channels]
@@ -335,12 +342,14 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
     about = {"reference_frames": frames_text("recovered")}
 
     def spread(of: Callable[[CameraParameters], np.ndarray]) -> xr.DataArray:
+        """Return covariances of all cameras and estimators in the units of the readings."""
         rows = {camera: parameters.rows_of(calibrated) for camera, calibrated in reading.cameras.items()}
         found = [[made @ of(recovery.parameters[c][e])[0] @ made.T for e in estimators] for c, made in rows.items()]
         both = {**coords, "parameter_2": keys}
         return xr.DataArray(np.array(found), dims=(*dims, "parameter_2"), coords=both)
 
     def by_estimator(group: str) -> xr.Dataset:
+        """Return the rows of a group, with sigmas, by estimator."""
         data: dict[str, list[float]] = {}
         for row in table:
             if row.group == group:
@@ -369,12 +378,12 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
 
 
 def as_frames(given: Any, name: str, channels: Sequence[str], shape: tuple[int, int]) -> np.ndarray:
-    """Frames as the analysis takes them, (C, frames, rows, columns), with the channels in the instrument's order.
+    """Return frames for the analysis, (C, frames, rows, columns), with the channels in the instrument's order.
 
     Raises
     ------
     ValueError
-        Other dimensions, channels or pixels.
+        Dimensions, channels or numbers of pixels differ from those of the instrument.
     """
     if isinstance(given, xr.DataArray) and "channel" in given.coords:
         missing = [key for key in channels if key not in given.channel.values]
@@ -389,7 +398,7 @@ def as_frames(given: Any, name: str, channels: Sequence[str], shape: tuple[int, 
 
 
 def name_html(name: str, cameras: Sequence[str], perturbations: Mapping[str, Any]) -> str:
-    """An instrument as a notebook shows it."""
+    """Return an instrument as HTML for a notebook."""
     head = f"<p><b>{escape(name)}</b>, cameras {escape(', '.join(cameras))}</p>"
     if not perturbations:
         return head + "<p>not perturbed</p>"

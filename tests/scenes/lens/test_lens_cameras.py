@@ -176,14 +176,14 @@ CURVE = XYPolynomial(x2=1e-3)
             (
                 Surface(-0.1, figure=figure),
                 "a figure on a grid",
-                "cannot carry this: a figure on a grid",
-                "which a camera's",
+                "cannot represent this: a figure on a grid",
+                "a camera's file cannot represent a figure on a grid",
             )
             for figure in (GRID, SummedFigure(ERROR, GRID))
         ),
-        (Surface(-0.1, terms=(CURVE,), figure=ERROR), "with other terms of its sag", "", ""),
+        (Surface(-0.1, terms=(CURVE,), figure=ERROR), "with other sag terms", "", ""),
         (Surface(-0.1, even=(0.0,) * 7 + (1e-9,)), "even powers beyond r^16", "", ""),
-        (Surface(-0.1, terms=(SAG,)), "terms of a sag that the format does not have", "is no polynomial", ""),
+        (Surface(-0.1, terms=(SAG,)), "sag terms that the format does not have", "is no polynomial", ""),
         (Surface(-0.1, even=(0.0,) * 9 + (1e-9,), terms=(CURVE,)), "a polynomial beyond order 20", "", ""),
         (Surface(even=(0.0,) * 9 + (1e-9,)), "even powers beyond", "a polynomial of so high an order", ""),
     ],
