@@ -98,7 +98,7 @@ def test_what_rests_on_the_stated_numbers(monkeypatch):
     assert "blurred" in uncertainty_report(run).with_verdict(numbers)["warnings"]
     height = numbers["quantities"]["ground"]["height_m"]
     sigma, first = height["after"][BEST]["sigma"], height["elasticities"][0]
-    assert (first["number"], first["stated"], first["unit"]) == ("mirror_figure figure Z7", 2.0, "nm")
+    assert (first["number"], first["value"], first["unit"]) == ("mirror_figure figure Z7", 2.0, "nm")
     assert first["elasticity"] == pytest.approx(0.756, abs=0.01)
     # sigma with the part of one number doubled: its square grows by three times the elasticity
     assert first["doubled"] == pytest.approx(sigma * np.sqrt(1.0 + 3.0 * first["elasticity"]))
@@ -164,7 +164,7 @@ def test_sigmas_are_those_of_the_joint_normal_distribution():
         np.testing.assert_allclose(remedy.sigma, np.sqrt(np.diag(other)), rtol=1e-4)
     np.testing.assert_allclose(limits.from_statement, np.diag(other) / np.diag(left), rtol=1e-4)
     # a motion that is known is one of zero variance, whatever goes with it
-    label, sigma = next(iter(limits.known.items()))
+    label, sigma = next(iter(limits.sigma_if_known.items()))
     own = np.array([one == label for one in stated.labels])
     rest = motions - motions[:, own] @ np.linalg.pinv(motions[np.ix_(own, own)]) @ motions[own]
     total = seen @ rest @ seen.T + limits.noise

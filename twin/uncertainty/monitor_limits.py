@@ -97,7 +97,7 @@ class MonitorLimits:
         Number of frames of each state.
     splits : Mapping[str, Split]
         Estimator -> variances of all quantities by motion.
-    least_seen : tuple of LeastObservable
+    least_observable : tuple of LeastObservable
         Least observable combination of motions for every quantity.
     remedies : tuple of Remedy
         Further measurements.
@@ -113,7 +113,7 @@ class MonitorLimits:
     noise: np.ndarray
     frames: int
     splits: Mapping[str, Split]
-    least_seen: tuple[LeastObservable, ...]
+    least_observable: tuple[LeastObservable, ...]
     remedies: tuple[Remedy, ...]
     outside: float
     without: str = ""
@@ -168,7 +168,7 @@ class MonitorLimits:
         return np.minimum(np.square(noise_free / np.where(with_noise > 0.0, with_noise, np.inf)), 1.0)
 
     @cached_property
-    def known(self) -> Mapping[str, np.ndarray]:
+    def sigma_if_known(self) -> Mapping[str, np.ndarray]:
         """Label -> (Q,) sigmas if that motion were known, for the motions listed first under the posterior."""
         names = {name for q in range(len(self.quantities)) for name, _ in self.lines(BEST, q)[:LINES]}
         # keep the order of the prior, since a set has none
@@ -380,7 +380,7 @@ def combination_text(limits: MonitorLimits, number: int, most: int = 4) -> str:
     most : int
         Largest number of motions to name.
     """
-    combination, quantity, stated = limits.least_seen[number], limits.quantities[number], limits.stated
+    combination, quantity, stated = limits.least_observable[number], limits.quantities[number], limits.stated
     order = sorted(range(len(combination.amounts)), key=lambda k: -abs(combination.amounts[k]))[:most]
     named = [
         f"{body_text(stated.labels[k])} {significant(combination.amounts[k] * stated.sigmas[k], 2, sign=True)} "

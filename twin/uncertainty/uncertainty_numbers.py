@@ -45,13 +45,13 @@ class _Limited:
         return {name: _Limited(self.limits, self.q, name) for name in self.limits.splits}
 
     @property
-    def known(self) -> dict[str, float]:
-        return {name: float(self.limits.known[name][self.q]) for name, _ in self.after[BEST].lines[:LINES]}
+    def sigma_if_known(self) -> dict[str, float]:
+        return {name: float(self.limits.sigma_if_known[name][self.q]) for name, _ in self.after[BEST].lines[:LINES]}
 
     @property
     def motions(self) -> list[tuple[str, float, str]]:
         """Label, amount and unit of the motions in the least observable combination."""
-        amounts, stated = self.limits.least_seen[self.q].amounts, self.limits.stated
+        amounts, stated = self.limits.least_observable[self.q].amounts, self.limits.stated
         order = np.argsort(-np.abs(amounts), kind="stable")[:SEEN]
         return [(stated.labels[k], float(amounts[k] * stated.sigmas[k]), stated.units[k]) for k in order]
 
@@ -83,19 +83,19 @@ _AMOUNT: Record[tuple[str, float, str]] = Record(
     Quantity("amount", itemgetter(1), "its amount in the combination"),
     Quantity("unit", itemgetter(2), "unit of the amount"),
 )
-_SEEN_LEAST: Record[_Limited] = Record(
+_LEAST_OBSERVABLE: Record[_Limited] = Record(
     "Least observable motions that change a quantity.",
-    Quantity("change", lambda one: one.limits.least_seen[one.q].change, "change of the quantity by all of them"),
+    Quantity("change", lambda one: one.limits.least_observable[one.q].change, "change of the quantity by all of them"),
     Quantity("motions", lambda one: one.motions, "the largest of them", record=_AMOUNT),
-    Quantity("spots_px", lambda one: one.limits.least_seen[one.q].spots, "spot shifts that they cause"),
+    Quantity("spots_px", lambda one: one.limits.least_observable[one.q].spots, "spot shifts that they cause"),
     Quantity(
-        "spots_noise_px", lambda one: one.limits.least_seen[one.q].noise, "noise standard deviation of the shifts"
+        "spots_noise_px", lambda one: one.limits.least_observable[one.q].noise, "noise standard deviation of the shifts"
     ),
 )
 _ELASTICITY: Record[tuple[Elasticity, int]] = Record(
     "Sensitivity of the posterior's standard deviation to a number of the prior.",
     Quantity("number", lambda one: one[0].number, "name of the number"),
-    Quantity("stated", lambda one: one[0].size, "its value in the prior"),
+    Quantity("value", lambda one: one[0].size, "its value in the prior"),
     Quantity("unit", lambda one: one[0].unit, "unit of the number"),
     Quantity("bodies", lambda one: len(one[0].bodies), "number of bodies that it applies to"),
     Quantity("elasticity", lambda one: float(one[0].elasticity[one[1]]), "relative change per relative change"),
@@ -105,7 +105,7 @@ _ELASTICITY: Record[tuple[Elasticity, int]] = Record(
         "standard deviation if the number is twice as large, and the prior is unchanged",
     ),
     Quantity(
-        "doubled_stated",
+        "doubled_in_prior",
         lambda one: float(one[0].told[one[1]]),
         "standard deviation if the number is twice as large, also in the prior",
     ),
@@ -127,8 +127,8 @@ _LIMITED: Record[_Limited] = Record(
     "Limits of one quantity, in the unit at the end of its key.",
     Quantity("before", lambda one: one, "variance before the measurement", record=_SPLIT),
     Quantity("after", lambda one: one.after, "variance that each estimator leaves", record=_SPLIT),
-    Quantity("known", lambda one: one.known, "remaining standard deviation if that motion is known"),
-    Quantity("least_seen", lambda one: one, "least observable motions", record=_SEEN_LEAST),
+    Quantity("sigma_if_known", lambda one: one.sigma_if_known, "remaining standard deviation if that motion is known"),
+    Quantity("least_observable", lambda one: one, "least observable motions", record=_LEAST_OBSERVABLE),
     Quantity(
         "from_statement",
         lambda one: float(one.limits.from_statement[one.q]),

@@ -187,7 +187,7 @@ def _ledger(limits: MonitorLimits, lines: int) -> Table:
         name, contributions = quantity_text(quantity), limits.lines(BEST, q)
         prior = dict(limits.lines("", q))
         for motion, share in contributions[:lines]:
-            sigma_if_known = float(limits.known[motion][q])
+            sigma_if_known = float(limits.sigma_if_known[motion][q])
             rows.append((name, body_text(motion), 100.0 * prior[motion], 100.0 * share, sigma_if_known))
         rest = [motion for motion, _ in contributions[lines:]]
         before = 100.0 * sum(prior[motion] for motion in rest)
