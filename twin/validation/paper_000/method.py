@@ -1,6 +1,8 @@
-"""Paper 000's method: passes over ground points, by the tests of the library (scenes/orbit/angle*.yaml); its equations;
-what it supposes of the light, of the cameras' centres and of the camera itself, whose traced change the ground has to
-show; and its uses, the heights that one arc second makes (sections 0 and 3) and off-axis angles of other cameras.
+"""Checks of the method of paper 000: passes over ground points, the equations, the assumptions and the uses.
+
+The passes are the tests of the library (scenes/orbit/angle*.yaml). The assumptions concern the light, the projection
+centres of the cameras, and the camera itself, whose traced change has to be observable from the ground. The uses are
+the height error of one arc second (sections 0 and 3) and the off-axis angles of other cameras.
 """
 
 from __future__ import annotations
@@ -52,14 +54,14 @@ PAIRS = (("forward", "nadir"), ("nadir", "backward"))
 
 @dataclass(frozen=True, eq=False)
 class Passes:
-    """One pass and its repeated measurements.
+    """Pass with its repeated measurements.
 
     Attributes
     ----------
     flight : AnglePass
-        The truth.
-    measured : tuple[Measurement, ...]
-        With errors drawn anew each time; the light's effects are in the points and taken out again.
+        True pass.
+    measured : tuple of Measurement
+        Measurements with errors drawn anew each time; the effects of the light are in the points and are corrected.
     """
 
     flight: AnglePass
@@ -87,8 +89,9 @@ class Passes:
         return np.asarray(-np.copysign(1.0, normal[2]) * normal)
 
     def ahead(self, line: str) -> np.ndarray:
-        """The true line of sight of a line's centre made square to its true normal, (3,); along it the normal moves
-        when the plane is pitched.
+        """Return the true line of sight of a line's centre, orthogonalised to the line's true normal, (3,).
+
+        The normal moves along this direction when the plane is pitched.
         """
         camera = self.flight.cameras[line]
         look = camera.look(np.array([0.5 * (camera.pixels - 1)]))[0]
@@ -107,12 +110,15 @@ class Passes:
 
 
 def planes_of(measured: Measurement, method: Method, lines: Iterable[str] = LINES) -> list[PlaneFit]:
-    """Planes of lines through the measured station."""
+    """Fit the planes of lines through the measured station."""
     return [fit_plane(measured.station, measured.strips[line], method) for line in lines]
 
 
 def setup_of(name: str, **changes: object) -> AngleSetup:
-    """A test of the library; changes: fields of its `errors`, or latitude, longitude and direction of its pass."""
+    """Return a test of the library with changed errors or another pass.
+
+    Changes are fields of its `errors`, or the latitude, longitude and direction of its pass.
+    """
     setup = AngleSetup.read(name)
     test = setup.test
     place: dict[str, Any] = {key: changes.pop(key) for key in ("latitude", "longitude", "direction") if key in changes}
@@ -166,11 +172,14 @@ def _turned(camera: AngleCamera, turns: Mapping[str, tuple[float, float, float]]
 
 _STEP = 1e-3
 TWIST = np.radians(10.0 / 60.0)
-"""How far the forward array is turned about its line of sight for eq6.parallel, radians."""
+"""Rotation of the forward array about its line of sight for eq6.parallel, radians."""
 
 
 def sum_of_squares(slopes: Array, points: Array, station: Array) -> float:
-    """S of (2) for slopes a0, a1 (2,), with a2 by (1); points (n, 3) and station (3,), metres. Square metres."""
+    """Return S of eq. (2), in square metres, for slopes a0, a1 (2,), with a2 by eq. (1).
+
+    Points (n, 3) and station (3,) are in metres.
+    """
     x, y, z = points.T
     x0, y0, z0 = station
     a0, a1 = slopes
@@ -178,7 +187,7 @@ def sum_of_squares(slopes: Array, points: Array, station: Array) -> float:
 
 
 def derivatives(slopes: Array, points: Array, station: Array) -> Array:
-    """The left sides of (4), (2,), square metres."""
+    """Return the left sides of eq. (4), (2,), in square metres."""
     x, y, z = points.T
     x0, y0, z0 = station
     a0, a1 = slopes
@@ -187,7 +196,10 @@ def derivatives(slopes: Array, points: Array, station: Array) -> Array:
 
 
 def numerical_derivatives(slopes: Array, points: Array, station: Array) -> Array:
-    """Derivatives of S by central differences, (2,); of a square form they are exact but for rounding."""
+    """Return the derivatives of S by central differences, (2,).
+
+    For a quadratic form they are exact except for rounding.
+    """
     out = []
     for step in _STEP * np.eye(2):
         above, below = (sum_of_squares(slopes + sign * step, points, station) for sign in (1.0, -1.0))
@@ -196,8 +208,9 @@ def numerical_derivatives(slopes: Array, points: Array, station: Array) -> Array
 
 
 def least_slopes(points: Array, station: Array) -> Array:
-    """The slopes that make S least, (2,): the vertex of a parabola through its values, found twice, as the second time
-    it is near and keeps more digits.
+    """Return the slopes that minimise S, (2,), as the vertex of a parabola through its values.
+
+    The vertex is computed twice, because from nearby values the second one keeps more digits.
     """
     place, size = np.zeros(2), 1.0
     for _ in range(3):
@@ -225,27 +238,27 @@ class Planes:
 
     @cached_property
     def corrected(self) -> list[list[PlaneFit]]:
-        """By (5) with the right sign, [pass][line]."""
+        """Planes by eq. (5) with the correct sign, [pass][line]."""
         return [planes_of(m, "corrected") for m in self.passes.measured]
 
     @cached_property
     def printed(self) -> list[list[PlaneFit]]:
-        """By (5) as printed."""
+        """Planes by eq. (5) as printed, [pass][line]."""
         return [planes_of(m, "printed") for m in self.passes.measured]
 
     @cached_property
     def angles(self) -> Array:
-        """By (6) and (7) from the corrected planes, (passes, 2), radians."""
+        """Angles by eqs. (6) and (7) from the corrected planes, (passes, 2), radians."""
         return np.array([intersection_angles(*fits).printed for fits in self.corrected])
 
 
 def make_passes(context: Context) -> Passes:
-    """Measurements that all checks of the equations share."""
+    """Simulate the measurements that all checks of the equations share."""
     return repeated(setup_of(TEST), np.random.SeedSequence([context.seed, 1]), context.count(full=1000, fast=250))
 
 
 def twisted_passes(context: Context) -> tuple[Passes, Passes]:
-    """Measurements with the forward array turned by ±`TWIST` about its line of sight."""
+    """Simulate measurements with the forward array rotated by ±`TWIST` about its line of sight."""
     look, setup, count = np.radians(25.0), setup_of(TEST), context.count(full=300, fast=80)
     streams = np.random.SeedSequence([context.seed, 2]).spawn(2)
     one, other = (
@@ -446,7 +459,7 @@ def _light(context: Context, passes: Passes) -> Iterator[CheckResult]:
 
 
 def _refraction(passes: Passes, line: str) -> float:
-    """How much smaller an angle looks through a thin atmosphere under the station, first order, radians (negative)."""
+    """Return the first-order change of an angle by a thin atmosphere below the station, radians (negative)."""
     flight = passes.flight
     point = passes.points[line]
     arm = flight.station - point[len(point) // 2]
@@ -460,7 +473,7 @@ def _refraction(passes: Passes, line: str) -> float:
 
 
 def _traced(context: Context, passes: Passes) -> Iterator[CheckResult]:
-    """Measurements of a traced instrument that has changed since the laboratory."""
+    """Check measurements of a traced instrument that has changed since the laboratory."""
     flight = passes.flight
     first, second = flight.pairs["alpha"]
     lab = dihedral_angle(
@@ -482,7 +495,7 @@ def _traced(context: Context, passes: Passes) -> Iterator[CheckResult]:
 
 
 def _seen(passes: Passes, line: str) -> float:
-    """How far a line's projection centres turn its plane ahead, seen from the ground, radians."""
+    """Return the rotation of a line's plane by its projection centres, as observed from the ground, radians."""
     flight = passes.flight
     camera = flight.laboratory[line]
     origin, look = camera.origin(flight.pixel[line]), camera.look(flight.pixel[line])
@@ -495,12 +508,12 @@ def _seen(passes: Passes, line: str) -> float:
 
 
 def height_passes(context: Context) -> Passes:
-    """One pass of th1 for the heights."""
+    """Simulate one pass of th1 for the heights."""
     return repeated(setup_of(TEST), np.random.SeedSequence([context.seed, 6]), 2)
 
 
 def off_axis_passes(context: Context) -> Passes:
-    """Measurements of all five lines."""
+    """Simulate measurements of all five lines."""
     seed = np.random.SeedSequence([context.seed, 7])
     return repeated(setup_of(OFF_AXIS), seed, context.count(full=800, fast=120))
 

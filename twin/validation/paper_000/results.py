@@ -1,9 +1,8 @@
-"""Paper 000's results: its Table 1, planes against resection, and what the text says of Figs. 3 to 5, sentence by
-sentence, with the number that decides each.
+"""Checks of the results of paper 000: Table 1, planes against resection, and the statements about Figs. 3 to 5.
 
-The words on the figures have no numbers: "far more" is taken as at least twice, "very near" as within a quarter,
-"little" as at most a quarter of the largest, and a slope that grows as one that grows by 5 %, the least that shows in a
-figure.
+Each statement of the text is decided by a number. The words on the figures have no numbers: "far more" is taken as at
+least twice, "very near" as within a quarter, "little" as at most a quarter of the largest, and a slope that grows as
+one that grows by 5 %, the least that is visible in a figure.
 """
 
 from __future__ import annotations
@@ -155,7 +154,7 @@ def _rms(bias: float, spread: float, factor: float) -> float:
 
 
 def _points(response: Callable[[float], float]) -> list[Chosen]:
-    """The ground points, on which the scatter of an angle hangs; response: of what is measured to a factor on that."""
+    """Return the error of the ground points as an input on which the scatter of an angle depends."""
     return [
         Chosen("error of a point", POINT_SIGMA, "m", response),
         Chosen("points on a line", POINTS, "1", lambda factor: response(factor**-0.5)),
@@ -192,7 +191,7 @@ def _pitch_variance(passes: Passes, line: str) -> float:
 
 
 def _distance(off: Array, covariance: Array) -> float:
-    """Mahalanobis distance of a pair."""
+    """Return the Mahalanobis distance of a pair."""
     return float(np.sqrt(off @ np.linalg.solve(covariance, off)))
 
 
@@ -234,22 +233,22 @@ PANELS = {
 
 @dataclass(frozen=True)
 class Sentence:
-    """One statement of the text: how `angle` answers when `what` is moved.
+    """Statement of the text about the response of `angle` when `what` is moved.
 
     Attributes
     ----------
     name : str
-        Of the row, without the paper.
+        Name of the row, without the paper.
     kind : Kind
-        What is said.
+        Kind of statement.
     what : str
         "station", or the line whose points move.
     angle : Angle
-        Of which it is said.
-    axes : tuple[str, ...]
-        Of which it is said; for signs those along which the angle rises.
-    others : tuple[str, ...]
-        With which they are compared; for signs those along which it falls.
+        Angle that the statement is about.
+    axes : tuple of str
+        Axes that it is about; for signs those along which the angle rises.
+    others : tuple of str
+        Axes that they are compared with; for signs those along which the angle falls.
     """
 
     name: str
@@ -261,18 +260,18 @@ class Sentence:
 
     @property
     def row(self) -> Check:
-        """What is compared."""
+        """Row of the validation for this statement."""
         return load_printed("000").groups["000.figures"].rows[f"000.{self.name}"]
 
     @property
     def implied(self) -> float:
-        """What the sentence asks of `measure`."""
+        """Value of `measure` that the statement implies."""
         return {
             "signs": 0.0, "largest": 1.0, "far": FAR, "alike": ALIKE, "little": LITTLE, "grows": GROWS, "opposite": 1.0,
         }[self.kind]  # fmt: skip
 
     def measure(self, rises: Rises, growth: Rises) -> float:
-        """The number that decides; growth: relative growth of the slopes, by the same keys."""
+        """Return the number that decides, from the rises of the angles and the relative growth of their slopes."""
 
         def rise(axis: str, angle: Angle = self.angle) -> float:
             return rises[self.what, angle, axis]
@@ -291,7 +290,7 @@ class Sentence:
         return max((-rise(axis, "beta") / rise(axis, "alpha") for axis in AXES), key=lambda ratio: abs(ratio - 1.0))
 
     def holds(self, rises: Rises, growth: Rises) -> bool:
-        """Whether the number says so, as the row compares it."""
+        """Return True if the number confirms the statement, as the row compares it."""
         return self.row.outside(self.measure(rises, growth), self.implied) <= self.row.tolerance
 
 
@@ -321,7 +320,7 @@ SENTENCES: tuple[Sentence, ...] = (
 def sensitivity_svg(
     figure: Figure, amount: Array, change: Mapping[tuple[str, str, str], Array], panels: Sequence[tuple[str, str]]
 ) -> None:
-    """A panel for each (what is moved, angle): a curve for each axis, arcsec over metres."""
+    """Draw a panel for each pair of moved object and angle, with a curve for each axis, arcsec over metres."""
     for axes, (what, angle) in zip(figure.subplots(1, 2, sharey=True), panels, strict=True):
         axes.axhline(0.0, color=GREY, lw=0.8)
         ends = {}
@@ -344,7 +343,7 @@ def sensitivity_svg(
 
 @drawing("places-000", 3.6)
 def places_svg(figure: Figure, held: Mapping[Place, int], total: int, marked: Sequence[Place]) -> None:
-    """How many sentences hold by place."""
+    """Draw the number of confirmed statements by geographic position."""
     axes = figure.subplots()
     lat, lon = (np.unique([place[k] for place in held]) for k in (0, 1))
     grid = np.array([[held[a, b] for b in lon] for a in lat])
@@ -376,7 +375,7 @@ class Answers:
 
     @classmethod
     def of(cls, table: Sequence[Sensitivity]) -> Answers:
-        """From the rows for every thing that is moved along every axis."""
+        """Return the answers from the rows for every moved object along every axis."""
         change = {
             (row.what, angle, row.axis): row.change[k] / ARCSEC for row in table for k, angle in enumerate(row.angles)
         }
@@ -400,7 +399,7 @@ class Answers:
 def make_passes(
     context: Context, place: Place | None = None, count: int | None = None, direction: str = "descending"
 ) -> Passes:
-    """Measurements at the place of the library's test, or at another (latitude, longitude), degrees."""
+    """Simulate measurements at the position of the library's test, or at another (latitude, longitude), degrees."""
     at: dict[str, Any] = {"direction": direction}
     if place is not None:
         at |= {"latitude": np.radians(place[0]), "longitude": np.radians(place[1])}
@@ -456,7 +455,7 @@ def _row(
 
 
 def _place(sentences: Sequence[Sentence], places: Mapping[Place, Answers]) -> Supposed:
-    """Where all of some sentences hold."""
+    """Return the positions where all of some statements are confirmed, as a choice."""
     held = sum(all(s.holds(a.rises, a.growth) for s in sentences) for a in places.values())
     text = f"holds at {held} of {len(places)} places from 25° to 50° N and 80° to 130° E"
     return Supposed("a descending pass over 40° N 116° E", text)

@@ -1,5 +1,7 @@
-"""Paper 003's checks over campaigns of seven test fields: quality of orbit and attitude, stability of the calibration,
-Tables 6 and 7, schemes of parameters, 1:50 000, with figures and tables.
+"""Checks of paper 003 over campaigns of seven test fields, with figures and tables.
+
+They cover the quality of orbit and attitude, the stability of the calibration, Tables 6 and 7, the schemes of
+parameters, and the accuracy for maps of 1:50 000.
 """
 
 from __future__ import annotations
@@ -108,7 +110,10 @@ class Flights:
 def flown(
     setup: CalibrationSetup, seeds: Sequence[np.random.SeedSequence], step: Callable[[int], None]
 ) -> list[Campaign]:
-    """Campaigns whose noise the adjustment takes as each exposure's own, which hardly changes what it estimates."""
+    """Simulate campaigns for an adjustment that treats the noise of each exposure as independent.
+
+    This hardly changes the estimates.
+    """
     out = []
     for k, seed in enumerate(seeds):
         step(k)
@@ -154,8 +159,10 @@ def flights_of(campaigns: Sequence[Campaign]) -> Flights:
 
 
 def _expected(campaign: Campaign, names: tuple[str, ...], floor: np.ndarray) -> np.ndarray:
-    """(S, K) RMS in plan from the true biases: a field's roll and pitch less the scheme's mean, times the height of
-    flight, beside the noise of the check points themselves. Yaw moves the swath's ends by 0.2 m for 1 arcsec.
+    """Return the (S, K) RMS in plan that the true biases imply.
+
+    It is a field's roll and pitch minus the scheme's mean, times the height of flight, and the noise of the check
+    points. Yaw moves the ends of the swath by 0.2 m for 1 arcsec.
     """
     true = {p.name: p.bias for p in campaign.passes}
     above = np.array([_above(p) for p in campaign.passes])
@@ -168,7 +175,7 @@ def _expected(campaign: Campaign, names: tuple[str, ...], floor: np.ndarray) -> 
 
 
 def _slopes(latitude: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(3,) amplitudes of sin(latitude - middle) in true biases (K, 3), and over their standard deviations."""
+    """Return the (3,) amplitudes of sin(latitude - middle) in true biases (K, 3), and their ratios to sigma."""
     reference = 0.5 * (latitude.min() + latitude.max())
     design = np.column_stack([np.sin(latitude - reference), np.ones_like(latitude)])
     best, square, _, _ = np.linalg.lstsq(design, true, rcond=None)
@@ -184,25 +191,28 @@ def _above(one: FieldPass) -> float:
 
 
 def lines_of(part: str) -> list[int]:
-    """Places in INNER of an element, ``f``, ``x`` or ``y``, of all lines."""
+    """Return the indices in INNER of an element, ``f``, ``x`` or ``y``, of all lines."""
     return [INNER.index(f"{line} {part}") for line in LINES]
 
 
 @dataclass(frozen=True, eq=False)
 class Quality:
-    """Passes of all campaigns, (N, K, 3): metres for the orbit's x, y, z in the Earth-fixed frame, radians for roll,
-    pitch, yaw of the attitude against the orbital frame.
+    """Quality of orbit and attitude of the passes of all campaigns.
+
+    All arrays are (N, K, 3): metres for the orbit's x, y, z in the Earth-fixed frame, radians for roll, pitch, yaw of
+    the attitude against the orbital frame.
 
     Attributes
     ----------
-    orbit, attitude : np.ndarray
-        RMS of the third differences of what is measured.
-    orbit_sigma, attitude_sigma : np.ndarray
+    orbit, attitude : (N, K, 3) ndarray
+        RMS of the third differences of the measurements.
+    orbit_sigma, attitude_sigma : (N, K, 3) ndarray
         Standard deviation of a reading that they imply.
-    orbit_error : np.ndarray
-        RMS of measured minus true. attitude_error: of measured against true, less its mean over the pass.
-    attitude_jump : np.ndarray
-        Standard deviation of a reading's own error, from measured less true of neighbouring readings.
+    orbit_error, attitude_error : (N, K, 3) ndarray
+        RMS of measured minus true values; of the attitude without its mean over the pass.
+    attitude_jump : (N, K, 3) ndarray
+        Standard deviation of the independent error of a reading, from measured minus true values of neighbouring
+        readings.
     """
 
     orbit: np.ndarray
@@ -239,7 +249,7 @@ def _pass(setup: CalibrationSetup, one: FieldPass) -> tuple[np.ndarray, ...]:
 
 
 def _readings(first: float, last: float, interval: float) -> np.ndarray:
-    """Times of the readings inside the span, seconds."""
+    """Return the times of the readings inside a span, seconds."""
     return interval * np.arange(np.ceil(first / interval - _EDGE), np.floor(last / interval + _EDGE) + 1.0)
 
 
@@ -324,7 +334,7 @@ def _interior(context: Context, flights: Flights, number: int, parts: tuple[str,
 
 @drawing("paper-003-schemes", 4.6)
 def schemes_svg(figure: Figure, found: Flights, plan: float, height: float) -> None:
-    """RMS in plan and height, scheme 0 being before calibration, on logarithmic axes with the limits."""
+    """Draw the RMS in plan and height on logarithmic axes with the limits; scheme 0 is before calibration."""
     panels = figure.subplots(1, 2)
     names = ["0\nlaboratory", "1\n1 field", "2\n2 fields", "3\n4 fields", "4\n6 fields", "5\nits own"]
     for axes, what, limit in zip(panels, ("plan", "height"), (plan, height), strict=True):
@@ -443,8 +453,10 @@ def _per_shift(setup: CalibrationSetup) -> float:
 
 
 def _varied(measured: float, flights: Flights, statistic: Callable[[np.ndarray], np.ndarray]) -> Chosen:
-    """The biases' variation between the fields: what the true biases imply of the (N, S, K) RMS in plan, with it times
-    a factor, gives the median of a statistic (N,), and how that changes.
+    """Return the variation of the biases between the fields as a chosen input.
+
+    A factor on it scales what the true biases imply of the (N, S, K) RMS in plan; the response is the median of a
+    statistic (N,).
     """
     floor = flights.plan_floor[:, None, :]
     turned = np.sqrt(np.maximum(flights.expected**2 - floor**2, 0.0))
@@ -457,12 +469,12 @@ def _varied(measured: float, flights: Flights, statistic: Callable[[np.ndarray],
 
 
 def _span(values: np.ndarray) -> np.ndarray:
-    """(N,) largest over smallest of (N, K)."""
+    """Return the (N,) ratios of largest to smallest value of (N, K)."""
     return np.asarray(values.max(axis=1) / values.min(axis=1))
 
 
 def _findings(context: Context, flights: Flights) -> Iterator[CheckResult]:
-    """What the paper says of the schemes, by statistics of the RMS in plan."""
+    """Check the paper's statements about the schemes by statistics of the RMS in plan."""
     plan = flights.plan
     # of RMS (N, S, K): scatter over the fields by one scheme over that by six fields; largest over smallest and mean by
     # six fields over those by one; the same of the field that is in no mean

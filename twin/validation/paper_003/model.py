@@ -1,5 +1,7 @@
-"""Checks of paper 003's rigorous model: on exact points, on marks on the ground and matched points in rendered images,
-and on drawn points, with the figure of what the points cannot tell.
+"""Checks of the rigorous model of paper 003.
+
+They use exact points, marks on the ground and matched points in rendered images, and drawn points. A figure shows the
+combination of parameters that the points cannot determine.
 """
 
 from __future__ import annotations
@@ -73,7 +75,7 @@ _TERRAIN: dict[str, Any] = {"kind": "fractal", "relief": "30 m", "exponent": 2.4
 
 
 def setup_of(file: str, fields: Sequence[str] = (), **changes: Any) -> CalibrationSetup:
-    """A file of the library with some of its fields and with other values of its test's attributes."""
+    """Return a file of the library with some of its fields and with other values of its test's attributes."""
     setup = CalibrationSetup.read(SCENES / ORBIT / file)
     if fields:
         chosen = FrozenMap({name: setup.test.fields[name] for name in fields})
@@ -82,20 +84,22 @@ def setup_of(file: str, fields: Sequence[str] = (), **changes: Any) -> Calibrati
 
 
 def changed(setup: CalibrationSetup, **changes: Any) -> CalibrationSetup:
-    """A setup with other values of its test's attributes."""
+    """Return a setup with other values of its test's attributes."""
     return setup.model_copy(update={"test": setup.test.model_copy(update=changes)})
 
 
 def without_light(setup: CalibrationSetup) -> CalibrationSetup:
-    """A setup without light time, aberration and refraction, which the paper does not mention. The adjustment removes
-    them from image points to 0.004 px, and a flight without them takes half the time.
+    """Return a setup without light time, aberration and refraction, which the paper does not mention.
+
+    The adjustment removes them from image points to 0.004 px, and a flight without them takes half the time.
     """
     return changed(setup, effects=_NO_LIGHT)
 
 
 def exact_and_images() -> CalibrationSetup:
-    """One field with the detectors that images need, with exact image points, control and orbit, no light's effects,
-    and an attitude with a constant bias only.
+    """Return a setup of one field with exact points and with the detectors that images need.
+
+    Image points, control and orbit are exact, the light has no effects, and the attitude has a constant bias only.
     """
     points = setup_of(FIELDS).test.points
     setup = without_light(setup_of(IMAGES, (FIELD,), images=None, points=points))
@@ -106,7 +110,7 @@ def exact_and_images() -> CalibrationSetup:
 
 
 def all_errors(value: float) -> Chosen:
-    """What is assumed of biases, orbit, attitude and points, to which the errors of a calibration are proportional."""
+    """Return the errors of biases, orbit, attitude and points, to which those of a calibration are proportional."""
     return Chosen.power("biases and errors of scenes/orbit/calibrate.yaml, times", 1.0, "1", value)
 
 
@@ -166,12 +170,12 @@ class Turned:
         return self.base.inertial_velocity(seconds)
 
     def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
-        """Turned."""
+        """Return the rotated attitude."""
         return np.asarray(self.base.body_to_itrs(seconds) @ Rotation.from_euler("XYZ", self.angles).as_matrix())
 
 
 def rays_at(sensor: Sensor, attitude: Platform, pitch: float, line: np.ndarray, pixel: np.ndarray) -> Rays:
-    """Rays of image points with the station and the given attitude of their exposure times."""
+    """Return the rays of image points with the station and the given attitude at their exposure times."""
     seconds = sensor.time(line)
     y = pitch * (pixel - 0.5 * (sensor.camera.pixels - 1))
     image = np.column_stack([np.zeros_like(y), y])
@@ -181,22 +185,24 @@ def rays_at(sensor: Sensor, attitude: Platform, pitch: float, line: np.ndarray, 
 
 
 def derivatives(setup: CalibrationSetup, one: FieldPass, bias: np.ndarray) -> tuple[str, str, float]:
-    """Coefficients of the error equations against image points of the rigorous sensor: each unknown of the sensor is
-    changed a little; what the unchanged model then misses is minus its coefficient.
+    """Compare the coefficients of the error equations with finite changes of the rigorous sensor.
+
+    Each unknown of the sensor is changed slightly; the resulting misclosure of the unchanged model is minus its
+    coefficient.
 
     Parameters
     ----------
     setup : CalibrationSetup
-        cameras.
+        Cameras.
     one : FieldPass
-        a pass; its check points are taken.
-    bias : np.ndarray
-        (3,) from the measured to the true attitude, radians.
+        Pass whose check points are used.
+    bias : (3,) ndarray
+        Rotation from the measured to the true attitude, radians.
 
     Returns
     -------
-    tuple[str, str, float]
-        Line and unknown that are farthest off, and their largest difference over the largest coefficient.
+    tuple of (str, str, float)
+        Line and unknown with the largest deviation, and its largest difference relative to the largest coefficient.
     """
     payload = changed_payload(setup.test, setup.camera)
     ground, still = one.check_ground, np.zeros(3)
@@ -223,8 +229,9 @@ def derivatives(setup: CalibrationSetup, one: FieldPass, bias: np.ndarray) -> tu
 def places_seen(
     setup: CalibrationSetup, one: FieldPass, line: str, interior: np.ndarray, bias: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lines and pixels of the check points in a line with a changed f, x, y (3,) that is turned by a bias (3,), by the
-    rigorous sensor.
+    """Return lines and pixels of the check points in a line with changed f, x, y (3,) and an attitude bias (3,).
+
+    They are those of the rigorous sensor.
     """
     turned = Turned(one.trajectory, bias)
     return true_sensors(setup, one, turned, {line: interior})[line].image(one.check_ground)
@@ -260,15 +267,21 @@ def errors_of(campaign: Campaign, one: FieldPass, found: Adjustment | Stepwise) 
 
 @dataclass(frozen=True, eq=False)
 class Rank:
-    """What the twelve unknowns of a field leave open.
+    """Combinations that the twelve unknowns of a field leave undetermined.
 
     Attributes
     ----------
     unknowns : int
-        How many. open: combinations. weak_sigma: of nadir y, metres, with nadir x held.
+        Number of unknowns.
+    open : int
+        Number of undetermined combinations.
+    weak_sigma : float
+        Sigma of nadir y, in metres, with nadir x fixed.
     moved : float
-        RMS that the rigorous sensor's image points move by when the open combination is carried out, x of every line
-        0.1 mm. alone: when only the x are. Pixels.
+        RMS displacement of the rigorous sensor's image points, in pixels, by the undetermined combination with 0.1 mm
+        in x of every line.
+    alone : float
+        RMS displacement by the changes of x alone, in pixels.
     """
 
     unknowns: int
@@ -284,7 +297,7 @@ class Rank:
 
 
 def rank_of(setup: CalibrationSetup, campaign: Campaign) -> Rank:
-    """The null vectors of one field by itself, and the first of them carried out by the sensor."""
+    """Compute the null vectors of one field, and apply the first of them to the sensor."""
     one = campaign.passes[0]
     own = campaign.independent
     found = adjust([one.control], own.laboratory, own.noise, gauge=GAUGE)
@@ -402,8 +415,9 @@ def rendered_marks(setup: CalibrationSetup, campaign: Campaign, seed: np.random.
 
 
 def missed(setup: CalibrationSetup, campaign: Campaign, marks: dict[str, FoundMarks]) -> dict[str, np.ndarray]:
-    """Line -> (n, 2) misclosure of the analysis's model at the marks, pixels: with the true interior and bias, the
-    measured attitude and the known ground.
+    """Return the (n, 2) misclosures of the analysis's model at the marks of each line, in pixels.
+
+    The model has the true interior orientation and bias, the measured attitude and the known ground.
     """
     one = campaign.passes[0]
     out = {}
@@ -445,20 +459,22 @@ def _matched(predicted: tuple[np.ndarray, np.ndarray], at: np.ndarray, ground: n
 
 @dataclass(frozen=True, eq=False)
 class FromImages:
-    """One field.
+    """Calibration of one field from images.
 
     Attributes
     ----------
     name : str
-        Of it.
+        Name of the field.
     control, check : int
-        Points that are left.
+        Numbers of accepted points.
     way : Stepwise
-        The stepwise solution. together: the simultaneous one, for sigmas.
-    error : dict[str, float]
-        Unknown -> stepwise estimate minus truth, radians and metres; free ones only.
-    covariance : np.ndarray
-        Of these, in their order.
+        Stepwise solution.
+    together : object
+        Simultaneous solution, for sigmas.
+    error : dict of str to float
+        Stepwise estimate minus truth of each free unknown, radians and metres.
+    covariance : ndarray
+        Covariance of these unknowns, in their order.
     before, after : CheckErrors
         Errors at check points with the laboratory's camera and with the field's parameters.
     """
@@ -474,7 +490,7 @@ class FromImages:
     after: CheckErrors
 
     def rms(self, names: tuple[str, ...]) -> tuple[float, float]:
-        """RMS error of some unknowns and the standard deviation of that, by their covariance."""
+        """Return the RMS error of some unknowns and its standard deviation by their covariance."""
         where = [list(self.error).index(n) for n in names]
         part = self.covariance[np.ix_(where, where)]
         # variance of a sum of squares of correlated normal errors is twice the trace of the squared covariance
@@ -490,8 +506,9 @@ def calibrated(campaign: Campaign) -> tuple[FromImages, ...]:
 
 
 def matching(campaign: Campaign) -> tuple[float, int, int]:
-    """RMS of right places of control points against the truth over lines and pixels, px; places of all points that
-    pass the matching, and those of them that are wrong by truth.
+    """Return the matching error of control points and the numbers of accepted and of wrong positions.
+
+    The error is the RMS of correct positions against the truth over lines and pixels, in pixels.
     """
     assert campaign.images is not None
     patches = [patch.judgements for field in campaign.images for patch in field.patches]
@@ -530,7 +547,7 @@ def _field(campaign: Campaign, one: FieldPass) -> FromImages:
 
 
 def summary(found: FromImages, names: tuple[str, ...]) -> str:
-    """Errors and sigmas of some unknowns of a field, in words."""
+    """Return errors and sigmas of some unknowns of a field as text."""
     sigma = dict(zip(found.error, np.sqrt(np.diag(found.covariance)).tolist(), strict=True))
     parts = []
     for n in names:
@@ -541,7 +558,7 @@ def summary(found: FromImages, names: tuple[str, ...]) -> str:
 
 @drawing("paper-003-open", 3.4)
 def open_svg(figure: Figure, rank: Rank, walk: Walk) -> None:
-    """Bars of the open combination, and sigmas over rounds."""
+    """Draw bars of the undetermined combination, and sigmas over rounds."""
     left, right = figure.subplots(1, 2)
     one = rank.open[0]
     names = [n if n.split()[-1] in "fxy" else n.split()[-1] for n in one.names]
@@ -625,7 +642,7 @@ def _simulated(context: Context, seed: np.random.SeedSequence) -> Iterator[Check
 
 
 def image_setup(fast: bool) -> CalibrationSetup:
-    """Fields of rendered images: one with fewer points in the fast run."""
+    """Return the fields of rendered images; the fast run has one field with fewer points."""
     setup = setup_of(IMAGES, (FIELD,) if fast else (FIELD, "Anhui"))
     if not fast:
         return setup

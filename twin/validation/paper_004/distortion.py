@@ -1,9 +1,9 @@
-"""Paper 004, sections 3.1 and 3.3: equations (1) to (4), Table 2 and the sources of error, by distortion tests from
-rendered collimator spots and by exact chief rays.
+"""Checks of paper 004, sections 3.1 and 3.3: equations (1) to (4), Table 2 and the sources of error.
 
-Measured: places of spots in rendered images, angles by the readings of a compensated turntable. True: chief rays of the
-as-built camera traced at the true angles, and the camera without distortion that is nearest to them. Without noise the
-equations are solved on chief rays of the camera as designed.
+Distortion tests use rendered collimator spots and exact chief rays. Measured: positions of spots in rendered images,
+angles from the readings of a compensated turntable. True: chief rays of the as-built camera traced at the true angles,
+and the nearest camera without distortion. Without noise the equations are solved on chief rays of the camera as
+designed.
 """
 
 from __future__ import annotations
@@ -71,23 +71,24 @@ class Perspective:
 
     @property
     def slope(self) -> float:
-        """Slope dL / d tan W at the middle, f / cos² w, metres: what stands for f in (1), which expands to the first
-        order of w. It differs from f by p² / f.
+        """Slope dL / d tan W at the middle, f / cos² w, in metres.
+
+        It takes the place of f in eq. (1), which expands to first order in w; it differs from f by p² / f.
         """
         return self.f + self.p**2 / self.f
 
     @classmethod
     def nearest(cls, where: Array, turn: Array, tilted: bool = True) -> Perspective:
-        """By nonlinear least squares, nothing expanded; with p = 0 unless ``tilted``.
+        """Fit the perspective by nonlinear least squares without expansion; p = 0 unless ``tilted``.
 
         Parameters
         ----------
-        where : Array
-            Of chief rays along the line, (N,), metres.
-        turn : Array
-            W of their directions, (N,), radians.
+        where : (N,) ndarray
+            Positions of chief rays along the line, metres.
+        turn : (N,) ndarray
+            Angles W of their directions, radians.
         tilted : bool
-            Whether p is sought.
+            True to estimate p.
         """
         start = (where[-1] - where[0]) / (np.tan(turn[-1]) - np.tan(turn[0]))
 
@@ -102,7 +103,7 @@ class Perspective:
 
 @dataclass(frozen=True, eq=False)
 class SpotTest:
-    """What one rendered test gives for the equations, and the truth."""
+    """Data of one rendered test for the equations, with the truth."""
 
     run: SimulatedDistortion
 
@@ -143,12 +144,13 @@ class SpotTest:
 
     @property
     def zero(self) -> float:
-        """By how much the zero of W is wrong, mean over the points, radians."""
+        """Error of the zero of W, mean over the points, in radians."""
         return float(np.mean(self.turn - self.true_turn))
 
     def shifted(self, *powers: int) -> tuple[Array, Array]:
-        """What the wrong zero alone does to a least-squares fit of these powers of tan W to the chief rays:
-        coefficients (P,) and what stays in the residual (N,), metres.
+        """Return the effect of the wrong zero alone on a least-squares fit of powers of tan W to the chief rays.
+
+        The effect consists of coefficients (P,) and of the residuals (N,), in metres.
         """
         columns = np.tan(self.true_turn)[:, None] ** np.array(powers)
         # what the camera images to W stands beside W + zero
@@ -193,7 +195,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 
 def measured_tests(context: Context) -> list[SimulatedDistortion]:
-    """Tests from rendered spots, each with a turntable of its own."""
+    """Run tests with rendered spots, each with another turntable."""
     with one_blas_thread():
         context.progress(0.0, "build the bench")
         bench = DistortionBench.build(DistortionSetup.read(TEST), context.backend)
@@ -211,7 +213,7 @@ def lower(raw: float | np.floating, compensated: float | np.floating) -> float:
 
 
 def _table2(context: Context) -> Iterator[CheckResult]:
-    """What the printed columns give."""
+    """Check the printed columns of Table 2."""
     raw, own = RAW, COMPENSATED
     changed = raw != own
     top = [np.eye(len(raw))[np.argmax(values)] for values in (raw, own)]
@@ -234,7 +236,7 @@ def _table2(context: Context) -> Iterator[CheckResult]:
 
 
 Facts = Mapping[str, Any]
-"""What the texts of all rows of rendered tests may name."""
+"""Facts that the texts of all rows of rendered tests may name."""
 
 
 def _eq1(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[CheckResult]:
@@ -251,7 +253,7 @@ def _eq1(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[
 
 
 def _by_eq1(test: SpotTest, turn: Array) -> float:
-    """RMS error of D by (1) with f and p of (2), metres."""
+    """Return the RMS error of D by eq. (1) with f and p of eq. (2), in metres."""
     f, p = principal_distance_and_point(test.place, turn)
     return rms(distortion(test.place, turn, f, p) - test.camera.rest)
 
@@ -275,7 +277,7 @@ def _eq2(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[
         return context.row("004.eq2.f", value, sigma, truth, equation=equation, scatter=scatter, **facts)
 
     def zero(found: Array, predicted: Array, equation: str) -> CheckResult:
-        """The principal point by a printed equation: the error of the zero comes out as p."""
+        """Check the principal point by a printed equation; the error of the zero appears as p."""
         error, turn = found - p_true, rms([t.zero for t in tests])
         more: dict[str, Any] = {
             "equation": equation,
@@ -314,7 +316,7 @@ def _uneven(
     identifier: str,
     solve: Callable[[SpotTest, tuple[Array, Array]], Any],
 ) -> CheckResult:
-    """The principal point by an equation, given a test with its places and angles, over the uneven points."""
+    """Check the principal point by an equation over unevenly spaced points."""
     found = np.array([solve(t, (t.place[UNEVEN], t.zeroed[UNEVEN])) for t in tests])
     true, turn = np.array([t.part.p for t in tests]), tests[0].true_turn[UNEVEN]
     scatter = MM * float(np.std(found - true, ddof=1))
@@ -324,7 +326,7 @@ def _uneven(
 
 
 def _sensitivity(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[CheckResult]:
-    """The rows of the sources of error."""
+    """Check the rows of the sources of error."""
     if not context.wants("004.sensitivity"):
         return
     half = np.flatnonzero(np.abs(tests[0].run.bench.field_angle) <= 0.5 * tests[0].run.bench.field_angle[-1])
@@ -369,7 +371,7 @@ def _ratio(over: Array, under: Array, column: int) -> float:
 
 
 def _errors_of_tests(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[CheckResult]:
-    """What is left of the dividing error in the angles of the tests, and of the distortion's error."""
+    """Check the remaining dividing error of the angles and the remaining error of the distortion."""
     own, raw = (
         np.array([np.std(angle(t) - t.true_turn) for t in tests]) / ARCSEC
         for angle in (lambda t: t.turn, lambda t: t.run.raw.fit.angle)
@@ -402,8 +404,9 @@ def _errors_of_tests(context: Context, tests: Sequence[SpotTest], facts: Facts) 
 
 
 def _moved(test: SpotTest) -> Array:
-    """By how much a correction of the readings moves the distortion of each point, (N,), metres: f times the
-    correction, less what zero, f and p take up of it.
+    """Return the change of the distortion at each point by a correction of the readings, (N,), in metres.
+
+    It is f times the correction, without the part that zero, f and p absorb.
     """
     correction = test.camera.f * (test.turn - test.run.raw.fit.angle)
     columns = np.tan(test.turn)[:, None] ** np.arange(3)
@@ -411,7 +414,7 @@ def _moved(test: SpotTest) -> Array:
 
 
 def _errors(tests: Sequence[SpotTest]) -> Array:
-    """RMS error of the distortion with raw and with compensated angles, (T, 2), micrometres."""
+    """Return the RMS errors of the distortion with raw and with compensated angles, (T, 2), in micrometres."""
     runs = [test.run for test in tests]
     return np.array([[UM * rms(run.error(m)) for m in (run.raw, run.compensated)] for run in runs])
 
@@ -442,7 +445,8 @@ def _show(context: Context, tests: Sequence[SpotTest]) -> None:
 
 
 def _statistics(raw: Array, compensated: Array) -> list[Cell]:
-    """RMS, mean and largest over the points of each test (T, N), and by how much they fall: medians of the tests."""
+    """Return RMS, mean and maximum over the points of each test (T, N), and their reductions, as medians of the tests.
+    """
     out: list[Cell] = []
     for size in (lambda v: np.sqrt(np.mean(v**2, axis=1)), lambda v: np.mean(v, axis=1), lambda v: np.max(v, axis=1)):
         before, after = size(raw), size(compensated)
@@ -453,8 +457,9 @@ def _statistics(raw: Array, compensated: Array) -> list[Cell]:
 
 @drawing("reduction-004", 4.2)
 def reduction_svg(figure: Figure, errors: NDArray[np.float64], paper: tuple[float, float], reduction: float) -> None:
-    """RMS with compensated over RMS with raw angles, micrometres, of each test (T, 2), raw and compensated, and of the
-    paper's Table 2, with the reduction that the paper claims.
+    """Draw the RMS with compensated over the RMS with raw angles, of each test and of the paper.
+
+    The errors are (T, 2), raw and compensated, in micrometres; the reduction is the one that the paper claims.
     """
     axes = figure.subplots()
     top = 1.08 * max(float(np.max(errors)), *paper)
@@ -475,8 +480,10 @@ def reduction_svg(figure: Figure, errors: NDArray[np.float64], paper: tuple[floa
 
 @drawing("principal-point-004", 3.6)
 def points_svg(figure: Figure, by_eq2: NDArray[np.float64], free: NDArray[np.float64]) -> None:
-    """Principal points of T tests: error of the zero in arcsec, p of (2) and p that the zero explains in mm, (T, 3); p
-    with a constant term and its sigma, mm, (T, 2).
+    """Draw the principal points of T tests.
+
+    The first array (T, 3) has the error of the zero in arcsec, p of eq. (2) and the p that the zero explains in mm; the
+    second (T, 2) has p with a constant term and its sigma, in mm.
     """
     left, right = figure.subplots(1, 2)
     zero, found, explained = by_eq2[np.argsort(by_eq2[:, 0])].T
@@ -495,8 +502,10 @@ def points_svg(figure: Figure, by_eq2: NDArray[np.float64], free: NDArray[np.flo
 
 
 def chief_rays(setup: DistortionSetup, backend: Backend) -> Callable[[Array], Array]:
-    """Exact mapping of the camera as designed: turns W (N,), radians, of a table that turns about the camera's X, to
-    places L (N,), metres, of chief rays along the line, counted from where W = 0 is imaged.
+    """Return the exact mapping of the camera as designed from rotations of a table to image positions.
+
+    Rotations W (N,), in radians, are about the camera's X; positions L (N,), in metres, are those of chief rays along
+    the line, from the image of W = 0.
     """
     test = setup.test
     camera = build_camera_under_test(test, setup.camera, backend)
@@ -513,7 +522,7 @@ def chief_rays(setup: DistortionSetup, backend: Backend) -> Callable[[Array], Ar
 
 
 def run_equations(context: Context) -> Iterator[CheckResult]:
-    """The printed equations on traced chief rays, without noise."""
+    """Check the printed equations on traced chief rays, without noise."""
     context.progress(0.0, "trace chief rays")
     setup = DistortionSetup.read(TEST)
     places = chief_rays(setup, context.backend)
@@ -529,7 +538,7 @@ def run_equations(context: Context) -> Iterator[CheckResult]:
 
 
 def _turn_to(places: Callable[[Array], Array], wanted: float, most: float) -> float:
-    """W within +-``most`` that is imaged to a place on the line, radians."""
+    """Return the W within +-``most`` that is imaged to a position on the line, in radians."""
     return float(brentq(lambda w: float(places(np.array([w]))[0]) - wanted, -most, most, xtol=1e-14))
 
 
@@ -553,7 +562,7 @@ def _ignored(context: Context, places: Callable[[Array], Array], turn: Array, pi
 
 
 def _solutions(context: Context, places: Callable[[Array], Array], edge: float) -> Iterator[CheckResult]:
-    """(2), (3), (4) against a singular value decomposition of (1)."""
+    """Check eqs. (2), (3) and (4) against a singular value decomposition of eq. (1)."""
     # not even about the middle, so that no sum vanishes and an error in any of them shows
     turn = edge * np.linspace(-1.0, 0.6, POINTS)
     where, t = places(turn), np.tan(turn)
@@ -577,4 +586,4 @@ def _solutions(context: Context, places: Callable[[Array], Array], edge: float) 
 GROUP = group_of("004.distortion", run)
 EQUATIONS = group_of("004.equations", run_equations)
 FIGURES = group_of("004.figures")
-"""What is printed in figures without numbers: rows that nothing can be compared with."""
+"""Figures printed without numbers: rows with which nothing can be compared."""

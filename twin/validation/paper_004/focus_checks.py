@@ -34,7 +34,7 @@ PARAMETERS = ("Δα", "Δβ", "Δγ", "Δx", "Δy", "Δz")
 ADJUSTMENTS = ("tilt about the surface's x", "tilt about its y", "turn in it", "slide along x", "slide along y", "lift")
 """Tilts and lift by shims, the others by hand."""
 LIMITS = np.array([10.0 * ARCSEC, 10.0 * ARCSEC, 10.0 * ARCSEC, 7e-6, 7e-6, 5e-6])
-"""What counts as a change: the theodolite's 10 arcsec, a panchromatic pixel, a step of the shims."""
+"""Smallest changes that count: the theodolite's 10 arcsec, a panchromatic pixel, a step of the shims."""
 TEST = "focus"
 ALIGNMENTS, FAST_ALIGNMENTS = 12, 1
 """Alignments from random mis-settings."""
@@ -84,7 +84,7 @@ def _parameters(bench: FocusBench, pose: Pose) -> Array:
 
 
 def _coupling(context: Context, bench: FocusBench) -> CheckResult:
-    """How many parameters the adjustments of the mount tie together."""
+    """Check the number of parameters that the adjustments of the mount couple."""
     change = effects(bench)
     tilt = float(np.degrees(bench.setup.test.mount.tilt))
     changed = "; ".join(
@@ -103,7 +103,10 @@ def _coupling(context: Context, bench: FocusBench) -> CheckResult:
 
 
 def coupled(change: Array) -> float:
-    """Parameters in the largest set that adjustments tie together, one after the other; change: as of `effects`."""
+    """Return the number of parameters in the largest set that adjustments couple one after the other.
+
+    The changes are those of `effects`.
+    """
     seen = np.abs(change) > LIMITS
     _, family = connected_components((seen.T @ seen).astype(float), directed=False)
     return float(np.bincount(family).max())
@@ -111,7 +114,7 @@ def coupled(change: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What the analysis makes of the MTF curves of an alignment's first state."""
+    """Result of the analysis for the MTF curves of an alignment's first state."""
 
     alignment: SimulatedFocus
 
@@ -131,7 +134,7 @@ class Plan:
 
     @cached_property
     def moved(self) -> Pose:
-        """Where the assembly would truly stand after exactly the motion wanted."""
+        """True pose of the assembly after exactly the planned motion."""
         return self.alignment.states[0].placement.pose @ Pose(self.motion.matrix, self.motion.shift)
 
     @property
@@ -157,7 +160,7 @@ class Plan:
 
 
 def measured_defocus(state: FocusState) -> tuple[Array, Array]:
-    """How far each CCD stands downstream of best focus by its MTF curves, and sigma, (N,), metres."""
+    """Return the distance of each CCD downstream of best focus by its MTF curves, and sigma, (N,), in metres."""
     out = []
     for scan in state.scans:
         vertices = [focus_vertex(scan.shift[edge], scan.mtf[edge], scan.sigma[edge]) for edge in scan.shift]
@@ -188,7 +191,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 
 def measured_alignments(context: Context, bench: FocusBench) -> list[SimulatedFocus]:
-    """Alignments from rendered edges."""
+    """Run alignments with rendered edges."""
     count = context.count(ALIGNMENTS, FAST_ALIGNMENTS) if context.wants("004.alignment") else 1
     alignments = []
     for k, seed in enumerate(np.random.SeedSequence(context.seed).generate_state(count)):
@@ -199,7 +202,7 @@ def measured_alignments(context: Context, bench: FocusBench) -> list[SimulatedFo
 
 
 def _edges(alignment: SimulatedFocus, band: str) -> list[EdgeMtf]:
-    """Edges along the track at the fields of a band, measured after the alignment."""
+    """Measure edges along the track at the fields of a band after the alignment."""
     noise, focus = alignment.bench.ccds[band].noise, alignment.states[-1].focus
     stacks = [f.frames[TRACK] for f, site in zip(focus, alignment.bench.sites, strict=True) if site.band == band]
     return [
@@ -208,8 +211,10 @@ def _edges(alignment: SimulatedFocus, band: str) -> list[EdgeMtf]:
 
 
 def _losses(factors: Mapping[str, float], value: float) -> list[Chosen]:
-    """An MTF's inputs that the paper does not print: the log of each factor goes as the square of its size, as that of
-    small wavefront errors (Maréchal), of diffusion and of small motions does.
+    """Return the inputs of an MTF that the paper does not print.
+
+    The logarithm of each factor is proportional to the square of its size, as for small wavefront errors (Maréchal),
+    diffusion and small motions.
     """
     every = float(np.prod(list(factors.values())))
     wavefront = factors["wavefront"]
@@ -262,7 +267,7 @@ def _mtf(context: Context, alignments: Sequence[SimulatedFocus], facts: Mapping[
 def _measured(
     context: Context, alignments: Sequence[SimulatedFocus], facts: Mapping[str, Any]
 ) -> Iterator[CheckResult]:
-    """What the analysis makes of the curves, against the traced pupils."""
+    """Check the results of the analysis of the curves against the traced pupils."""
     looks = [(a.states[0], a.states[-1]) for a in alignments]
     error = np.array([[measured_defocus(state)[0] - state.true_defocus for state in pair] for pair in looks])
     span = [a.states[0].true_defocus for a in alignments]
@@ -285,7 +290,9 @@ def _measured(
 
 
 def _chips(placed: Sequence[tuple[SimulatedFocus, Pose, Mapping[str, float]]]) -> Chosen:
-    """How the line CCDs were glued, on which the largest distance from best focus hangs, millimetres."""
+    """Return the glueing errors of the line CCDs, on which the largest distance from best focus depends, in
+    millimetres.
+    """
     flat, as_glued = (
         np.array([[s.defocus(pose, share * heights[s.band]) for s in a.bench.sites] for a, pose, heights in placed])
         for share in (0.0, 1.0)
@@ -298,14 +305,14 @@ def _chips(placed: Sequence[tuple[SimulatedFocus, Pose, Mapping[str, float]]]) -
 
 
 def _theodolite(alignments: Sequence[SimulatedFocus], value: float) -> Chosen:
-    """What the line's turn is measured and set with, and is proportional to."""
+    """Return the error of measuring and setting the line's rotation, to which the result is proportional."""
     return Chosen.power(
         "error of the theodolite and of the setting", alignments[0].bench.setup.test.level / ARCSEC, "arcsec", value
     )
 
 
 def _reached(context: Context, alignments: Sequence[SimulatedFocus], facts: Mapping[str, Any]) -> Iterator[CheckResult]:
-    """What the loop of measuring, shimming and measuring reaches."""
+    """Check the result of the loop of measuring, shimming and measuring."""
     plan = alignments[0].bench.setup.test
     far = np.array([[MM_PER_M * np.max(np.abs(s.true_defocus)) for s in a.states] for a in alignments])
     turns = np.array([[abs(s.true_level) / ARCMIN for s in a.states] for a in alignments])
@@ -331,8 +338,10 @@ def _reached(context: Context, alignments: Sequence[SimulatedFocus], facts: Mapp
 def alignment_svg(
     figure: Figure, far: NDArray[np.float64], turns: NDArray[np.float64], far_bound: float, turn_bound: float
 ) -> None:
-    """Alignments before and after: largest distance from best focus of each state, mm, and turns of the line, arcmin,
-    both (A, S), with what the paper reached.
+    """Draw alignments before and after, with the results of the paper.
+
+    Shown are the largest distance from best focus of each state, in mm, and rotations of the line, in arcmin, both (A,
+    S).
     """
     labels = ("farthest CCD from best focus [mm]", "turn of the line [arcmin]")
     panels = zip(figure.subplots(1, 2), (far, turns), (far_bound, turn_bound), labels, strict=True)
@@ -360,7 +369,7 @@ def _second_round(alignment: SimulatedFocus) -> float:
 
 
 def _list(values: Array, digits: int) -> str:
-    """The values, or their range where there are many."""
+    """Return the values as text, or their range if there are many."""
     if len(values) > 4:
         return f"{np.min(values):.{digits}f} to {np.max(values):.{digits}f}"
     return ", ".join(f"{value:.{digits}f}" for value in values)

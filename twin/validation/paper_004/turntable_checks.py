@@ -41,14 +41,14 @@ CLOSED_FORMS = tuple(name for name in FITS if name != NETWORK)
 
 @dataclass(frozen=True, eq=False)
 class FittedTable:
-    """One turntable, fitted.
+    """Turntable with its fits.
 
     Attributes
     ----------
     chosen : str
-        The closed form that cross-validation on the calibration points chooses.
-    held_out : Mapping[str, float]
-        RMS of each fit at readings that no fit has seen, radians; infinite where it failed.
+        Closed form that cross-validation on the calibration points selects.
+    held_out : mapping of str to float
+        RMS of each fit at readings that no fit has used, radians; infinite if the fit failed.
     """
 
     chosen: str
@@ -92,7 +92,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 
 def _criterion(context: Context, series: Sequence[CalibrationSeries]) -> CheckResult:
-    """Where the rule begins to reject, from the readings that it kept and rejected."""
+    """Check the rejection limit of the rule by the readings that it accepted and rejected."""
     readings, keep = (np.concatenate([getattr(s, name) for s in series]) for name in ("comparisons", "keep"))
     size = np.abs(readings - readings.mean(axis=1, keepdims=True)) / readings.std(axis=1, ddof=1, keepdims=True)
     kept, rejected = float(np.max(size[keep])), float(np.min(size[~keep]))
@@ -143,7 +143,9 @@ def _repeats(
 
 
 def _readings(spec: TurntableTestSpec, seeds: NDArray[np.integer], identifier: str, value: float) -> list[Chosen]:
-    """What the largest RMS of the repeats hangs on: the scatter of a reading, and before the criterion gross errors."""
+    """Return the inputs of the largest RMS of the repeats: the scatter of a reading, and gross errors before the
+    criterion.
+    """
     scatter = float(np.hypot(spec.dividing_error.repeatability, spec.reference.noise)) / ARCSEC
     if identifier.endswith("chauvenet"):
         return [Chosen.power("scatter of a reading", scatter, "arcsec", value)]
@@ -164,7 +166,7 @@ def _readings(spec: TurntableTestSpec, seeds: NDArray[np.integer], identifier: s
 
 
 def _with_errors(spec: TurntableTestSpec, scatter: float, gross: float) -> TurntableTestSpec:
-    """The test with the scatter of its readings and its gross errors times factors."""
+    """Return the test with factors on the scatter of its readings and on its gross errors."""
     table, reference = spec.dividing_error, spec.reference
     noise = {"noise": scatter * reference.noise, "gross_error": gross * reference.gross_error}
     update = {
@@ -175,7 +177,7 @@ def _with_errors(spec: TurntableTestSpec, scatter: float, gross: float) -> Turnt
 
 
 def dividing(value: float, power: float = 1.0) -> Chosen:
-    """The dividing error, to which what fits leave of it is proportional, and what that does to the distortion."""
+    """Return the dividing error as an input, to which the remaining error of fits and its effect are proportional."""
     return Chosen.power("dividing error of scenes/lab/turntable.yaml, times", 1.0, "1", value, power)
 
 

@@ -38,14 +38,14 @@ _FIXED = CameraChangeSpec.model_validate({"lasting": {"angles": 3 * ["0.002 arcs
 
 
 def strip(image: float, attitude: float) -> AdjustSetup:
-    """One pass of three lines without control.
+    """Return the setup of one pass of three lines without control.
 
     Parameters
     ----------
     image : float
-        Standard deviation of an image point, pixels of 5 m.
+        Standard deviation of an image point, in pixels of 5 m.
     attitude : float
-        Of a reading of the attitude, twice a second, arcseconds.
+        Standard deviation of a reading of the attitude, twice a second, in arcseconds.
     """
     setup = AdjustSetup.read(SCENES / ORBIT / "adjust.yaml")
     test, lines = setup.test, ("forward", "nadir", "backward")
@@ -83,7 +83,9 @@ def height_error(drawn: DrawnBlock, bundle: bool) -> float:
 
 @one_blas_thread()
 def ratios(image: float, seed: np.random.SeedSequence) -> np.ndarray:
-    """Errors of heights of a bundle at 5 m over those of intersection at 0.5 m, at `ERRORS` of the attitude."""
+    """Return the height errors of a bundle at 5 m relative to those of intersection at 0.5 m, for the `ERRORS` of
+    attitude.
+    """
     return np.array(
         [
             height_error(draw_block(strip(image, error), seed), True)
@@ -94,8 +96,9 @@ def ratios(image: float, seed: np.random.SeedSequence) -> np.ndarray:
 
 
 def limit(found: np.ndarray) -> float:
-    """Arcseconds from which on the bundle has the smaller errors, by ratios (3,) at `ERRORS`; their logarithms are all
-    but a parabola in that of the error.
+    """Return the attitude error, in arcseconds, above which the bundle has the smaller errors.
+
+    The ratios (3,) are those at `ERRORS`; their logarithms are nearly a parabola in the logarithm of the error.
     """
     place, value = np.log(ERRORS), np.log(found)
     fine = np.linspace(np.log(0.05), np.log(5.0), 2001)
@@ -104,7 +107,7 @@ def limit(found: np.ndarray) -> float:
 
 
 def run(context: Context) -> Iterator[CheckResult]:
-    """The row."""
+    """Check the row."""
     count = context.count(STRIPS, FAST_STRIPS)
     root = np.random.SeedSequence(context.seed)
     every = []
