@@ -1,6 +1,7 @@
-"""Draw docs/conventions.svg, the picture of docs/conventions.md. Run it from anywhere: python docs/draw_conventions.py
+"""Drawing of docs/conventions.svg, the picture of docs/conventions.md.
 
-The look angles and the camera cut come from the library's gf7_pair and its trace; panels d and e are not to scale.
+Run it from anywhere: python docs/draw_conventions.py. The look angles and the section of the camera are those of the
+library's gf7_pair and its trace; panels d and e are not to scale.
 """
 
 from __future__ import annotations
@@ -29,19 +30,19 @@ Point = tuple[float, float]
 
 
 def arrow(ax: Any, start: Point, end: Point, colour: str = INK, width: float = 1.8, style: str = "-|>") -> None:
-    """A straight arrow in data coordinates."""
+    """Draw a straight arrow in data coordinates."""
     props = {"arrowstyle": style, "color": colour, "lw": width, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 12}
     ax.annotate("", end, start, arrowprops=props, zorder=6)
 
 
 def text(ax: Any, place: Point, words: str, colour: str = INK, size: float = SIZE, **options: Any) -> None:
-    """Centred text, on a white ground that keeps lines away."""
+    """Write centred text on a white ground that hides lines."""
     options = {"ha": "center", "va": "center", **options}
     ax.text(*place, words, color=colour, fontsize=size, bbox=SHADOW, zorder=7, **options)
 
 
 def normal(ax: Any, place: Point, into: bool, colour: str, words: str, shift: Point, radius: float) -> None:
-    """The symbol of an axis that points into the paper (cross) or out of it (dot)."""
+    """Draw the symbol of an axis that points into the paper (cross) or out of it (dot)."""
     ax.plot(*place, marker="o", ms=radius, mfc="white", mec=colour, mew=1.4, zorder=6)
     mark, size = ("x", 0.55 * radius) if into else (".", 0.5 * radius)
     ax.plot(*place, marker=mark, ms=size, color=colour, mew=1.4, zorder=7)
@@ -49,7 +50,7 @@ def normal(ax: Any, place: Point, into: bool, colour: str, words: str, shift: Po
 
 
 def arc(ax: Any, centre: Point, radius: float, start_deg: float, end_deg: float, colour: str) -> None:
-    """A curved arrow from one angle to another, counter-clockwise when end > start."""
+    """Draw a curved arrow from one angle to another, counter-clockwise when end > start."""
     angle = np.radians(np.linspace(start_deg, end_deg, 60))
     x, y = centre[0] + radius * np.cos(angle), centre[1] + radius * np.sin(angle)
     ax.plot(x[:-3], y[:-3], color=colour, lw=1.4, zorder=5)
@@ -57,14 +58,14 @@ def arc(ax: Any, centre: Point, radius: float, start_deg: float, end_deg: float,
 
 
 def plain(ax: Any, title: str) -> None:
-    """No ticks, equal axes, a title on the left."""
+    """Set equal axes without ticks and a title on the left."""
     ax.set_aspect("equal")
     ax.axis("off")
     ax.set_title(title, loc="left", fontsize=SIZE + 1.5, fontweight="bold", color=INK)
 
 
 def draw_base(ax: Any, spec: InstrumentSpec) -> None:
-    """Side view of the instrument, the scene below: X to the right, Z down, Y out of the paper."""
+    """Draw the instrument from the side, the scene below: X to the right, Z down, Y out of the paper."""
     ax.set_anchor("N")
     plain(ax, "a   base frame and look angles (seen against +Y, scene below)")
     ax.plot([-2.3, 2.3], [0, 0], color="#c9ced6", lw=5, solid_capstyle="round", zorder=0)
@@ -98,7 +99,7 @@ def draw_base(ax: Any, spec: InstrumentSpec) -> None:
 
 
 def draw_turns(ax: Any) -> None:
-    """The three rotations of a camera in an oblique view."""
+    """Draw the three rotations of a camera in an oblique view."""
     ax.set_anchor("N")
     plain(ax, "b   changes of a camera")
     ends = {"X": (1.0, 0.0), "Y": (-0.66, -0.5), "Z": (0.0, -1.0)}
@@ -122,7 +123,7 @@ def draw_turns(ax: Any) -> None:
 
 
 def traced_rays(model: CameraModel, backend: Backend) -> np.ndarray:
-    """Points (rays, 6, 2) as (z, y) from before M1 to the image, for three rays in the plane of symmetry."""
+    """Return points (rays, 6, 2) as (z, y) from before M1 to the image, for three rays in the plane of symmetry."""
     bare = model.bare_assembly(apertures=False)
     names = model.mirrors
     stop = names.index(model.spec.stop)
@@ -139,7 +140,7 @@ def traced_rays(model: CameraModel, backend: Backend) -> np.ndarray:
 
 
 def draw_camera(ax: Any, model: CameraModel, backend: Backend) -> None:
-    """Cut through the camera in its plane of symmetry: z to the right, y up, x into the paper; to scale."""
+    """Draw a section of the camera in its plane of symmetry, to scale: z to the right, y up, x into the paper."""
     plain(ax, "c   camera gf7 in its plane of symmetry, to scale (seen along +x = camera +Y)")
     rays = traced_rays(model, backend)
     for k, ray in enumerate(rays):
@@ -205,7 +206,7 @@ def draw_camera(ax: Any, model: CameraModel, backend: Backend) -> None:
 
 
 def draw_plane(ax: Any) -> None:
-    """Focal plane seen from the scene: X up, Y to the left, Z toward the viewer; not to scale."""
+    """Draw the focal plane seen from the scene, not to scale: X up, Y to the left, Z toward the viewer."""
     ax.set_anchor("N")
     plain(ax, "d   focal plane (+Z toward the viewer, not to scale)")
     ax.add_patch(_box((-4.6, -1.15), 9.2, 2.3, "#f7f7f8", "#9aa1ab", 1.0))
@@ -232,7 +233,7 @@ def draw_plane(ax: Any) -> None:
 
 
 def draw_pixels(ax: Any) -> None:
-    """An area CCD's pixel grid in the same view as the focal plane."""
+    """Draw an area CCD's pixel grid in the same view as the focal plane."""
     ax.set_anchor("N")
     plain(ax, "e   area CCD, same view")
     n = 5
@@ -260,7 +261,7 @@ def _box(corner: Point, width: float, height: float, face: str, edge: str, line:
 
 
 def draw(path: Path) -> None:
-    """Make the picture; SVG or PNG by the name's end."""
+    """Draw the picture as SVG or PNG, by the file's suffix."""
     import matplotlib
 
     matplotlib.use("Agg")

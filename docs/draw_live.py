@@ -1,5 +1,6 @@
-"""Make docs/live.webp, the picture of docs/live.md: the live twin while two knobs are dragged. Run it from anywhere:
-python docs/draw_live.py. It needs Chromium and the extras `test` and `live`.
+"""Recording of docs/live.webp, the picture of docs/live.md: the live twin while two knobs are dragged.
+
+Run it from anywhere: python docs/draw_live.py. It needs Chromium and the extras `test` and `live`.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ DESPACE, TURN = "base/forward/M2 shift z", "base/backward/focal_plane rotate z"
 
 
 def values() -> list[dict[str, float]]:
-    """What the knobs show in each picture: the mirror there and half back, then the focal plane."""
+    """Return the values of the knobs in each picture: the mirror forward and half back, then the focal plane."""
     there = 5.0 * np.sin(np.linspace(0.0, 2.2, 16))
     turn = 9.0 * np.sin(np.linspace(0.0, 1.6, 14))
     out = [{DESPACE: round(float(z), 2), TURN: 0.0} for z in there]
@@ -34,7 +35,7 @@ def values() -> list[dict[str, float]]:
 
 
 def main() -> None:
-    """Drag, look, write."""
+    """Drag the knobs, record, and write the picture."""
     with running("gf7_pair", "--port", "0") as command, sync_playwright() as made:
         browser = made.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = Page(browser, command.address, *SIZE)

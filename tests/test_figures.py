@@ -48,7 +48,7 @@ def test_what_stands_in_a_marked_place_is_replaced(text: str, right: str) -> Non
     ("text", "told"),
     [
         ("0.1<!-- a.d -->", "no such figure: a.d"),
-        ("some<!-- c -->", "no number stands before"),
+        ("some<!-- c -->", "have no number before them"),
         ("1 ± 2<!-- c -->", "c has no sigma"),
     ],
 )

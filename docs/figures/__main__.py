@@ -29,10 +29,10 @@ def main(
         bool, typer.Option("--fill", help="Measure nothing; put the file's numbers into the pages.")
     ] = False,
 ) -> None:
-    """Measure the figures that pages quote, write docs/figures/figures.yaml, and put them into the pages.
+    """Measure the figures that pages quote, write docs/figures/figures.yaml, and insert them into the pages.
 
-    Those of the papers' checks are read from docs/validation, which a full run of twin.validate makes; the others are
-    measured here; the studies among them take half an hour.
+    Figures of the papers' checks are read from docs/validation, which a full run of twin.validate writes; the others
+    are measured here, which takes half an hour because of the studies among them.
 
     Example: python -m docs.figures --only launch
     """
@@ -43,34 +43,34 @@ def main(
 
 
 def pages() -> list[Path]:
-    """README and all Markdown pages of docs."""
+    """Return README and all Markdown pages of docs."""
     return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def places(text: str, figures: Mapping[str, Figure]) -> Iterator[tuple[str, str, str]]:
-    """Name of the figure, what stands there and what should, for each marked place of a page.
+    """Yield name of the figure, present text and correct text of each marked number of a page.
 
     Raises
     ------
     ValueError
-        a mark without a number before it, or one that names no figure.
+        A mark has no number before it, or names no figure.
     """
-    found = list(_PLACE.finditer(text))
-    if len(found) != len(_MARK.findall(text)):
-        loose = sorted({*_MARK.findall(text)} - {place[0][len(place["text"]) :] for place in found})
-        raise ValueError(f"no number stands before: {loose}")
-    for place in found:
+    marks = list(_PLACE.finditer(text))
+    if len(marks) != len(_MARK.findall(text)):
+        loose = sorted({*_MARK.findall(text)} - {place[0][len(place["text"]) :] for place in marks})
+        raise ValueError(f"these marks have no number before them: {loose}")
+    for place in marks:
         yield place["name"], place["text"], _quoted(place, figures)
 
 
 def filled(text: str, figures: Mapping[str, Figure]) -> str:
-    """A page with the figures as they are now; errors as `places`."""
+    """Return a page with its figures updated. Exceptions are those of `places`."""
     list(places(text, figures))
     return _PLACE.sub(lambda place: _quoted(place, figures) + place[0][len(place["text"]) :], text)
 
 
 def fill(figures: Mapping[str, Figure]) -> list[Path]:
-    """Write the figures into all pages; returns those that changed."""
+    """Write the figures into all pages; return those that changed."""
     changed = []
     for page in pages():
         text = page.read_text("utf-8")
@@ -82,6 +82,7 @@ def fill(figures: Mapping[str, Figure]) -> list[Path]:
 
 
 def _quoted(place: re.Match[str], figures: Mapping[str, Figure]) -> str:
+    """Return the text of a figure for a marked number."""
     if place["name"] not in figures:
         raise ValueError(f"no such figure: {place['name']}")
     figure = figures[place["name"]]
@@ -95,6 +96,7 @@ def _quoted(place: re.Match[str], figures: Mapping[str, Figure]) -> str:
 
 
 def _decimal(value: float, digits: int) -> str:
+    """Return a rounded number as text."""
     return f"{round(value, digits):.{max(digits, 0)}f}".replace("-", "−")
 
 

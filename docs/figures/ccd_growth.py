@@ -1,5 +1,6 @@
-"""Principal distances of heated cameras, whose line CCDs expand or keep their length: the table "CCDs grow, too" of the
-page monitor.md.
+"""Principal distances of heated cameras whose line CCDs expand or keep their length.
+
+They are the table "CCDs grow, too" of the page monitor.md.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import twin
-from analysis.monitor.recovery import recover
+from analysis.monitor.recovery import recover_monitor
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -24,11 +25,11 @@ NO_HEAT = {"temperature": {"change": "1e-9 K"}}
 LINE = "base/{}/focal_plane/line"
 SEED = 1
 PRINTED = "paper_single"
-"""The estimator that reads d_f by equation (7)."""
+"""Estimator that reads d_f by equation (7)."""
 
 
 def measured() -> dict[str, tuple[float, int, str]]:
-    """Name -> value, decimals, unit."""
+    """Return value, decimals and unit of each figure, by name."""
     camera, prism = "base/*", "base/*/monitor/left/prism_180"
     warmer: Mapping[str, Mapping[str, Any]] = {camera: {"temperature": "0.2 K"}}
     rows: Mapping[str, tuple[str, Mapping[str, Mapping[str, Any]], int]] = {
@@ -49,29 +50,30 @@ def measured() -> dict[str, tuple[float, int, str]]:
 
 
 def _heated(instrument: str, perturb: Mapping[str, Mapping[str, Any]]) -> tuple[float, float, float]:
-    """True d_f with a line CCD that keeps its length, the same with one that expands, and the latter as (7) reads it
-    from images without noise, micrometres.
+    """Return d_f of line CCDs that keep their length and that expand, and the reading of the latter, in micrometres.
+
+    The first two are true values; the reading is by equation (7) from images without noise.
 
     Parameters
     ----------
     instrument : str
         Name of the pair.
     perturb : Mapping[str, Mapping[str, Any]]
-        As of a job; ``*`` stands for each camera.
+        Perturbation as in a job; ``*`` stands for each camera.
     """
     pair = twin.load(instrument)
     nodes = {key.replace("*", camera): what for key, what in perturb.items() for camera in (EXPANDS, KEEPS)}
     shot = pair.perturbed({**nodes, LINE.format(KEEPS): NO_HEAT}).render(frames=1, seed=SEED)
     experiment = pair.experiment
     grey = experiment.expected_frames(shot.expected["photons"].values)
-    found = recover(grey[0], grey[1:], experiment.calibration, frames=1)
+    recovery = recover_monitor(grey[0], grey[1:], experiment.calibration, frames=1)
     true = shot.truth["d_f_um"]
-    read = float(found.parameters[EXPANDS][PRINTED].d_f_m[0])
+    read = float(recovery.parameters[EXPANDS][PRINTED].d_f_m[0])
     return float(true.sel(camera=KEEPS)), float(true.sel(camera=EXPANDS)), 1e6 * read
 
 
 def _orbit() -> dict[str, tuple[float, int, str]]:
-    """RMS over the orbit of d_f and of its reading by (7) minus the truth, for line CCDs of both kinds."""
+    """Return the RMS over an orbit of d_f, and of its reading by (7) minus the truth, for line CCDs of both kinds."""
     orbit = twin.load(ROOT / "scenes/examples/orbit.yaml")
     kept = orbit.perturbed({LINE.format(camera): NO_HEAT for camera in orbit.cameras})
     out: dict[str, tuple[float, int, str]] = {}
@@ -86,4 +88,5 @@ def _orbit() -> dict[str, tuple[float, int, str]]:
 
 
 def _rms(values: np.ndarray) -> float:
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))

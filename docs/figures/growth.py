@@ -1,7 +1,8 @@
-"""Draw docs/growth.svg, how processor time grows, from the numbers of a benchmark. To measure and draw them anew:
+"""Drawing of docs/growth.svg, the growth of processor time with problem size, from the numbers of a benchmark.
 
-python -m tests.benchmarks --only growth --json > docs/figures/growth.json
-python -m docs.figures.growth
+To measure and draw it again:
+
+    python -m tests.benchmarks --only growth --json > docs/figures/growth.json python -m docs.figures.growth
 """
 
 from __future__ import annotations
@@ -26,27 +27,27 @@ TITLES = {
 
 
 def times(numbers: dict[str, float], key: str) -> tuple[np.ndarray, np.ndarray]:
-    """Sizes and seconds of one growth.
+    """Return sizes and seconds of one growth.
 
     Parameters
     ----------
     numbers : dict[str, float]
-        Of the benchmark.
+        Numbers of the benchmark.
     key : str
-        Of the growth.
+        Key of the growth, one of ``TITLES``.
     """
-    found = {int(m[1]): value for name, value in numbers.items() if (m := re.fullmatch(rf"{key}_(\d+)_s", name))}
-    sizes = np.array(sorted(found))
-    return sizes, np.array([found[size] for size in sizes.tolist()])
+    seconds = {int(m[1]): value for name, value in numbers.items() if (m := re.fullmatch(rf"{key}_(\d+)_s", name))}
+    sizes = np.array(sorted(seconds))
+    return sizes, np.array([seconds[size] for size in sizes.tolist()])
 
 
 def drawn(numbers: dict[str, float]) -> str:
-    """The picture as SVG.
+    """Return the picture as SVG.
 
     Parameters
     ----------
     numbers : dict[str, float]
-        Of the benchmark ``growth``.
+        Numbers of the benchmark ``growth``.
     """
     with look("growth"):
         figure = new_figure(2.9)

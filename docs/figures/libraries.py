@@ -1,4 +1,4 @@
-"""Other people's libraries beside what is written here: the measured reasons on the page by_hand.md."""
+"""Comparison with other libraries: the measured numbers of the page by_hand.md."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SEED = 1
 
 
 def measured() -> dict[str, tuple[float, int, str]]:
-    """Name -> value, decimals, unit. Needs what ``bash setup.sh --test`` installs."""
+    """Return value, decimals and unit of each figure, by name. Needs the packages of ``bash setup.sh --test``."""
     ours, theirs = _matching()
     special = _import_cost("scipy.special")
     return {
@@ -32,7 +32,7 @@ def measured() -> dict[str, tuple[float, int, str]]:
 
 
 def _import_cost(module: str) -> float:
-    """Time of the processor that an import takes after NumPy's, seconds; the least of three."""
+    """Return the processor time of an import after NumPy's, in seconds, the least of three."""
 
     def spent(code: str) -> float:
         found = []
@@ -47,7 +47,7 @@ def _import_cost(module: str) -> float:
 
 
 def _zernike_difference() -> float:
-    """Largest difference of the first 36 terms from poppy's on a disk."""
+    """Return the largest difference of the first 36 Zernike terms from poppy's on a disk."""
     from poppy.zernike import zernike1
 
     y, x = np.mgrid[-1:1:201j, -1:1:201j]
@@ -58,8 +58,9 @@ def _zernike_difference() -> float:
 
 
 def _matching() -> tuple[float, float]:
-    """RMS error of places along an axis, ours and by phase correlation to a hundredth of a pixel: windows of 25 pixels
-    of a random texture with a tenth of its contrast as noise, shifted by up to half a pixel.
+    """Return RMS errors of positions along an axis, by our matching and by phase correlation to a hundredth of a pixel.
+
+    Windows of 25 pixels of a random texture, with a tenth of its contrast as noise, are shifted by up to half a pixel.
     """
     from skimage.registration import phase_cross_correlation
 

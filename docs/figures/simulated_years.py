@@ -1,5 +1,7 @@
-"""Figures and pictures of simulated orbits: the years on the page operation.md, three lives, each followed and held
-against its truth; the loop in orbit.md, one orbit with the loop closed, and the same with the loop open.
+"""Figures and pictures of simulated orbits.
+
+They are the years on the page operation.md, three simulated missions, each estimated and compared with its truth; and
+the loop in orbit.md, one orbit with the loop closed, and the same with the loop open.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SEED = 1
 PICTURE, LOOP_PICTURE = ROOT / "docs/operation.svg", ROOT / "docs/loop.svg"
 _LONG = 2000
-"""Letters of a line from which on it is one of the data's."""
+"""Number of characters above which a line of the SVG is a curve of data."""
 _YEARS = ("--from", "2027-01-01T00:00:00Z", "--days", "1096", "--every", "6d", "--coefficient-error", "30%")
 SENSORS = (
     "base",
@@ -27,7 +29,7 @@ SENSORS = (
     "base/forward/focal_plane",
     "base/backward/focal_plane",
 )
-"""Bodies with a sensor in the life in which some fail."""
+"""Bodies with a sensor in the mission in which some fail."""
 STUCK = "base/forward"
 DEAD = ("base/backward", "base/central_prism")
 _FAILING = (
@@ -40,7 +42,7 @@ LIVES: Mapping[str, tuple[str, ...]] = {
     "two": ("scenes/examples/operation_two.yaml",),
     "failing": ("scenes/examples/operation.yaml", *_FAILING),
 }
-"""Name of a life -> its plan and further words of the command that simulates it."""
+"""Name of a mission -> its plan and further arguments of the command that simulates it."""
 _QUANTITIES = {
     "angle": ("intersection_angle", "change_arcsec", "arcsec"),
     "height": ("ground", "height_m", "m"),
@@ -52,11 +54,11 @@ _DIGITS = {
     "pair": {"angle": 3, "height": 2, "forward": 1, "backward": 1},
     "two": {"angle": 4, "height": 4, "forward": 2, "backward": 2},
 }
-"""Lives whose errors the page tells -> decimals of each."""
+"""Missions whose errors the page quotes -> decimals of each."""
 
 
 def short(drawn: str) -> str:
-    """A drawing whose long lines are told to a hundredth of a pixel: half of the bytes.
+    """Return a drawing with long curves rounded to a hundredth of a pixel, which halves its size.
 
     Parameters
     ----------
@@ -71,16 +73,16 @@ def short(drawn: str) -> str:
 
 
 def judged(words: tuple[str, ...], place: Path, picture: bool) -> dict[str, Any]:
-    """Simulate a life and judge it.
+    """Simulate a mission and compare its estimate with the truth.
 
     Parameters
     ----------
     words : tuple[str, ...]
-        Plan and further words.
+        Plan and further arguments.
     place : Path
-        Folder for all of it.
+        Folder for all results.
     picture : bool
-        Whether the page shows this one.
+        Whether the page shows this mission.
     """
     record, out = place / "life", place / "judged"
     plan, *more = words
@@ -96,7 +98,7 @@ def judged(words: tuple[str, ...], place: Path, picture: bool) -> dict[str, Any]
 
 
 def measured() -> Mapping[str, tuple[float, int, str]]:
-    """Name of a figure -> value, decimals, unit; the picture of the page is drawn as well."""
+    """Return value, decimals and unit of each figure, by name, and draw the picture of the page."""
     out: dict[str, tuple[float, int, str]] = {}
     for life, words in LIVES.items():
         with tempfile.TemporaryDirectory(prefix="operation-") as place:
@@ -127,7 +129,7 @@ _LOOP = {
 
 
 def loop_measured() -> dict[str, tuple[float, int, str]]:
-    """Run the example and draw the page's picture; figure -> value, decimals, unit."""
+    """Run the example, draw the page's picture, and return value, decimals and unit of each figure."""
     with tempfile.TemporaryDirectory(prefix="figures-") as place:
         run = Path(place, "run")
         words = ("twin.orbit", "monitor", "scenes/orbit/loop.yaml", "--seed", str(SEED), "--quiet", "--out", str(run))

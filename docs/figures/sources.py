@@ -1,4 +1,4 @@
-"""Where measured figures come from, and the file in which they stand."""
+"""Sources of measured figures, and the file that stores them."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from scenes.yaml.yaml_file import read_yaml
 ROOT = Path(__file__).resolve().parents[2]
 FILE = Path(__file__).with_name("figures.yaml")
 SUMMARY = ROOT / "docs/validation/README.md"
-"""The summary of a full run of twin.validate."""
+"""Summary of a full run of twin.validate."""
 HEAD = "# Measured figures that README and docs quote. Made by `python -m docs.figures`; not to be edited.\n"
 _NUMBER = re.compile(r"(-?[\d.]+(?:e-?\d+)?)(?: ± ([\d.]+))?")
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A measured number.
+    """Measured number.
 
     Attributes
     ----------
     value : float
-        In the unit.
-    sigma : float | None
-        One standard deviation in the unit, None where none is known.
+        Value in the unit.
+    sigma : float or None
+        Standard deviation in the unit, None where it is unknown.
     unit : str
-        Empty for a pure number.
+        Unit, empty for a dimensionless number.
     digits : int
-        Decimals with which pages quote it, if they do not say otherwise.
+        Decimals with which pages quote it by default.
     command : str
-        What measures it.
-    seed : int | None
-        Of its random numbers, None where it has none.
+        Command that measures it.
+    seed : int or None
+        Seed of its random numbers, None where there are none.
     """
 
     value: float
@@ -54,14 +54,14 @@ class Figure:
 
 
 def _checks() -> Iterator[tuple[str, int, float, str]]:
-    """Checks of the papers whose figures pages quote: name, decimals, factor from the summary's unit, unit."""
+    """Return name, decimals, factor from the summary's unit, and unit of the papers' checks that pages quote."""
     with FILE.with_name("checks.csv").open(encoding="utf-8", newline="") as lines:
         for row in csv.DictReader(lines):
             yield row["check"], int(row["digits"]), float(row["factor"]), row["unit"]
 
 
 def _at(file: str, *keys: str, per: float = 1.0) -> Read:
-    """The number below these keys of a JSON file, times ``per``."""
+    """Return a reader of the number below these keys of a JSON file, times ``per``."""
 
     def read(run: Path) -> float:
         found = json.loads((run / file).read_text("utf-8"))
@@ -73,7 +73,7 @@ def _at(file: str, *keys: str, per: float = 1.0) -> Read:
 
 
 def _share(quantity: tuple[str, ...], motion: str) -> Read:
-    """Share of the motions whose names begin so in the variance of what `posterior` reads, per cent."""
+    """Return a reader of the share of motions, by name prefix, in the variance of a `posterior` reading, in percent."""
 
     def read(run: Path) -> float:
         found = json.loads((run / "uncertainty.json").read_text("utf-8"))["quantities"]
@@ -86,7 +86,7 @@ def _share(quantity: tuple[str, ...], motion: str) -> Read:
 
 
 def _false_turn(run: Path) -> float:
-    """Turn about Y that the forward camera's spots show and that is not there, arcseconds."""
+    """Return the rotation about Y, in arcseconds, that the forward camera's spots show although it did not occur."""
     read, true = (json.loads((run / f"{name}.json").read_text("utf-8"))["cameras"] for name in ("recovered", "truth"))
     return abs(float(read["forward"]["model"]["d_alpha_arcsec"] - true["forward"]["d_alpha_arcsec"]))
 
@@ -98,8 +98,9 @@ GROUND = ("along", "across", "height")
 
 
 def _readings() -> dict[str, tuple[int, str, Read]]:
-    """What is true in the example job, what `posterior` reads, and both sigmas: backward camera, angle between the
-    cameras and a point on the ground.
+    """Return figures of the example job: true values, `posterior` readings, and both sigmas.
+
+    They are those of the backward camera, the angle between the cameras and a point on the ground.
     """
     out: dict[str, tuple[int, str, Read]] = {
         "launch.angle_true": (3, "arcsec", _at("truth.json", *ANGLE)),
@@ -125,7 +126,7 @@ def _readings() -> dict[str, tuple[int, str, Read]]:
 
 
 def _limits(prior: str) -> dict[str, tuple[int, str, Read]]:
-    """Sigmas of the forward camera before and after a measurement, and of the angle and the height."""
+    """Return sigmas of the forward camera before and after a measurement, and of the angle and the height."""
     places = {name: ("forward", f"{name}_{unit}") for name, (unit, _) in CHANGES.items()}
     places |= {"angle": ANGLE, "height": HEIGHT}
     out: dict[str, tuple[int, str, Read]] = {}
@@ -143,7 +144,7 @@ _HEIGHT = ("uncertainty.json", "quantities", *HEIGHT)
 
 
 def _doubt(of: str) -> Read:
-    """What the height's sigma says of the stated number that it follows most: under 'elasticities'."""
+    """Return a reader of the largest elasticity of the height's sigma with respect to the prior."""
 
     def read(run: Path) -> float:
         found = json.loads((run / "uncertainty.json").read_text("utf-8"))["quantities"]["ground"]["height_m"]
@@ -176,16 +177,16 @@ RUNS: Mapping[tuple[str, ...], Mapping[str, tuple[int, str, Read]]] = {
     },
     **STUDIES,
 }
-"""Command that makes a run folder -> its figures: decimals, unit, and how it is read there."""
+"""Command that makes a run folder -> its figures: decimals, unit, and function that reads each of them there."""
 
 
 def of_validation(summary: str) -> dict[str, Figure]:
-    """The figures that a full validation gives: the checks' measured values, and how many rows have which verdict.
+    """Return the figures of a full validation: the checks' measured values, and the number of rows with each verdict.
 
     Parameters
     ----------
     summary : str
-        Text of the page that it makes.
+        Text of the page that it writes.
     """
     command = re.findall(r"Made by `(python -m twin\.validate .*?)`", summary)[0]
     seed = int(re.findall(r"--seed (\d+)", command)[0])
@@ -209,8 +210,10 @@ def of_validation(summary: str) -> dict[str, Figure]:
 
 
 def _modules() -> dict[str, tuple[Callable[[], Mapping[str, tuple[float, int, str]]], int | None]]:
-    """Beginning of the names of figures that no command writes -> what measures them (value, decimals, unit), and the
-    seed of its random numbers. The modules are imported here, since they need what ``setup.sh --test`` installs.
+    """Return prefix of the figures' names -> function that measures them (value, decimals, unit), and its seed.
+
+    These figures are not written by a command. The modules are imported here, since they need the packages of
+    ``setup.sh --test``.
     """
     from docs.figures import ccd_growth, libraries, simulated_years
 
@@ -223,7 +226,7 @@ def _modules() -> dict[str, tuple[Callable[[], Mapping[str, tuple[float, int, st
 
 
 def measure(known: Mapping[str, Figure], only: str = "") -> dict[str, Figure]:
-    """All figures, those anew whose names begin with ``only``."""
+    """Return all figures, measuring again those whose names begin with ``only``."""
     out = dict(known) | {k: v for k, v in of_validation(SUMMARY.read_text("utf-8")).items() if k.startswith(only)}
     for name, (find, seed) in _modules().items():
         if name.startswith(only) or only.startswith(name):
@@ -245,7 +248,7 @@ def measure(known: Mapping[str, Figure], only: str = "") -> dict[str, Figure]:
 
 
 def read_figures(file: Path = FILE) -> dict[str, Figure]:
-    """The file's figures by name."""
+    """Return the file's figures by name."""
     tree = read_yaml(file).data if file.exists() else {}
     return {name: Figure(**one) for name, one in tree.items()}
 

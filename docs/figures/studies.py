@@ -1,4 +1,4 @@
-"""Figures of the shipped studies on the page studies.md: how each is read in the study's folder."""
+"""Figures of the shipped studies on the page studies.md: readers of a study's folder."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 Read = Callable[[Path], float]
-"""Run folder -> a number in it."""
+"""Function from a run folder to a number in it."""
 
 _CAMERAS = ("forward", "backward")
 _GRADIENT_3_SIGMA = 22.5
@@ -21,13 +21,13 @@ _ALLOWED = 0.1
 
 
 def _runs(folder: Path) -> pd.DataFrame:
-    """Runs of a study that have numbers; columns without their units."""
+    """Return the runs of a study that have numbers, with column names without units."""
     table = pd.read_csv(folder / "study.csv").rename(columns=lambda name: name.partition(" [")[0])
     return table[table["failed"] == 0]
 
 
 def _failed(words: str = "") -> Read:
-    """Number of failed runs whose reason contains some words."""
+    """Return a reader of the number of failed runs whose reason contains some words."""
 
     def read(folder: Path) -> float:
         table = pd.read_csv(folder / "study.csv")
@@ -38,7 +38,7 @@ def _failed(words: str = "") -> Read:
 
 
 def _exponent(factor: str) -> Read:
-    """Exponent of a factor in the noise of d_alpha: least squares of logarithms over all runs with numbers."""
+    """Return a reader of a factor's exponent in the noise of d_alpha: a fit of logarithms over all runs."""
     factors = ("aperture", "pinhole", "frames", "wavelength")
 
     def read(folder: Path) -> float:
@@ -51,7 +51,10 @@ def _exponent(factor: str) -> Read:
 
 
 def _alpha_noise(aperture: float) -> Read:
-    """Mean noise of d_alpha for a prism aperture in mm, with pinholes of 20 um, 4 frames and 650 nm, mas."""
+    """Return a reader of the mean noise of d_alpha, in mas, for a prism aperture in mm.
+
+    Pinholes are 20 um, with 4 frames at 650 nm.
+    """
 
     def read(folder: Path) -> float:
         table = _runs(folder)
@@ -62,7 +65,7 @@ def _alpha_noise(aperture: float) -> Read:
 
 
 def _heat_error(camera: str) -> Read:
-    """Three standard deviations of d_alpha and d_beta together at an unsteadiness of 1, arcsec."""
+    """Return a reader of 3 sigma of d_alpha and d_beta together at an unsteadiness of 1, in arcsec."""
 
     def read(folder: Path) -> float:
         table = _runs(folder)
@@ -73,17 +76,20 @@ def _heat_error(camera: str) -> Read:
 
 
 def _heat_limit(camera: str) -> Read:
-    """Gradient that gives the allowed error, three standard deviations, mK/m."""
+    """Return a reader of the gradient, in mK/m, that causes the allowed error at three standard deviations."""
     return lambda folder: _GRADIENT_3_SIGMA * _ALLOWED / _heat_error(camera)(folder)
 
 
 def _rms(table: pd.DataFrame, name: str) -> float:
-    """RMS of a column over the runs and both cameras."""
+    """Return the RMS of a column over the runs and both cameras."""
     return float(np.sqrt(np.mean([np.mean(np.square(table[f"{camera}_{name}"])) for camera in _CAMERAS])))
 
 
 def _alignment_error(change: str, over: str = "") -> Read:
-    """RMS error of a change; divided by the RMS of its noise (``sigma_noise``) or total sigma (``sigma``) if given."""
+    """Return a reader of a change's RMS error.
+
+    It is divided by the RMS of its noise (``sigma_noise``) or total sigma (``sigma``) if ``over`` names one.
+    """
 
     def read(folder: Path) -> float:
         table = _runs(folder)
@@ -93,7 +99,7 @@ def _alignment_error(change: str, over: str = "") -> Read:
 
 
 def _statistic(response: str, what: str) -> Read:
-    """A statistic of a response: ``mean``, ``std``, ``p95``."""
+    """Return a reader of a statistic of a response: ``mean``, ``std``, ``p95``."""
 
     def read(folder: Path) -> float:
         return float(json.loads((folder / "statistics.json").read_text("utf-8"))["responses"][response][what]["value"])
@@ -102,7 +108,10 @@ def _statistic(response: str, what: str) -> Read:
 
 
 def _height(minutes: float | None) -> Read:
-    """Mean height error with a measurement at this interval, None for no measurement; mounts as in the base, metres."""
+    """Return a reader of the mean height error, in metres, with a measurement at this interval, or with none.
+
+    The mounts are those of the base.
+    """
 
     def read(folder: Path) -> float:
         table = _runs(folder)
@@ -115,23 +124,23 @@ def _height(minutes: float | None) -> Read:
 
 
 def _design(of: Callable[[dict[str, Any]], float]) -> Read:
-    """A number of design.json."""
+    """Return a reader of a number of design.json."""
     return lambda folder: float(of(json.loads((folder / "design.json").read_text("utf-8"))))
 
 
 def _errors(design: dict[str, Any], when: str, line: bool = False) -> np.ndarray:
-    """Wavefront errors of the fields before or after, waves rms; of those on the line alone if wanted."""
+    """Return wavefront errors of the fields before or after, in waves rms, optionally of those on the line alone."""
     errors, fields = np.array(design["wavefront_error_waves"][when]), np.array(design["fields_deg"])
     return np.asarray(errors[fields[:, 1] == 0.0] if line else errors)
 
 
 def _starts(design: dict[str, Any], what: str) -> np.ndarray:
-    """A number of each start."""
+    """Return a number of each start."""
     return np.array([start[what] for start in design["starts"]], float)
 
 
 def _errors_of_best(design: dict[str, Any]) -> float:
-    """The least wavefront error over the field of all starts, waves rms."""
+    """Return the least wavefront error over the field of all starts, in waves rms."""
     return float(_starts(design, "wavefront_error_waves").min())
 
 
@@ -210,4 +219,4 @@ STUDIES: Mapping[tuple[str, ...], Mapping[str, tuple[int, str, Read]]] = {
         "studies.design.jacobians_most": (0, "", _design(lambda d: _starts(d, "jacobians").max())),
     },
 }
-"""Command of a shipped study -> its figures: decimals, unit, and how each is read in the study's folder."""
+"""Command of a shipped study -> its figures: decimals, unit, and function that reads each in the study's folder."""

@@ -1,7 +1,7 @@
-"""Build the documentation: `python -m docs.site --out DIR`.
+"""Command that builds the documentation: `python -m docs.site --out DIR`.
 
-The pages in docs, the notebooks and the reference, which is made from the program, are gathered in a folder, where each
-has the place that it has in the project, so that its links hold; Sphinx makes the site of them.
+The pages in docs, the notebooks and the reference, which is generated from the program, are gathered in a folder at the
+same relative paths as in the project, so that their links hold; Sphinx builds the site from them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).resolve().parent
 NEEDED = ("sphinx", "myst_nb", "furo", "sphinx_copybutton")
 OWN = "'self' file:"
-"""Files of the site, on a server or in a folder; not every browser takes a folder for one origin."""
+"""Sources of the site's own files, on a server or in a folder; not every browser treats a folder as one origin."""
 _INLINE = re.compile(r"<(script|style)\b([^>]*)>(.*?)</\1>", re.S | re.I)
 _HEAD = re.compile(r"<head[^>]*>\s*(<meta charset=[^>]*>)?", re.I)
 _EVENT = re.compile(r"<[a-z][^<>]*\s(on[a-z]+)\s*=", re.I)
@@ -33,7 +33,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 
 
 class BuildError(Exception):
-    """The site cannot be built, or is not as it should be; the message says all that is wrong."""
+    """Error of a site that cannot be built or has faults; the message lists all of them."""
 
 
 @app.command()
@@ -46,8 +46,9 @@ def main(
         Path | None, typer.Option(help="Write only the page with every key of every file: docs/keys.md.")
     ] = None,
 ) -> None:
-    """Build the documentation as web pages that need no network: guides, notebooks, and the reference, made from the
-    program. Sphinx's warnings are errors, every link within the site is followed. Needs the extra `docs`.
+    """Build the documentation as web pages that need no network: guides, notebooks, and the generated reference.
+
+    Sphinx's warnings are errors, and every link within the site is checked. Needs the extra `docs`.
     """
     if keys is not None:
         from docs.site.file_pages import key_page
@@ -68,9 +69,9 @@ def build(out: Path, notebooks: bool = True) -> int:
     Parameters
     ----------
     out : Path
-        Folder for the pages; what a former build left there is replaced.
+        Folder for the pages; the site of a previous build there is replaced.
     notebooks : bool
-        Whether to run the notebooks; otherwise they are shown as they are.
+        Whether the notebooks are run; otherwise they are shown as they are.
 
     Returns
     -------
@@ -80,12 +81,12 @@ def build(out: Path, notebooks: bool = True) -> int:
     Raises
     ------
     BuildError
-        a package is missing, the reference cannot be made, Sphinx warns, or a page needs the network.
+        A package is missing, the reference cannot be made, Sphinx warns, or a page needs the network.
     """
     if missing := [name for name in NEEDED if importlib.util.find_spec(name) is None]:
         raise BuildError(f"not installed: {', '.join(missing)}; install the extra `docs`: pip install -e .[docs]")
     if out.exists() and any(out.iterdir()) and not (out / "objects.inv").exists():
-        raise BuildError(f"{out} holds something else than a site; choose another folder")
+        raise BuildError(f"{out} contains other files than a site; choose another folder")
     with tempfile.TemporaryDirectory(prefix="docs-") as place:
         source, made = Path(place, "source"), Path(place, "site")
         stage(source)
@@ -98,20 +99,20 @@ def build(out: Path, notebooks: bool = True) -> int:
 
 
 def stage(source: Path) -> None:
-    """Put everything that the site is made of into a new folder.
+    """Copy or generate all sources of the site in a new folder.
 
     Raises
     ------
     BuildError
-        a key has no example, or a file of a run folder no description.
+        A key has no example, or a file of a run folder no description.
     """
-    # what the pages are made from takes seconds to import
+    # Imported here, because these modules take seconds to import.
     from docs.site.command_pages import command_page
     from docs.site.file_pages import file_pages
     from docs.site.run_pages import run_pages
 
     shutil.copytree(HERE / "pages", source)
-    # notebooks write beside themselves
+    # Copied, because notebooks write into their folder.
     shutil.copytree(ROOT / "docs", source / "docs", ignore=shutil.ignore_patterns("site"))
     shutil.copy(ROOT / "README.md", source)
     for linked in ("optics", "scenes", "tests"):
@@ -126,12 +127,12 @@ def stage(source: Path) -> None:
 
 
 def run_sphinx(source: Path, made: Path, notebooks: str) -> int:
-    """Make pages in a process that imports this checkout, and return their number.
+    """Build the pages in a process that imports this checkout, and return their number.
 
     Parameters
     ----------
     source : Path
-        Folder with the pages' sources, of which index is the first.
+        Folder with the pages' sources, the first of which is index.
     made : Path
         Folder for the site.
     notebooks : str
@@ -140,8 +141,7 @@ def run_sphinx(source: Path, made: Path, notebooks: str) -> int:
     Raises
     ------
     BuildError
-        Sphinx warns: of a link or its place that is not there, a page that no other leads to, and more; or a page needs
-        the network.
+        Sphinx warns, for instance of a broken link or of a page to which no other leads, or a page needs the network.
     """
     environment = os.environ | {"JUPYTER_PLATFORM_DIRS": "1"}
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
@@ -161,16 +161,16 @@ def run_sphinx(source: Path, made: Path, notebooks: str) -> int:
 
 
 def with_policy(text: str) -> str:
-    """A page with its Content-Security-Policy at the beginning of its head: its own files, and what Sphinx writes into
-    it.
+    """Return a page with a Content-Security-Policy at the beginning of its head.
 
-    Scripts and style sheets that stand in the page are allowed by their checksums; all text is the project's own.
-    ``style`` attributes are allowed, since figures and highlighted programs have them.
+    It allows the site's own files and what Sphinx writes into the page. Scripts and style sheets in the page are
+    allowed by their checksums; all text is the project's own. ``style`` attributes are allowed, since figures and
+    highlighted programs have them.
 
     Raises
     ------
     ValueError
-        The page has no head, loads something from the network, or has attributes that hold programs, which no checksum
+        The page has no head, loads something from the network, or has attributes with programs, which no checksum
         covers.
     """
     head = _HEAD.search(text)
@@ -192,7 +192,7 @@ def with_policy(text: str) -> str:
             "style-src-attr": "'unsafe-inline'",
             "img-src": f"{OWN} data:",
             "font-src": f"{OWN} data:",
-            # the search reads pages for its excerpts, and its field is a form
+            # The search reads pages for its excerpts, and its field is a form.
             "connect-src": OWN,
             "form-action": OWN,
         }

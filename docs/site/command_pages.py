@@ -1,4 +1,4 @@
-"""The page of the commands: every program that can be run, its arguments and options, as its own parser knows them."""
+"""Page of the commands: every program, its arguments and options, generated from its parser."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from twin.framework.console import parser
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("twin", "analysis", "scenes", "optics")
 FIRST = ("twin.render", "twin.recover", "twin.lab", "twin.orbit", "twin.study", "twin.design")
-"""Programs that stand first; the others follow by name."""
+"""Programs listed first; the others follow by name."""
 NOT_FOR_USERS = {"twin.framework.doctor_probe": "the doctor's own helper"}
-"""Modules that can be run and are no commands, with the reason."""
+"""Modules that can be run but are not commands, with the reason."""
 
 
 @cache
 def programs() -> tuple[str, ...]:
-    """Modules of the packages that can be run by ``python -m``, those for users."""
+    """Return the modules for users that can be run by ``python -m``."""
     found = []
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
@@ -36,33 +36,34 @@ def programs() -> tuple[str, ...]:
 
 
 def _runs(path: Path) -> bool:
-    """Whether a file, run as a program, starts one at its end."""
+    """Return True if a file, run as a program, starts one at its end."""
     text = path.read_text("utf-8")
     last = ast.parse(text).body[-1:] if '__name__ == "__main__"' in text else []
     return any(isinstance(node, ast.If) and ast.unparse(node.test) == "__name__ == '__main__'" for node in last)
 
 
 def commands(program: str) -> dict[str, Any]:
-    """Words that call a command -> the command, of all subcommands of a program."""
+    """Return all subcommands of a program by the words that call them."""
     command = parser(program)
     below = getattr(command, "commands", None)
     return {f"{program} {name}": one for name, one in below.items()} if below else {program: command}
 
 
 def command_page() -> str:
-    """Markdown of the page."""
+    """Return the page in Markdown."""
     introduction = """# Commands
 
 Each is `.venv/bin/python -m NAME` (an environment of your own: `python -m NAME`), or `camtwin` with the last part of
-the name, `camtwin render`, and has a `--help` that says the same as this page. All that make a run folder share
+the name, `camtwin render`, and has a `--help` with the same text as this page. All that make a run folder share
 `--out`, `--seed`, `--backend`, `--force`, `--json` and `--quiet`;
-what is in the folders says [the next page](run_folders/index.md). Exit codes: 0 success, 2 bad input (one line for
+[the next page](run_folders/index.md) describes the folders. Exit codes: 0 success, 2 bad input (one line for
 each fault with file, line and key; nothing is written), 1 anything else, 130 interrupted.
 """
     return "\n".join([introduction, *map(_program, programs())])
 
 
 def _program(program: str) -> str:
+    """Return the section of a program."""
     group, below = parser(program), commands(program)
     if program in below:
         return f"## {code(program)}\n\n{_command(program, group)}"
@@ -71,7 +72,7 @@ def _program(program: str) -> str:
 
 
 def help_text(command: Any) -> str:
-    """What ``--help`` says above the options; indented lines of it are shown as they stand."""
+    """Return the text of ``--help`` above the options; its indented lines are shown verbatim."""
     text = inspect.cleandoc(command.help or "").replace("\b", "").replace("\f", "")
     out: list[str] = []
     for indented, blocks in groupby(text.split("\n\n"), lambda block: block.startswith(" ")):
@@ -83,6 +84,7 @@ def help_text(command: Any) -> str:
 
 
 def _command(words: str, command: Any) -> str:
+    """Return usage, help and options of a command."""
     arguments = [p for p in command.params if not p.opts[0].startswith("-")]
     usage = " ".join(["python -m", words, *(p.name.upper() for p in arguments), "[OPTIONS]"])
     rows = [_row(words, p) for p in command.params]
@@ -91,6 +93,7 @@ def _command(words: str, command: Any) -> str:
 
 
 def _row(words: str, param: Any) -> list[str]:
+    """Return the table row of an option or argument."""
     is_option = param.opts[0].startswith("-")
     names = [*param.opts, *param.secondary_opts] if is_option else [param.name.upper()]
     shown = ", ".join(map(code, names))
@@ -100,6 +103,7 @@ def _row(words: str, param: Any) -> list[str]:
 
 
 def _takes(param: Any) -> str:
+    """Return the type and limits of a parameter as text."""
     if getattr(param, "is_flag", False):
         return "nothing"
     sort = getattr(param.type_descriptor, "annotation", str)

@@ -38,5 +38,5 @@ toc_object_entries = False
 
 
 def setup(app: Sphinx) -> None:
-    """Tables in CSV have no colours."""
+    """Register CSV as text without highlighting."""
     app.add_lexer("csv", TextLexer)

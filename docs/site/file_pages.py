@@ -1,5 +1,6 @@
-"""Pages of the YAML files and of what jobs name in them: every key of every sort of file, with what it means, takes,
-defaults to, and an example; every node of the shipped instruments.
+"""Pages of the YAML files and of the nodes of the shipped instruments.
+
+A page lists every key of a kind of file with its meaning, type, default and an example.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from scenes.specs.load import INSTRUMENTS, SCENES, library_names
 from scenes.specs.perturbation import NodeInfo
 
 ACTIONS = ("rotate", "shift", "scale", "figure", "radius", "conic", "index", "abbe", "temperature")
-"""Columns of the tables of nodes, as they are written in a job."""
+"""Columns of the tables of nodes, as written in a job."""
 
 
 def file_pages() -> dict[str, str]:
-    """Path of a page in the site's source -> Markdown."""
+    """Return the pages in Markdown, by their paths in the site's source."""
     pages = {f"reference/files/{kind}.md": _page(kind) for kind in MODELS}
     return {"reference/files/index.md": _index(), **pages, "reference/nodes.md": _node_page()}
 
@@ -56,18 +57,19 @@ written. A key without a default must be written.
 
 
 def title(kind: str) -> str:
-    """Title of a kind of file."""
+    """Return the title of a kind of file."""
     return kind.replace("_", " ").capitalize()
 
 
 def read_by(kind: str) -> str:
-    """Which command reads a sort of file, and where its name stands in others."""
+    """Return the command that reads a kind of file, and the place of its name in other files."""
     (known,) = (one for one in file_kinds() if one.name == kind)
     command = f"by {code(f'python -m {known.command}')}" if known.command else ""
     return ", or ".join(filter(None, (command, known.place and f"in {known.place}")))
 
 
 def _index() -> str:
+    """Return the index page of the files."""
     rows = (
         [
             f"[{title(kind)}]({kind}.md)",
@@ -80,7 +82,7 @@ def _index() -> str:
     return f"""# Files: every key
 
 Every quantity carries its unit, `2 arcsec`; any unit of the same dimension may be written. Three quantities of one
-unit may be written in a row, `0 0 3 um`, where a list of them is asked for. A file that names another one does so by
+unit may be written in a row, `0 0 3 um`, where a list of them is required. A file that names another one does so by
 its name in the library or by a path relative to itself. An unknown key is an error with its line and the nearest key
 that there is.
 
@@ -88,7 +90,7 @@ These pages are made from the models that check the files. The same models give 
 completes keys and marks mistakes while typing: `python -m scenes.schema --out schemas`, then as the first line of a
 file `# yaml-language-server: $schema=schemas/job.schema.json`.
 
-{table(["File", "What it says", "Read", "Shipped"], rows, "files")}
+{table(["File", "Content", "Read", "Shipped"], rows, "files")}
 ```{{toctree}}
 :hidden:
 
@@ -98,6 +100,7 @@ file `# yaml-language-server: $schema=schemas/job.schema.json`.
 
 
 def _page(kind: str) -> str:
+    """Return the page of a kind of file."""
     files = shipped()[kind]
     parts = [f"# {title(kind)}\n\n{prose(sentence(summary(MODELS[kind])))}\n\nRead {read_by(kind)}.\n"]
     parts += [_section(kind, model, places) for model, places in sections(MODELS[kind]).items()]
@@ -108,23 +111,26 @@ def _page(kind: str) -> str:
 
 
 def _shipped(path: Path, opened: bool) -> str:
+    """Return a shipped file in a section that can be folded."""
     name, text = path.relative_to(SCENES.parent).as_posix(), path.read_text("utf-8").rstrip()
     opening = "<details open>" if opened else "<details>"
     return f"{opening}<summary><code>{name}</code></summary>\n\n```yaml\n{text}\n```\n\n</details>\n"
 
 
 def _section(kind: str, model: type[Spec], places: list[str]) -> str:
+    """Return the section of a mapping, with the table of its keys."""
     if places == [""]:
-        head, said = "## The file", ""
+        head, description = "## The file", ""
     else:
-        head, said = f"## {code(places[0])}", f"{prose(sentence(summary(model)))}\n"
+        head, description = f"## {code(places[0])}", f"{prose(sentence(summary(model)))}\n"
         if places[1:]:
-            said += f"\nThe same at {', '.join(map(code, places[1:]))}.\n"
+            description += f"\nThe same at {', '.join(map(code, places[1:]))}.\n"
     rows = (_row(kind, model, places[0], key) for key in keys(model))
-    return f"{head}\n\n{said}\n{table(['Key', 'Meaning', 'Takes', 'Default', 'Example'], rows, 'keys')}"
+    return f"{head}\n\n{description}\n{table(['Key', 'Meaning', 'Takes', 'Default', 'Example'], rows, 'keys')}"
 
 
 def _row(kind: str, model: type[Spec], place: str, key: Key) -> list[str]:
+    """Return the table row of a key."""
     full, value = f"{place}.{key.name}".lstrip("."), example(kind, model, key.name)[key.name]
     shown = code(f"{key.name}: {flow(value)}")
     if key.below:
@@ -135,25 +141,26 @@ def _row(kind: str, model: type[Spec], place: str, key: Key) -> list[str]:
 
 
 def _default(key: Key) -> str:
-    """Return the value that holds where a key is not written, in Markdown; empty where it must be written."""
+    """Return the default of a key in Markdown; empty if the key is required."""
     return key.default if key.default in ("none", "empty", "its own defaults") else code(key.default)
 
 
 def _takes(takes: Takes) -> str:
-    """What may stand after a key, its units and limits, in a line."""
+    """Return type, units and limits of a key in one line."""
     units = f"in {', '.join(map(code, takes.units))}" if takes.units else ""
     before, one_of, names = takes.what.partition("one of ")
-    # names that something else follows stay as they are
+    # Names followed by an alternative stay as they are.
     what = f"{before}one of {', '.join(map(code, names.split(', ')))}" if one_of and " or " not in names else takes.what
     return "; ".join(filter(None, (f"{what} {units}".strip(), takes.limits)))
 
 
 def _node_page() -> str:
+    """Return the page of the nodes."""
     parts = [
         """# Nodes of the shipped instruments
 
-What stands under `perturb:` in a job, `base/forward/M2`, is the path of a body in the tree of parts: what is done to
-a body happens to all that it carries. `rotate` and `scale` act about a *pivot*, `origin` where none is named. Axes
+A key under `perturb:` in a job, `base/forward/M2`, is the path of a body in the tree of parts; a perturbation of a
+body moves all bodies that it carries. `rotate` and `scale` act about a *pivot*, `origin` where none is named. Axes
 and signs are those of [conventions](../docs/conventions.md); keys and limits those of [a job](files/job.md).
 
 In a script the same table is `twin.load("gf7_pair").nodes`. An instrument of your own has the nodes of its own
@@ -167,7 +174,7 @@ cameras: their names are those of its file, mirrors those of the camera's file.
 
 
 def node_table(name: str, nodes: Mapping[str, NodeInfo]) -> str:
-    """The table of one instrument: path of a node -> what may be done to it, in the order of the paths."""
+    """Return the table of one instrument's nodes with what each allows, sorted by path."""
     rows = (
         [
             f"{anchor(f'{name}-{path}')}{code(path)}",

@@ -1,4 +1,4 @@
-"""Markdown as the generated pages need it."""
+"""Markdown for the generated pages."""
 
 from __future__ import annotations
 
@@ -7,50 +7,50 @@ from collections.abc import Iterable, Sequence
 
 
 def code(text: str) -> str:
-    """Text as code, in a cell of a table, too."""
+    """Return text as code, also valid in a cell of a table."""
     fence = "``" if "`" in text else "`"
     pad = " " if "`" in text else ""
     return f"{fence}{pad}{text}{pad}{fence}" if text else ""
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]], name: str = "") -> str:
-    """A table; with the name of a class the style sheet can tell it from others."""
+    """Return a table, with the name of a class for the style sheet if there is one."""
     lines = [f"| {' | '.join(heads)} |", f"|{'|'.join(' --- ' for _ in heads)}|"]
     for row in rows:
         cells = [" ".join(cell.split()).replace("|", "\\|") for cell in row]
         lines.append(f"| {' | '.join(cells)} |")
-    # a class on the next block is an attribute of MyST
+    # MyST's attribute syntax sets the class of the next block.
     return (f"{{.{name}}}\n" if name else "") + "\n".join(lines) + "\n"
 
 
 def prose(text: str) -> str:
-    """A docstring in Markdown: what stands between two backquotes is code there as well, and so is an option."""
+    """Return a docstring in Markdown: text between backquotes and options become code."""
     parts = re.split(r"(`[^`]*`)", re.sub(r"``([^`]+)``", r"`\1`", text))
     return "".join(part if part.startswith("`") else _plain(part) for part in parts)
 
 
 def _plain(text: str) -> str:
-    """Text without code, in which no character begins emphasis, a tag or a role."""
+    """Return text without code, escaped so that no character begins emphasis, a tag or a role."""
     escaped = re.sub(r"([*<>{}\[\]$]|(?<!\w)_|_(?!\w))", r"\\\1", text)
     return re.sub(r"(?<![\w-])(--[a-z][\w-]*)", r"`\1`", escaped)
 
 
 def anchor(text: str) -> str:
-    """A place that a link can lead to; not seen."""
+    """Return an invisible anchor for links."""
     return f'<span id="{slug(text)}"></span>'
 
 
 def slug(text: str) -> str:
-    """A text as the name of a place in a page."""
+    """Return a text as the name of an anchor."""
     return re.sub(r"[^\w.-]+", "-", text).strip("-").lower()
 
 
 def sentence(text: str) -> str:
-    """With a capital and a full stop."""
+    """Return a text with a capital and a full stop."""
     text = text.strip()
     if not text:
         return ""
-    # names of things in the program keep their letters
+    # Identifiers keep their case.
     word = text.split()[0]
     first = text if re.search(r"[`_./=]\w|^[a-zA-Z]\b", word) else text[0].upper() + text[1:]
     return first if first.endswith((".", ":", "!", "?")) else f"{first}."

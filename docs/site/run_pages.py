@@ -1,5 +1,6 @@
-"""The pages of the run folders: every file that a command leaves, and every field, column, variable and tag in it, read
-off the golden runs of every command; meanings and units are those of the records that make the files.
+"""Pages of the run folders: every file that a command writes, and every field, column, variable and tag in it.
+
+They are read from the golden runs of every command; meanings and units are those of the records that make the files.
 """
 
 from __future__ import annotations
@@ -28,21 +29,21 @@ ROOT = Path(__file__).resolve().parents[2]
 FOLDER = "reference/run_folders"
 DESCRIBED = read_yaml(Path(__file__).with_name("run_files.yaml")).data
 PRINTED = ("exit", "stdout", "stderr", "exact")
-"""Keys of a golden run that are no files."""
+"""Keys of a golden run that are not files."""
 SHOWN_NAMES = 4
 Tree = dict[str, Any]
-"""Segment of a path -> what is below it; a leaf is the sort of the value, as text."""
+"""Segment of a path -> subtree; a leaf is the type of the value, as text."""
 _LISTS = re.compile(r"(\[\])*$")
 
 
-# --- what golden runs left -------------------------------------------------------------------------------
+# --- content of golden runs -------------------------------------------------------------------------------
 
 
-def kept_fields(job: str) -> dict[str, Any]:
-    """Return file -> what stands in it without the values, of a golden run; empty for one without files.
+def golden_fields(job: str) -> dict[str, Any]:
+    """Return file -> structure of its content without values, of a golden run; empty for one without files.
 
-    ``fields`` of JSON: path of a value -> its sort. ``columns`` of CSV. ``variables`` of netCDF: name -> dimensions,
-    sort of number and attributes, and ``attributes`` of its groups. ``dtype`` and ``tags`` of TIFF.
+    JSON has ``fields``: path of a value -> its type. CSV has ``columns``. netCDF has ``variables``: name -> dimensions,
+    type of number and attributes, and ``attributes`` of its groups. TIFF has ``dtype`` and ``tags``.
     """
     run = json.loads(golden_file(job).read_text("utf-8"))["run"]
     return {name: _fields(name, tree) for name, tree in run.items() if name not in PRINTED}
@@ -55,9 +56,9 @@ def _fields(name: str, tree: dict[str, Any]) -> dict[str, Any]:
         return {"columns": tree["head"]}
     if name.endswith(".nc"):
         variables = {
-            f"{group.rstrip('/')}/{variable}".lstrip("/"): told
+            f"{group.rstrip('/')}/{variable}".lstrip("/"): description
             for group, data in tree.items()
-            for variable, told in data["variables"].items()
+            for variable, description in data["variables"].items()
         }
         return {"variables": variables, "attributes": [key for data in tree.values() for key in sorted(data["attrs"])]}
     if name.endswith(".tiff"):
@@ -67,25 +68,25 @@ def _fields(name: str, tree: dict[str, Any]) -> dict[str, Any]:
 
 @cache
 def golden_runs() -> dict[str, dict[str, list[Any]]]:
-    """Command -> file of its run folders -> what stands in it in each golden job that has it."""
+    """Return command -> file of its run folders -> structure of the file in each golden job that has it."""
     out: dict[str, dict[str, list[Any]]] = {}
     for job in ALL:
         words = [word for word in job.words[1:2] if re.fullmatch(r"[a-z]+", word)]
         words += [word for word in job.words if word == "--gradient"]
         command = " ".join([job.words[0], *words])
         if command in DESCRIBED["commands"]:
-            for name, told in kept_fields(job.name).items():
-                out.setdefault(command, {}).setdefault(name, []).append(told)
+            for name, fields in golden_fields(job.name).items():
+                out.setdefault(command, {}).setdefault(name, []).append(fields)
     return out
 
 
 def described(command: str) -> list[dict[str, str]]:
-    """The files of a command's run folder as the reference lists them.
+    """Return the entries of a command's run folder files for the reference.
 
     Raises
     ------
     LookupError
-        a golden run has a file that is not described.
+        A golden run has a file that is not described.
     """
     everywhere, there = DESCRIBED["everywhere"], []
     for name in golden_runs()[command]:
@@ -94,7 +95,7 @@ def described(command: str) -> list[dict[str, str]]:
                 there.append(entry)
                 break
         else:
-            raise LookupError(f"{command}: run_files.yaml does not say what {name} is")
+            raise LookupError(f"{command}: run_files.yaml does not describe {name}")
     return [*DESCRIBED["commands"][command], *(entry for entry in everywhere if entry in there)]
 
 
@@ -102,11 +103,11 @@ def described(command: str) -> list[dict[str, str]]:
 
 
 def field_tree(several: list[Any]) -> Tree:
-    """The fields of a JSON file in all the runs that wrote it, things of one sort together."""
+    """Return the fields of a JSON file over all runs that wrote it, with equal structures merged."""
     tree: Tree = {}
-    for told in several:
-        for path, sort in told["fields"].items():
-            # names in braces may have dots
+    for run in several:
+        for path, sort in run["fields"].items():
+            # Names in braces may have dots.
             *above, last = re.findall(r"(?:\{[^{}]*\}|[^.{}])+", path)
             here = tree
             for part in above:
@@ -120,8 +121,9 @@ def field_tree(several: list[Any]) -> Tree:
 
 
 def grouped(tree: Tree, above: str = "") -> Tree:
-    """The tree with mappings that have the same below them under one segment, ``{a|b}``; numbers, too, where the key
-    ``above`` them has their unit, for then their own keys are names.
+    """Return the tree with mappings of equal content merged into one segment, ``{a|b}``.
+
+    Numbers are merged as well where the key above them has the unit.
     """
     below = {key: grouped(one, key) if isinstance(one, dict) else one for key, one in tree.items()}
     named = bool(unit((above,)))
@@ -133,24 +135,24 @@ def grouped(tree: Tree, above: str = "") -> Tree:
 
 
 def names(part: str) -> list[str]:
-    """The names that a segment of a path stands for."""
+    """Return the names that a segment of a path stands for."""
     return _LISTS.sub("", part).strip("{}").split("|")
 
 
 def lists(part: str) -> str:
-    """The brackets at the end of a segment."""
+    """Return the brackets at the end of a segment."""
     return part[len(_LISTS.sub("", part)) :]
 
 
 def _together(keys: list[str]) -> str:
     if len(keys) == 1:
         return keys[0]
-    every = dict.fromkeys(name for key in keys for name in names(key))
-    return f"{{{'|'.join(every)}}}{lists(keys[0])}"
+    merged = dict.fromkeys(name for key in keys for name in names(key))
+    return f"{{{'|'.join(merged)}}}{lists(keys[0])}"
 
 
 def leaves(tree: Tree, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str]]:
-    """(segments, sort) of every field."""
+    """Yield (segments, type) of every field."""
     for key, below in tree.items():
         if isinstance(below, dict):
             yield from leaves(below, (*above, key))
@@ -159,7 +161,7 @@ def leaves(tree: Tree, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str,
 
 
 def shown_path(path: tuple[str, ...]) -> str:
-    """A path as the reference writes it; of many names the first few."""
+    """Return a path as the reference writes it, with only the first few of many names."""
 
     def few(found: re.Match[str]) -> str:
         listed = found[1].split("|")
@@ -170,7 +172,7 @@ def shown_path(path: tuple[str, ...]) -> str:
 
 
 def unit(path: tuple[str, ...]) -> str:
-    """The unit that the key of a field says, or the nearest key above it that says one."""
+    """Return the unit in the key of a field, or in the nearest key above it that has one."""
     for part in reversed(path):
         key = names(part)[0].removesuffix("_sigma")
         inverse = re.search(r"_per_(mm|m|px)$", key)
@@ -184,11 +186,11 @@ def unit(path: tuple[str, ...]) -> str:
     return ""
 
 
-# --- what the fields mean --------------------------------------------------------------------------------
+# --- meaning of the fields --------------------------------------------------------------------------------
 
 
 def meaning(kind: str, path: tuple[str, ...]) -> str:
-    """What a field holds, as far as the source says; ``kind`` is the file's name without .json."""
+    """Return the meaning of a field, as far as the source declares it; ``kind`` is the file's name without .json."""
     key = names(path[-1])[0]
     if kind == "manifest":
         return attributes(Manifest).get(names(path[0])[0], "")
@@ -200,9 +202,7 @@ def meaning(kind: str, path: tuple[str, ...]) -> str:
 
 
 def declared(kind: str, path: tuple[str, ...]) -> tuple[str, str]:
-    """What the record of a kind of file says of the field at the end of a path, and what the record below it says of
-    itself.
-    """
+    """Return the description of a field in the record of a kind of file, and that in the record below it."""
     record = _records().get(kind)
     here, said = record, ""
     for part in path:
@@ -210,7 +210,7 @@ def declared(kind: str, path: tuple[str, ...]) -> tuple[str, str]:
         if found is not None:
             said, here = found.meaning, found.below
         elif not part.startswith("{") and (here is None or here is record):
-            # a name of a mapping leads to the record that the mapping holds; anything else is not declared
+            # A name of a mapping leads to the record in the mapping; anything else is not declared.
             return "", ""
     return said, "" if here is None else here.meaning
 
@@ -222,7 +222,7 @@ def _sources() -> Iterator[tuple[Path, ast.Module]]:
 
 @cache
 def _records() -> Mapping[str, Record[Any]]:
-    """Kind of file -> the record whose meaning begins with the file's name."""
+    """Return kind of file -> the record whose meaning begins with the file's name."""
     out = {}
     for path, module in _sources():
         for node in module.body:
@@ -236,9 +236,7 @@ def _records() -> Mapping[str, Record[Any]]:
 
 @cache
 def artefact_titles() -> tuple[tuple[str, str, str], ...]:
-    """(folder of the source, regular expression of an artefact's name, its title), of all calls that name and title
-    one.
-    """
+    """Return (folder of the source, pattern of an artefact's name, title) of all calls that name and title one."""
     out = []
     for path, module in _sources():
         for node in ast.walk(module):
@@ -247,24 +245,24 @@ def artefact_titles() -> tuple[tuple[str, str, str], ...]:
                 given |= {one.arg: one.value for one in node.keywords if one.arg in ("name", "title")}
                 if len(given) == 2 and (title := _text(given["title"], "…"))[:1].isupper():
                     out.append((path.parent.as_posix(), _text(given["name"], r"[\w-]+"), title))
-    # a name in so many words before one that is partly filled in
+    # Literal names precede names that are partly filled in.
     return tuple(sorted(out, key=lambda found: "[" in found[1]))
 
 
 def _text(node: ast.expr, hole: str) -> str:
-    """A literal or formatted text with something in place of what is filled in; empty for anything else."""
+    """Return a literal or formatted text with a placeholder for inserted values; empty for anything else."""
     if isinstance(node, ast.JoinedStr):
         return "".join(str(part.value) if isinstance(part, ast.Constant) else hole for part in node.values)
     return node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ""
 
 
 def artefact_title(command: str, file: str) -> str:
-    """What a figure or table in artefacts/ shows; empty where the source does not say it in so many words."""
+    """Return the title of a figure or table in artefacts/; empty where the source has no literal title."""
     folders, stem = DESCRIBED["folders"], Path(file).stem
     place = next((folder for words, folder in folders.items() if command.startswith(words)), command.replace(".", "/"))
     found = [(home, said) for home, name, said in artefact_titles() if re.fullmatch(name, stem)]
     here = [said for home, said in found if home.startswith(place)]
-    # made where no other command has its reports
+    # Fall back to sources outside of the commands' folders.
     shared = [said for home, said in found if not home.startswith(tuple(folders.values()))]
     return (here or [said for said in shared if len(shared) == 1] or [""])[0]
 
@@ -273,7 +271,7 @@ def artefact_title(command: str, file: str) -> str:
 
 
 def run_pages() -> dict[str, str]:
-    """Path of a page in the site's source -> Markdown."""
+    """Return the pages in Markdown, by their paths in the site's source."""
     files = {
         command: command.replace("twin.", "").replace(" --", "-").replace(".", "-").replace(" ", "-")
         for command in golden_runs()

@@ -1,6 +1,4 @@
-"""Every key of every sort of YAML file, read off the JSON Schemas of the models that check the files, with an example
-that its model takes.
-"""
+"""Every key of every kind of YAML file, from the JSON Schemas of the models that check the files, with examples."""
 
 from __future__ import annotations
 
@@ -23,11 +21,11 @@ from scenes.yaml.spec import Catalogued, Spec, validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 
 NAMED, NODE, LISTED = ".NAME", ".NODE", "[]"
-"""How a key path writes what stands under a name of the user's choice, under a node's path, and the items of a list."""
+"""Notation in key paths for an item under a user's name, under a node's path, and for the items of a list."""
 LONGEST = 70
-"""Characters of an example in a table; of longer ones a shorter one is looked for."""
+"""Characters of an example in a table above which a shorter example is sought."""
 BY_HAND = Path(__file__).with_name("examples.yaml")
-"""Model -> mappings with keys that no shipped file has; what a mapping lacks a shipped one of its model adds."""
+"""File with model -> mappings for keys that no shipped file has; missing keys are taken from a shipped mapping."""
 _ATTRIBUTE = re.compile(r"^(\w+(?:, \w+)*)(?: : .*)?\n((?:(?: {4}.*)?\n)*(?: {4}.*))", re.MULTILINE)
 """One attribute of a class under NumPy's heading: its names, and the indented text below them."""
 _QUANTITY = re.compile(r"(?:an? |the )?(.*) with its unit \((.*)\), e\.g\. '[^']*'(?:; (.*))?")
@@ -48,18 +46,18 @@ _BOUNDS = {
 
 @dataclass(frozen=True)
 class Takes:
-    """What may stand after a key.
+    """Values that a key allows.
 
     Attributes
     ----------
     what : str
-        In words: "angle", "3 × length", "one of traced, ignore".
+        Type in words: "angle", "3 × length", "one of traced, ignore".
     units : tuple[str, ...]
-        That are suggested; others of the same dimension are read, too.
+        Suggested units; others of the same dimension are read, too.
     limits : str
-        In words, empty for none.
+        Limits in words, empty for none.
     below : tuple[tuple[str, str], ...]
-        Names of the specifications that it holds, each after what stands between in a key path: "", ".NAME", "[]".
+        Names of the specifications that it contains, each after the part of the key path before it: "", ".NAME", "[]".
     """
 
     what: str
@@ -68,7 +66,7 @@ class Takes:
     below: tuple[tuple[str, str], ...] = ()
 
     def within(self, what: str, between: str) -> Takes:
-        """The same for each of several that stand together."""
+        """Return the same values as items of a list or mapping."""
         each = "" if what.startswith("mapping") and self.what == "mapping" else f", each {self.what}"
         below = tuple((f"{between}{more}", model) for more, model in self.below)
         return Takes(f"{what}{each}", self.units, self.limits, below)
@@ -81,15 +79,15 @@ class Key:
     Attributes
     ----------
     name : str
-        Of the key.
+        Name of the key.
     meaning : str
-        What the docstring says, without the SI unit that only the program knows.
+        Description in the docstring, without the SI unit, which applies to the program only.
     takes : Takes
-        What may stand after it.
+        Values that it allows.
     default : str
-        What holds where it is not written, as YAML; empty where it must be written.
+        Default value, as YAML; empty for a required key.
     below : tuple[tuple[str, type[Spec]], ...]
-        Models of what it holds, each after what stands between in a key path.
+        Models of its content, each after the part of the key path before it.
     """
 
     name: str
@@ -100,9 +98,7 @@ class Key:
 
 
 def sections(model: type[Spec]) -> dict[type[Spec], list[str]]:
-    """All mappings of one sort of file in the order in which its keys lead to them: model -> key paths where it stands,
-    "" for the file itself.
-    """
+    """Return the key paths of all mappings of a kind of file, by model, in the order of the keys; "" is the file."""
     places: dict[type[Spec], list[str]] = {}
 
     def walk(here: type[Spec], place: str) -> None:
@@ -117,40 +113,40 @@ def sections(model: type[Spec]) -> dict[type[Spec], list[str]]:
 
 @cache
 def keys(model: type[Spec]) -> tuple[Key, ...]:
-    """The keys of one mapping."""
+    """Return the keys of one mapping."""
     schema, said, out = model.model_json_schema(schema_generator=WithUnits), attributes(model), []
     for field, item in schema["properties"].items():
         info = model.model_fields[field]
         parts = list(_parts((info.annotation, *info.metadata)))
         catalogue = [", ".join(part.names) for part in parts if isinstance(part, Catalogued)]
         takes = Takes(f"one of {catalogue[0]}") if catalogue else taken(item)
-        # a model of a few keys may say all in a sentence
+        # A model of a few keys may describe all of them in its summary.
         meaning = said.get(field) or summary(model)
         if takes.units:
             meaning = _SI_UNIT.sub("", meaning)
-        # what a program calls None is a key that is not written
+        # None in the program is a key that is not written.
         meaning = re.sub(r"\bNone (?=for|where|if|when|in)", "left out ", meaning)
         models = {part.__name__: part for part in parts if inspect.isclass(part) and issubclass(part, Spec)}
-        # what else the schema names has a page of its own
+        # Other models of the schema have a page of their own.
         below = tuple((between, models[name]) for between, name in takes.below if name in models)
         out.append(Key(field, meaning, takes, "" if info.is_required() else _default(item, takes), below))
     return tuple(out)
 
 
 def _parts(hints: typing.Iterable[Any]) -> Iterator[Any]:
-    """Types and annotations at any depth of type hints."""
+    """Yield types and annotations at any depth of type hints."""
     for hint in hints:
         yield hint
         yield from _parts(typing.get_args(hint))
 
 
 def summary(model: type[Any]) -> str:
-    """First paragraph of a docstring."""
+    """Return the first paragraph of a docstring."""
     return " ".join((model.__doc__ or "").split("\n\n")[0].split())
 
 
 def attributes(model: type[Any]) -> dict[str, str]:
-    """What the docstrings of a class and of those it inherits from say of its attributes."""
+    """Return the descriptions of attributes in the docstrings of a class and its bases."""
     out: dict[str, str] = {}
     for base in reversed(model.__mro__):
         text = inspect.cleandoc(base.__dict__.get("__doc__") or "").partition("Attributes\n----------\n")[2]
@@ -160,12 +156,12 @@ def attributes(model: type[Any]) -> dict[str, str]:
 
 
 def taken(schema: Mapping[str, Any]) -> Takes:
-    """What a JSON Schema lets stand after a key.
+    """Return the values that a JSON Schema allows for a key.
 
     Raises
     ------
     TypeError
-        a form that the reference cannot describe.
+        The schema has a form that the reference cannot describe.
     """
     if "$ref" in schema:
         return Takes("mapping", below=(("", re.split("__|/", schema["$ref"])[-1]),))
@@ -189,7 +185,7 @@ def taken(schema: Mapping[str, Any]) -> Takes:
 
 
 def _either(schemas: list[dict[str, Any]]) -> Takes:
-    # a mapping without keys stands in the place of the file that a name means; a vector may be a text as well
+    # A mapping without keys represents the file that a name means; a vector may be a text as well.
     named = [one for one in schemas if one.get("type") != "null" and one.get("additionalProperties") is not True]
     alike = {json.dumps(one.get("items", one).get("description", one)): one for one in reversed(named)}
     several = [taken(one) for one in reversed(alike.values())]
@@ -222,33 +218,33 @@ def _mapping(schema: Mapping[str, Any]) -> Takes:
 
 
 def bound_text(value: float) -> str:
-    """A limit as the reference writes it."""
+    """Return a limit as the reference writes it."""
     if value == 2**63 - 1:
         return "2⁶³ − 1"
     return f"{value:,}".replace(",", "\N{NARROW NO-BREAK SPACE}") if isinstance(value, int) else f"{value:g}"
 
 
 def _default(schema: Mapping[str, Any], takes: Takes) -> str:
-    """What holds where a key is not written, as it would be written."""
+    """Return the default of a key as a file would write it."""
     value = schema.get("default", {})
     if value is None:
         return "none"
     if "$ref" in schema or (takes.below and value):
         return "its own defaults"
     text = flow(value) if value or isinstance(value, bool | int | float) else "empty"
-    # no power of ten where another unit does without
+    # Prefer a unit that needs no power of ten.
     return re.sub(r"([\d.]+e\+\d+) um", lambda found: f"{1e-6 * float(found[1]):g} m", text)
 
 
 def flow(value: Any) -> str:
-    """A value as one line of YAML."""
+    """Return a value as one line of YAML."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key}: {flow(one)}" for key, one in value.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(flow(one) for one in value) + "]"
     if isinstance(value, float):
         return f"{value:g}" if float(f"{value:g}") == value else repr(value)
-    # what could be read as something else stands in quotes, in the way of JSON, which YAML reads
+    # Texts that YAML could read as another type are quoted as in JSON.
     return value if isinstance(value, str) and _PLAIN.fullmatch(value) else json.dumps(value, ensure_ascii=False)
 
 
@@ -257,12 +253,12 @@ def flow(value: Any) -> str:
 
 @cache
 def shipped() -> dict[str, tuple[Path, ...]]:
-    """Sort of file -> the shipped files of that sort, in order.
+    """Return the shipped files of each kind, in order.
 
     Raises
     ------
     ValueError
-        a shipped file that is of no sort, or of several.
+        A shipped file is of no kind, or of several.
     """
     out: dict[str, list[Path]] = {kind: [] for kind in MODELS}
     for path in sorted(SCENES.rglob("*.yaml")):
@@ -275,7 +271,7 @@ def shipped() -> dict[str, tuple[Path, ...]]:
 
 @cache
 def kinds_of(path: Path) -> tuple[str, ...]:
-    """The sorts of file that a file can be read as."""
+    """Return the kinds of file that a file can be read as."""
     yaml = _read(path)
     out = []
     for kind, model in MODELS.items():
@@ -295,7 +291,7 @@ def _read(path: Path) -> YamlFile:
 
 @cache
 def _instances(kind: str) -> dict[type[Spec], list[dict[str, Any]]]:
-    """Every mapping of each model in the shipped files of a sort."""
+    """Return every mapping of each model in the shipped files of a kind."""
     found: dict[type[Spec], list[dict[str, Any]]] = {}
     for path in shipped()[kind]:
         for model, data in _mappings(MODELS[kind], _read(path).data):
@@ -304,7 +300,7 @@ def _instances(kind: str) -> dict[type[Spec], list[dict[str, Any]]]:
 
 
 def _mappings(model: type[Spec], data: Any) -> Iterator[tuple[type[Spec], dict[str, Any]]]:
-    """All specifications within one, as plain data; nothing where a name stands in the place of a mapping."""
+    """Yield all specifications within one, as plain data; nothing where a name takes the place of a mapping."""
     if isinstance(data, dict):
         yield model, data
         for key in keys(model):
@@ -320,12 +316,12 @@ def _mappings(model: type[Spec], data: Any) -> Iterator[tuple[type[Spec], dict[s
 
 @cache
 def example(kind: str, model: type[Spec], name: str) -> dict[str, Any]:
-    """A mapping that a model takes, with the key in it: of a shipped file, of that sort if there is one, or `BY_HAND`.
+    """Return a mapping that a model accepts, with the key in it, from a shipped file or `BY_HAND`.
 
     Raises
     ------
     LookupError
-        There is none.
+        There is no such mapping.
     """
     (key,) = (one for one in keys(model) if one.name == name)
     shipped_ones = [data for other in (kind, *MODELS) for data in _instances(other).get(model, ())]
@@ -346,12 +342,12 @@ def example(kind: str, model: type[Spec], name: str) -> dict[str, Any]:
 
 @cache
 def read_by_hand() -> dict[str, list[dict[str, Any]]]:
-    """Name of a model -> mappings."""
+    """Return the mappings of ``BY_HAND`` by the name of their model."""
     return dict(read_yaml(BY_HAND).data)
 
 
 def accepted(model: type[Spec], data: Any) -> bool:
-    """Whether the model takes the mapping."""
+    """Return True if the model accepts the mapping."""
     try:
         model.model_validate(data)
     except (ValidationError, InputError):

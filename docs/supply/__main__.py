@@ -1,4 +1,4 @@
-"""What is installed, and under which terms: `python -m docs.supply lock|sbom|licences|audit`."""
+"""Locked packages and their licences: `python -m docs.supply lock|sbom|licences|audit`."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ Layer = Annotated[
 
 
 @contextmanager
-def _told() -> Iterator[None]:
-    """Failures as one line and exit code 2."""
+def _exit_on_failure() -> Iterator[None]:
+    """Print failures as one line and exit with code 2."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -62,12 +62,13 @@ def _refuse(text: object) -> NoReturn:
 def lock(
     upgrade: Annotated[bool, typer.Option("--upgrade", help="Newest versions of what is not pinned there.")] = False,
 ) -> None:
-    """Write docs/supply/lock/*.txt anew from pyproject.toml, install.in and peers.in. Versions stay where they can.
-    Afterwards run licences.
+    """Write docs/supply/lock/*.txt again from pyproject.toml, install.in and peers.in, keeping versions where possible.
+
+    Run licences afterwards.
 
     Example: python -m docs.supply lock
     """
-    with _told():
+    with _exit_on_failure():
         for layer, packages in make_lock(upgrade=upgrade).items():
             sys.stdout.write(f"{layer}.txt: {len(packages)} packages\n")
 
@@ -80,7 +81,7 @@ def sbom(
 
     Example: python -m docs.supply sbom --out sbom.cdx.json --for install,runtime
     """
-    with _told():
+    with _exit_on_failure():
         from docs.supply.sbom import bill
 
         out.write_text(bill(_layers(layers)), "utf-8")
@@ -89,11 +90,11 @@ def sbom(
 
 @app.command()
 def licences() -> None:
-    """Bring docs/supply/licences.csv up to the lock, and count. Only packages that it lacks are fetched, and read.
+    """Update docs/supply/licences.csv to the lock, and print counts; only missing packages are fetched and read.
 
     Example: python -m docs.supply licences
     """
-    with _told():
+    with _exit_on_failure():
         from docs.supply.licences import read_carried, update
 
         rows = update()
@@ -111,34 +112,35 @@ def licences() -> None:
 def audit(
     layers: Layer = ALL, service: Annotated[Literal["pypi", "osv"], typer.Option(help="Who is asked.")] = "pypi"
 ) -> None:
-    """Ask for known vulnerabilities of the locked packages, those of this Python and platform. Needs the network. Exit
-    code 0: none is known; 1: some are, and listed; 2: not all packages could be checked.
+    """Look up known vulnerabilities of the locked packages for this Python and platform. Needs the network.
+
+    Exit code 0: none is known; 1: some are, and listed; 2: not all packages could be checked.
 
     Example: python -m docs.supply audit --for install,runtime
     """
     lists = [word for layer in _layers(layers) for word in ("-r", str(FOLDER / f"{layer}.txt"))]
     # everything is pinned: nothing is to be resolved or installed
     options = ["--disable-pip", "--no-deps", "--require-hashes", "--progress-spinner", "off"]
-    with _told(), tempfile.TemporaryDirectory(prefix="audit-") as place:
+    with _exit_on_failure(), tempfile.TemporaryDirectory(prefix="audit-") as place:
         out = Path(place, "answer.json")
         command = [sys.executable, "-m", "pip_audit", "-s", service, "-f", "json", "-o", str(out), *options, *lists]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if not out.exists():
-            said = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
-            raise SupplyError(f"pip-audit got no answer: {said[0]}")
-        number, found = findings(out.read_text("utf-8"))
-    sys.stdout.write("".join(f"{line}\n" for line in found))
-    sys.stdout.write(f"{number} packages checked, {len(found)} known vulnerabilities\n")
-    raise typer.Exit(1 if found else 0)
+            last_line = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
+            raise SupplyError(f"pip-audit failed: {last_line[0]}")
+        number, vulnerabilities = findings(out.read_text("utf-8"))
+    sys.stdout.write("".join(f"{line}\n" for line in vulnerabilities))
+    sys.stdout.write(f"{number} packages checked, {len(vulnerabilities)} known vulnerabilities\n")
+    raise typer.Exit(1 if vulnerabilities else 0)
 
 
 def findings(answer: str) -> tuple[int, list[str]]:
-    """How many packages pip-audit's JSON answers for, and a line for each known vulnerability.
+    """Return the number of packages in pip-audit's JSON, and a line for each known vulnerability.
 
     Raises
     ------
     SupplyError
-        It does not answer for all packages; pip-audit itself takes one that its service does not know for a good one.
+        The JSON lacks some of the packages; pip-audit itself treats a package unknown to its service as free of faults.
     """
     packages = json.loads(answer)["dependencies"]
     skipped = [p["name"] for p in packages if "skip_reason" in p]

@@ -1,4 +1,4 @@
-"""The licence of every locked package, as an SPDX expression: read from the packages, kept beside in licences.csv."""
+"""Licence of every locked package as an SPDX expression, read from the packages and stored in licences.csv."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from twin.framework.lock_file import FOLDER, Locked, normal, read_lock
 TABLE = Path(__file__).with_name("licences.csv")
 CARRIED = Path(__file__).with_name("carried.csv")
 BY_HAND = "its licence file, read by a person"
-"""Source of rows that no rule below gives; such rows stay while the version does."""
+"""Source of rows that no rule below gives; such rows stay until the version changes."""
 OTHER_NAMES = {
     "apache 2": "Apache-2.0",
     "apache 2.0": "Apache-2.0",
@@ -36,32 +36,32 @@ OTHER_NAMES = {
     "psfl": "PSF-2.0",
     "python software foundation license": "PSF-2.0",
 }
-"""How packages spell it, in lower case; of the BSD licences the text of the licence tells which."""
+"""Spellings of licences in packages, in lower case; for BSD licences the licence's text determines which."""
 COPYLEFT = {
     "strong": re.compile(r"A?GPL-|OSL-|SSPL-|EUPL-|CECILL-2"),
     "weak": re.compile(r"LGPL-|MPL-|EPL-|CDDL-|CPL-"),
 }
-"""Beginning of a licence's name -> what it asks of those who pass the package on; see docs/installed.md."""
+"""Prefix of a licence's name -> obligations of those who redistribute the package; see docs/installed.md."""
 LEAVES = re.compile(r"GCC-exception|Bootloader-exception|Classpath-exception")
-"""Exceptions that leave programs alone which only use the package."""
+"""Exceptions that do not affect programs which only use the package."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the table.
+    """Row of the table.
 
     Attributes
     ----------
     package, version : str
-        As locked.
+        Name and version as locked.
     for_ : str
-        Layer of the lock for which it is there.
+        First layer of the lock that has it.
     licence : str
         SPDX expression.
     copyleft : str
         No, weak or strong.
     said_by : str
-        Where the licence was read.
+        File or field in which the licence was read.
     """
 
     package: str
@@ -74,9 +74,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Carried:
-    """Somebody else's library within a package's files, under another licence than the package: a line of carried.csv,
-    which people write.
-    """
+    """Third-party library within a package's files under another licence: a row of carried.csv, written by hand."""
 
     package: str
     library: str
@@ -89,13 +87,13 @@ HEADS = [field.name.rstrip("_").replace("_", " ") for field in fields(Row)]
 
 
 def read_table(file: Path = TABLE) -> tuple[Row, ...]:
-    """All rows."""
+    """Return all rows."""
     with file.open(encoding="utf-8", newline="") as lines:
         return tuple(Row(*line) for line in list(csv.reader(lines))[1:])
 
 
 def read_carried(file: Path = CARRIED) -> tuple[Carried, ...]:
-    """All rows."""
+    """Return all rows."""
     with file.open(encoding="utf-8", newline="") as lines:
         return tuple(Carried(*line) for line in list(csv.reader(lines))[1:])
 
@@ -108,14 +106,14 @@ def write_table(rows: Iterable[Row], file: Path = TABLE) -> None:
 
 
 def update(folder: Path = FOLDER, file: Path = TABLE) -> tuple[Row, ...]:
-    """Read the licence of every locked package that the table does not have at this version, and write the table.
+    """Read the licences of locked packages that the table lacks at this version, and write the table.
 
-    The files of these packages are fetched by their checksums into a folder that goes afterwards; nothing is installed.
+    The files of these packages are fetched by their checksums into a temporary folder; nothing is installed.
 
     Raises
     ------
     SupplyError
-        What a package says is no licence that is known here; the index cannot be reached.
+        A package states an unknown licence; the index cannot be reached.
     """
     packages = unique(read_lock(folder))
     known = {(row.package, row.version): row for row in read_table(file)} if file.exists() else {}
@@ -136,7 +134,7 @@ def update(folder: Path = FOLDER, file: Path = TABLE) -> tuple[Row, ...]:
 
 
 def unique(packages: Iterable[Locked]) -> tuple[Locked, ...]:
-    """One entry for each name and version, of its first layer, with all who ask for it; sorted by name."""
+    """Return one entry per name and version, of its first layer, with all that require it; sorted by name."""
     found: dict[tuple[str, str], Locked] = {}
     for p in packages:
         first = found.setdefault((p.name, p.version), p)
@@ -147,7 +145,7 @@ def unique(packages: Iterable[Locked]) -> tuple[Locked, ...]:
 
 
 def _fetched(packages: Iterable[Locked]) -> Mapping[tuple[str, str], tuple[str, str]]:
-    """(name, version) -> licence and where it stands, or "" and what stands there instead."""
+    """Return (name, version) -> licence and its source, or "" and the unclear text."""
     out: dict[tuple[str, str], tuple[str, str]] = {}
     for python in PYTHONS:
         out |= _read([p for p in packages if (p.name, p.version) not in out], python, markers=True)
@@ -175,13 +173,15 @@ def _read(packages: Iterable[Locked], python: str, markers: bool) -> dict[tuple[
 
 
 def licence_of(package: importlib.metadata.Distribution) -> tuple[str, str]:
-    """SPDX expression of what a package's own files say, and where; an empty one, and what stands there, if unclear."""
-    said = package.metadata
-    expression = said.get("License-Expression")
+    """Return the SPDX expression in a package's files and its source, or "" and the unclear text."""
+    metadata = package.metadata
+    expression = metadata.get("License-Expression")
     if expression:
         return expression, "License-Expression"
-    field = (said.get("License") or "").strip()
-    classes = [line.rpartition(" :: ")[2] for line in said.get_all("Classifier") or [] if line.startswith("License ::")]
+    field = (metadata.get("License") or "").strip()
+    classes = [
+        line.rpartition(" :: ")[2] for line in metadata.get_all("Classifier") or [] if line.startswith("License ::")
+    ]
     classes = [name for name in classes if name != "OSI Approved"]
     for text, place in ((field, "License"), *((name, "Classifier") for name in classes if len(classes) == 1)):
         if len(text) < 60 and (known := OTHER_NAMES.get(text.lower(), text if _is_spdx(text) else "")):
@@ -200,14 +200,14 @@ def licence_of(package: importlib.metadata.Distribution) -> tuple[str, str]:
 
 @cache
 def spdx() -> Any:
-    """What reads SPDX expressions; made once, for it takes a while."""
+    """Return the parser of SPDX expressions, cached because it takes long to make."""
     from license_expression import get_spdx_licensing  # only for the tables' makers: readers do without
 
     return get_spdx_licensing()
 
 
 def _is_spdx(text: str) -> bool:
-    """Whether this is an expression of the licences' short names."""
+    """Return True if this is an SPDX expression."""
     from license_expression import ExpressionError
 
     try:
@@ -223,7 +223,7 @@ def _licence_files(package: importlib.metadata.Distribution) -> list[str]:
 
 
 def _bsd_of(text: str) -> str:
-    """Which BSD licence a text is, "" if none."""
+    """Return the BSD licence of a text, "" if it is none."""
     words = " ".join(text.lower().split())
     if "redistribution and use in source and binary forms" not in words:
         return ""
@@ -232,8 +232,10 @@ def _bsd_of(text: str) -> str:
 
 
 def copyleft(expression: str) -> str:
-    """What a licence asks of those who pass the package on: no, weak (the package's own source, changes with it) or
-    strong (the source of what is made with it, too). Of alternatives the one that asks least.
+    """Return the obligations of those who redistribute the package: no, weak or strong.
+
+    Weak concerns the package's own source and its changes, strong also the source of what is made with it. Of
+    alternative licences the least demanding counts.
     """
     tree = spdx().parse(expression)
     ranks = ("no", "weak", "strong")

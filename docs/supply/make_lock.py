@@ -1,4 +1,4 @@
-"""Makes the lock files: uv finds versions that go together on every Python and platform, with checksums."""
+"""Lock files: uv finds compatible versions for every Python and platform, with checksums."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ EXTRAS: Mapping[str, tuple[str, ...] | None] = {"runtime": (), "live": ("live",)
 """Layer -> extras of pyproject.toml that it adds to those before it; None for all."""
 OLDEST, PYTHONS = "3.11", ("3.11", "3.12", "3.13")
 PLATFORM = "x86_64-manylinux_2_28"
-"""Debian 12 has a newer C library than that."""
+"""Platform of the wheels; Debian 12 has a newer C library."""
 HEADS = {
     "install": "What everything else is installed with.",
     "runtime": "What the twin needs.",
@@ -30,18 +30,18 @@ HEAD = """# {what} Made by `python -m docs.supply lock` from {source}; not to be
 
 
 class SupplyError(Exception):
-    """What was asked for cannot be made or told; the message says why."""
+    """Error of a command of this package; the message gives the reason."""
 
 
 def make_lock(folder: Path = FOLDER, upgrade: bool = False) -> dict[str, tuple[Locked, ...]]:
-    """Write all files anew. A version that they have stays where pyproject.toml allows it.
+    """Write all files again, keeping locked versions where pyproject.toml allows it.
 
     Parameters
     ----------
     folder : Path
-        With install.in and peers.in.
+        Folder with install.in and peers.in.
     upgrade : bool
-        Take the newest versions of whatever pyproject.toml does not pin.
+        Use the newest versions of whatever pyproject.toml does not pin.
 
     Returns
     -------
@@ -51,7 +51,7 @@ def make_lock(folder: Path = FOLDER, upgrade: bool = False) -> dict[str, tuple[L
     Raises
     ------
     SupplyError
-        No versions go together, a package has no wheel, or the index cannot be reached.
+        No versions are compatible, a package has no wheel, or the index cannot be reached.
     """
     project = ROOT / "pyproject.toml"
     former = [folder / f"{layer}.txt" for layer in EXTRAS]
@@ -60,15 +60,15 @@ def make_lock(folder: Path = FOLDER, upgrade: bool = False) -> dict[str, tuple[L
         "install": compiled(folder / "install.in", "", "--no-build"),
         "peers": compiled(folder / "peers.in", "", "--no-build", "--no-deps"),
     }
-    every = blocks(compiled(project, preferred, "--all-extras"), "test")
-    pinned = "".join(every.values())
-    taken = set(blocks(texts["install"], "install"))
+    all_blocks = blocks(compiled(project, preferred, "--all-extras"), "test")
+    pinned = "".join(all_blocks.values())
+    written = set(blocks(texts["install"], "install"))
     for layer, extras in EXTRAS.items():
         chosen = ["--all-extras"] if extras is None else [word for name in extras for word in ("--extra", name)]
-        found = every if extras is None else blocks(compiled(project, pinned, *chosen), layer)
+        layer_blocks = all_blocks if extras is None else blocks(compiled(project, pinned, *chosen), layer)
         # what more Pythons need for the tests than for the rest stands in both files, each with its marker
-        texts[layer] = "".join(every.get(key, text) for key, text in found.items() if key not in taken)
-        taken |= set(found)
+        texts[layer] = "".join(all_blocks.get(key, text) for key, text in layer_blocks.items() if key not in written)
+        written |= set(layer_blocks)
     with tempfile.TemporaryDirectory(prefix="lock-") as place:
         made = Path(place)
         for layer, text in texts.items():
@@ -81,8 +81,9 @@ def make_lock(folder: Path = FOLDER, upgrade: bool = False) -> dict[str, tuple[L
 
 
 def blocks(text: str, layer: str) -> dict[tuple[str, str, str], str]:
-    """(name, version, marker) of each package in a lock file -> its lines. pip itself, which a package asks for, is in
-    install.txt, whoever asks.
+    """Return (name, version, marker) of each package in a lock file -> its lines.
+
+    pip, which some package requires, is always in install.txt.
     """
     packages = parse(text, layer, layer)
     parts, lines = [], text.splitlines(keepends=True)
@@ -96,16 +97,16 @@ def blocks(text: str, layer: str) -> dict[tuple[str, str, str], str]:
 
 
 def compiled(source: Path, preferred: str, *options: str) -> str:
-    """What uv makes of a list of requirements, with lines as pip reads them.
+    """Return uv's resolution of a list of requirements, as lines for pip.
 
     Parameters
     ----------
     source : Path
         pyproject.toml or a list.
     preferred : str
-        Lines of a former lock, whose versions stay where they can.
+        Lines of a previous lock, whose versions are kept where possible.
     options : str
-        Further ones.
+        Further options of uv.
     """
     with tempfile.TemporaryDirectory(prefix="lock-") as place:
         out = Path(place, "lock.txt")
@@ -117,7 +118,10 @@ def compiled(source: Path, preferred: str, *options: str) -> str:
 
 
 def _check_wheels(folder: Path, layers: Iterable[str]) -> None:
-    """Whether every package has a wheel with a known hash on the Pythons that setup.sh serves; nothing is installed."""
+    """Raise SupplyError unless every package has a wheel with a known hash on the Pythons that setup.sh serves.
+
+    Nothing is installed.
+    """
     files = [word for layer in layers if layer != "peers" for word in ("-r", str(folder / f"{layer}.txt"))]
     for chosen in (files, ["-r", str(folder / "peers.txt")]):
         for python in PYTHONS:
@@ -127,7 +131,7 @@ def _check_wheels(folder: Path, layers: Iterable[str]) -> None:
 
 
 def run_uv(words: list[str]) -> str:
-    """Run uv in the project's folder. Raises SupplyError with what it says."""
+    """Run uv in the project's folder. Raises SupplyError with its message."""
     beside = Path(sysconfig.get_path("scripts"), "uv")
     program = str(beside) if beside.exists() else shutil.which("uv")
     if program is None:

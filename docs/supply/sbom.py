@@ -1,4 +1,4 @@
-"""The software bill of materials in CycloneDX: every locked package, its checksums, licence and who needs it."""
+"""Software bill of materials in CycloneDX: every locked package, its checksums, licence and dependents."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ from docs.supply.make_lock import ROOT, SupplyError
 from twin.framework.lock_file import FOLDER, LAYERS, read_lock
 
 EPOCH = datetime(1980, 1, 1, tzinfo=UTC)
-"""Time stamp of every bill: the same lock gives the same bytes. The history of the lock gives the real date."""
+"""Time stamp of every bill, so that the same lock gives the same bytes. The history of the lock gives the real date."""
 
 
 def bill(layers: Iterable[str] = LAYERS, folder: Path = FOLDER) -> str:
-    """The bill as JSON, valid against the schema of CycloneDX 1.6.
+    """Return the bill as JSON, valid against the schema of CycloneDX 1.6.
 
     Parameters
     ----------
-    layers : Iterable[str]
+    layers : iterable of str
         Files of the lock.
     folder : Path
-        Of the lock.
+        Folder of the lock.
 
     Raises
     ------
     SupplyError
-        a package is in no row of the licences, or the bill is not valid.
+        A package is missing from the licences, or the bill is not valid.
     LockError
-        a lock file cannot be read.
+        A lock file cannot be read.
     """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     licences = {(row.package, row.version): row for row in read_table()}
@@ -91,6 +91,6 @@ def bill(layers: Iterable[str] = LAYERS, folder: Path = FOLDER) -> str:
 
 
 def _carried(inner: Carried, package: PackageURL) -> Component:
-    """A library within the files of a package."""
+    """Return the component of a library within the files of a package."""
     licence = LicenseFactory().make_from_string(inner.licence)
     return Component(name=inner.library, bom_ref=f"{package}#{inner.library}", licenses=[licence])

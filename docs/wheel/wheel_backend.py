@@ -1,9 +1,9 @@
-"""Builds the project. In a wheel all packages live within one, ``space_camera_twin``: `optics` and `analysis` are names
-of other people's packages. The source tree keeps them at its top, and an editable installation serves that.
+"""Build backend of the project (PEP 517).
 
-Imports are rewritten, and the command lines in help and messages; nothing else in the packages names a module of
-theirs. What is inserted is always ``PREFIX`` and a dot, so that the program's digest
-(`twin.framework.provenance`) can leave it out again.
+In a wheel all packages are inside one, ``space_camera_twin``, because `optics` and `analysis` are names of other
+packages on the index. The source tree keeps them at its top, and an editable installation uses that. Imports are
+rewritten, and so are the command lines in help and messages; nothing else in the packages names a module of theirs. The
+inserted text is always ``PREFIX`` and a dot, so that the program's digest (`twin.framework.provenance`) can exclude it.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ _COMMAND = re.compile(rf"\bpython -m (?=({'|'.join(PACKAGES)})\.|\{{)")
 
 
 def rewritten(source: str) -> str:
-    """A module's text as it stands in a wheel.
+    """Return a module's text as it is in a wheel.
 
     Raises
     ------
     ValueError
-        ``import optics`` with a later ``optics.something``; the name would be another one.
+        The module has ``import optics`` and later uses ``optics.something``, a name that the prefix would change.
     """
     lines = source.splitlines(keepends=True)
     nodes = list(ast.walk(ast.parse(source)))
@@ -71,13 +71,13 @@ def _ours(module: str) -> bool:
 
 
 def _insert(lines: list[str], number: int, found: str, before: str) -> None:
-    """Put the prefix into a line, where it reads ``found``, after ``before``."""
+    """Insert the prefix into a line, before ``found`` and after ``before``."""
     at = lines[number - 1].index(found) + len(before)
     lines[number - 1] = f"{lines[number - 1][:at]}{PREFIX}.{lines[number - 1][at:]}"
 
 
 def arrange(source: Path, place: Path) -> None:
-    """Copy the project to a place, as it is in a wheel."""
+    """Copy the project to a folder, arranged as in a wheel."""
     for package in PACKAGES:
         ignored = shutil.ignore_patterns("__pycache__")
         shutil.copytree(source / package, place / PREFIX / package, ignore=ignored)
@@ -105,14 +105,14 @@ def _arranged() -> Iterator[None]:
 def build_wheel(
     wheel_directory: str, config_settings: dict[str, Any] | None = None, metadata_directory: str | None = None
 ) -> str:
-    """Build the wheel into a folder; returns its name. (PEP 517)"""
+    """Build the wheel into a folder and return its name (PEP 517)."""
     target = str(Path(wheel_directory).absolute())
     with _arranged():
         return build_meta.build_wheel(target, config_settings)
 
 
 def prepare_metadata_for_build_wheel(metadata_directory: str, config_settings: dict[str, Any] | None = None) -> str:
-    """Write what the wheel will say of itself into a folder; returns its name. (PEP 517)"""
+    """Write the wheel's metadata into a folder and return its name (PEP 517)."""
     target = str(Path(metadata_directory).absolute())
     with _arranged():
         return build_meta.prepare_metadata_for_build_wheel(target, config_settings)
