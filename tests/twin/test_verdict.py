@@ -20,7 +20,7 @@ import twin
 import twin.main_job.render_job as render_job_module
 from analysis.monitor.limits import Split
 from analysis.monitor.parameters import ANGLE, CAMERA_PARAMETERS, GROUND
-from docs.site.run_pages import kept_fields
+from docs.site.run_pages import golden_fields
 from scenes.specs.resolved import resolve
 from scenes.specs.study import UNITS, unit_of
 from tests.golden.digest import expanded
@@ -549,7 +549,7 @@ def test_every_number_has_the_unit_that_its_key_says() -> None:
 def test_no_key_of_a_result_hides_its_unit() -> None:
     """In the results of all commands a key with the word of a unit is known to be in that unit."""
     for file in GOLDEN.glob("*.json"):
-        for name, content in kept_fields(file.stem).items():
+        for name, content in golden_fields(file.stem).items():
             for key in content.get("fields", {}):
                 for part in re.split(r"[.\[\]{}|]+", key):
                     words = part.split("_")
