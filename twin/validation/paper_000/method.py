@@ -78,9 +78,9 @@ class Passes:
         return tuple(resect_measurement(m) for m in self.measured)
 
     def normal(self, line: str) -> np.ndarray:
-        """True unit normal of a line's plane, (3,), ITRS, its z component negative like the paper's (a0, a1, -1).
+        """Return the true unit normal of a line's plane, (3,), ITRS, with negative z like the paper's (a0, a1, -1).
 
-        From the exact directions of the camera's pixels at the points, not from the points.
+        It follows from the exact directions of the camera's pixels at the points, not from the points.
         """
         looks = self.flight.cameras[line].look(self.flight.pixel[line])
         body = np.linalg.svd(looks)[2][2]

@@ -58,7 +58,7 @@ _INPUT_OF = {
     "prism_0_rotation": "rotation of the 0° prism",
     "central_prism_thermal": "gradient in the central prism",
 }
-"""What a line's input is; those of rotations act through the prisms' residual angle errors, which are chosen too."""
+"""Input of each line; rotations act through the residual angle errors of the prisms, which are chosen too."""
 _ANGLE, _LENGTH = ("arcsec", ARCSEC), ("mm", 1e-3)
 _PARAMETERS = {
     "d_beta": ("d_beta_rad", "Δβ, 3σ", *_ANGLE),
@@ -70,17 +70,17 @@ _PARAMETERS = {
 
 
 def frame_mean(error: float, frames: int = FRAMES) -> float:
-    """The random error of a mean of frames from that of a single one, (12)'s first term."""
+    """Return the random error of a mean of frames from that of a single one, the first term of eq. (12)."""
     return error / sqrt(frames)
 
 
 def root_sum(errors: Mapping[str, float]) -> float:
-    """(12): the root of the sum of squares of Table 3's lines, the centroid's over the frames."""
+    """Return eq. (12): the root of the sum of squares of Table 3's lines, with the centroid's error over the frames."""
     return sqrt(sum((frame_mean(e) if name == "centroid" else e) ** 2 for name, e in errors.items()))
 
 
 def root_sum_of_squares(lines: Mapping[str, BudgetLine]) -> tuple[float, float]:
-    """(12) of simulated lines and its standard deviation, radians."""
+    """Return eq. (12) for simulated lines and its standard deviation, radians."""
     total = root_sum({name: line.three_sigma for name, line in lines.items()})
     weight = {name: frame_mean(1.0) ** 2 if name == "centroid" else 1.0 for name in lines}
     sigma = sqrt(sum((weight[n] * line.three_sigma * line.sigma) ** 2 for n, line in lines.items())) / total
@@ -111,28 +111,28 @@ def propagated(spot: float, geometry: MonitorGeometry, estimator: str = "paper_s
 
 @dataclass(frozen=True, eq=False)
 class BudgetImages:
-    """What was simulated; what is not wanted is empty or None.
+    """Results of the simulation; parts that are not requested are empty or None.
 
     Attributes
     ----------
     geometry : MonitorGeometry
-        Of the first camera; both are alike.
-    inputs : tuple[int, int, int]
-        Trials per line (twice as many for FEW_DRAWS), with all causes, and groups of frames.
-    lines : dict[str, BudgetLine]
-        Of Table 3.
-    focal_plane : tuple[float, float] | None
-        True and read change of d_f by the focal plane's temperature, m.
-    halved : tuple[float, float, float] | None
-        Glass path of the 180-deg prism before and after halving, m, and the ratio of its errors.
-    together : CombinedErrors | None
+        Geometry of the first camera; both are alike.
+    inputs : (int, int, int)
+        Trials per line (twice as many for FEW_DRAWS), trials with all causes, and groups of frames.
+    lines : dict of str to BudgetLine
+        Lines of Table 3.
+    focal_plane : (float, float) or None
+        True and measured change of d_f by the focal plane's temperature, metres.
+    halved : (float, float, float) or None
+        Glass path of the 180-deg prism before and after halving, metres, and the ratio of its errors.
+    together : CombinedErrors or None
         All causes at once.
-    scatter : tuple[tuple[float, float], tuple[float, float]] | None
-        Of the centroid in single frames and in means of FRAMES, radians, with standard deviations.
+    scatter : pair of (float, float) or None
+        Scatter of the centroid in single frames and in means of FRAMES, radians, with standard deviations.
     line_pixel : float
-        Of the line CCD, metres.
-    roll_pixels : float | None
-        How far ROLL moves the line of sight of the line's end, pixels of the line CCD.
+        Pixel of the line CCD, metres.
+    roll_pixels : float or None
+        Displacement of the line of sight at the line's end by ROLL, in pixels of the line CCD.
     """
 
     geometry: MonitorGeometry
@@ -179,7 +179,7 @@ def measured(context: Context) -> BudgetImages:
 
 
 def three_sigma(budget: ErrorBudget, cause: str) -> float:
-    """The input of a cause whose components are alike, SI."""
+    """Return the three-sigma input of a cause whose components are alike, in SI units."""
     return 3.0 * budget.prior.of_causes((cause,)).components[0].sigma
 
 
@@ -191,8 +191,9 @@ def more_trials(budget: ErrorBudget, factor: int) -> ErrorBudget:
 
 
 def centroid_scatter(budget: ErrorBudget, groups: int) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Three sigma of the energy centroid in single frames and in means of FRAMES of them, radians, each with its
-    standard deviation; the same frames serve both.
+    """Return three sigma of the energy centroid in single frames and in means of FRAMES of them.
+
+    Both are in radians, each with its standard deviation; the same frames serve both.
     """
     setup = budget.experiment
     pattern = setup.pattern(budget.seed)
@@ -223,7 +224,8 @@ def _positions(budget: ErrorBudget, images: np.ndarray, frames: int) -> np.ndarr
 
 
 def line_end_shift(budget: ErrorBudget) -> float:
-    """How far a turn of the line CCD by ROLL moves the line of sight of its end, in pixels of the line CCD."""
+    """Return the displacement of the line of sight at the line CCD's end by a rotation ROLL, in pixels of the line CCD.
+    """
     experiment = budget.experiment
     camera = next(iter(experiment.instrument.cameras))
     state = {f"{BASE}/{camera}/focal_plane": Motion(rotate=(0.0, 0.0, ROLL))}
@@ -236,7 +238,7 @@ def line_end_shift(budget: ErrorBudget) -> float:
 
 @drawing("error-budget", lambda lines: 1.0 + 0.32 * len(lines))
 def budget_svg(figure: Figure, lines: Mapping[str, tuple[float, float, float]]) -> None:
-    """A row per line: text -> (printed, simulated, sigma), arcsec."""
+    """Draw a row per line with the printed and the simulated value and its sigma, in arcsec."""
     axes = figure.subplots()
     for row, (printed, simulated, sigma) in enumerate(lines.values()):
         axes.plot([printed], [row], "|", color=INK, ms=16.0, mew=2.0, label="printed" if row == 0 else None)
@@ -282,7 +284,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 
 def _in_sum(images: BudgetImages, name: str, value: float) -> Chosen:
-    """The input of one line, on which a root of squares hangs only with the line's share; value: of the root."""
+    """Return the input of one line, on which a root of squares depends only through the line's share."""
     line = images.lines[name]
     share = (frame_mean(1.0) if name == "centroid" else 1.0) * line.three_sigma / ARCSEC
 
@@ -293,7 +295,7 @@ def _in_sum(images: BudgetImages, name: str, value: float) -> Chosen:
 
 
 def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
-    """(12) and Table 4."""
+    """Check eq. (12) and Table 4."""
     facts: dict[str, Any] = {"images": images, "frames": FRAMES}
     if {"001.eq12", "001.table4.root_sum"} & context.selected:
         total, sigma = root_sum_of_squares(images.lines)
@@ -335,12 +337,12 @@ def _show(context: Context, lines: Mapping[str, BudgetLine]) -> None:
 
 
 def _all_causes(value: float) -> list[Chosen]:
-    """What all inputs make together, to which every error is proportional."""
+    """Return all inputs together as a choice, to which every error is proportional."""
     return [Chosen.power("errors by all inputs of scenes/library/budgets/monitor_pair.yaml, times", 1.0, "1", value)]
 
 
 def _monitored(context: Context, images: BudgetImages, together: CombinedErrors) -> Iterator[CheckResult]:
-    """Rows of all causes at once, Table 5 among them, with its errors by formula and by Monte Carlo."""
+    """Check the rows of all causes at once, Table 5 among them, with errors by formula and by Monte Carlo."""
     facts: dict[str, Any] = {"images": images, "frames": FRAMES}
 
     def row(identifier: str, error: tuple[float, float], unit: float, implied: float | None = None) -> CheckResult:

@@ -1,5 +1,7 @@
-"""Paper 001's formulas on rendered images: single changes (1) to (7); the joint form, that is superposition (8),
-symmetry (9), separation (10) and (11), Table 1's last column on all four changes at once, and Fig. 4's angle.
+"""Checks of the formulas of paper 001 on rendered images.
+
+Single changes test (1) to (7). The joint form tests superposition (8), symmetry (9), separation (10) and (11), the last
+column of Table 1 for all four changes at once, and the angle of Fig. 4.
 
 A displacement is before - after, in any unit of length; X is across the line, Y along it, L at its +Y end.
 """
@@ -75,8 +77,9 @@ def superposed(first: Value, second: Value) -> Value:
 
 
 def right_of_focal_length(left: Value) -> Value:
-    """Eq. (9): Y of the right spot from that of the left one when the focal length changes. When the line of sight
-    turns about X they are alike.
+    """Return Y of the right spot from that of the left one for a change of focal length, eq. (9).
+
+    For a rotation of the line of sight about X both are equal.
     """
     return -left
 
@@ -155,7 +158,7 @@ class MonitorImages:
         self.covariance = np.concatenate([p.shift_covariance for p in pieces])
 
     def geometry(self, camera: str) -> MonitorGeometry:
-        """What the formulas are given of a camera."""
+        """Return the geometry of a camera that the formulas use."""
         return self.experiment.calibration.cameras[camera].geometry
 
     @property
@@ -174,22 +177,23 @@ class MonitorImages:
         return fmean(self.local(camera) for camera in self.cameras)
 
     def estimates(self) -> recovery.Estimates:
-        """What each estimator reads from the spots of all states."""
+        """Estimates of all estimators from the spots of all states."""
         return recovery.estimates(self.before, self.after, self.covariance, self.experiment.calibration.cameras)
 
     def reading(self, camera: str, motion: str, parameter: str) -> Measured:
-        """What the printed formula of a single change reads of one state, SI."""
+        """Return the reading of one state by the printed formula of a single change, in SI units."""
         found = self.estimates().parameters[camera]["paper_single"]
         state, k = self.motions.index(motion), PARAMETERS.index(parameter)
         return float(found.vector[state, k]), float(found.sigma[state, k])
 
     def true(self, camera: str, motion: str, parameter: str) -> float:
-        """Traced change of one of PARAMETERS, SI."""
+        """Return the traced change of one of PARAMETERS, in SI units."""
         return float(getattr(self.truth.cameras[camera], parameter)[self.motions.index(motion)])
 
     def spots(self, camera: str, motion: str, axis: str) -> tuple[float, float, float]:
-        """Displacements before - after of the left and the right spot along ``axis``, X or Y, and the sigma of each,
-        metres; the two sigmas are taken as equal.
+        """Return the displacements before - after of the left and the right spot along an axis, and their common sigma.
+
+        The axis is X or Y; all numbers are in metres.
         """
         state, k, column = self.motions.index(motion), self.cameras.index(camera), "YX".index(axis)
         moved = (self.before - self.after)[state, 2 * k : 2 * k + 2, column]
@@ -198,13 +202,13 @@ class MonitorImages:
         return float(moved[0]) * pitch, float(moved[1]) * pitch, float(np.sqrt(variance.mean())) * pitch
 
     def ratio(self, of: Callable[[str], Measured]) -> Ratio:
-        """Mean ratio from that of each camera; the noise of the cameras is independent."""
+        """Return the mean of the cameras' ratios; the noise of the cameras is independent."""
         cameras = {camera: of(camera) for camera in self.cameras}
         values, sigmas = np.array(list(cameras.values())).T
         return Ratio(float(values.mean()), float(np.sqrt(np.sum(sigmas**2)) / len(values)), cameras)
 
     def over(self, motion: str, parameter: str, amount: float | None = None) -> Ratio:
-        """Reading divided by the amount of the motion, by default by the traced change."""
+        """Return the reading divided by the amount of the motion, by default by the traced change."""
         return self.ratio(
             lambda camera: quotient(
                 self.reading(camera, motion, parameter),
@@ -233,9 +237,9 @@ class SingleMotions(MonitorImages):
         super().__init__(context, experiment, states)
 
     def needed_factor(self, parameter: str) -> Ratio:
-        """The factor that (2) or (3) needs where it has cos²: true change times 2f over the mean spot shift.
+        """Return the factor required in place of cos² in (2) or (3): true change times 2f over the mean spot shift.
 
-        Along the line f is here the focal length at its centre, where d_beta is taken; across it the formula's own.
+        Along the line f is the focal length at its centre, where d_beta is taken; across it, that of the formula.
         """
         motion = {"d_beta": "along Y", "d_alpha": "along X"}[parameter]
 
@@ -252,8 +256,9 @@ class SingleMotions(MonitorImages):
         return self.ratio(factor)
 
     def displacement(self, direction: str) -> Ratio:
-        """Turn of a return face, ``along`` or ``across`` the line, by (1) from the mean displacement of the spots, over
-        the turn that was made; f is the focal length in that direction.
+        """Return the rotation of a return face by eq. (1) over the true rotation, ``along`` or ``across`` the line.
+
+        Eq. (1) uses the mean displacement of the spots; f is the focal length in that direction.
         """
 
         def turn(camera: str) -> Measured:
@@ -298,7 +303,7 @@ class SingleMotions(MonitorImages):
 
 @drawing("formulas-001", lambda ratios: 0.8 + 0.27 * len(ratios))
 def _ratios_svg(figure: Figure, ratios: Mapping[str, tuple[str, float]]) -> None:
-    """A row per check: id -> (equation, measured over right)."""
+    """Draw a row per check with its equation and the ratio of measured to correct value."""
     axes = figure.subplots()
     axes.axvline(1.0, color=INK, lw=1.0)
     for row, (_, value) in enumerate(ratios.values()):
@@ -358,17 +363,20 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 
 def single_images(context: Context) -> SingleMotions:
-    """The images of all single motions and their spots."""
+    """Render all single motions and measure their spots."""
     return SingleMotions(context, context.experiment(INSTRUMENT))
 
 
 def without_cos2(geometry: MonitorGeometry, local: float) -> float:
-    """What (2) and Table 1 read of a turn about X without cos²β; local: focal length at the line's centre over f."""
+    """Return the reading of a rotation about X by (2) and Table 1 without cos²β, relative to the truth.
+
+    The local value is the focal length at the line's centre over f.
+    """
     return math.cos(geometry.field_beta_rad) ** 2 * local
 
 
 def _singles(context: Context, images: SingleMotions, shown: dict[str, Ratio]) -> Iterator[CheckResult]:
-    """The rows of (1) to (7); equations that say the same share one."""
+    """Check the rows of (1) to (7); equations with the same content share a row."""
 
     def row(identifier: str, ratio: Ratio, *explained: float | None, **facts: object) -> CheckResult:
         shown.setdefault(identifier, ratio)
@@ -444,8 +452,9 @@ class JointMotions(MonitorImages):
         self.mixtures = [k for k, name in enumerate(self.motions) if name.startswith("mixture")]
 
     def superposition(self, one: str, other: str, axis: str) -> Ratio:
-        """Displacement of a spot by both changes over what (8) makes of the displacements by each; per camera the side
-        that is farther from 1.
+        """Return a spot's displacement by both changes over that of eq. (8) from the displacements by each.
+
+        For each camera it is that of the side farther from 1.
         """
 
         def worse(camera: str) -> Measured:
@@ -467,7 +476,7 @@ class JointMotions(MonitorImages):
         return self.ratio(sides)
 
     def stray(self, motion: str, wrong: str, right: str) -> Ratio:
-        """Common displacement along the axis that a change should not move, over the size along the one it should."""
+        """Return the common displacement along the wrong axis over the size along the right one."""
 
         def share(camera: str) -> Measured:
             left, other, sigma = self.spots(camera, motion, wrong)
@@ -479,8 +488,9 @@ class JointMotions(MonitorImages):
     def separated(
         self, single: str, axis: str, part: int, parts: Callable[[float, float], tuple[float, float]]
     ) -> Ratio:
-        """A share that ``parts`` takes out of all four changes at once, over the mean size of the spots' displacement
-        by its own change alone, with the sign of the left spot.
+        """Return the part that a formula separates from all four changes, relative to that of the single change.
+
+        The displacement is the mean size over the spots, with the sign of the left spot.
         """
 
         def share(camera: str) -> Measured:
@@ -493,14 +503,15 @@ class JointMotions(MonitorImages):
         return self.ratio(share)
 
     def response(self, estimator: str) -> tuple[np.ndarray, np.ndarray]:
-        """What an estimator reads per true change when all four change at once, and its sigma.
+        """Return the response of an estimator to true changes when all four change at once, and its sigma.
 
-        Least squares of the readings of the mixtures on the traced changes and a constant, mean of the cameras.
+        It is a least-squares fit of the readings of the mixtures to the traced changes and a constant, as a mean of the
+        cameras.
 
         Returns
         -------
-        tuple[np.ndarray, np.ndarray]
-            (4, 4) readings by changes, in the order of PARAMETERS, arcsec and micrometres, twice.
+        tuple of (4, 4) ndarray
+            Readings by changes, in the order of PARAMETERS, in arcsec and micrometres; and sigma.
         """
         parameters = self.estimates().parameters
         matrices, variances = [], []
@@ -517,8 +528,9 @@ class JointMotions(MonitorImages):
         return np.mean(matrices, axis=0), sigma
 
     def angle(self, estimator: str) -> tuple[float, float, float]:
-        """Slope of the read on the traced change of the intersection angle over the mixtures, its sigma, and the rms
-        of what is left, radians.
+        """Return the slope of measured over traced change of the intersection angle, its sigma, and the rms residual.
+
+        The slope is over all mixtures; the residual is in radians.
         """
         found = self.estimates().angle[estimator]
         true, read = self.truth.angle_change[self.mixtures], found.change_rad[self.mixtures]
@@ -529,7 +541,7 @@ class JointMotions(MonitorImages):
 
 
 def joint_images(context: Context) -> JointMotions:
-    """The images of all states of the joint form and their spots."""
+    """Render all states of the joint form and measure their spots."""
     context.progress(0.1, f"build {INSTRUMENT}")
     return JointMotions(context, context.experiment(INSTRUMENT), context.count(full=6, fast=1))
 

@@ -1,5 +1,7 @@
-"""How far paper 001's formulas hold: readings of noise-free images along single and joint changes, under defocus, for
-other pupil offsets, fields and kinds of return, and where they leave a tolerance.
+"""Ranges of validity of the formulas of paper 001.
+
+Readings of noise-free images are followed along single and joint changes, under defocus, and for other pupil offsets,
+fields and kinds of return, up to where they exceed a tolerance.
 """
 
 from __future__ import annotations
@@ -72,18 +74,18 @@ class Bench:
         self.frames = experiment.instrument.spec.autocollimator.frames
 
     def geometry(self, camera: str) -> MonitorGeometry:
-        """What the formulas are given of a camera."""
+        """Return the geometry of a camera that the formulas use."""
         if camera not in self._geometry:
             self._geometry[camera] = self.experiment.geometry(camera)
         return self._geometry[camera]
 
     def positions(self, states: Sequence[State]) -> np.ndarray:
-        """Centres of the spots in rendered images, (S, C, 2) (row, column), px.
+        """Return the centres of the spots in rendered images, (S, C, 2) (row, column), in pixels.
 
         Raises
         ------
         SpotError, BeamMissedError
-            a spot is too near its CCD's edge or outside it, or its beam is lost.
+            A spot is too near its CCD's edge or outside it, or its beam is lost.
         """
         path = self.experiment.path
         rows, columns = path.shape
@@ -99,13 +101,14 @@ class Bench:
         return out
 
     def traced(self, states: Sequence[State]) -> np.ndarray:
-        """Means of the traced spots over the return face, (S, C, 2) (row, column) px from the CCD's middle, wherever
-        they fall.
+        """Return the means of the traced spots over the return face, also outside the CCD.
+
+        They are (S, C, 2) (row, column), in pixels from the CCD's middle.
 
         Raises
         ------
         BeamMissedError, AimError
-            a beam is lost, or a part of it.
+            A beam is lost, or a part of it.
         """
         path = self.experiment.path
         known, scout = path.coarse_trace(states), path.scout
@@ -146,9 +149,7 @@ class Bench:
 
 
 def _windows(images: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Windows of that shape around the brightest pixel of each image (B, H, W), and (B, 2) how far their first pixels
-    are from those of a window in the middle.
-    """
+    """Return windows around the brightest pixel of each image (B, H, W), and their offsets from the middle (B, 2)."""
     if images.shape[1:] == shape:
         return images, np.zeros((len(images), 2))
     brightest = np.stack(np.unravel_index(images.reshape(len(images), -1).argmax(axis=1), images.shape[1:]), axis=-1)
@@ -201,7 +202,7 @@ class Curves:
 
 @dataclass(frozen=True, eq=False)
 class Domain:
-    """How far something holds: followed in images as far as they go, traced on from there, until the beam is lost.
+    """Domain of validity: followed in images as far as they go, and traced from there until the beam is lost.
 
     Attributes
     ----------
@@ -210,7 +211,7 @@ class Domain:
     lost : float
         Size beyond which the beam is lost or not followed.
     lost_why : str
-        Which of the two.
+        Which of these two applies.
     """
 
     images: Curves
@@ -228,16 +229,16 @@ class Domain:
 
 
 def sampled(sample: Sample, sizes: Sequence[float], names: Sequence[str] | None = None) -> Curves:
-    """Curves at given sizes, with points added where they pass the limit.
+    """Sample curves at given sizes, and add points where they cross the limit.
 
     Parameters
     ----------
     sample : Sample
-        What is sampled.
-    sizes : Sequence[float]
-        To begin with, ascending.
-    names : Sequence[str] | None
-        Whose limits are refined; all by default.
+        Function that is sampled.
+    sizes : sequence of float
+        Initial sizes, ascending.
+    names : sequence of str or None
+        Curves whose limits are refined; all by default.
     """
     first = np.array(sizes, dtype=float)
     curves = Curves(first, sample(first))
@@ -262,7 +263,7 @@ CLAIMED = {
     "d_gamma": _TABLE.number("table5.d_gamma_arcsec"),
     "d_f": 1e3 * _TABLE.number("table5.d_f_mm"),
 }
-"""What section 3.3 and Table 5 claim of an error: arcsec and um."""
+"""Errors claimed by section 3.3 and Table 5, in arcsec and um."""
 FINE = {"d_alpha": 0.1, "d_beta": 0.1, "d_gamma": 0.1, "d_f": 40.0}
 """0.1 arcsec for all angles, and Table 5's 0.04 mm."""
 RELATIVE = 0.01
@@ -287,22 +288,22 @@ _FAR_BOX = 200.0
 
 @dataclass(frozen=True, eq=False)
 class Range(Domain):
-    """One parameter changed in one direction; sizes are true changes in table units.
+    """Range of one parameter changed in one direction; sizes are true changes in table units.
 
     The names of the curves are those of ``criterion`` and WINDOW.
 
     Attributes
     ----------
     parameter : str
-        Of NAMES.
+        One of NAMES.
     sign : int
         +1 or -1.
-    raw : Mapping[str, np.ndarray]
-        Of the images, form -> error over the true change as (N, 2), for the figure.
-    raw_traced : Mapping[str, np.ndarray]
-        The same traced.
+    raw : mapping of str to ndarray
+        Error over the true change from images, (N, 2), by form, for the figure.
+    raw_traced : mapping of str to ndarray
+        Traced values of the same.
     trace_gap : float
-        Largest difference of a traced spot shift to the rendered one, px.
+        Largest difference of a traced spot shift from the rendered one, in pixels.
     """
 
     parameter: str
@@ -323,7 +324,7 @@ def criterion(form: str, kind: str) -> str:
 
 
 def motion_of(camera: str, parameter: str, geometry: MonitorGeometry) -> tuple[ElementaryMotion, float]:
-    """The single motion behind a parameter, and its amount (SI) for one table unit of change."""
+    """Return the single motion of a parameter, and its amount (SI) for one table unit of change."""
     k = NAMES.index(parameter)
     f, f_x = focal_lengths(geometry)
     amount = (-f_x * ARCSEC, f * ARCSEC, ARCSEC * f_x / f, 1e-6 / f)[k]
@@ -414,7 +415,7 @@ def _joined(parts: Mapping[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def beam_end(bench: Bench, states: Callable[[np.ndarray], list[State]], start: float, far: float) -> tuple[float, str]:
-    """The largest size, from ``start`` up to ``far``, whose beams pass whole, to 1 %, and why no larger one does."""
+    """Return the largest size with whole beams, from ``start`` up to ``far``, to 1 %, and the reason of the limit."""
 
     def fault(size: float) -> str:
         try:
@@ -437,7 +438,8 @@ def beam_end(bench: Bench, states: Callable[[np.ndarray], list[State]], start: f
 
 
 def joint_states(bench: Bench, changes: Mapping[str, np.ndarray]) -> list[State]:
-    """States in which every camera makes changes (S, 4), table units, as far as the motions do them exactly."""
+    """Return states in which every camera has changes (S, 4), in table units, as far as motions produce them exactly.
+    """
     states: list[dict[str, Motion]] = [{} for _ in next(iter(changes.values()))]
     for camera, wanted in changes.items():
         units = [motion_of(camera, name, bench.geometry(camera))[1] for name in NAMES]
@@ -456,7 +458,7 @@ class Corners(Domain):
     """
 
     def text(self, name: str) -> str:
-        """The limit in words."""
+        """Return the limit as text."""
         share, whence = self.limit(name)
         return f"{share:.3g}" + (" (beam cut)" if whence == self.lost_why else "")
 
@@ -517,7 +519,7 @@ class Separation:
     trials: int
 
     def mean(self, form: str, read: str, changed: str) -> tuple[float, float]:
-        """Mean of the cameras and its standard deviation."""
+        """Return the mean of the cameras and its standard deviation."""
         p, q = NAMES.index(read), NAMES.index(changed)
         values = [self.gain[form][c][p, q] for c in self.gain[form]]
         sigmas = [self.sigma[form][c][p, q] for c in self.sigma[form]]
@@ -565,7 +567,7 @@ place of the area CCD from its pinhole, where another one is needed, metres, and
 SHIFT = 60e-6
 """Shift of the line CCD, metres."""
 CONFOCAL = load_printed("004").number("alignment.confocal_mm") / 1e3
-"""How well paper 004 sets the line CCD to the focus, metres."""
+"""Accuracy with which paper 004 sets the line CCD to the focus, metres."""
 SMALL = {"d_alpha": 2.0, "d_beta": 2.0, "d_gamma": 40.0, "d_f": 1500.0}
 """Single changes whose readings are compared in a defocused camera and at other fields: a third of the area CCD."""
 
@@ -579,29 +581,29 @@ def variant(
     field: float | None = None,
     ccd_offset: tuple[float, float] | None = None,
 ) -> MonitorExperiment:
-    """The experiment with one camera of an instrument, changed and built anew.
+    """Build the experiment anew with one camera of an instrument, changed.
 
     Parameters
     ----------
     resolved : ResolvedJob
-        The instrument as its file gives it.
+        Instrument as its file gives it.
     backend : Backend
-        Where to trace.
+        Backend of the ray trace.
     camera : str
-        The camera that is kept.
-    pixels : int | None
+        Camera that remains.
+    pixels : int or None
         Rows and columns of the area CCDs.
-    pupil_offset : tuple[float, float] | None
+    pupil_offset : (float, float) or None
         Centre (X, Y) of the monitor's sub-aperture in the entrance pupil, metres.
-    field : float | None
-        Of the area CCDs, radians.
-    ccd_offset : tuple[float, float] | None
-        (X, Y) from the pinhole to the area CCD's centre, metres.
+    field : float or None
+        Field angle of the area CCDs, radians.
+    ccd_offset : (float, float) or None
+        Vector (X, Y) from the pinhole to the area CCD's centre, metres.
 
     Raises
     ------
     InputError
-        The prisms cannot stand so.
+        The prisms cannot be placed in this way.
     """
     spec = resolved.instrument
     site = spec.cameras[camera]
@@ -649,7 +651,7 @@ def with_return(experiment: MonitorExperiment, kind: str) -> MonitorExperiment:
 
 
 def _returning(instrument: Instrument, kind: str) -> Assembly:
-    """The assembly with mirrors square to each other behind every facet's opening."""
+    """Return the assembly with mutually perpendicular mirrors behind every facet's opening."""
     old = instrument.assembly
     bodies, elements, sequences = list(old.tree.bodies), dict(old.elements), dict(old.sequences)
     for channel in instrument.channels:
@@ -668,7 +670,7 @@ def _returning(instrument: Instrument, kind: str) -> Assembly:
 
 
 def _mirrors(kind: str) -> list[Pose]:
-    """Poses of the mirrors in the facet's frame (x along the line, y across it, z to the light)."""
+    """Return the poses of the mirrors in the facet's frame (x along the line, y across it, z to the light)."""
     if kind.startswith("roof"):
         ridge = 1 if kind == "roof" else 0
         return [Pose(about_axis(ridge, side * math.pi / 4)) for side in (1.0, -1.0)]
@@ -678,16 +680,16 @@ def _mirrors(kind: str) -> list[Pose]:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """What a kind of return does.
+    """Response of a kind of return.
 
     Attributes
     ----------
     kind : str
-        Of RETURNS.
-    across, along : np.ndarray
-        (2,) motion of the spots (left, right) over the motion of the line CCD across and along the line.
-    gain : np.ndarray
-        (4,) corrected reading over truth, single changes.
+        One of RETURNS.
+    across, along : (2,) ndarray
+        Motion of the spots (left, right) over the motion of the line CCD across and along the line.
+    gain : (4,) ndarray
+        Corrected reading over truth for single changes.
     """
 
     kind: str
@@ -712,18 +714,18 @@ def responses(resolved: ResolvedJob, backend: Backend, like: Bench) -> list[Resp
 
 
 def depth_of_focus(resolved: ResolvedJob, camera: str) -> float:
-    """2 λ N², where a quarter of a wave of defocus is reached at the monitor's wavelength, metres."""
+    """Return 2 λ N², at which defocus reaches a quarter wave at the monitor's wavelength, in metres."""
     spec = resolved.cameras[resolved.instrument.cameras[camera].camera]
     return 2.0 * resolved.instrument.autocollimator.wavelength * (spec.focal_length / spec.entrance_pupil) ** 2
 
 
 def piston(camera: str, amount: float, *, along: tuple[float, float] = (0.0, 0.0), turn: float = 0.0) -> State:
-    """The line CCD moved along Z (and along X and Y, and turned about Z), metres and radians."""
+    """Return the state with the line CCD moved along Z (and along X and Y, and rotated about Z), metres and radians."""
     return {f"{BASE}/{camera}/focal_plane": Motion(rotate=(0.0, 0.0, turn), shift=(*along, amount))}
 
 
 def false_slopes(bench: Bench, form: str, pistons: Sequence[float]) -> np.ndarray:
-    """Reading minus truth per metre of piston between before and after, (4,), table units, by images."""
+    """Return reading minus truth per metre of piston between before and after, (4,), table units, from images."""
     camera = bench.cameras[0]
     states = [piston(camera, z) for z in pistons]
     readings = bench.readings(bench.positions([{}]), bench.positions(states))[camera][form]
@@ -770,8 +772,9 @@ def pupil_study(
 
 
 def piston_curves(bench: Bench, count: int) -> Curves:
-    """The false readings of the corrected form over the piston (metres), as shares of FINE and CLAIMED, the worse of
-    the two directions.
+    """Return the false readings of the corrected form over the piston, in metres, as shares of FINE and CLAIMED.
+
+    They are those of the worse of the two directions.
     """
     camera, origin = bench.cameras[0], bench.positions([{}])
 

@@ -40,12 +40,12 @@ Data = dict[str, Any]
 
 
 def _shown(name: str) -> tuple[float, str, str]:
-    """How sizes of a parameter are shown: in what, from table units, its name, and the same after a number in prose."""
+    """Return factor from table units, unit and name with which sizes of a parameter are shown."""
     return (1e-3, "mm", " mm") if name == "d_f" else (1.0, "arcsec", "″")
 
 
 def _size(value: float, name: str) -> str:
-    """A size in table units as it is shown, with four digits and no exponent."""
+    """Return a size in table units as text, with four digits and no exponent."""
     per, _, unit = _shown(name)
     value *= per
     return (f"{value:.4g}" if value < 1e4 else f"{value:.0f}") + unit
@@ -107,7 +107,7 @@ def limit_of(both: Sequence[ranges.Range], form: str, kind: str) -> tuple[float,
 
 
 def limit_text(both: Sequence[ranges.Range], form: str, kind: str) -> str:
-    """The limit of `limit_of` in words."""
+    """Return the limit of `limit_of` as text."""
     size, whence = limit_of(both, form, kind)
     if size == 0.0:
         return "nowhere"
@@ -116,7 +116,7 @@ def limit_text(both: Sequence[ranges.Range], form: str, kind: str) -> str:
 
 
 def _range(context: Context, identifier: str, both: list[ranges.Range], geometry: MonitorGeometry) -> CheckResult:
-    """The printed formula's range of one parameter."""
+    """Check the range of the printed formula of one parameter."""
     name = both[0].parameter
     per, _, unit = _shown(name)
     limit, whence = limit_of(both, PRINTED, "claimed")
@@ -302,7 +302,7 @@ def _four(value: float) -> str:
 
 
 def _thinned(points: np.ndarray) -> np.ndarray:
-    """Points (N, 2) without those that nearly coincide with the one before."""
+    """Remove points (N, 2) that nearly coincide with the previous one."""
     kept = [0]
     for i in range(1, len(points)):
         if points[i, 0] > 1.25 * points[kept[-1], 0]:
@@ -312,7 +312,7 @@ def _thinned(points: np.ndarray) -> np.ndarray:
 
 @drawing("ranges-001-singles", 7.4)
 def singles_svg(figure: Figure, own: Mapping[str, Sequence[ranges.Range]]) -> None:
-    """A panel per parameter: error over the true change, both on logarithmic axes."""
+    """Draw a panel per parameter: error over the true change, both on logarithmic axes."""
     for axes, name in zip(figure.subplots(2, 2).ravel(), _ORDER, strict=True):
         both = own[name]
         per, unit, _ = _shown(name)
@@ -345,7 +345,7 @@ def singles_svg(figure: Figure, own: Mapping[str, Sequence[ranges.Range]]) -> No
 
 @drawing("ranges-001-joint", 6.2)
 def joint_svg(figure: Figure, corners: ranges.Corners) -> None:
-    """A panel per parameter: worst corner as a share of the claim over the share of the box."""
+    """Draw a panel per parameter: the worst corner as a share of the claim over the share of the box."""
     panels = figure.subplots(2, 2, sharex=True).ravel()
     for axes, name in zip(panels, _ORDER, strict=True):
         axes.axhline(1.0, color=INK, lw=1.0, ls=":")
@@ -367,7 +367,7 @@ def joint_svg(figure: Figure, corners: ranges.Corners) -> None:
 
 @drawing("ranges-001-defocus", 3.9)
 def defocus_svg(figure: Figure, pupil: ranges.PupilStudy, curves: ranges.Curves, focal: tuple[float, float]) -> None:
-    """False readings per piston over the pupil, and over the piston."""
+    """Draw false readings per piston over the pupil, and false readings over the piston."""
     left, right = figure.subplots(1, 2)
     grid = np.array([-0.3, 0.3])
     for axis, name, length, sign in ((0, "d_alpha", focal[0], -1.0), (1, "d_beta", focal[1], 1.0)):
@@ -423,7 +423,7 @@ def field_svg(figure: Figure, points: Sequence[ranges.FieldPoint]) -> None:
 def _show_causes(
     context: Context, own: Mapping[str, list[ranges.Range]], geometry: MonitorGeometry, local: float, data: Data
 ) -> None:
-    """What limits every formula by itself; ``local``: focal length along the line at its centre, metres."""
+    """Add the limits of every formula by itself; the local focal length is along the line at its centre, metres."""
     f, f_x = focal_lengths(geometry)
     cos2 = math.cos(geometry.field_beta_rad) ** 2
     causes: tuple[tuple[str, str, float | None, str], ...] = (
@@ -452,7 +452,7 @@ def _show_causes(
 
 
 def _show_singles(context: Context, found: Mapping[str, Mapping[str, list[ranges.Range]]], data: Data) -> None:
-    """Domains of every formula by itself."""
+    """Add the domains of every formula by itself."""
     rows: list[list[Cell]] = []
     listed: dict[str, dict[str, Any]] = {instrument: {} for instrument in found}
     for instrument, name in ((instrument, name) for instrument in found for name in NAMES):
@@ -506,7 +506,10 @@ def _show_defocus(
     focal: tuple[float, float],
     data: Data,
 ) -> None:
-    """False readings by defocus; ``change`` of the gain; ``focal``: across and along the line, metres."""
+    """Add the false readings by defocus.
+
+    The change is that of the gain; the focal lengths are across and along the line, in metres.
+    """
     theory = {name: 1.0 / f**2 / ARCSEC for name, f in zip(("d_alpha", "d_beta"), focal, strict=True)}
     rows: list[list[Cell]] = []
     listed: dict[str, Any] = {}
@@ -534,7 +537,7 @@ def _show_defocus(
 
 
 def _show_field(context: Context, points: Sequence[ranges.FieldPoint], data: Data) -> None:
-    """The area CCDs at other fields."""
+    """Add the results of the area CCDs at other fields."""
     rows: list[list[Cell]] = []
     listed = []
     for p in points:

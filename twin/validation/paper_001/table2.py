@@ -101,8 +101,9 @@ def printed_mean_difference(axis: str) -> float:
 
 
 def _mean_difference(context: Context, found: Measured, series: laboratory.Series) -> CheckResult:
-    """Row of the last line of Table 2 for one axis: mean over the benches, and the standard deviation of one bench
-    under the errors that the scene declares.
+    """Check the last line of Table 2 for one axis by the mean over the benches.
+
+    The noise is the standard deviation of one bench under the errors that the scene declares.
     """
     axis, spec = series.axis, found.setup.spec
     perfect, result = found.ideal[axis], found.real[0][axis]
@@ -188,13 +189,13 @@ _TITLES = {
 
 
 def bench_png(reader: laboratory.Reader, tables: Sequence[laboratory.ReadingTable]) -> bytes:
-    """The picture as PNG.
+    """Return the picture of the bench as PNG.
 
     Parameters
     ----------
     reader : laboratory.Reader
-        Of the experiment.
-    tables : Sequence[laboratory.ReadingTable]
+        Reader of the experiment.
+    tables : sequence of laboratory.ReadingTable
         Rendered benches, each with the series of Table 2.
     """
     from matplotlib.figure import Figure
@@ -210,7 +211,7 @@ def bench_png(reader: laboratory.Reader, tables: Sequence[laboratory.ReadingTabl
 
 
 def _plan(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where points (..., 3) of the bench lie on paper, seen from above (X up): Z to the right, Y down, millimetres."""
+    """Project points (..., 3) of the bench onto paper, seen from above (X up): Z to the right, Y down, millimetres."""
     return 1e3 * points[..., 2], -1e3 * points[..., 1]
 
 

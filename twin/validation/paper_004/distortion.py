@@ -363,7 +363,7 @@ def _sensitivity(context: Context, tests: Sequence[SpotTest], facts: Facts) -> I
 
 
 def _ratio(over: Array, under: Array, column: int) -> float:
-    """Standard deviation of a ratio of RMS over tests, by leaving one out at a time."""
+    """Return the standard deviation of a ratio of RMS over tests by the jackknife."""
     n = len(over)
     keep = ~np.eye(n, dtype=bool)
     values = np.array([rms(over[k, column]) / rms(under[k, column]) for k in keep])

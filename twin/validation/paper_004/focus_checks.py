@@ -290,8 +290,9 @@ def _measured(
 
 
 def _chips(placed: Sequence[tuple[SimulatedFocus, Pose, Mapping[str, float]]]) -> Chosen:
-    """Return the glueing errors of the line CCDs, on which the largest distance from best focus depends, in
-    millimetres.
+    """Return the glueing errors of the line CCDs, in millimetres, as an input.
+
+    The largest distance from best focus depends on them.
     """
     flat, as_glued = (
         np.array([[s.defocus(pose, share * heights[s.band]) for s in a.bench.sites] for a, pose, heights in placed])

@@ -143,8 +143,9 @@ def _repeats(
 
 
 def _readings(spec: TurntableTestSpec, seeds: NDArray[np.integer], identifier: str, value: float) -> list[Chosen]:
-    """Return the inputs of the largest RMS of the repeats: the scatter of a reading, and gross errors before the
-    criterion.
+    """Return the inputs of the largest RMS of the repeats.
+
+    They are the scatter of a reading and, before the criterion, gross errors.
     """
     scatter = float(np.hypot(spec.dividing_error.repeatability, spec.reference.noise)) / ARCSEC
     if identifier.endswith("chauvenet"):

@@ -83,9 +83,7 @@ def height_error(drawn: DrawnBlock, bundle: bool) -> float:
 
 @one_blas_thread()
 def ratios(image: float, seed: np.random.SeedSequence) -> np.ndarray:
-    """Return the height errors of a bundle at 5 m relative to those of intersection at 0.5 m, for the `ERRORS` of
-    attitude.
-    """
+    """Return height errors of a bundle at 5 m over those of intersection at 0.5 m, at `ERRORS` of the attitude."""
     return np.array(
         [
             height_error(draw_block(strip(image, error), seed), True)
