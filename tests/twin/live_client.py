@@ -35,7 +35,7 @@ class StandIn:
     def kill(self) -> None:
         self.condition = "ended"
 
-    async def start_again(self) -> None:
+    async def restart(self) -> None:
         self.started += 1
         self.condition = "runs"
 

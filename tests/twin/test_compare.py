@@ -52,7 +52,7 @@ def run(*words: object) -> tuple[int, str]:
 def test_a_run_is_the_same_as_itself_again(runs: Path, tmp_path: Path) -> None:
     code, text = run(runs / "a", runs / "again", "--out", tmp_path / "out")
     assert code == 0
-    assert "again gave the same as a (no input changed" in text
+    assert "again has the same results as a (no input changed" in text
     found = json.loads((tmp_path / "out/compare.json").read_text())
     assert found["same"]
     assert found["others"][0]["compared"] > 1000
@@ -160,7 +160,7 @@ def test_a_changed_file_of_a_run(runs: Path, tmp_path: Path) -> None:
     (copy / "irradiance.nc").write_bytes(b"CDF")
     refused("cannot be read as a netCDF file", runs / "a", copy)
     written("manifest.json", "twin.render", "twin.orbit")
-    refused("runs of two kinds", runs / "a", copy)
+    refused("the runs are of different kinds", runs / "a", copy)
     (copy / "truth.json").write_text("{")
     written("manifest.json", "twin.orbit", "twin.render")
     refused("not JSON", runs / "a", copy)

@@ -16,7 +16,7 @@ from scenes.yaml.errors import InputError
 from tests.tiers import quick
 from twin.framework.provenance import program_digest
 from twin.live.camera_pictures import CameraPictures
-from twin.live.computer import Answers
+from twin.live.computer import RequestHandler
 from twin.live.knobs import KINDS, knob_name, perturbation
 from twin.live.live_bench import LiveBench, course_text, job_text
 from twin.live.messages import AskedState, AskedView, BlindState
@@ -34,7 +34,7 @@ def bench() -> LiveBench:
 
 @pytest.fixture(scope="module")
 def first(bench) -> AskedState:
-    return bench.at_rest
+    return bench.initial_state
 
 
 def changed(state: AskedState, knobs: dict[str, float] | None = None, **other) -> AskedState:
@@ -232,13 +232,13 @@ def test_knobs_keep_the_units_of_the_job(tmp_path):
     )
     loaded = twin.load(file)
     bench = LiveBench(loaded)
-    asked = bench.at_rest
+    asked = bench.initial_state
     assert asked.knobs[f"{M2} shift z"] == 3.0
     # of several units the usual one; of one the file's
     assert asked.knobs["base/backward/M2 shift y"] == 2000.0
-    assert bench.knobs["base/backward/M2 shift y"].reach == 4000.0
+    assert bench.knobs["base/backward/M2 shift y"].extent == 4000.0
     knob = bench.knobs["base/backward/M3 shift x"]
-    assert (knob.unit, knob.value, knob.reach, knob.limit) == ("mm", 2.5, 5.0, 100.0)
+    assert (knob.unit, knob.value, knob.extent, knob.limit) == ("mm", 2.5, 5.0, 100.0)
     assert asked.knobs[f"{M2} figure Z20"] == 7.0
     assert asked.knobs["base/forward temperature"] == 0.5
     # to the bit, whatever the unit
@@ -272,7 +272,7 @@ def test_a_course_is_played_with_the_main_jobs_states(backend):
     course = bench.twin.resolved.job.course
     assert course is not None
     states = series_states(bench.twin.experiment, bench.twin.resolved.job)
-    asked = bench.at_rest
+    asked = bench.initial_state
     assert asked.time == course.shown
     for k in (0, 7, 20):
         assert bench.states(changed(asked, time=k)) == states[k]
@@ -281,22 +281,22 @@ def test_a_course_is_played_with_the_main_jobs_states(backend):
 @pytest.mark.second
 def test_other_values_of_a_factor_build_the_instrument_anew():
     """With half the aperture a quarter of the light comes, and the readings are noisier."""
-    answers = Answers("scenes/examples/study_aperture.yaml", "llvm", lambda part: None)
-    asked = answers.bench.at_rest
+    answers = RequestHandler("scenes/examples/study_aperture.yaml", "llvm", lambda part: None)
+    asked = answers.bench.initial_state
     whole, _ = answers.bench.state(asked)
-    opened = answers.to("factors", {"aperture": 25.0})
+    opened = answers.handle("factors", {"aperture": 25.0})
     assert not isinstance(opened, str)
     half, _ = answers.bench.state(asked)
     known = (asked.noise, asked.frames, asked.seed)
     for change, sent in (({}, False), ({"noise": False}, True), ({"frames": 3}, True), ({"seed": 99}, True)):
-        message = answers.to("state", (changed(asked, **change), known))
+        message = answers.handle("state", (changed(asked, **change), known))
         head = json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])
         assert ("before" in head["images"]) == sent, change
     key = "d_alpha_arcsec_sigma_noise"
     camera = whole["readings"]["cameras"]["forward"]["model"]
     assert half["readings"]["cameras"]["forward"]["model"][key] > 1.5 * camera[key]
-    assert "aperture" in answers.to("factors", {"aperture": -3.0})
+    assert "aperture" in answers.handle("factors", {"aperture": -3.0})
     view = AskedView(n=1, state=asked, view="spot", camera="forward")
-    assert "svg" in json.loads(answers.to("view", view))
-    told = json.loads(answers.to("course", []))
+    assert "svg" in json.loads(answers.handle("view", view))
+    told = json.loads(answers.handle("course", []))
     assert "at least" in told["problem"]

@@ -74,7 +74,7 @@ def canvas(page: Page, channel: str) -> np.ndarray:
 
 def test_dragging_the_despace_moves_the_spots_as_twin_render_does(page, backend, tmp_path):
     """Canvas, table and 3-D view against a run of the job that the page saves."""
-    at_rest = page.page.evaluate(f"liveTwin.scene.position('{M2}')")
+    initial_state = page.page.evaluate(f"liveTwin.scene.position('{M2}')")
     page.drag(DESPACE, 25.0)
     page.still()
     value = page.page.evaluate(f"liveTwin.knobs.knobs['{DESPACE}']")
@@ -95,7 +95,7 @@ def test_dragging_the_despace_moves_the_spots_as_twin_render_does(page, backend,
     assert float(shown[1].replace("−", "-")) == pytest.approx(true, abs=0.5 * 10.0 ** -len(shown[1].partition(".")[2]))
     moved = page.page.evaluate(f"liveTwin.scene.position('{M2}')")
     factor = float(page.page.text_content("#factor-value").replace(",", ""))
-    distance = np.linalg.norm(np.subtract(moved, at_rest))
+    distance = np.linalg.norm(np.subtract(moved, initial_state))
     # the factor is shown with two digits; the view is in single precision
     assert distance == pytest.approx(1e-6 * value * factor, rel=0.06)
 

@@ -17,7 +17,14 @@ from websockets.frames import Frame, Opcode
 
 from tests.twin.live_client import SECRET, StandIn, ask, connect, numbered, serving, state
 from twin.live import guard
-from twin.live.guard import COOKIE, MOST_KNOWN, MOST_OF_ONE, MOST_STRANGERS, Guard, names_of_this_machine
+from twin.live.guard import (
+    COOKIE,
+    MOST_AUTHENTICATED,
+    MOST_OF_ONE_ADDRESS,
+    MOST_UNAUTHENTICATED,
+    Guard,
+    names_of_this_machine,
+)
 
 WRONG = [
     b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(range(256)),  # TLS
@@ -104,7 +111,7 @@ def test_who_says_nothing_locks_nobody_out(capfd):
             ws.recv(5)
             # a machine on which much else runs holds up one answer or the other
             assert np.quantile(answered(port, ws, 20), 0.9) < PROMPT
-        assert len(server.connections) <= MOST_STRANGERS + MOST_KNOWN
+        assert len(server.connections) <= MOST_UNAUTHENTICATED + MOST_AUTHENTICATED
     said = capfd.readouterr()
     assert (said.out, said.err) == ("", "")
 
@@ -114,10 +121,10 @@ def test_one_address_does_not_take_the_places_of_others():
     with serving(StandIn()) as (port, _), ExitStack() as stack:
         quiet = lines(stack, port, 5, source="127.0.0.9")
         time.sleep(0.1)
-        loud = lines(stack, port, 3 * MOST_OF_ONE)
+        loud = lines(stack, port, 3 * MOST_OF_ONE_ADDRESS)
         time.sleep(0.3)
         assert not any(ended(line, 0.01) for line in quiet)
-        assert sum(ended(line, 0.01) for line in loud) == 2 * MOST_OF_ONE
+        assert sum(ended(line, 0.01) for line in loud) == 2 * MOST_OF_ONE_ADDRESS
 
 
 @pytest.mark.second
@@ -163,7 +170,7 @@ def test_an_answer_that_is_not_taken_is_given_up(monkeypatch):
 @pytest.mark.second
 def test_a_page_that_never_reads_is_dropped_and_leaves_nothing(monkeypatch):
     """A client of its own: others read by themselves, in a thread."""
-    monkeypatch.setattr("twin.live.clients.PATIENCE", 0.3)
+    monkeypatch.setattr("twin.live.clients.SEND_TIMEOUT", 0.3)
     monkeypatch.setattr(guard, "UNREAD", 0.3)
     with serving(StandIn(bytes_each=30_000_000)) as (port, server), ExitStack() as stack:
         head = SOCKET.replace(b"127.0.0.1", f"127.0.0.1:{port}".encode())
@@ -171,13 +178,13 @@ def test_a_page_that_never_reads_is_dropped_and_leaves_nothing(monkeypatch):
         [line] = lines(stack, port, 1, said)
         assert b" 101 " in line.recv(4096)
         came, n = time.monotonic(), 0
-        while server.desk.clients or server._uvicorn.server_state.connections:
+        while server.api.clients or server._uvicorn.server_state.connections:
             assert time.monotonic() - came < 20.0
             n += 1
             with suppress(OSError):  # it may be cut off by now
                 line.sendall(Frame(Opcode.TEXT, state(n).encode()).serialize(mask=True))
             time.sleep(0.1)
-        assert server.desk.states >= 2
+        assert server.api.states >= 2
 
 
 @pytest.mark.parametrize("pieces", [[b"\xff\xfe"], [b'{"type": "\xc3', b'\x28"}']])
@@ -235,7 +242,7 @@ def test_every_name_of_this_machine_and_no_other():
 def test_the_port_of_http_is_not_written():
     guard = Guard.of(SECRET, "127.0.0.1", 80)
     headers = {"host": "127.0.0.1", "origin": "http://127.0.0.1", "cookie": f"space_camera_twin_80={SECRET}"}
-    assert guard.refuses(headers, socket=True) == ""
+    assert guard.refusal(headers, socket=True) == ""
 
 
 @pytest.mark.parametrize("site", [None, "none", "same-origin", "same-site", "cross-site", ""])
@@ -243,7 +250,7 @@ def test_a_request_of_another_site_is_refused(site) -> None:
     """Another port of this host is another page, though the browser calls it the same site."""
     headers = {"host": "127.0.0.1:5", "cookie": f"space_camera_twin_5={SECRET}"}
     headers |= {} if site is None else {"sec-fetch-site": site}
-    found = Guard.of(SECRET, "127.0.0.1", 5).refuses(headers)
+    found = Guard.of(SECRET, "127.0.0.1", 5).refusal(headers)
     assert found == ("" if site in (None, "none", "same-origin") else "the page comes from elsewhere")
 
 

@@ -41,7 +41,7 @@ def test_values_of_a_studys_factors_stay_when_the_process_is_started_again() -> 
         process.kill()
         with pytest.raises(ComputerLost, match="killed by SIGKILL"):
             await process.ask("state", ASKED)
-        await process.start_again()
+        await process.restart()
         assert process.opened.greeting["factors"][0]["now"] == pytest.approx(0.9 * factor["now"])
         assert await readings() == expected
 
@@ -65,5 +65,5 @@ def test_a_process_that_cannot_start_says_why() -> None:
             process.start(lambda part: process.kill())
         threading.Thread(target=kill, daemon=True).start()
         with pytest.raises(CannotStart, match="3 times when it was started again"):
-            asyncio.run(process.start_again())
+            asyncio.run(process.restart())
         ended.set()

@@ -111,12 +111,12 @@ def test_a_run_opens_in_the_state_that_was_saved(pair, backend, tmp_path, monkey
         assert source.notes == ()
         assert (source.name, source.about) == ("run", "run: a job of the monitor")
     bench = bench_of(source, pair)
-    assert (bench.at_rest.frames, bench.at_rest.seed, bench.at_rest.time) == (3, 11, None)
-    shown, after = bench.state(bench.at_rest)
+    assert (bench.initial_state.frames, bench.initial_state.seed, bench.initial_state.time) == (3, 11, None)
+    shown, after = bench.state(bench.initial_state)
     assert shown["readings"] == stated(run.recovered_dict())
     assert shown["truth"] == run.truth_dict()
     assert np.array_equal(after, run.after[:, 0])
-    assert np.array_equal(bench.before(bench.at_rest), run.before[:, 0])
+    assert np.array_equal(bench.before(bench.initial_state), run.before[:, 0])
 
 
 def test_what_was_changed_after_the_run_is_told(tmp_path):
@@ -133,7 +133,7 @@ def test_a_page_takes_so_many_frames_and_says_so(pair, tmp_path):
     many = JOB.replace("frames: 2", f"frames: {MOST_FRAMES + 1}")
     source = read_source(str(written(tmp_path, many)))
     assert source.notes == (f"the page takes {MOST_FRAMES} frames in place of {MOST_FRAMES + 1}",)
-    assert bench_of(source, pair).at_rest.frames == MOST_FRAMES
+    assert bench_of(source, pair).initial_state.frames == MOST_FRAMES
     assert read_source(str(written(tmp_path, JOB.replace("frames: 2", f"frames: {MOST_FRAMES}")))).notes == ()
 
 
@@ -142,7 +142,7 @@ def test_a_seed_of_63_bits_is_known_by_its_last_ones(pair, tmp_path):
     """A number in JSON holds 53; the saved job has all."""
     seed = 2**62 + 2**55 + 12345
     bench = bench_of(read_source(str(written(tmp_path, JOB.replace("seed: 1", f"seed: {seed}")))), pair)
-    asked = AskedState(**json.loads(bench.at_rest.model_dump_json()))
+    asked = AskedState(**json.loads(bench.initial_state.model_dump_json()))
     assert (asked.seed, bench.greeting()["seed"]) == (12345, 12345)
     other = AskedState(**{**asked.model_dump(), "seed": 12346})
     for one, wanted in ((asked, seed), (other, 12346)):
@@ -187,7 +187,7 @@ def test_a_run_of_a_study_that_cannot_be_built_names_the_factor(tmp_path, monkey
     assert "despace" in read_source(file, 0).scalars
     place = ("job", "perturb", "base/forward/M2", "shift", 2)
     too_far = [(place, "9 parsec")]
-    monkeypatch.setattr("twin.live.source.base_with", lambda setup, scalars: with_values(setup.base, too_far))
+    monkeypatch.setattr("twin.live.source.base_with_factors", lambda setup, scalars: with_values(setup.base, too_far))
     with pytest.raises(InputError, match=r"study\.yaml:4: factors\.despace.*(at job\.perturb.*of the base)"):
         read_source(file, 0)
 
@@ -254,7 +254,7 @@ def test_a_monitored_orbit_is_a_course_with_the_motions_of_its_mounts(pair, tmp_
     assembly = bench.twin.experiment.instrument.assembly
     moved = "base/backward/focal_plane"
     for k, state in zip(numbers, expected, strict=True):
-        shown = bench.states(AskedState(**{**bench.at_rest.model_dump(), "time": k}))
+        shown = bench.states(AskedState(**{**bench.initial_state.model_dump(), "time": k}))
         assert set(shown) == set(state)
         one, two = assembly.place([shown]), assembly.place([state])
         for path in state:

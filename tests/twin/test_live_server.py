@@ -20,7 +20,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from tests.twin.live_client import SECRET, StandIn, ask, connect, numbered, serving, state
 from twin.framework.cli import InputErrorText
 from twin.live.__main__ import TOKEN, _serve
-from twin.live.clients import BAD_MESSAGES, Client, Goodbye
+from twin.live.clients import BAD_MESSAGES, Client, Disconnected
 from twin.live.computer import CannotStart, ComputerLost
 from twin.live.guard import BadToken, Guard, new_token
 from twin.live.messages import LARGEST_MESSAGE, AskedState, BadMessage, BlindState, read_message
@@ -116,11 +116,11 @@ def test_another_origin_is_refused(running, origin):
 )
 def test_a_socket_is_refused_before_it_is_accepted(running, cookie, origin, host):
     port, server = running
-    before = len(server.desk.clients)
+    before = len(server.api.clients)
     with pytest.raises(InvalidStatus) as refused:
         connect(port, cookie, origin, host)
     assert refused.value.response.status_code == 403
-    assert len(server.desk.clients) == before
+    assert len(server.api.clients) == before
 
 
 @pytest.mark.parametrize(
@@ -253,16 +253,16 @@ def test_a_page_may_say_so_much(monkeypatch):
     client = Client()
     for count, wait in ((2000, 0.5), (200, 0.0)):
         for _ in range(count):
-            client.take(GOOD[0])
+            client.receive(GOOD[0])
         now[0] += wait
-    with pytest.raises(Goodbye, match="too many messages"):
-        client.take(GOOD[0])
+    with pytest.raises(Disconnected, match="too many messages"):
+        client.receive(GOOD[0])
 
 
 def test_too_many_pages(running):
     port, server = running
     for _ in range(100):
-        if not server.desk.clients:
+        if not server.api.clients:
             break
         time.sleep(0.05)
     with ExitStack() as stack:
@@ -314,7 +314,7 @@ def test_a_slow_reader_hinders_nobody_and_holds_one_answer():
             quick.send(state(n))
             time.sleep(0.002)
         wait_for(quick, 119)
-        waiting = [client for client in server.desk.clients if client._answer is not None]
+        waiting = [client for client in server.api.clients if client._answer is not None]
         assert len(waiting) <= 1
         # what the system holds for a line that is not read, and then the last state
         wait_for(slow, 119)
@@ -322,11 +322,11 @@ def test_a_slow_reader_hinders_nobody_and_holds_one_answer():
 
 def test_a_recording_is_bounded_and_has_no_hidden_states():
     client = Client()
-    client.take(json.dumps({"type": "record", "on": True}))
+    client.receive(json.dumps({"type": "record", "on": True}))
     for one in (*(AskedState(n=n) for n in range(5)), BlindState(n=9, blind=3)):
-        client.kept(one)
-    client.take(json.dumps({"type": "record", "on": False}))
-    client.kept(AskedState(n=6))
+        client.state_computed(one)
+    client.receive(json.dumps({"type": "record", "on": False}))
+    client.state_computed(AskedState(n=6))
     assert client.recorded is not None
     assert [one.n for _, one in client.recorded] == list(range(5))
 
@@ -356,24 +356,24 @@ def test_messages_and_what_waits_for_a_page_are_bounded():
             read_message(state(1, **{unknown: 5}))
     client = Client()
     for k in range(40):
-        client.tell({"k": k})
-    assert [json.loads(one)["k"] for one in client._letters] == list(range(8, 40))
+        client.queue_json({"k": k})
+    assert [json.loads(one)["k"] for one in client._queued_texts] == list(range(8, 40))
 
 
 def test_what_is_hidden_is_chosen_here_and_stays_until_it_is_revealed():
     client = Client()
-    client.take(json.dumps({"type": "blind", "on": True}))
-    client.take(state(1))
+    client.receive(json.dumps({"type": "blind", "on": True}))
+    client.receive(state(1))
     assert isinstance(client.state, BlindState)
     hidden = client.state.blind
-    client.take(json.dumps({"type": "save", "what": "job", "state": {"type": "state", "n": 1}}))
+    client.receive(json.dumps({"type": "save", "what": "job", "state": {"type": "state", "n": 1}}))
     assert isinstance(client.saves[0].state, BlindState)
-    client.take(state(2))
+    client.receive(state(2))
     assert client.state.blind == hidden
-    client.take(json.dumps({"type": "blind", "on": False}))
+    client.receive(json.dumps({"type": "blind", "on": False}))
     assert isinstance(client.reveal, BlindState)
     assert client.reveal.blind == hidden
-    client.take(state(3))
+    client.receive(state(3))
     assert not isinstance(client.state, BlindState)
 
 
@@ -429,7 +429,7 @@ def test_a_computer_that_ends_while_nobody_asks_is_told_and_started_again():
 
 @pytest.mark.second
 def test_a_stopped_computer_is_told_and_started_again_if_it_stays(monkeypatch):
-    monkeypatch.setattr("twin.live.clients.STOPPED", 1.0)
+    monkeypatch.setattr("twin.live.clients.STOP_TIMEOUT", 1.0)
     computer = StandIn()
     with pages(computer) as (port, _, ws):
         began = time.monotonic()
@@ -464,7 +464,7 @@ def test_a_computer_that_goes_on_is_told_before_its_answer_comes():
 
 def test_a_computer_that_cannot_be_started_again_ends_the_server_with_the_reason():
     class Gone(StandIn):
-        async def start_again(self) -> None:
+        async def restart(self) -> None:
             raise CannotStart("job.yaml: no such file")
 
     listening = listen("127.0.0.1", 0)
@@ -487,7 +487,7 @@ def test_an_instrument_that_cannot_be_built_is_told_by_the_command(monkeypatch):
 
 @pytest.mark.second
 def test_the_server_ends_when_the_last_page_is_closed(monkeypatch):
-    monkeypatch.setattr("twin.live.server.LINGER", 0.3)
+    monkeypatch.setattr("twin.live.server.IDLE_TIMEOUT", 0.3)
     with serving(StandIn(), stay=False) as (port, server):
         with connect(port) as ws:
             ws.recv(5)

@@ -659,5 +659,5 @@ def test_a_record_of_another_version_is_left_alone(record: Path) -> None:
     base.commit()
     base.close()
     for opened in (lambda: History(str(record)), lambda: initialise_record(str(record), pair())):
-        with pytest.raises(NotARecord, match=f"is of version {later}, this program knows"):
+        with pytest.raises(NotARecord, match=f"has version {later}, this program needs"):
             opened()

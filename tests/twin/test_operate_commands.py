@@ -208,7 +208,7 @@ def test_an_estimate_that_fails_does_not_hide_what_was_taken(record: Path, life:
     assert done.exit_code == 0
     assert "1 taken" in done.stdout
     said_so = " ".join(done.stderr.split())
-    assert "the readings are in the record, but the estimate cannot be computed:  the record's plan" in said_so
+    assert "the readings are in the record, but the estimate cannot be computed: the record's plan" in said_so
 
 
 @pytest.mark.second

@@ -16,7 +16,7 @@ from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE, ANGLE_GROUP
 from optics.numerics.backend import load_backend
-from scenes.models.disturbances import Component, motions_of_spec, state_of
+from scenes.models.disturbances import Component, prior_of_spec, state_of
 from scenes.specs.disturbances import MOST_JOINT
 from scenes.specs.load import ORBIT, SCENES, load_disturbances
 from scenes.specs.operation import OperationSetup
@@ -185,7 +185,7 @@ def test_two_causes_about_two_points_are_one_motion(tmp_path: Path) -> None:
     np.testing.assert_allclose(changes[2], changes[0], rtol=1e-4, atol=3e-10)
     for name, text in prior.files.items():
         (tmp_path / name).write_text(text, "utf-8")
-    back = motions_of_spec(load_disturbances(str(tmp_path / "p.yaml")), experiment().instrument)
+    back = prior_of_spec(load_disturbances(str(tmp_path / "p.yaml")), experiment().instrument)
     np.testing.assert_allclose(back.covariance, prior.table @ found.covariance @ prior.table.T, rtol=1e-9, atol=1e-24)
 
 

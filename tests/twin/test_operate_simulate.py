@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from analysis.monitor.disturbances import TimeLaw
-from scenes.models.disturbances import Component, StatedMotions, drawn_course
+from scenes.models.disturbances import Component, DisturbancePrior, drawn_course
 from scenes.specs.disturbances import TimeLawSpec
 from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve_with
@@ -81,10 +81,10 @@ def two(law: TimeLawSpec, kind: str = "shift", correlation: float = 0.0, bodies:
         Component("slip", body, kind, k, "origin", s * size)
         for k, (body, s) in enumerate(zip(bodies, (2, 3), strict=True))
     )
-    return StatedMotions("some", parts, np.array([[1.0, correlation], [correlation, 1.0]]), (law, law))
+    return DisturbancePrior("some", parts, np.array([[1.0, correlation], [correlation, 1.0]]), (law, law))
 
 
-def life(stated: StatedMotions, days: np.ndarray, seed: int, **more) -> Life:
+def life(stated: DisturbancePrior, days: np.ndarray, seed: int, **more) -> Life:
     times = START + np.round(days * DAY * MICRO).astype(np.int64)
     return drawn_life(stated, times, START, seed, **{"causes": {}, **more})
 
@@ -146,7 +146,7 @@ def test_coefficients_scale_what_temperatures_do_and_not_what_sensors_read() -> 
 def test_what_one_cause_draws_does_not_depend_on_the_others() -> None:
     one = two(TimeLawSpec(drift="1 d"))
     other = Component("other", "c", "shift", 0, "origin", 1e-6)
-    more = StatedMotions("more", (*one.components, other), np.eye(3), (*one.laws, TimeLawSpec(jump="1 d")))
+    more = DisturbancePrior("more", (*one.components, other), np.eye(3), (*one.laws, TimeLawSpec(jump="1 d")))
     assert np.array_equal(life(one, np.arange(9.0), 2).amounts, life(more, np.arange(9.0), 2).amounts[:, :2])
     assert not np.array_equal(life(one, np.arange(9.0), 2).amounts, life(one, np.arange(9.0), 3).amounts)
 
@@ -228,7 +228,7 @@ def test_the_files_of_a_life_are_made_again_and_verified(made: tuple[Path, Path,
     record, _, _ = made
     done = invoke(verify, record / "simulated")
     assert done.exit_code == 0, done.stdout + done.stderr
-    assert "came out the same" in done.stdout
+    assert "has the same numbers in all" in done.stdout
 
 
 # --- what is made of it ----------------------------------------------------------------------------------

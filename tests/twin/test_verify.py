@@ -335,7 +335,8 @@ def test_options_that_do_not_go_together_are_refused(folder) -> None:
 
 def test_the_files_alone_take_no_computing(folder) -> None:
     result = invoke(app, folder, "--files")
-    assert (result.exit_code, result.stdout) == (0, "All 3 files are as the run wrote them. The run was not repeated.\n")
+    verdict = "All 3 files are as the run wrote them. The run was not repeated.\n"
+    assert (result.exit_code, result.stdout) == (0, verdict)
     flip(folder / "numbers.json", 12)
     result = invoke(app, folder, "--files", "--json")
     assert result.exit_code == 1

@@ -1,1 +1,1 @@
-"""Run folders of one kind beside each other: what went in, what came out, and the images."""
+"""Comparison of run folders of one kind, and verification of a run folder: inputs, results and images."""

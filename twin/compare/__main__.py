@@ -1,4 +1,4 @@
-"""``python -m twin.compare``: what differs between run folders."""
+"""``python -m twin.compare``: differences between run folders."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from twin.framework.command import Result, finished, run_command
 from twin.framework.procedure import Session
 
 DIFFERENT = 1
-"""Exit code where results differ, as that of diff."""
+"""Exit code if results differ, as that of diff."""
 
 app = cli.program()
 
@@ -29,22 +29,18 @@ app = cli.program()
 def main(
     runs: Annotated[list[Path], typer.Argument(readable=False, help="Run folders; the first is the reference.")],
     options: cli.Options,
-    rtol: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Numbers that agree to this part of the larger are the same.")
-    ] = 1e-9,
+    rtol: Annotated[float, typer.Option(min=0.0, max=1.0, help="Relative tolerance of numbers.")] = 1e-9,
     sigmas: Annotated[
         float | None,
         typer.Option(
-            min=0.0,
-            help="Numbers with a sigma are the same within so many of them, and recorded frames do not count. Default: "
-            "all to --rtol.",
+            min=0.0, help="Tolerance of numbers with a sigma, in sigmas; recorded frames are ignored. Default: --rtol."
         ),
     ] = None,
 ) -> None:
-    """Compare run folders of one kind: what went in, what came out, and the images.
+    """Compare run folders of one kind: inputs, results and images.
 
     Any run folders of one command can be compared: two jobs that differ in one perturbation, one job before and after
-    a change of the program, the same study with other seeds. Times and durations are left out.
+    a change of the program, the same study with other seeds. Times and durations are ignored.
 
     For example:
 

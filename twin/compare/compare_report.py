@@ -1,4 +1,4 @@
-"""The differences between runs, for a reader: tables of inputs and results, the images side by side."""
+"""Differences between runs, and their report: tables of inputs and results, and the images side by side."""
 
 from __future__ import annotations
 
@@ -21,24 +21,20 @@ from twin.framework.run_folder import Manifest, finished_manifest
 from twin.framework.svg import BLUE, GREY, look, new_figure, plain_axes, signed_map, to_png, to_svg
 
 MOST_BARS = 30
-"""Changes of a figure: the largest for their sigma."""
+"""Largest number of changes in the figure, the most significant ones."""
 _MOST_IMAGES = 8
-"""Images that are shown."""
+"""Largest number of images shown."""
 
 
 def compare_report(comparison: Comparison) -> Report:
-    """Report of a comparison."""
+    """Return the report of a comparison."""
     names = comparison.names
     told, more = answer(*verdict(comparison))
     summary = Table(
         "summary",
         "What differs",
-        f"Against {names[0]}. A number counts where it differs by more than {comparison.rtol:g} of itself"
-        + (
-            "."
-            if comparison.sigmas is None
-            else f" and, where it has a sigma, by more than {comparison.sigmas:g} sigma."
-        ),
+        f"Differences from {names[0]}. A number differs if it deviates by more than {comparison.rtol:g} of its value"
+        + ("." if comparison.sigmas is None else f" and, if it has a sigma, by more than {comparison.sigmas:g} sigma."),
         ("run", "inputs", "numbers", "images", "compared", "largest [sigma]"),
         [_row(name, found) for name, found in zip(names[1:], comparison.found, strict=True)],
     )
@@ -59,14 +55,13 @@ def compare_report(comparison: Comparison) -> Report:
 
 
 def _row(name: str, found: Differences) -> list[Cell]:
+    """Return the row of a run in the summary."""
     far = max((abs(one.in_sigma) for one in found.numbers if one.in_sigma is not None), default=None)
     return [name, len(found.inputs), len(found.numbers), len(found.arrays), found.compared, far]
 
 
 def _warnings(comparison: Comparison) -> tuple[str, ...]:
-    """Warnings of differences that make a comparison doubtful: other versions, other warnings of the runs
-    themselves.
-    """
+    """Return warnings of other versions and of other warnings of the runs, which make a comparison doubtful."""
     first = comparison.runs[0]
     out = []
     for name, run in zip(comparison.names[1:], comparison.runs[1:], strict=True):
@@ -85,6 +80,7 @@ def _warnings(comparison: Comparison) -> tuple[str, ...]:
 
 
 def _artefacts(reference: Run, run: Run, found: Differences, names: tuple[str, str], k: int) -> tuple[Artefact, ...]:
+    """Return the tables and figures of one run against the reference."""
     out: list[Artefact] = []
     if found.inputs:
         rows: list[list[Cell]] = [[_text(value) for value in one.values()] for one in found.inputs]
@@ -98,36 +94,39 @@ def _artefacts(reference: Run, run: Run, found: Differences, names: tuple[str, s
             for n in sorted(found.numbers, key=lambda one: one.file != "truth.json")
             if not is_sigma(n.key)
         ]
-        columns = ("file", "key", *names, "difference", "sigma", "of", "in sigma")
-        about = "Units are the keys' endings; sigma is that of the difference of independent measurements, of noise if "
-        about += "runs state it, else as they state it. Runs of one seed share their noise, and differ by less."
+        columns = ("file", "key", *names, "difference", "sigma", "sigma from", "in sigma")
+        about = "The keys end in their units. Sigma is that of the difference of two independent measurements: from "
+        about += "image noise if stated, otherwise the total. Runs of one seed share their noise and differ by less."
         left = len(found.numbers) - len(rows)
-        about += f" {left} sigmas that changed are in compare.json." if left else ""
+        about += f" compare.json lists {left} changed sigmas." if left else ""
         out.append(Table(f"numbers-{k}", "Results", about, columns, rows, (None,) * 7 + (1,)))
     if found.arrays:
-        heads = ("file", "variable", "shape", "largest", "rms", "peak", "share that differs")
+        heads = ("file", "variable", "shape", "largest", "rms", "peak", "differing share")
         rows = [[a.file, a.name, _shape(a), a.largest, a.rms, a.peak, a.share] for a in found.arrays]
-        about = f"Differences, and the peak of {names[0]}; in the file's own units."
+        about = f"Differences and the peak of {names[0]}, in the units of the file."
         out.append(Table(f"images-{k}", "Images", about, heads, rows))
         out += _pictures(reference, run, found, names, k)
     return tuple(out)
 
 
 def _text(value: Leaf) -> str:
+    """Return a value of an input as text."""
     return "\N{EM DASH}" if value is None else str(value)
 
 
 def _value(value: Leaf) -> Cell:
+    """Return a value of a result as a cell."""
     return str(value) if isinstance(value, bool) else value
 
 
 def _shape(array: ArrayDifference) -> str:
+    """Return the shapes of both arrays as text."""
     here, there = ("none" if s is None else " x ".join(map(str, s)) for s in (array.shape, array.other_shape))
     return here if here == there else f"{here}, {there}"
 
 
 def _changes(found: Differences, names: tuple[str, str], k: int) -> SvgFigure | None:
-    """The changes that are largest for their sigma."""
+    """Return the figure of the most significant changes; None if no number has a sigma."""
     known = [one for one in found.numbers if one.in_sigma is not None]
     chosen = sorted(known, key=lambda one: -abs(one.in_sigma or 0.0))[:MOST_BARS]
     if not chosen:
@@ -144,15 +143,15 @@ def _changes(found: Differences, names: tuple[str, str], k: int) -> SvgFigure | 
         axes.margins(y=0.02)
         plain_axes(axes)
         drawn = to_svg(figure)
-    caption = f"{names[1]} minus {names[0]}, over the sigma of the difference of independent measurements, of noise "
-    caption += "where runs state it."
+    caption = f"{names[1]} minus {names[0]}, divided by the sigma of the difference of two independent measurements "
+    caption += "(from image noise if the runs state it)."
     if len(known) > len(chosen):
         caption += f" The {len(chosen)} largest of {len(known)}."
     return SvgFigure(f"changes-{k}", "Results that have a sigma", caption, drawn)
 
 
 def _pictures(reference: Run, run: Run, found: Differences, names: tuple[str, str], k: int) -> list[Artefact]:
-    """Images of both runs and their difference: the mean over all but the last two axes."""
+    """Return images of both runs and their difference, averaged over all but the last two axes."""
     out: list[Artefact] = []
     for array in found.arrays:
         if array.largest is None or array.shape is None or len(array.shape) < 2 or min(array.shape[-2:]) < 8:
@@ -172,7 +171,7 @@ def _pictures(reference: Run, run: Run, found: Differences, names: tuple[str, st
 
 
 def _views(first: np.ndarray, second: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """Means of frames; of further axes (state, channel) each place by itself that differs."""
+    """Return mean images over the frames; for further axes (state, channel) each differing index by itself."""
     if first.ndim <= 3:
         axes = tuple(range(first.ndim - 2))
         return [("", first.mean(axis=axes), second.mean(axis=axes))]
@@ -181,6 +180,7 @@ def _views(first: np.ndarray, second: np.ndarray) -> list[tuple[str, np.ndarray,
 
 
 def _picture(first: np.ndarray, second: np.ndarray, names: tuple[str, str], title: str) -> bytes:
+    """Return a PNG of two images and their difference."""
     with look("image"):
         figure = new_figure(3.6)
         axes = figure.subplots(1, 3)
@@ -205,18 +205,18 @@ KIND = "compare"
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """One run against the reference.
+    """Differences of one run from the reference.
 
     Attributes
     ----------
     inputs : tuple[Mapping[str, Leaf], ...]
-        Keys of config.yaml with different values: ``key``, ``reference``, ``other``; None where there is none.
+        Keys of config.yaml with different values: ``key``, ``reference``, ``other``; None where a run lacks the key.
     numbers : tuple[NumberDifference, ...]
-        Results that are not the same to the tolerance.
+        Results that differ by more than the tolerance.
     arrays : tuple[ArrayDifference, ...]
-        Images that are not the same to the tolerance of their peak.
+        Images that differ by more than the tolerance of their peak.
     compared : int
-        How many numbers and arrays both runs have.
+        Number of numbers and arrays that both runs have.
     """
 
     inputs: tuple[Mapping[str, Leaf], ...]
@@ -232,14 +232,14 @@ class Differences:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A run folder with its manifest and the keys and values of its config.yaml."""
+    """Run folder with its manifest, and the keys and values of its config.yaml."""
 
     folder: Path
     manifest: Manifest
     inputs: Mapping[str, Leaf]
 
     def file(self, name: str) -> Path | None:
-        """Return a file of the run, None where it has none of that name."""
+        """Return a file of the run; None if the run has no file of that name."""
         return self.folder / name if name in self.manifest.sha256 else None
 
 
@@ -249,7 +249,7 @@ def read_run(folder: Path) -> Run:
     Raises
     ------
     InputError
-        It is none, or config.yaml cannot be read.
+        The folder is not a run folder, or config.yaml cannot be read.
     """
     manifest = finished_manifest(folder)
     config = read_yaml(folder / "config.yaml").data if "config.yaml" in manifest.sha256 else {}
@@ -262,24 +262,25 @@ def differences(reference: Run, other: Run, rtol: float, sigmas: float | None) -
     Parameters
     ----------
     reference : Run
-        The first.
+        The first run.
     other : Run
-        The second.
+        The second run.
     rtol : float
-        Numbers that agree to this part of the larger one are the same, and elements of arrays to this part of the
-        array's peak.
+        Relative tolerance: of the larger of two numbers, and for arrays of the peak.
     sigmas : float | None
-        Where a number has a sigma in both runs, differences within so many of them do not count; sigmas themselves and
-        recorded frames, in which the noise is another draw, are then left out. None holds all to ``rtol``.
+        Where a number has a sigma in both runs, differences within this multiple of it do not count; the sigmas and the
+        recorded frames, whose noise is another draw, are then ignored. None compares all to ``rtol``.
 
     Raises
     ------
     InputError
-        They are of two kinds, or a file cannot be read.
+        The runs are of different kinds, or a file cannot be read.
     """
     if reference.manifest.kind != other.manifest.kind:
         kinds = f"{reference.manifest.kind} and {other.manifest.kind}"
-        raise InputError(Issue("runs of two kinds", str(other.folder), found=kinds, allowed="runs of one command"))
+        raise InputError(
+            Issue("the runs are of different kinds", str(other.folder), found=kinds, allowed="runs of one command")
+        )
     inputs = [
         {"key": key, "reference": here, "other": there}
         for key in dict.fromkeys((*reference.inputs, *other.inputs))
@@ -294,7 +295,7 @@ def differences(reference: Run, other: Run, rtol: float, sigmas: float | None) -
     for name in (*results, *images):
         found = difference.file_difference(name, reference.file(name), other.file(name))
         count += found.common_arrays
-        arrays += [one for one in found.arrays if not _same_array(one, rtol)]
+        arrays += [array for array in found.arrays if not _same_array(array, rtol)]
         if name in results:
             count += found.common_numbers
             numbers += [one for one in found.numbers if not _same_number(one, rtol, sigmas)]
@@ -302,7 +303,7 @@ def differences(reference: Run, other: Run, rtol: float, sigmas: float | None) -
 
 
 def _same_input(here: Leaf, there: Leaf) -> bool:
-    """Return whether two inputs are the same, also as 3 um and 0.003 mm."""
+    """Return whether two inputs are equal, also if their units differ, as 3 um and 0.003 mm."""
     if here == there and type(here) is type(there):
         return True
     one, two = split_quantity(here), split_quantity(there)
@@ -315,6 +316,7 @@ def _same_input(here: Leaf, there: Leaf) -> bool:
 
 
 def _same_number(one: NumberDifference, rtol: float, sigmas: float | None) -> bool:
+    """Return whether two results are equal within the tolerances."""
     if sigmas is not None and is_sigma(one.key):
         return True
     if one.difference is None:  # of which both are None one is no key of its file
@@ -325,23 +327,24 @@ def _same_number(one: NumberDifference, rtol: float, sigmas: float | None) -> bo
 
 
 def _same_array(one: ArrayDifference, rtol: float) -> bool:
+    """Return whether two arrays are equal within the tolerance."""
     return one.finite and (one.largest or 0.0) <= rtol * (one.peak or 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Runs of one kind beside each other.
+    """Comparison of runs of one kind.
 
     Attributes
     ----------
     runs : tuple[Run, ...]
-        The first is the reference.
+        The runs; the first is the reference.
     found : tuple[Differences, ...]
-        Of every other one, what differs from the reference.
+        Differences of each other run from the reference.
     rtol : float
-        Numbers that agree to this part are the same.
+        Relative tolerance of numbers.
     sigmas : float | None
-        Differences within so many sigma do not count, None where all do.
+        Multiple of sigma within which differences do not count; None if all count.
     """
 
     runs: tuple[Run, ...]
@@ -356,7 +359,7 @@ class Comparison:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names that distinguish the folders: their own, or their paths where two have one name."""
+        """Names of the folders, or their paths if two names are equal."""
         names = [run.folder.resolve().name for run in self.runs]
         return tuple(names if len(set(names)) == len(names) else [str(run.folder) for run in self.runs])
 
@@ -367,7 +370,7 @@ def compare(folders: Sequence[Path], rtol: float, sigmas: float | None) -> Compa
     Raises
     ------
     InputError
-        Fewer than two, no run folder, or runs of several kinds.
+        There are fewer than two folders, a folder is not a run folder, or the runs are of different kinds.
     """
     if len(folders) < 2:
         raise InputError(Issue("a comparison needs two runs or more", found=f"{len(folders)}"))
@@ -376,7 +379,7 @@ def compare(folders: Sequence[Path], rtol: float, sigmas: float | None) -> Compa
 
 
 def numbers(comparison: Comparison) -> Mapping[str, Any]:
-    """Contents of compare.json."""
+    """Return the content of compare.json."""
     others = []
     for run, found in zip(comparison.runs[1:], comparison.found, strict=True):
         others.append(
@@ -386,7 +389,7 @@ def numbers(comparison: Comparison) -> Mapping[str, Any]:
                 "compared": found.compared,
                 "inputs": found.inputs,
                 "numbers": [_plain(one, "scale", "difference", "in_sigma") for one in found.numbers],
-                "arrays": [_plain(one, "where reference other depth") for one in found.arrays],
+                "arrays": [_plain(array, "where reference other depth") for array in found.arrays],
             }
         )
     return {
@@ -400,31 +403,31 @@ def numbers(comparison: Comparison) -> Mapping[str, Any]:
 
 
 def _plain(one: NumberDifference | ArrayDifference, without: str, *derived: str) -> dict[str, Any]:
-    """Fields of a difference and numbers that follow from them, which are None where they are not finite."""
+    """Return the fields of a difference and derived numbers as plain data; None for numbers that are not finite."""
     values = {key: value for key, value in vars(one).items() if key not in without.split()}
     more = {key: getattr(one, key) for key in derived}
     return values | {key: value if value is not None and abs(value) < math.inf else None for key, value in more.items()}
 
 
 def verdict(comparison: Comparison) -> list[str]:
-    """A sentence for each run beside the first, and one for its largest change."""
+    """Return a sentence for each run against the first, and one for its most significant change."""
     parts = []
     for name, found in zip(comparison.names[1:], comparison.found, strict=True):
         inputs = f"{len(found.inputs)} input{'s' * (len(found.inputs) != 1)}" if found.inputs else "no input"
         if found.same:
             parts.append(
-                f"the run {name} gave the same as {comparison.names[0]} ({inputs} changed, {found.compared} compared)"
+                f"run {name} has the same results as {comparison.names[0]} ({inputs} changed, {found.compared} compared)"
             )
             continue
         what = [f"{len(found.numbers)} numbers"] * bool(found.numbers) + [f"{len(found.arrays)} images"] * bool(
             found.arrays
         )
         parts.append(
-            f"the run {name} differs from {comparison.names[0]} in {' and '.join(what)} of {found.compared} "
+            f"run {name} differs from {comparison.names[0]} in {' and '.join(what)} of {found.compared} results "
             f"({inputs} changed)"
         )
         far = max(found.numbers, key=lambda one: abs(one.in_sigma or 0.0), default=None)
         if far is not None and far.in_sigma is not None:
-            kind = "of the noise alone" if far.sigma_of == NOISE else "as stated"
-            parts.append(f"the largest change for its sigma is {far.key}, {far.in_sigma:+.3g} sigma {kind}")
+            kind = "from image noise" if far.sigma_of == NOISE else "as stated"
+            parts.append(f"the most significant change is {far.key}, {far.in_sigma:+.3g} sigma {kind}")
     return parts

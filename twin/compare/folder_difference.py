@@ -1,7 +1,7 @@
-"""The difference of two run folders, file by file: numbers with their sigmas, texts, arrays and images.
+"""Differences of two run folders, file by file: numbers with their sigmas, texts, arrays and images.
 
-Files are read by what they are, not by who wrote them. What names a time, a duration or a version is left out.
-`file_difference` names every number, text and array that is not the same to the bit; ``twin.compare`` and
+Files are read by their format, independent of the program that wrote them. Keys of times, durations and versions are
+excluded. `file_difference` lists every number, text and array that is not equal to the bit; ``twin.compare`` and
 ``twin.verify`` decide which of these count.
 """
 
@@ -31,37 +31,37 @@ from scenes.yaml.yaml_file import parse_yaml
 from twin.framework.data_files import read_netcdf
 
 Leaf = float | int | str | bool | None
-LEFT_OUT = frozenset(
+EXCLUDED_KEYS = frozenset(
     (
         *("seconds", "worker_seconds", "runs_computed", "states_per_second", "wall_time_s", "started_unix_s"),
         *("fingerprint", "sha256", "versions", "schema", "reference_frames"),
     )
 )
-"""Keys of results that say how the run was done, not what it gave."""
+"""Keys of results that describe how the run was done, instead of its results."""
 STATEMENTS = frozenset(("verdict", "warnings"))
-"""Sentences at the top of a result that follow from its numbers."""
-NAMES = ("name", "motion", "label", "field", "path", "time_s")
-"""Keys that distinguish the entries of a list, the first that does."""
+"""Keys of sentences at the top of a result that follow from its numbers."""
+ENTRY_NAMES = ("name", "motion", "label", "field", "path", "time_s")
+"""Keys that distinguish the entries of a list; the first one that does is used."""
 NOISE = "noise"
-"""Name of a sigma that more frames lower."""
-_SERIES = 12
-"""Numbers of a list from which it is compared as an array."""
+"""Name of the sigma from image noise, which more frames reduce."""
+_ARRAY_LENGTH = 12
+"""Length above which a list of numbers is compared as an array."""
 
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """The content of a file.
+    """Content of a file.
 
     Attributes
     ----------
     numbers : Mapping[str, Leaf]
         Key -> number or text.
-    arrays : Mapping[str, np.ndarray]
+    arrays : Mapping[str, ndarray]
         Name -> array.
     statements : Mapping[str, Any]
-        Sentences that follow from the numbers.
+        Key -> sentences that follow from the numbers.
     drawn : bool
-        Whether it is a picture.
+        Whether the file is a picture.
     """
 
     numbers: Mapping[str, Leaf]
@@ -72,23 +72,23 @@ class Content:
 
 @dataclass(frozen=True)
 class NumberDifference:
-    """A number or text with different values.
+    """Number or text with different values in two files.
 
     Attributes
     ----------
     file : str
-        In the run folder, ``recovered.json``.
+        Path in the run folder, such as ``recovered.json``.
     key : str
-        In the file, which ends in its unit.
+        Key in the file, which ends in its unit.
     reference, other : Leaf
-        Both values; None where there is none.
+        Both values; None where a file lacks the key.
     sigma : float | None
-        Standard deviation of the difference of two independent measurements, from both files' sigmas; None where they
+        Standard deviation of the difference of two independent measurements, from both files' sigmas; None if they
         state none.
     sigma_of : str
-        The ``noise`` of the images alone, or ``stated``; empty without a sigma.
+        ``noise`` of the images alone, or ``stated``; empty without a sigma.
     scale : float
-        Largest number of its sort in both files.
+        Largest number of the same kind in both files.
     """
 
     file: str
@@ -101,43 +101,43 @@ class NumberDifference:
 
     @property
     def difference(self) -> float | None:
-        """Other minus reference, None unless both are numbers."""
+        """Other minus reference; None unless both are numbers."""
         if is_number(self.reference) and is_number(self.other):
             return float(self.other) - float(self.reference)  # type: ignore[arg-type]
         return None
 
     @property
     def in_sigma(self) -> float | None:
-        """The difference over its sigma."""
+        """Difference divided by its sigma; None without a sigma."""
         return None if self.difference is None or not self.sigma else self.difference / self.sigma
 
 
 @dataclass(frozen=True)
 class ArrayDifference:
-    """An image, or another array, with different values.
+    """Image or other array with different values in two files.
 
     Attributes
     ----------
     file : str
-        In the run folder.
+        Path in the run folder.
     name : str
-        Of the variable; empty for an image.
+        Name of the variable; empty for an image.
     shape, other_shape : tuple[int, ...] | None
-        Of the reference's and of the other, None where there is none.
+        Shapes of the reference and of the other array; None where a file lacks it.
     largest : float | None
-        Absolute difference at most; None unless both are numbers of one shape.
+        Largest absolute difference; None unless both are numeric and of one shape.
     rms : float | None
-        Of the difference.
+        Root mean square of the difference.
     peak : float | None
         Largest absolute value of the reference.
     share : float | None
-        Of the elements that differ; None where the shapes do.
+        Share of the elements that differ; None if the shapes differ.
     where : tuple[int, ...]
         Index of the element that differs most.
     reference, other : Leaf
-        Its values.
+        Values of this element.
     depth : int
-        Bytes of an element of an unsigned array, 0 for others.
+        Bytes of an element of an unsigned array; 0 for other types.
     """
 
     file: str
@@ -155,28 +155,28 @@ class ArrayDifference:
 
     @property
     def finite(self) -> bool:
-        """Whether the element that differs most is a number in both."""
+        """Whether the element that differs most is finite in both arrays."""
         return self.largest is not None and math.isfinite(float(self.other or 0) - float(self.reference or 0))
 
 
 @dataclass(frozen=True, eq=False)
 class FileDifference:
-    """All that is not the same to the bit in a file of two run folders.
+    """All values of a file in two run folders that are not equal to the bit.
 
     Attributes
     ----------
     file : str
-        In the run folders.
+        Path in the run folders.
     numbers : tuple[NumberDifference, ...]
-        Numbers and texts.
+        Numbers and texts that differ.
     arrays : tuple[ArrayDifference, ...]
-        Images and other arrays.
+        Images and other arrays that differ.
     statements : tuple[NumberDifference, ...]
-        Sentences that follow from the numbers.
+        Differing sentences that follow from the numbers.
     common_numbers, common_arrays : int
-        How many are in both; of a file with the same bytes that is no JSON 0 and 1.
+        Number of values in both files; 0 and 1 for files of equal bytes that are not JSON.
     drawn : bool
-        Whether it is a picture.
+        Whether the file is a picture.
     """
 
     file: str
@@ -194,16 +194,16 @@ def file_difference(name: str, reference: Path | None, other: Path | None) -> Fi
     Parameters
     ----------
     name : str
-        In the run folders.
+        Path in the run folders.
     reference : Path | None
-        The file in the first folder, None where it has none.
+        The file in the first folder; None if it does not exist.
     other : Path | None
-        In the second.
+        The file in the second folder.
 
     Raises
     ------
     InputError
-        One cannot be read.
+        A file cannot be read.
     """
     if reference is not None and other is not None and _same_bytes(reference, other):
         if ending(name) != "json":
@@ -215,21 +215,23 @@ def file_difference(name: str, reference: Path | None, other: Path | None) -> Fi
 
 
 def content_difference(name: str, reference: Content, other: Content) -> FileDifference:
-    """Compare two contents.
+    """Compare the contents of two files.
 
     Parameters
     ----------
     name : str
-        Of the file.
+        Name of the file.
     reference : Content
-        The first.
+        Content of the first.
     other : Content
-        The second.
+        Content of the second.
     """
     one, two = reference.numbers, other.numbers
     scales = _scales(one, two)
     numbers = [
-        NumberDifference(name, key, one.get(key), two.get(key), *sigma_of(one, two, key), scales.get(_sort(key), 0.0))
+        NumberDifference(
+            name, key, one.get(key), two.get(key), *sigma_of(one, two, key), scales.get(_quantity_kind(key), 0.0)
+        )
         for key in dict.fromkeys((*one, *two))
         if not (key in one and key in two and _same(one[key], two[key]))
     ]
@@ -246,18 +248,18 @@ def content_difference(name: str, reference: Content, other: Content) -> FileDif
 
 
 def array_difference(file: str, name: str, here: np.ndarray | None, there: np.ndarray | None) -> ArrayDifference | None:
-    """Compare two arrays; None where they are the same to the bit.
+    """Compare two arrays; return None if they are equal to the bit.
 
     Parameters
     ----------
     file : str
-        That they are in.
+        File of the arrays.
     name : str
-        Of both.
-    here : np.ndarray | None
-        The first, of any shape; None where there is none.
-    there : np.ndarray | None
-        The second.
+        Name of both arrays.
+    here : ndarray | None
+        The first array, of any shape; None if it does not exist.
+    there : ndarray | None
+        The second array.
     """
     if here is None or there is None or here.shape != there.shape:
         first, second = (None if array is None else array.shape for array in (here, there))
@@ -297,12 +299,12 @@ def _same_bytes(one: Path, two: Path) -> bool:
 
 
 def ending(name: str) -> str:
-    """Return a file's ending in small letters, without the dot."""
+    """Return the suffix of a file name in lower case, without the dot."""
     return name.rpartition(".")[2].lower()
 
 
 def is_number(value: Any) -> bool:
-    """Return whether a value is a number and no truth value."""
+    """Return whether a value is a number and not a boolean."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -312,24 +314,26 @@ def _same(here: Any, there: Any) -> bool:
 
 
 def is_sigma(key: str) -> bool:
-    """Whether a key holds the standard deviation of another number, or what correcting by it leaves."""
+    """Return whether a key holds the standard deviation, or the residual after correction, of another number."""
     last = key.rpartition(".")[2]
     return last == "sigma" or last.endswith(("_sigma", "_sigma_noise")) or last.startswith(("sigma_", "left_"))
 
 
 def sigma_of(reference: Mapping[str, Leaf], other: Mapping[str, Leaf], key: str) -> tuple[float | None, str]:
-    """Return the sigma of the difference of two numbers and what it is of: of the noise of both runs, from
-    ``x_sigma_noise`` beside them in both runs, else as stated, from ``x_sigma`` or ``sigma``. The error of an
-    estimator by the motions is the same in runs of the same motions, and does not scatter between them.
+    """Return the sigma of the difference of two numbers, and its source.
+
+    The source is ``noise`` if both runs state ``x_sigma_noise`` beside the number, otherwise ``stated``, from
+    ``x_sigma`` or ``sigma``. An estimator's error from the motions is the same in runs of the same motions, and does
+    not scatter between them.
 
     Parameters
     ----------
     reference : Mapping[str, Leaf]
         Key -> value of the first file.
     other : Mapping[str, Leaf]
-        Of the second.
+        Key -> value of the second file.
     key : str
-        Of the numbers.
+        Key of the numbers.
     """
     head, dot, last = key.rpartition(".")
     for name in (f"{last}_sigma_noise", f"{last}_sigma", *(("sigma",) if last == "value" else ())):
@@ -339,9 +343,10 @@ def sigma_of(reference: Mapping[str, Leaf], other: Mapping[str, Leaf], key: str)
     return None, ""
 
 
-def _sort(key: str) -> str:
-    """Return what numbers of one sort have in common: a table's column; the key's last name that is one, as of Zernike
-    terms by their titles ``zernike_waves``.
+def _quantity_kind(key: str) -> str:
+    """Return the name that numbers of one kind have in common.
+
+    It is a table's column, or the last part of a key that is an identifier, such as ``zernike_waves`` of Zernike terms.
     """
     if key.startswith("row "):
         return key.partition(", ")[2]
@@ -350,16 +355,16 @@ def _sort(key: str) -> str:
 
 
 _PLACE = re.compile(r"\[(?:\[[^\]]*\]|[^\[\]])*\]")
-"""The part of a key after a list's name: the number of an entry, or what distinguishes it."""
+"""Index in a key after a list's name: number of an entry, or its distinguishing name."""
 
 
 def _scales(*contents: Mapping[str, Leaf]) -> dict[str, float]:
-    """Return the largest number of each sort, beside which others may be zero but for rounding."""
+    """Return the largest number of each kind, relative to which small numbers are zero within rounding."""
     out: dict[str, float] = {}
     for numbers in contents:
         for key, value in numbers.items():
             if isinstance(value, float) and math.isfinite(value):
-                name = _sort(key)
+                name = _quantity_kind(key)
                 out[name] = max(out.get(name, 0.0), abs(value))
     return out
 
@@ -368,19 +373,19 @@ def _scales(*contents: Mapping[str, Leaf]) -> dict[str, float]:
 
 
 def content_of(path: Path, name: str) -> Content:
-    """Read a file by what it is.
+    """Read a file by its format.
 
     Parameters
     ----------
     path : Path
         The file.
     name : str
-        In the run folder, whose ending says what it is; others are texts.
+        Path in the run folder, whose suffix determines the format; unknown formats are read as text.
 
     Raises
     ------
     InputError
-        It cannot be read.
+        The file cannot be read.
     """
     try:
         content = path.read_bytes()
@@ -397,7 +402,7 @@ def content_of(path: Path, name: str) -> Content:
 
 
 def plain(data: Any) -> Content:
-    """Content of nested plain data."""
+    """Return the content of nested plain data."""
     statements = {key: data[key] for key in STATEMENTS if key in data} if isinstance(data, Mapping) else {}
     rest = {key: value for key, value in data.items() if key not in statements} if isinstance(data, Mapping) else data
     values = dict(leaves(rest))
@@ -406,23 +411,23 @@ def plain(data: Any) -> Content:
 
 
 def leaves(data: Any, key: str = "", series: bool = True) -> Iterator[tuple[str, Any]]:
-    """Keys and values of nested data, without those of `LEFT_OUT`.
+    """Yield keys and values of nested data, without those of `EXCLUDED_KEYS`.
 
     Parameters
     ----------
     data : Any
         Mappings and lists.
     key : str
-        Of it; keys of what is in it follow.
+        Key of the data, which precedes the keys in it.
     series : bool
-        Whether long lists of numbers come whole, as arrays.
+        Yield long lists of numbers as arrays.
     """
     if isinstance(data, Mapping):
         for name, value in data.items():
-            if name not in LEFT_OUT:
+            if name not in EXCLUDED_KEYS:
                 yield from leaves(value, f"{key}.{name}" if key else str(name), series)
     elif isinstance(data, list):
-        if series and len(data) > _SERIES and (array := _as_array(data)) is not None:
+        if series and len(data) > _ARRAY_LENGTH and (array := _as_array(data)) is not None:
             yield key, array
             return
         names = _entry_names(data)
@@ -440,8 +445,8 @@ def _as_array(data: Sequence[Any]) -> np.ndarray | None:
 
 
 def _entry_names(data: Sequence[Any]) -> list[str]:
-    """Names that tell the entries of a list apart, so that an entry that is put in moves no other."""
-    for name in NAMES:
+    """Return names that distinguish the entries of a list, so that an inserted entry does not rename the others."""
+    for name in ENTRY_NAMES:
         labels = [str(entry[name]) for entry in data if isinstance(entry, Mapping) and name in entry]
         if len(labels) == len(data) and len(set(labels)) == len(labels):
             return labels
@@ -449,7 +454,7 @@ def _entry_names(data: Sequence[Any]) -> list[str]:
 
 
 def _yaml(content: bytes) -> Content:
-    """Comments, layout and the choice of units are the user's, and not the run's."""
+    """Return the content of a YAML file; comments, layout and the choice of units do not count."""
     file = parse_yaml(content.decode("utf-8"))
     kind = kind_of(file.data)
     if kind is not None:
@@ -470,6 +475,7 @@ def _csv(content: bytes) -> Content:
 
 
 def _cell(text: str) -> Leaf:
+    """Return a cell as a number if possible, otherwise as text."""
     for kind in (int, float):
         with suppress(ValueError):
             return kind(text)
@@ -480,7 +486,7 @@ def _netcdf(content: bytes) -> Content:
     data = read_netcdf(content)
     arrays = {str(name): np.asarray(data[name].values) for name in (*data.data_vars, *data.coords)}
     attributes = {name: value for name, value in data.attrs.items() if isinstance(value, str | float)}
-    numbers = {f"attribute {name}": value for name, value in attributes.items() if name not in LEFT_OUT}
+    numbers = {f"attribute {name}": value for name, value in attributes.items() if name not in EXCLUDED_KEYS}
     return Content(numbers, arrays, {})
 
 
@@ -518,11 +524,11 @@ def _png(content: bytes) -> Content:
 
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _IDENTIFIER = re.compile(r"""(\bid="|url\(#|href="#)[^")]*""")
-"""Identifiers of an SVG are checksums of what they name."""
+"""Identifiers in an SVG, which are checksums of the elements they name."""
 
 
 def _text(content: bytes, drawn: bool = False) -> Content:
-    """Words and numbers of a text; of anything else the bytes."""
+    """Return the words and numbers of a text; the bytes of anything else."""
     try:
         text = content.decode("utf-8")
     except UnicodeDecodeError:
@@ -536,7 +542,7 @@ def _drawing(content: bytes) -> Content:
 
 
 def _scene(content: bytes) -> Content:
-    """The JSON of a GLB, and the numbers of its geometry."""
+    """Return the JSON of a GLB, and the numbers of its geometry."""
     length = struct.unpack_from("<I", content, 12)[0]
     scene = plain(json.loads(content[20 : 20 + length]))
     binary = content[20 + length + 8 :]
@@ -557,4 +563,4 @@ READERS: dict[str, Callable[[bytes], Content]] = {
     "glb": _scene,
     "journal": lambda content: Content({}, {}, {}),  # of a study, whose numbers stand in study.nc
 }
-"""Ending of a file -> what reads it."""
+"""Suffix of a file -> function that reads it."""

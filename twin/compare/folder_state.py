@@ -1,4 +1,4 @@
-"""A run folder against its manifest, and the machine and program that made it against those here."""
+"""State of a run folder against its manifest, and differences of machine and program between two runs."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from twin.framework.run_folder import Manifest
 
 @dataclass(frozen=True)
 class FolderState:
-    """A run folder against its manifest.
+    """State of a run folder against its manifest.
 
     Attributes
     ----------
     folder : Path
-        Of the run.
+        Folder of the run.
     manifest : Manifest
-        Of the run.
+        Manifest of the run.
     changed : tuple[str, ...]
-        Files that are not as the run wrote them.
+        Files that were altered after the run.
     missing : tuple[str, ...]
-        Files of the run that are gone.
+        Files of the run that are missing.
     additional : tuple[str, ...]
         Files that the run did not write.
     inputs_changed : tuple[str, ...]
-        Files outside the folder that the run read and that hold something else now.
+        Input files outside the folder that have changed since.
     inputs_gone : tuple[str, ...]
-        Those that are not there any more.
+        Input files that are missing.
     """
 
     folder: Path
@@ -47,7 +47,7 @@ class FolderState:
 
     @property
     def whole(self) -> bool:
-        """Whether the folder holds what the run left, and nothing else."""
+        """Whether the folder holds exactly the files of the run."""
         return not (self.changed or self.missing or self.additional)
 
     @property
@@ -57,17 +57,17 @@ class FolderState:
 
     @property
     def is_study(self) -> bool:
-        """Whether it is of a study's runs, of which a part can be made again."""
+        """Whether the folder is that of a study's runs, a part of which can be repeated."""
         return self.manifest.program == "twin.study" and not self.manifest.gradient
 
 
 def folder_state(folder: Path) -> FolderState:
-    """Look at every file of a run folder.
+    """Check every file of a run folder.
 
     Raises
     ------
     InputError
-        It is none, or the run in it is not finished.
+        The folder is not a run folder, or its run is not finished.
     """
     manifest = _manifest(folder)
     content = (folder / MANIFEST).read_bytes()
@@ -91,7 +91,7 @@ def folder_state(folder: Path) -> FolderState:
 
 
 def _as_read(place: Path, known: str) -> str:
-    """Return whether an input is gone or changed; empty where it is as the run read it."""
+    """Return ``gone`` or ``changed`` for an input; empty if it is as the run read it."""
     if not place.is_file():
         return "gone"
     try:
@@ -106,7 +106,7 @@ def _manifest(folder: Path) -> Manifest:
     Raises
     ------
     InputError
-        There is none, with what the folder is instead.
+        There is none; the message says what the folder is instead.
     """
     manifest = run_folder.read_manifest(folder)
     if manifest is not None:
@@ -133,11 +133,11 @@ class Elsewhere:
     Attributes
     ----------
     program : tuple[str, ...]
-        The source, or packages: other numbers may be meant.
+        Differences of the source or of packages, which may change results.
     processor : tuple[str, ...]
-        What rounds otherwise, and nothing more: processor, linear algebra, C library.
+        Differences that only change rounding: processor, linear algebra, C library.
     known : bool
-        Whether the manifest says where the run was made.
+        Whether the manifest states where the run was made.
     """
 
     program: tuple[str, ...]
@@ -151,11 +151,11 @@ def elsewhere(manifest: Manifest, here: Provenance | None, now: Mapping[str, str
     Parameters
     ----------
     manifest : Manifest
-        Of the run.
+        Manifest of the run.
     here : Provenance | None
-        Where it was repeated.
+        Provenance of the repetition.
     now : Mapping[str, str]
-        Versions that repeated it.
+        Versions of the packages of the repetition.
     """
     program, made = _changes(manifest.versions, now), manifest.provenance
     if made is None or here is None:
@@ -179,7 +179,7 @@ def _changes(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
 
 
 def _machine(where: Provenance) -> dict[str, str]:
-    """Return what rounds numbers but for kernels; no number depends on how many threads there are."""
+    """Return the properties that change rounding, except the kernels; the number of threads does not."""
     settings = [f"{key}={value}" for key, value in where.settings.items() if not key.endswith("THREADS")]
     return {
         "processor": where.processor,
@@ -190,5 +190,5 @@ def _machine(where: Provenance) -> dict[str, str]:
 
 
 def _kernels(where: Provenance) -> dict[str, str]:
-    """Library of linear algebra -> processor that its sums are for."""
+    """Return library of linear algebra -> processor for which its kernels are made."""
     return {f"{one.name} {one.version}": one.kernels for one in where.blas}

@@ -1,1 +1,1 @@
-"""The live twin: a page on which a knob turns, the spots move and the readings follow."""
+"""The live twin: a web page with sliders for every body, which shows spots and readings as they change."""

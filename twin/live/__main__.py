@@ -1,4 +1,4 @@
-"""``python -m twin.live``: turn a knob, the spots move, the readings follow."""
+"""``python -m twin.live``: the instrument as a page in the browser."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from twin.framework.cli import BackendName, InputErrorText, Quiet, check_backend
 
 PORT = 8790
 TOKEN = "TWIN_LIVE_TOKEN"
-"""Environment variable with a token that stays the same when the server is started again."""
+"""Environment variable with a token that stays valid when the server is restarted."""
 EXTRA = (
     "the live twin needs starlette, uvicorn and websockets, which are not installed; install them with "
     "`bash setup.sh --live`"
 )
+"""Error if the optional packages are missing."""
 
 app = program()
 
@@ -78,12 +79,12 @@ def main(
 
 
 def _readable(what: str, run: int | None) -> tuple[str, ...]:
-    """What is to be opened, checked as far as reading it can tell, in words.
+    """Read the source, and return its description and notes.
 
     Raises
     ------
     InputError
-        It cannot be read, is not valid, or is nothing that can be opened.
+        The source cannot be read, is not valid, or cannot be opened as a page.
     """
     from twin.live.source import read_source
 
@@ -101,12 +102,12 @@ def _serve(
     about: Sequence[str],
     console: Console | None,
 ) -> None:
-    """Build, listen, print the address, serve.
+    """Build the instrument, print the address and serve the page.
 
     Raises
     ------
     InputErrorText
-        The extra is missing, the address is taken, or the instrument cannot be built.
+        The extra is missing, the address is in use, or the instrument cannot be built.
     """
     try:
         from twin.live.guard import BadToken, Guard, new_token

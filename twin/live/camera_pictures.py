@@ -1,4 +1,4 @@
-"""Pictures of one camera in a state of the knobs: wavefront, spot, MTF, through focus, a knife edge on its line CCD."""
+"""Pictures of one camera in a perturbed state: wavefront, spot, MTF, through focus, knife edge on its line CCD."""
 
 from __future__ import annotations
 
@@ -18,22 +18,23 @@ from twin.targets.target_images import DIRECTIONS, TargetCamera
 from twin.targets.target_measurement import EdgeReading, read_edge, target_camera
 
 SIZE = (7.6, 3.5)
-"""Inches."""
+"""Size of a picture, in inches."""
 FOCUS = 150e-6
-"""Defocus to either side of the picture through focus, metres."""
+"""Largest defocus of the through-focus picture on either side, in metres."""
 STEPS = 49
-PLACE = "centre"
-"""Place on the line where the knife edge stands."""
+"""Number of defocus values of the through-focus picture."""
+LINE_POSITION = "centre"
+"""Position of the knife edge on the line CCD."""
 UM = "\N{MICRO SIGN}m"
 
 
 class CameraPictures:
-    """Pictures of an instrument's cameras beside what they are as designed; what does not change is kept.
+    """Pictures of an instrument's cameras beside the nominal ones; unchanging parts are cached.
 
     Parameters
     ----------
     experiment
-        The instrument.
+        Monitor experiment of the instrument.
     """
 
     def __init__(self, experiment: MonitorExperiment) -> None:
@@ -41,29 +42,29 @@ class CameraPictures:
         self._benches: dict[str, tuple[TargetCamera, TargetsSpec]] = {}
 
     def draw(self, view: str, camera: str, field: float, state: State, frames: int, seed: int) -> str:
-        """A picture as SVG.
+        """Return a picture as SVG.
 
         Parameters
         ----------
         view : str
             ``wavefront``, ``spot``, ``mtf``, ``focus`` or ``target``.
         camera : str
-            name.
+            Name of the camera.
         field : float
-            Along the line, as a share of the half field; of a target the line's middle.
+            Field along the line, as a share of the half field; a target is always at the centre of the line.
         state : State
             Body -> motion.
         frames : int
-            Of the target.
+            Number of frames of the target.
         seed : int
-            Of their noise.
+            Seed of their noise.
 
         Raises
         ------
         InputError
-            No such camera, or one that cannot image targets.
+            The camera does not exist, or cannot image targets.
         ValueError
-            a state in which its light is lost.
+            The camera's light is lost in this state.
         """
         instrument = self.experiment.instrument
         if camera not in instrument.cameras:
@@ -73,21 +74,26 @@ class CameraPictures:
             if view == "target":
                 self._target(figure, camera, state, frames, seed)
             else:
-                both = [CameraView.within(instrument, camera, self.experiment.backend, one) for one in ({}, state)]
-                {"wavefront": _wavefront, "spot": _spot, "mtf": _mtf, "focus": _focus}[view](figure, both, field)
+                views = [CameraView.within(instrument, camera, self.experiment.backend, one) for one in ({}, state)]
+                {"wavefront": _wavefront, "spot": _spot, "mtf": _mtf, "focus": _focus}[view](figure, views, field)
             return to_svg(figure)
 
     def _target(self, figure: Figure, camera: str, state: State, frames: int, seed: int) -> None:
+        """Draw the knife edge before and after, and the MTF from both images."""
         bench, settings = self._bench(camera)
         pattern = bench.ccd.pattern(stream(seed, 3, 0))
         shots: list[tuple[np.ndarray, EdgeReading]] = []
         for when, one in enumerate(({}, state)):
-            place = bench.views(one)[PLACE]
-            imager = place.edge(DIRECTIONS[0], settings.angle)
-            photons = place.ccd.white_photons(settings.white) * place.light.light * place.edge_image(imager)
-            taken = place.ccd.expose(photons, place.column, pattern, frames, stream(seed, 4, when))
+            view_of_target = bench.views(one)[LINE_POSITION]
+            imager = view_of_target.edge(DIRECTIONS[0], settings.angle)
+            photons = (
+                view_of_target.ccd.white_photons(settings.white)
+                * view_of_target.light.light
+                * view_of_target.edge_image(imager)
+            )
+            taken = view_of_target.ccd.expose(photons, view_of_target.column, pattern, frames, stream(seed, 4, when))
             mean = np.asarray(taken.mean(axis=0))
-            shots.append((mean, read_edge(place, DIRECTIONS[0], imager.optics.normal, mean, frames)))
+            shots.append((mean, read_edge(view_of_target, DIRECTIONS[0], imager.optics.normal, mean, frames)))
         images = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.5))
         top = max(float(mean.max()) for mean, _ in shots)
         curve = images[2]
@@ -103,8 +109,8 @@ class CameraPictures:
                 own = reading.measured
                 pitch = 1e3 * bench.ccd.band.pitch
                 curve.plot(own.frequency / pitch, own.mtf, ".", color=colour, ms=3.0, label=f"{name}, from the image")
-            told = reading.nyquist
-            text = reading.reason if told is None else f"{told[0]:.4f} ± {told[1]:.4f} at Nyquist"
+            nyquist_mtf = reading.nyquist
+            text = reading.reason if nyquist_mtf is None else f"{nyquist_mtf[0]:.4f} ± {nyquist_mtf[1]:.4f} at Nyquist"
             axes.set_xlabel(text, fontsize=7.5)
         curve.axvline(0.5e-3 / bench.ccd.band.pitch, color=GREY, lw=0.8, ls=":")
         curve.set_xlabel("cycles/mm")
@@ -113,6 +119,7 @@ class CameraPictures:
         curve.legend(fontsize=7)
 
     def _bench(self, camera: str) -> tuple[TargetCamera, TargetsSpec]:
+        """Return the target bench of a camera, and its settings."""
         if camera not in self._benches:
             experiment = self.experiment
             instrument, resolved = experiment.instrument, _with_targets(experiment.resolved)
@@ -122,12 +129,12 @@ class CameraPictures:
 
 
 def _with_targets(resolved: ResolvedJob) -> ResolvedJob:
-    """The job with knife edges among its images, and so with the data sheets of its line CCDs.
+    """Return the job with knife edges among its images, and so with the data sheets of its line CCDs.
 
     Raises
     ------
-    InputError
-        Its cameras have none.
+    ValueError
+        The cameras have no line CCD that can image targets.
     """
     if resolved.line_detectors is not None:
         return resolved
@@ -138,8 +145,9 @@ def _with_targets(resolved: ResolvedJob) -> ResolvedJob:
         raise ValueError(f"no targets can be imaged: {error}") from error
 
 
-def _wavefront(figure: Figure, both: list[CameraView], field: float) -> None:
-    waves = [one.wavefront((field, 0.0), points=65) for one in both]
+def _wavefront(figure: Figure, views: list[CameraView], field: float) -> None:
+    """Draw the nominal and the present wavefront."""
+    waves = [one.wavefront((field, 0.0), points=65) for one in views]
     most = max(float(np.nanmax(np.abs(wave.map))) for wave in waves)
     meshes = []
     for axes, wave, name in zip(figure.subplots(1, 2), waves, ("as designed", "now"), strict=True):
@@ -149,8 +157,9 @@ def _wavefront(figure: Figure, both: list[CameraView], field: float) -> None:
     figure.colorbar(meshes[0], ax=figure.axes, label=f"waves of {1e9 * waves[0].wavelength:.0f} nm", shrink=0.85)
 
 
-def _spot(figure: Figure, both: list[CameraView], field: float) -> None:
-    spots = [one.spot((field, 0.0)) for one in both]
+def _spot(figure: Figure, views: list[CameraView], field: float) -> None:
+    """Draw the nominal and the present spot diagram."""
+    spots = [one.spot((field, 0.0)) for one in views]
     half = max(max(1.15 * spot.airy, 1.1 * spot.farthest) for spot in spots)
     for axes, spot, name in zip(figure.subplots(1, 2), spots, ("as designed", "now"), strict=True):
         draw_spot(axes, spot, half)
@@ -159,8 +168,9 @@ def _spot(figure: Figure, both: list[CameraView], field: float) -> None:
         axes.set_ylabel(f"along the track [{UM}]")
 
 
-def _mtf(figure: Figure, both: list[CameraView], field: float) -> None:
-    for axes, one, name in zip(figure.subplots(1, 2, sharey=True), both, ("as designed", "now"), strict=True):
+def _mtf(figure: Figure, views: list[CameraView], field: float) -> None:
+    """Draw the nominal and the present MTF."""
+    for axes, one, name in zip(figure.subplots(1, 2, sharey=True), views, ("as designed", "now"), strict=True):
         found = one.mtf((field, 0.0))
         draw_mtf(axes, found)
         along, across = found.at(found.nyquist)
@@ -168,10 +178,11 @@ def _mtf(figure: Figure, both: list[CameraView], field: float) -> None:
     figure.axes[0].legend(fontsize=7)
 
 
-def _focus(figure: Figure, both: list[CameraView], field: float) -> None:
+def _focus(figure: Figure, views: list[CameraView], field: float) -> None:
+    """Draw the nominal and the present MTF at Nyquist through focus."""
     axes = figure.subplots()
     shift = np.linspace(-FOCUS, FOCUS, STEPS)
-    for one, name, style in zip(both, ("as designed", "now"), ((0, (3, 2)), "-"), strict=True):
+    for one, name, style in zip(views, ("as designed", "now"), ((0, (3, 2)), "-"), strict=True):
         pupil = one.pupils([(field, 0.0)])[0]
         colour = np.array([one.model.spec.wavelength])
         frequency = one.nyquist * np.eye(2)

@@ -1,8 +1,8 @@
-"""Pages that are connected, and what is to be computed for them: of each only the last state that it asked for.
+"""Connected pages, and the scheduling of their requests: of each page only the latest requested state is computed.
 
-A slider sends faster than states can be computed, and a slow line takes less than is computed. So there is one
-place for a page's next state and one for its next answer, and what comes later takes the place of what was there.
-Nothing grows.
+A slider sends faster than states can be computed, and a slow connection receives more slowly than they are computed. So
+there is one slot for a page's next state and one for its next answer, and a later one replaces an earlier one. No queue
+grows without limit.
 """
 
 from __future__ import annotations
@@ -21,39 +21,40 @@ from twin.live import messages
 from twin.live.computer import BeforeKey, Computer, ComputerLost, Kind
 
 MOST_CLIENTS = 8
+"""Largest number of connected pages."""
 RATE, BURST = 400.0, 2000
 """Messages a second that a page may send, and how many at once: four times what the fastest pointer does."""
 BAD_MESSAGES = 20
-"""Messages that are none, after which a page is sent away."""
+"""Number of invalid messages after which a page is disconnected."""
 MOST_RECORDED = 20_000
-"""States of a recording; the oldest are forgotten."""
-MOST_LETTERS = 32
-"""Answers beside states and pictures that wait for a slow line."""
-LOOK = 0.25
-"""Seconds from one look at the process that computes to the next."""
-STOPPED = 10.0
-"""Seconds for which it may be stopped by a signal; then it is started again."""
-PATIENCE = 20.0
-"""Seconds that a page may take to receive one answer."""
+"""Largest number of states in a recording; the oldest are dropped."""
+MOST_QUEUED = 32
+"""Largest number of queued texts for a slow connection, besides states and pictures."""
+WATCH_INTERVAL = 0.25
+"""Interval at which the computing process is checked, in seconds."""
+STOP_TIMEOUT = 10.0
+"""Time after which a process stopped by a signal is restarted, in seconds."""
+SEND_TIMEOUT = 20.0
+"""Time that a page may take to receive one answer, in seconds."""
 POLICY_VIOLATION, TRY_AGAIN = 1008, 1013
 """Codes with which a WebSocket is closed."""
 
 
-AGAIN = "{}; it is started again, and the knobs stay"
-HALTED = (
+RESTARTED_TEXT = "{}; it is started again, and the knobs stay"
+STOPPED_TEXT = (
     "the process that computes ({pid}) was stopped by a signal; `kill -CONT {pid}` lets it go on, after "
     "{seconds:.0f} s it is started again; the knobs stay"
 )
-"""What pages are told of the process that computes."""
+"""Messages to the pages about the computing process."""
 
 
-class Goodbye(Exception):
-    """A page is sent away.
+class Disconnected(Exception):
+    """Disconnection of a page by the server.
 
     Attributes
     ----------
     code
-        Of the WebSocket; reason: for the page.
+        Close code of the WebSocket; the message is the reason shown on the page.
     """
 
     def __init__(self, code: int, reason: str) -> None:
@@ -62,13 +63,13 @@ class Goodbye(Exception):
 
 
 @dataclass(frozen=True, eq=False)
-class _Wish:
-    """Something that a page wants.
+class _Request:
+    """Request of a page.
 
     Attributes
     ----------
     kind : str
-        The attribute of `Client` in which it stood, one of ``saves`` for "save".
+        Attribute of `Client` that held it; "save" for one of ``saves``.
     asked : Any
         The message.
     """
@@ -79,16 +80,32 @@ class _Wish:
 
 @dataclass(eq=False)
 class Client:
-    """One page.
+    """One connected page.
 
     Attributes
     ----------
-    state : messages.AskedState | None
-        That it wants next; view: picture that it wants next.
-    shown : messages.AskedState | None
-        Last state that was computed for it.
+    state : AskedState | None
+        State that it requests next.
+    view : AskedView | None
+        Picture that it requests next.
+    saves : deque[Save]
+        Files that it requests.
+    factors : Factors | None
+        Values of a study's factors that it requests.
+    reveal : BlindState | None
+        State whose hidden motions it wants revealed.
+    shown : AskedState | None
+        Latest state computed for it.
     before : BeforeKey | None
-        For which noise, frames and seed it has the images before.
+        Noise, frames and seed of the reference images that it has.
+    blind : int | None
+        Seed of the hidden motions; None if nothing is hidden.
+    recorded : deque[tuple[float, AskedState]] | None
+        Recorded states with their seconds since the recording began.
+    record_began : float
+        Monotonic time at which the recording began; 0 if none is running.
+    bad : int
+        Number of invalid messages so far.
     """
 
     state: messages.AskedState | None = None
@@ -106,125 +123,126 @@ class Client:
     _refilled: float = field(default_factory=time.monotonic)
     _answer: tuple[bytes, BeforeKey] | None = None
     _picture: str | None = None
-    _letters: deque[str] = field(default_factory=lambda: deque(maxlen=MOST_LETTERS))
+    _queued_texts: deque[str] = field(default_factory=lambda: deque(maxlen=MOST_QUEUED))
     _to_send: asyncio.Event = field(default_factory=asyncio.Event)
 
     @property
     def busy(self) -> bool:
-        """Whether it waits for something."""
+        """Whether it has an open request."""
         return bool(self.state or self.view or self.factors or self.saves or self.reveal)
 
-    def next_wish(self) -> _Wish:
-        """What it wants next, which it then no longer wants. It has to want something."""
+    def next_request(self) -> _Request:
+        """Remove and return its next request; there has to be one."""
         if self.saves and not (self.factors or self.state or self.reveal):
-            return _Wish("save", self.saves.popleft())
+            return _Request("save", self.saves.popleft())
         kind = next(kind for kind in ("factors", "state", "reveal", "view") if getattr(self, kind) is not None)
-        wish = _Wish(kind, getattr(self, kind))
+        request = _Request(kind, getattr(self, kind))
         setattr(self, kind, None)
-        return wish
+        return request
 
-    def put_back(self, wish: _Wish) -> None:
-        """Keep a wish that could not be served; a later wish of the same kind goes before it."""
-        if wish.kind == "save":
-            self.saves.appendleft(wish.asked)
-        elif getattr(self, wish.kind) is None:
-            setattr(self, wish.kind, wish.asked)
+    def requeue(self, request: _Request) -> None:
+        """Put back a request that could not be served, unless a later one of the same kind replaces it."""
+        if request.kind == "save":
+            self.saves.appendleft(request.asked)
+        elif getattr(self, request.kind) is None:
+            setattr(self, request.kind, request.asked)
 
-    def take(self, text: str | bytes) -> None:
-        """Take a message of the page.
+    def receive(self, text: str | bytes) -> None:
+        """Handle a message of the page.
 
         Raises
         ------
-        Goodbye
-            Too many, or too many that are none.
+        Disconnected
+            The page sent too many messages, or too many invalid ones.
         """
         now = time.monotonic()
         self._tokens = min(BURST, self._tokens + RATE * (now - self._refilled)) - 1.0
         self._refilled = now
         if self._tokens < 0.0:
-            raise Goodbye(POLICY_VIOLATION, "too many messages")
+            raise Disconnected(POLICY_VIOLATION, "too many messages")
         try:
             message = messages.read_message(text)
         except messages.BadMessage as error:
             self.bad += 1
             if self.bad > BAD_MESSAGES:
-                raise Goodbye(POLICY_VIOLATION, "too many messages that are none") from None
-            self.tell({"type": "refused", "problem": str(error)})
+                raise Disconnected(POLICY_VIOLATION, "too many messages that are none") from None
+            self.queue_json({"type": "refused", "problem": str(error)})
             return
-        self._do(message, now)
+        self._handle(message, now)
 
-    def _do(self, message: messages.Message, now: float) -> None:
+    def _handle(self, message: messages.Message, now: float) -> None:
+        """Store the request of a message."""
         match message:
             case messages.AskedState():
-                self.state = self._own(message)
+                self.state = self._with_hidden(message)
             case messages.AskedView():
                 self.view = message
             case messages.Factors():
                 self.factors = message
             case messages.Save():
-                self.saves.append(message.model_copy(update={"state": self._own(message.state)}))
+                self.saves.append(message.model_copy(update={"state": self._with_hidden(message.state)}))
             case messages.Blind():
                 if message.on:
                     self.blind = secrets.randbelow(messages.LARGEST_SEED)
                 elif self.blind is not None:
                     self.reveal = _hiding(self.shown or messages.AskedState(n=0), self.blind)
                     self.blind = None
-                self.tell({"type": "blind", "on": self.blind is not None})
+                self.queue_json({"type": "blind", "on": self.blind is not None})
             case messages.Record():
                 if message.on:
                     self.recorded, self.record_began = deque(maxlen=MOST_RECORDED), now
                     if self.shown is not None:
                         self.recorded.append((0.0, self.shown))
-                self.tell({"type": "record", "on": message.on, "states": len(self.recorded or ())})
+                self.queue_json({"type": "record", "on": message.on, "states": len(self.recorded or ())})
                 if not message.on:
                     self.record_began = 0.0
 
-    def _own(self, state: messages.AskedState) -> messages.AskedState:
-        """With what is hidden from the page."""
+    def _with_hidden(self, state: messages.AskedState) -> messages.AskedState:
+        """Return a state with the motions hidden from the page."""
         return state if self.blind is None else _hiding(state, self.blind)
 
-    def kept(self, state: messages.AskedState) -> None:
-        """A state was computed."""
+    def state_computed(self, state: messages.AskedState) -> None:
+        """Note that a state was computed, and record it if a recording is running."""
         self.shown = state
         if self.recorded is not None and self.record_began and not isinstance(state, messages.BlindState):
             self.recorded.append((time.monotonic() - self.record_began, state))
 
-    def answer(self, message: bytes, before: BeforeKey) -> None:
-        """Send a state with the images before for this noise, frames and seed; the last one wins."""
+    def queue_state(self, message: bytes, before: BeforeKey) -> None:
+        """Send a state that contains the reference images of this noise, frames and seed; a later one replaces it."""
         self._answer = message, before
         self._to_send.set()
 
-    def picture(self, message: str) -> None:
-        """Send a picture; the last one wins."""
+    def queue_picture(self, message: str) -> None:
+        """Send a picture; a later one replaces it."""
         self._picture = message
         self._to_send.set()
 
-    def letter(self, message: str) -> None:
-        """Send a text, after those that wait."""
-        self._letters.append(message)
+    def queue_text(self, message: str) -> None:
+        """Send a text after the queued ones."""
+        self._queued_texts.append(message)
         self._to_send.set()
 
-    def tell(self, told: dict[str, Any]) -> None:
-        """Send plain data, after those that wait."""
-        self.letter(json.dumps(told))
+    def queue_json(self, told: dict[str, Any]) -> None:
+        """Send plain data as JSON after the queued texts."""
+        self.queue_text(json.dumps(told))
 
     async def send(
         self, as_text: Callable[[str], Awaitable[None]], as_bytes: Callable[[bytes], Awaitable[None]]
     ) -> None:
-        """Send for ever what there is to send.
+        """Send queued messages, without end.
 
         Raises
         ------
-        Goodbye
-            The page does not take it.
+        Disconnected
+            The page does not receive them in time.
         """
         while True:
             await self._to_send.wait()
             self._to_send.clear()
             try:
-                async with asyncio.timeout(PATIENCE):
-                    while self._letters:
-                        await as_text(self._letters.popleft())
+                async with asyncio.timeout(SEND_TIMEOUT):
+                    while self._queued_texts:
+                        await as_text(self._queued_texts.popleft())
                     if self._answer is not None:
                         (answer, before), self._answer = self._answer, None
                         await as_bytes(answer)
@@ -233,20 +251,21 @@ class Client:
                         picture, self._picture = self._picture, None
                         await as_text(picture)
             except TimeoutError:
-                raise Goodbye(TRY_AGAIN, "the line is too slow") from None
+                raise Disconnected(TRY_AGAIN, "the line is too slow") from None
 
 
 def _hiding(state: messages.AskedState, seed: int) -> messages.BlindState:
+    """Return a state with hidden motions drawn from a seed."""
     return messages.BlindState.model_validate({**state.model_dump(), "blind": seed})
 
 
-class Desk:
-    """Hands the pages' wishes to the computer, one page after the other, states before pictures.
+class LiveApi:
+    """Scheduler that passes the pages' requests to the computing process, page by page, states before pictures.
 
     Parameters
     ----------
     computer
-        That computes.
+        Handle of the computing process.
     """
 
     def __init__(self, computer: Computer) -> None:
@@ -254,77 +273,78 @@ class Desk:
         self.clients: list[Client] = []
         self.states = 0
         """Number of states computed so far."""
-        self.trouble: dict[str, Any] = {}
+        self.process_trouble: dict[str, Any] = {}
         """What is wrong with the process that computes, as pages are told; empty if nothing is."""
         self._wake = asyncio.Event()
-        self._suspect: object = None
+        self._suspect_message: object = None
 
-    def enter(self) -> Client:
-        """A new page.
+    def connect(self) -> Client:
+        """Add a new page.
 
         Raises
         ------
-        Goodbye
-            There are too many.
+        Disconnected
+            Too many pages are connected.
         """
         if len(self.clients) >= MOST_CLIENTS:
-            raise Goodbye(TRY_AGAIN, f"{MOST_CLIENTS} pages are open already")
+            raise Disconnected(TRY_AGAIN, f"{MOST_CLIENTS} pages are open already")
         client = Client()
         self.clients.append(client)
         return client
 
-    def leave(self, client: Client) -> None:
-        """A page is gone."""
+    def disconnect(self, client: Client) -> None:
+        """Remove a page."""
         with contextlib.suppress(ValueError):
             self.clients.remove(client)
 
-    def wake(self) -> None:
-        """Somebody wants something."""
+    def notify(self) -> None:
+        """Wake the scheduler for a new request."""
         self._wake.set()
 
-    async def work(self) -> None:
-        """Answer for ever.
+    async def serve_requests(self) -> None:
+        """Serve requests, without end.
 
         Raises
         ------
         CannotStart
-            The process that computes ended and cannot be started again.
+            The computing process ended and cannot be restarted.
         """
         while True:
             if self.computer.condition == "ended":
-                await self._start_again()
+                await self._restart()
             client = self._next()
             if client is None:
                 self._wake.clear()
                 await self._wake.wait()
                 continue
-            wish = client.next_wish()
+            request = client.next_request()
             try:
-                await self._serve(client, wish)
+                await self._answer_request(client, request)
             except ComputerLost as error:
-                self._lost(client, wish, str(error))
-                await self._start_again()
+                self._requeue_lost(client, request, str(error))
+                await self._restart()
 
-    async def watch(self) -> None:
-        """Look for ever how the process that computes is; tell the pages when it does not run, and what comes next."""
+    async def watch_process(self) -> None:
+        """Check the computing process, without end, and inform the pages when its condition changes."""
         since = 0.0
         while True:
-            await asyncio.sleep(LOOK)
-            condition, known = self.computer.condition, self.trouble.get("state", "runs")
+            await asyncio.sleep(WATCH_INTERVAL)
+            condition, known = self.computer.condition, self.process_trouble.get("state", "runs")
             if condition == "ended":
-                self._tell_of("ended", AGAIN.format(self.computer.ending))
-                self.wake()
+                self._announce("ended", RESTARTED_TEXT.format(self.computer.ending))
+                self.notify()
             elif condition == "stopped" and known != "stopped":
                 since = time.monotonic()
-                self._tell_of("stopped", HALTED.format(pid=self.computer.pid, seconds=STOPPED))
-            elif condition == "stopped" and time.monotonic() - since > STOPPED:
+                self._announce("stopped", STOPPED_TEXT.format(pid=self.computer.pid, seconds=STOP_TIMEOUT))
+            elif condition == "stopped" and time.monotonic() - since > STOP_TIMEOUT:
                 self.computer.kill()
             elif condition == "runs":
-                self._goes_on()
+                self._announce_running()
 
     async def _ask(self, kind: Kind, question: Any) -> Any:
-        """The computer's answer. An answer that comes while the pages still believe the process stopped shows that it
-        goes on, and they are told so before they get it, however long the next look at the process is away.
+        """Return the answer of the computing process.
+
+        An answer shows that a process reported as stopped runs again; the pages are informed before they get it.
 
         Raises
         ------
@@ -332,46 +352,48 @@ class Desk:
             The process ended.
         """
         answer = await self.computer.ask(kind, question)
-        if self.trouble and self.computer.condition == "runs":
-            self._goes_on()
+        if self.process_trouble and self.computer.condition == "runs":
+            self._announce_running()
         return answer
 
-    def _goes_on(self) -> None:
-        """Tell the pages that the process runs, if what they know is that it was stopped."""
-        if self.trouble.get("state") == "stopped":
-            self._tell_of("runs")
+    def _announce_running(self) -> None:
+        """Inform the pages that the process runs, if it was reported as stopped."""
+        if self.process_trouble.get("state") == "stopped":
+            self._announce("runs")
 
-    def _tell_of(self, state: str, problem: str = "") -> None:
-        """Tell all pages, those that come later too, how it is with the process that computes; each news once."""
+    def _announce(self, state: str, problem: str = "") -> None:
+        """Inform all present and later pages about the computing process; each change once."""
         told = {"type": "computing", "state": state, "problem": problem}
-        if told == self.trouble or (state == "ended" and self.trouble.get("state") == "ended"):
+        if told == self.process_trouble or (state == "ended" and self.process_trouble.get("state") == "ended"):
             return
-        self.trouble = told if problem else {}
-        for one in self.clients:
-            one.tell(told)
+        self.process_trouble = told if problem else {}
+        for client in self.clients:
+            client.queue_json(told)
 
-    def _lost(self, client: Client, wish: _Wish, problem: str) -> None:
-        """The process ended over a wish. It is kept, unless the process has ended over it before."""
-        self._tell_of("ended", AGAIN.format(problem))
-        if wish.asked is self._suspect:
-            client.tell({"type": "refused", "problem": f"{problem} twice over the same {wish.kind}, which is left out"})
+    def _requeue_lost(self, client: Client, request: _Request, problem: str) -> None:
+        """Put back a request during which the process ended, unless the process ended twice during it."""
+        self._announce("ended", RESTARTED_TEXT.format(problem))
+        if request.asked is self._suspect_message:
+            client.queue_json(
+                {"type": "refused", "problem": f"{problem} twice over the same {request.kind}, which is left out"}
+            )
         else:
-            self._suspect = wish.asked
-            client.put_back(wish)
+            self._suspect_message = request.asked
+            client.requeue(request)
 
-    async def _start_again(self) -> None:
-        """Start the process that computes anew; who waits goes on waiting."""
-        self._tell_of("ended", AGAIN.format(self.computer.ending))
+    async def _restart(self) -> None:
+        """Restart the computing process; waiting requests stay."""
+        self._announce("ended", RESTARTED_TEXT.format(self.computer.ending))
         before = self.computer.opened.greeting
-        await self.computer.start_again()
-        for one in self.clients:
-            one.before = None
+        await self.computer.restart()
+        for client in self.clients:
+            client.before = None
             if self.computer.opened.greeting != before:  # its files were changed meanwhile
-                one.tell({"type": "hello", **self.computer.opened.greeting})
-        self._tell_of("runs")
+                client.queue_json({"type": "hello", **self.computer.opened.greeting})
+        self._announce("runs")
 
     def _next(self) -> Client | None:
-        """The next page that wants a state, else anything; a page that was served goes to the end."""
+        """Return the next page that requests a state, or else anything; a served page moves to the end."""
         for wants in (lambda c: c.factors or c.state, lambda c: c.busy):
             for client in self.clients:
                 if wants(client):
@@ -381,32 +403,34 @@ class Desk:
         return None
 
     async def _build(self, client: Client, asked: messages.Factors) -> None:
+        """Build the instrument with other values of a study's factors, and inform all pages."""
         for one in self.clients:
-            one.tell({"type": "building"})
+            one.queue_json({"type": "building"})
         found = await self._ask("factors", asked.values)
         if isinstance(found, str):
-            client.tell({"type": "refused", "problem": found})
+            client.queue_json({"type": "refused", "problem": found})
         else:
             for one in self.clients:
                 one.shown = one.before = one.recorded = None
         for one in self.clients:
-            one.tell({"type": "hello", **self.computer.opened.greeting})
+            one.queue_json({"type": "hello", **self.computer.opened.greeting})
 
-    async def _serve(self, client: Client, wish: _Wish) -> None:
-        asked = wish.asked
-        match wish.kind:
+    async def _answer_request(self, client: Client, request: _Request) -> None:
+        """Compute the answer to a request, and queue it."""
+        asked = request.asked
+        match request.kind:
             case "factors":
                 await self._build(client, asked)
             case "state":
                 key = (asked.noise, asked.frames, asked.seed)
-                client.answer(await self._ask("state", (asked, client.before)), key)
-                client.kept(asked)
+                client.queue_state(await self._ask("state", (asked, client.before)), key)
+                client.state_computed(asked)
                 self.states += 1
             case "reveal":
-                client.letter(await self._ask("hidden", asked))
+                client.queue_text(await self._ask("hidden", asked))
             case "save" if asked.what == "job":
-                client.letter(await self._ask("job", asked.state))
+                client.queue_text(await self._ask("job", asked.state))
             case "save":
-                client.letter(await self._ask("course", list(client.recorded or ())))
+                client.queue_text(await self._ask("course", list(client.recorded or ())))
             case _:
-                client.picture(await self._ask("view", asked))
+                client.queue_picture(await self._ask("view", asked))

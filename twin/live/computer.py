@@ -1,7 +1,7 @@
-"""The process that computes, its answers, and the handle by which the server asks it.
+"""Computing process of the live twin, its answers, and the handle by which the server uses it.
 
-One process does all computing, so that a page's drag does not take the cores from its own readings; asked for more than
-it can do, the server asks it for the last state only (`twin.live.clients`).
+One process does all computing, so that one page does not take the cores from its own readings. Under overload the
+server requests only the latest state (`twin.live.clients`).
 """
 
 from __future__ import annotations
@@ -25,35 +25,35 @@ from optics.numerics.backend import BackendUnavailable, cores, kernel_threads, o
 from optics.numerics.llvm import LibraryMissing
 from scenes.yaml.errors import InputError
 from twin.live.camera_pictures import CameraPictures
-from twin.live.live_bench import LOST, LiveBench, course_text, job_text
+from twin.live.live_bench import IMPOSSIBLE, LiveBench, course_text, job_text
 from twin.live.messages import AskedState, AskedView, BlindState, Opened, packed
 from twin.live.source import read_source
 from twin.pictures.light_paths import trace_light_paths
 from twin.pictures.scene_file import scene_bytes
 from twin.scripting.instrument_twin import InstrumentTwin
 
-KEPT = 3
-"""Instruments of a study that stay built."""
+MOST_BUILT = 3
+"""Largest number of a study's instruments that stay built."""
 
 
-class Answers:
-    """An instrument that is ready to answer.
+class RequestHandler:
+    """Built instrument that answers requests.
 
     Parameters
     ----------
     what
-        As of `twin.live.source.read_source`.
+        Source, as for `twin.live.source.read_source`.
     backend
-        Where to trace.
+        Backend that traces.
     advance
-        Told of each part of the preparation.
+        Called with each part of the preparation.
     run
-        Of a study, as of `twin.live.source.read_source`.
+        Number of a study's run, as for `twin.live.source.read_source`.
 
     Raises
     ------
     InputError, BackendUnavailable, LibraryMissing
-        It cannot be built.
+        The instrument cannot be built.
     """
 
     def __init__(self, what: str, backend: str, advance: Callable[[str], None], run: int | None = None) -> None:
@@ -66,12 +66,12 @@ class Answers:
     def _open(
         self, factors: Mapping[str, float], advance: Callable[[str], None] = lambda part: None
     ) -> tuple[LiveBench, CameraPictures, Opened]:
-        """The instrument with these values of a study's factors, built if it is not.
+        """Return the instrument for these values of a study's factors, and build it if necessary.
 
         Raises
         ------
         InputError
-            They cannot be.
+            The values are not possible.
         """
         key = json.dumps(dict(sorted(factors.items())))
         if key not in self._built:
@@ -90,120 +90,121 @@ class Answers:
             scene = scene_bytes(experiment.instrument, {}, light)
             self._built[key] = bench, CameraPictures(experiment), Opened(greeting, scene)
         self._built.move_to_end(key)
-        while len(self._built) > KEPT:
+        while len(self._built) > MOST_BUILT:
             self._built.popitem(last=False)
         return self._built[key]
 
-    def to(self, kind: str, question: Any) -> Any:
-        """The answer to one question; see the methods."""
+    def handle(self, kind: str, question: Any) -> Any:
+        """Return the answer to a request of one kind; see the methods."""
         return getattr(self, f"_{kind}")(question)
 
     def _factors(self, factors: Mapping[str, float]) -> Opened | str:
-        """Turn to an instrument with other values of factors; a text says why that cannot be."""
+        """Switch to an instrument with other values of factors; an error is returned as text."""
         try:
             self.bench, self.pictures, self.opened = self._open(factors)
-        except LOST as error:
+        except IMPOSSIBLE as error:
             return str(error)[:1000]
         return self.opened
 
     def _state(self, question: tuple[AskedState, tuple[bool, int, int] | None]) -> bytes:
-        """A state's message with its images; with those before, if the page does not have them."""
+        """Return a state's message with its images, and with the reference images if the page lacks them."""
         asked, known = question
-        told, after = self.bench.state(asked)
+        message, after = self.bench.state(asked)
         images = {} if after is None else {"after": after}
         key = (asked.noise, asked.frames, asked.seed)
         if key != known:
             images["before"] = self.bench.before(asked)
-        if told.get("guess") and "image" in told["guess"]:
-            images["guess"] = told["guess"].pop("image")
-        return packed(told, images)
+        if message.get("guess") and "image" in message["guess"]:
+            images["guess"] = message["guess"].pop("image")
+        return packed(message, images)
 
     def _view(self, asked: AskedView) -> str:
-        """A picture's message."""
-        told: dict[str, Any] = {"type": "view", "n": asked.n, "view": asked.view, "camera": asked.camera}
+        """Return the message of a picture."""
+        message: dict[str, Any] = {"type": "view", "n": asked.n, "view": asked.view, "camera": asked.camera}
         try:
             state = self.bench.states(asked.state)
-            told["svg"] = self.pictures.draw(
+            message["svg"] = self.pictures.draw(
                 asked.view, asked.camera, asked.field, state, asked.state.frames, self.bench.seed_of(asked.state.seed)
             )
-        except LOST as error:
-            told["problem"] = str(error)[:1000]
-        return json.dumps(told)
+        except IMPOSSIBLE as error:
+            message["problem"] = str(error)[:1000]
+        return json.dumps(message)
 
     def _hidden(self, asked: BlindState) -> str:
-        """What was hidden, and what it truly did."""
+        """Return the hidden motions and the resulting truth."""
         return json.dumps({"type": "revealed", **self.bench.hidden(asked)})
 
     def _job(self, asked: AskedState) -> str:
-        """A job file of a state."""
+        """Return a job file of a state."""
         return self._file("job.yaml", lambda: job_text(self.bench, asked))
 
     def _course(self, kept: Sequence[tuple[float, AskedState]]) -> str:
-        """A job file with a course of what was recorded."""
+        """Return a job file with the recorded states as a course."""
         return self._file("course.yaml", lambda: course_text(self.bench, kept))
 
     def _file(self, name: str, text: Callable[[], str]) -> str:
-        told: dict[str, Any] = {"type": "file", "name": name}
+        """Return the message of a file."""
+        message: dict[str, Any] = {"type": "file", "name": name}
         try:
-            told["text"] = text()
+            message["text"] = text()
         except (InputError, ValueError) as error:
-            told["problem"] = str(error)[:1000]
-        return json.dumps(told)
+            message["problem"] = str(error)[:1000]
+        return json.dumps(message)
 
 
 Kind = Literal["state", "view", "hidden", "job", "course", "factors"]
 BeforeKey = tuple[bool, int, int]
 Condition = Literal["starts", "runs", "stopped", "ended"]
-ENDS = 3.0
-"""Seconds that the process is given to end by itself."""
+EXIT_TIMEOUT = 3.0
+"""Time that the process is given to end by itself, in seconds."""
 ATTEMPTS = 3
-"""How often it is started again when it ends while it starts."""
+"""Number of attempts to restart the process if it ends during its start."""
 
 
 class ComputerLost(Exception):
-    """The process that computes ended; the text says how."""
+    """End of the computing process; the message says how it ended."""
 
 
 class CannotStart(Exception):
-    """The instrument cannot be built; the text says why, as a command tells it."""
+    """Failure to build the instrument; the message is that of a command."""
 
 
 class Computer:
-    """The process that computes, asked from an event loop; one question after the other.
+    """Handle of the computing process for an event loop; it answers one request at a time.
 
     Parameters
     ----------
     what
-        As of `twin.live.source.read_source`.
+        Source, as for `twin.live.source.read_source`.
     backend
-        Where to trace.
+        Backend that traces.
     run
-        Of a study, likewise.
+        Number of a study's run.
     """
 
     def __init__(self, what: str, backend: str, run: int | None = None) -> None:
         self._what, self._backend, self._run = what, backend, run
         self._process: Any = None
         self._pipe: Connection | None = None
-        self._turn = asyncio.Lock()
-        self._starting = self._asked = self._leaving = False
+        self._request_lock = asyncio.Lock()
+        self._starting = self._asked = self._shutting_down = False
         # two threads that ask the system for one process' end take it from each other
-        self._looks = threading.Lock()
+        self._process_lock = threading.Lock()
         self._factors: Any = None
         self.opened = Opened({}, b"")
 
     def start(self, advance: Callable[[str], None] = lambda part: None) -> None:
-        """Start the process and wait until every kernel is compiled.
+        """Start the process and wait until all kernels are compiled.
 
         Parameters
         ----------
         advance : Callable[[str], None]
-            Told of each part when it begins.
+            Called with each part when it begins.
 
         Raises
         ------
         CannotStart
-            why.
+            The process cannot be started; the message says why.
         """
         try:
             self._start(advance)
@@ -211,42 +212,42 @@ class Computer:
             raise CannotStart(str(error)) from error
 
     def _start(self, advance: Callable[[str], None] = lambda part: None) -> None:
-        """Start the process once and wait until it is ready, as `start` says.
+        """Start the process once and wait until it is ready.
 
         Raises
         ------
         CannotStart
             The instrument cannot be built.
         ComputerLost
-            The process ended before it was.
+            The process ended during its start.
         """
         context = multiprocessing.get_context("spawn")
-        self._pipe, theirs = context.Pipe()
+        self._pipe, child_pipe = context.Pipe()
         self._process = context.Process(
-            target=compute, args=(theirs, self._what, self._backend, self._run), daemon=True
+            target=compute, args=(child_pipe, self._what, self._backend, self._run), daemon=True
         )
         self._process.start()
-        theirs.close()
+        child_pipe.close()
         try:
             while True:
-                said, value = self._pipe.recv()
-                if said == "part":
+                kind_of_answer, value = self._pipe.recv()
+                if kind_of_answer == "part":
                     advance(value)
-                elif said == "ready":
+                elif kind_of_answer == "ready":
                     self.opened = value
                     return
                 else:
                     raise CannotStart(value)
         except (EOFError, OSError) as error:
-            raise ComputerLost(self._end_of_it()) from error
+            raise ComputerLost(self._describe_end()) from error
 
-    def _start_again(self) -> None:
-        """Start it as it was: with what was last made of a study's factors.
+    def _restart(self) -> None:
+        """Start the process again, with the latest values of a study's factors.
 
         Raises
         ------
         CannotStart
-            why.
+            The process cannot be started; the message says why.
         """
         for attempt in range(1, ATTEMPTS + 1):
             try:
@@ -257,52 +258,53 @@ class Computer:
                         self.opened = found
                 return
             except ComputerLost as error:
-                if attempt == ATTEMPTS or self._leaving:
+                if attempt == ATTEMPTS or self._shutting_down:
                     raise CannotStart(f"{error}, {attempt} times when it was started again") from error
 
-    async def start_again(self) -> None:
-        """Start another process in place of one that ended, as that was.
+    async def restart(self) -> None:
+        """Replace a process that ended by a new one.
 
         Raises
         ------
         CannotStart
-            why.
+            The process cannot be started; the message says why.
         """
-        async with self._turn:
+        async with self._request_lock:
             self._starting = True
             try:
-                await asyncio.get_running_loop().run_in_executor(None, self._start_again)
+                await asyncio.get_running_loop().run_in_executor(None, self._restart)
             finally:
                 self._starting = False
 
     async def ask(self, kind: Kind, question: Any) -> Any:
-        """The answer to a question.
+        """Return the answer to a request.
 
         Raises
         ------
         ComputerLost
             The process ended.
         """
-        async with self._turn:
+        async with self._request_lock:
             answer = await asyncio.get_running_loop().run_in_executor(None, self._exchange, kind, question)
             if kind == "factors" and not isinstance(answer, str):
                 self._factors, self.opened = question, answer
             return answer
 
     def _exchange(self, kind: Kind, question: Any) -> Any:
+        """Send a request and wait for its answer."""
         assert self._pipe is not None
         self._asked = True
         try:
             self._pipe.send((kind, question))
             return self._pipe.recv()
         except (EOFError, OSError) as error:
-            raise ComputerLost(self._end_of_it()) from error
+            raise ComputerLost(self._describe_end()) from error
         finally:
             self._asked = False
 
-    def _end_of_it(self) -> str:
-        """How it ended, of a process that has closed its pipe; whatever is left of it is ended."""
-        last = time.monotonic() + ENDS
+    def _describe_end(self) -> str:
+        """Wait for the end of a process that has closed its pipe, and return how it ended."""
+        last = time.monotonic() + EXIT_TIMEOUT
         while self._alive():
             if time.monotonic() > last:
                 self.kill()
@@ -310,12 +312,12 @@ class Computer:
         return self.ending
 
     def _alive(self) -> bool:
-        with self._looks:
+        with self._process_lock:
             return self._process is not None and bool(self._process.is_alive())
 
     @property
     def ending(self) -> str:
-        """In words, how the process ended that has."""
+        """Description of how the process ended."""
         code = None if self._process is None else self._process.exitcode
         if code is None:
             return "the process that computes ended"
@@ -324,26 +326,26 @@ class Computer:
 
     @property
     def pid(self) -> int | None:
-        """Number of the process; None before it was started."""
+        """Process id; None before the start."""
         return None if self._process is None else self._process.pid
 
     @property
     def condition(self) -> Condition:
-        """How the process is: stopped by a signal, or ended by itself or by somebody."""
+        """Condition of the process: starting, running, stopped by a signal, or ended."""
         alive = self._alive()
         if alive and _stopped(self._process.pid):
             return "stopped"
         return "starts" if self._starting else "runs" if alive else "ended"
 
     def kill(self) -> None:
-        """End it at once; whoever waits for an answer is told that it ended."""
-        with self._looks:
+        """Kill the process; whoever waits for an answer gets ComputerLost."""
+        with self._process_lock:
             if self._process is not None:
                 self._process.kill()
 
     def leave(self) -> None:
-        """The server ends: nobody waits for an answer any more, and one that is awaited would keep the server."""
-        self._leaving = True
+        """Prepare the end of the server: kill the process if an answer is awaited, which would delay the server."""
+        self._shutting_down = True
         if self._asked or self._starting or self.condition == "stopped":
             self.kill()
 
@@ -352,41 +354,41 @@ class Computer:
         if self._pipe is not None:
             self._pipe.close()
         if self._process is not None:
-            self._process.join(ENDS)
+            self._process.join(EXIT_TIMEOUT)
             if self._process.is_alive():
                 self._process.kill()
                 self._process.join()
 
 
 def _stopped(pid: int) -> bool:
-    """Whether a process was stopped by a signal, but not by a debugger; False where the system does not tell."""
+    """Return whether a process was stopped by a signal (not by a debugger); False where the system does not tell."""
     try:
-        told = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace")
+        message = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace")
     except OSError:
         return False
-    return told.rpartition(")")[2].split()[:1] == ["T"]
+    return message.rpartition(")")[2].split()[:1] == ["T"]
 
 
 def compute(pipe: Connection, what: str, backend: str, run: int | None) -> None:
-    """What the process does: build the instrument, then answer until the pipe is closed.
+    """Run the computing process: build the instrument, then answer requests until the pipe is closed.
 
     Parameters
     ----------
     pipe : Connection
-        To the server.
+        Pipe to the server.
     what : str
-        As of `Computer`.
+        Source, as for `Computer`.
     backend : str
-        likewise.
+        Backend that traces.
     run : int | None
-        likewise.
+        Number of a study's run.
     """
     # Ctrl-C goes to the whole group of the terminal; the server ends this process by closing the pipe
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _end_with(os.getppid())
     with one_blas_thread():
         try:
-            answers = Answers(what, backend, lambda part: pipe.send(("part", part)), run)
+            answers = RequestHandler(what, backend, lambda part: pipe.send(("part", part)), run)
             pipe.send(("ready", answers.opened))
             # what is built stays; looking through it again and again would cost every state some milliseconds
             gc.collect()
@@ -401,7 +403,7 @@ def compute(pipe: Connection, what: str, backend: str, run: int | None) -> None:
                 return
             # a state is many small kernels; whatever else is asked for may have large ones
             kernel_threads(1 if kind == "state" else cores())
-            pipe.send(answers.to(kind, question))
+            pipe.send(answers.handle(kind, question))
 
 
 def _end_with(parent: int) -> None:

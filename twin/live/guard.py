@@ -1,16 +1,15 @@
-"""Who may speak to a server of pages, how many at once, and how long each may take.
+"""Access control of the page's server, limits on its connections, and timeouts.
 
-The address that the command prints carries a random token. The first request with it gets the token as a cookie, which
-no script can read and no other site can send, and is led to the page without it. Every other request, and the WebSocket
-before it is accepted, needs the cookie, a Host that is the server's own (a page elsewhere may have its name resolve to
-127.0.0.1) and, where the browser tells it, an Origin that is the page's own.
+The address that the command prints contains a random token. The first request with it sets the token as a cookie, which
+no script can read and no other site can send, and is redirected to the page without the token. Every other request, and
+the WebSocket before it is accepted, needs the cookie, a Host header of this server (another site's name may resolve to
+127.0.0.1) and, where the browser sends it, an Origin header of the page itself.
 
-uvicorn's own limits turn against the user here: ``limit_concurrency`` counts connections that say nothing, so that
-whoever opens enough of them locks everybody out, and ``timeout_keep_alive`` begins with the first answer. So a
-connection that has not yet shown the token is a **stranger** until it does, which a browser does within its first
-request. Strangers never take a place of somebody who has the token: they have places of their own, few for each
-address, and if these are taken the one that has waited longest makes room. Every request's head, answer and silence
-after it has its time.
+uvicorn's own limits do not suffice: ``limit_concurrency`` counts idle connections, so that anybody who opens enough of
+them locks out all others, and ``timeout_keep_alive`` begins only with the first answer. Therefore a connection is
+**unauthenticated** until it shows the token, which a browser does with its first request. Unauthenticated connections
+have places of their own, few for each address, and never take a place of an authenticated one; if their places are
+full, the oldest is closed. The head of every request, its answer and the idle time after it have timeouts.
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 SHORTEST = 22
-"""Characters of a token that the environment sets."""
+"""Smallest length of a token set by the environment, in characters."""
 COOKIE = "space_camera_twin_{port}"
-"""Name of the cookie. Browsers keep one jar for a host, whatever the port: two servers on one host, two names."""
+"""Name of the cookie. Browsers share cookies among all ports of a host, so that the name contains the port."""
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 EVERYWHERE = ("0.0.0.0", "::")
-"""Hosts that stand for all numbers of this machine."""
+"""Host addresses that stand for all interfaces of this machine."""
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -47,25 +46,25 @@ HEADERS: Mapping[str, str] = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
-"""Headers of every answer."""
+"""HTTP headers of every answer."""
 
 
 class BadToken(ValueError):
-    """A token that somebody could guess."""
+    """Token that is too easy to guess."""
 
 
 def new_token(variable: str) -> str:
-    """The token of a server: random, or the environment's.
+    """Return the token of a server: random, or set by the environment.
 
     Parameters
     ----------
     variable : str
-        Of the environment, with a token that stays the same when the server is started again.
+        Environment variable with a token that stays valid when the server is restarted.
 
     Raises
     ------
     BadToken
-        The environment's is too short, or has characters that a cookie cannot have.
+        The token of the environment is too short, or has characters that a cookie cannot have.
     """
     named = os.environ.get(variable, "")
     if not named:
@@ -77,16 +76,16 @@ def new_token(variable: str) -> str:
 
 @dataclass(frozen=True)
 class Guard:
-    """What a request needs.
+    """Requirements on a request.
 
     Attributes
     ----------
     token : str
-        The secret.
+        The secret token.
     hosts : tuple[str, ...]
-        Names under which the server is called, with their port.
+        Host names of the server, with its port.
     port : int
-        It listens on.
+        Port of the server.
     """
 
     token: str
@@ -95,12 +94,12 @@ class Guard:
 
     @classmethod
     def of(cls, token: str, host: str, port: int) -> Guard:
-        """The guard of a server that listens on a host and a port."""
+        """Return the guard of a server that listens on a host and a port."""
         named = f"[{host}]" if ":" in host else host.lower()
         names = LOOPBACK if host in ("127.0.0.1", "localhost", "::1") else (named, *LOOPBACK)
         if host in EVERYWHERE:
             names = (*names, *(name.lower() for name in names_of_this_machine()))
-        return cls(token, tuple(_called(name, port) for name in names), port)
+        return cls(token, tuple(_host_text(name, port) for name in names), port)
 
     @property
     def cookie_name(self) -> str:
@@ -109,37 +108,37 @@ class Guard:
 
     @property
     def cookie(self) -> str:
-        """What sets the cookie; the token is renewed with every server, so that it needs no date."""
+        """Set-Cookie header; it has no expiry date, since every server has a new token."""
         return f"{self.cookie_name}={self.token}; HttpOnly; SameSite=Strict; Path=/"
 
-    def knows(self, token: str) -> bool:
-        """Whether it is the token; takes as long whatever is wrong with it."""
+    def is_token(self, token: str) -> bool:
+        """Return whether a text is the token, in constant time."""
         return secrets.compare_digest(token.encode(), self.token.encode())
 
-    def knows_cookie(self, headers: Mapping[str, str]) -> bool:
-        """Whether a request brings the token as its cookie.
+    def has_token_cookie(self, headers: Mapping[str, str]) -> bool:
+        """Return whether a request has the token as its cookie.
 
         Parameters
         ----------
         headers : Mapping[str, str]
-            Of the request, names in small letters.
+            Headers of the request, names in lower case.
         """
-        return any(map(self.knows, _cookies(headers.get("cookie", ""), self.cookie_name)))
+        return any(map(self.is_token, _cookies(headers.get("cookie", ""), self.cookie_name)))
 
-    def refuses_host(self, headers: Mapping[str, str], reached: str = "") -> str:
-        """Why a request's host or origin is not the server's own; empty if it is.
+    def host_refusal(self, headers: Mapping[str, str], local_address: str = "") -> str:
+        """Return why a request's host or origin is not the server's own; empty if it is.
 
         Parameters
         ----------
         headers : Mapping[str, str]
-            Of the request, names in small letters.
-        reached : str
-            Number of this machine under which the request came here. A page elsewhere whose name resolves to it calls
-            it by that name.
+            Headers of the request, names in lower case.
+        local_address : str
+            Address of this machine at which the request arrived, which is accepted as a host name. A page of another
+            site whose name resolves to it sends that name instead.
         """
         host = headers.get("host", "").lower()
-        plain = reached.removeprefix("::ffff:")
-        own = _called(f"[{plain}]" if ":" in plain else plain, self.port)
+        plain = local_address.removeprefix("::ffff:")
+        own = _host_text(f"[{plain}]" if ":" in plain else plain, self.port)
         if host not in self.hosts and not (plain and host == own):
             return "this server has another name"
         origin = headers.get("origin")
@@ -149,160 +148,162 @@ class Guard:
             return "the page comes from elsewhere"
         return ""
 
-    def refuses(self, headers: Mapping[str, str], socket: bool = False, reached: str = "") -> str:
-        """Why a request is refused; empty if it is not.
+    def refusal(self, headers: Mapping[str, str], socket: bool = False, local_address: str = "") -> str:
+        """Return why a request is refused; empty if it is accepted.
 
         Parameters
         ----------
         headers : Mapping[str, str]
-            Of the request, names in small letters.
+            Headers of the request, names in lower case.
         socket : bool
-            Whether it asks for a WebSocket, for which browsers always tell the origin.
-        reached : str
-            As of `refuses_host`.
+            Whether it requests a WebSocket, for which browsers always send the origin.
+        local_address : str
+            See `host_refusal`.
         """
-        why = self.refuses_host(headers, reached)
+        why = self.host_refusal(headers, local_address)
         if not why and socket and "origin" not in headers:
             why = "no origin"
-        if not why and not self.knows_cookie(headers):
+        if not why and not self.has_token_cookie(headers):
             why = "open the address that the command printed"
         return why
 
 
-def _called(name: str, port: int) -> str:
-    """A host as browsers write it: without the port that is HTTP's own."""
+def _host_text(name: str, port: int) -> str:
+    """Return a host as browsers write it: without the default port of HTTP."""
     return name if port == 80 else f"{name}:{port}"
 
 
 def names_of_this_machine() -> tuple[str, ...]:
-    """By which other machines may call it, the shortest first."""
+    """Return the host names of this machine, the shortest first."""
     return tuple(sorted({name for name in (sockets.gethostname(), sockets.getfqdn()) if name}, key=len))
 
 
 def _cookies(header: str, name: str) -> Iterator[str]:
-    """Values of all cookies of a name; those of other programs on this host may be written in any way."""
+    """Yield the values of all cookies of a name; cookies of other programs on this host may have any form."""
     for part in header.split(";"):
         found, _, value = part.strip().partition("=")
         if found == name:
             yield value
 
 
-HEAD = 5.0
-"""Seconds in which the head of a request has to be there, from the connection's beginning or the head's first byte."""
-ANSWER = 60.0
-"""Seconds in which an answer has to be taken."""
-SILENCE = 30.0
-"""Seconds between an answer and the next request."""
-MOST_STRANGERS, MOST_OF_ONE = 128, 64
+HEAD_TIMEOUT = 5.0
+"""Time for the head of a request, from the connection's beginning or the head's first byte, in seconds."""
+ANSWER_TIMEOUT = 60.0
+"""Time in which an answer has to be received, in seconds."""
+KEEP_ALIVE = 30.0
+"""Idle time between an answer and the next request, in seconds."""
+MOST_UNAUTHENTICATED, MOST_OF_ONE_ADDRESS = 128, 64
 """Connections without the token, in all and of one address."""
-MOST_KNOWN = 64
-"""Connections with the token that carry no page's WebSocket: eight pages of a browser open six each."""
-AT_ONCE = 16
-"""Connections that are accepted before anybody who waits is served: an eighth of the strangers, so that several looks
-at what has arrived come before a newcomer can be the one that makes room."""
+MOST_AUTHENTICATED = 64
+"""Largest number of authenticated connections without a WebSocket: eight pages of a browser open six each."""
+ACCEPT_BACKLOG = 16
+"""Number of connections accepted before any waiting one is served: an eighth of the unauthenticated places.
+
+Received data are therefore looked at several times before a new connection can be the one that is closed.
+"""
 QUEUE = 1024
-"""Connections that the system keeps waiting to be accepted."""
+"""Number of connections that the operating system queues for acceptance."""
 INVALID_TEXT = 1007
-"""Code with which a WebSocket is closed whose text is not UTF-8."""
-UNREAD = 5.0
-"""Seconds that a page which is sent away may take for the rest of its answer."""
+"""Close code of a WebSocket whose text is not UTF-8."""
+CLOSE_TIMEOUT = 5.0
+"""Time that a disconnected page may take to receive the rest of its answer, in seconds."""
 
 
 class Connections:
-    """All that are open and carry no WebSocket.
+    """All open connections without a WebSocket.
 
     Parameters
     ----------
-    knows
-        Whether a request's headers, names in small letters, hold the token.
+    is_token
+        Function that returns whether a request's headers, names in lower case, contain the token.
     """
 
-    def __init__(self, knows: Callable[[Mapping[str, str]], bool]) -> None:
-        self.knows = knows
+    def __init__(self, is_token: Callable[[Mapping[str, str]], bool]) -> None:
+        self.is_token = is_token
         # in the order in which they came
-        self._strangers: dict[Connection, str] = {}
-        self._known: dict[Connection, None] = {}
+        self._unauthenticated: dict[Connection, str] = {}
+        self._authenticated: dict[Connection, None] = {}
 
     def __len__(self) -> int:
-        return len(self._strangers) + len(self._known)
+        return len(self._unauthenticated) + len(self._authenticated)
 
     def protocol(self) -> type[Connection]:
-        """The class of which uvicorn makes one for each connection."""
+        """Return the class that uvicorn instantiates for each connection."""
         return type("BoundConnection", (Connection,), {"all": self})
 
-    def came(self, one: Connection, address: str) -> None:
-        """A stranger came; it, or who makes room for it, is cut off when there are too many."""
-        self._strangers[one] = address
-        count = Counter(self._strangers.values())
-        if count[address] > MOST_OF_ONE:
-            self._cut(address)
-        elif len(self._strangers) > MOST_STRANGERS:
-            self._cut(count.most_common(1)[0][0])
+    def register(self, one: Connection, address: str) -> None:
+        """Add an unauthenticated connection, and close the oldest one if there are too many."""
+        self._unauthenticated[one] = address
+        count = Counter(self._unauthenticated.values())
+        if count[address] > MOST_OF_ONE_ADDRESS:
+            self._close_oldest(address)
+        elif len(self._unauthenticated) > MOST_UNAUTHENTICATED:
+            self._close_oldest(count.most_common(1)[0][0])
 
-    def is_known(self, one: Connection) -> None:
-        """Count a stranger that showed the token among the known; the oldest of these makes room."""
-        if self._strangers.pop(one, None) is None:
+    def authenticate(self, one: Connection) -> None:
+        """Count a connection that showed the token as authenticated, and close the oldest one if there are too many."""
+        if self._unauthenticated.pop(one, None) is None:
             return
-        self._known[one] = None
-        if len(self._known) > MOST_KNOWN:
-            first = next(iter(self._known))
-            self.went(first)
+        self._authenticated[one] = None
+        if len(self._authenticated) > MOST_AUTHENTICATED:
+            first = next(iter(self._authenticated))
+            self.forget(first)
             first.cut()
 
-    def went(self, one: Connection) -> None:
-        """Forget a connection that is closed, or carries a WebSocket from now on."""
-        self._strangers.pop(one, None)
-        self._known.pop(one, None)
+    def forget(self, one: Connection) -> None:
+        """Remove a connection that is closed, or that has become a WebSocket."""
+        self._unauthenticated.pop(one, None)
+        self._authenticated.pop(one, None)
 
-    def _cut(self, address: str) -> None:
-        """The oldest stranger of an address."""
-        oldest = next(one for one, its in self._strangers.items() if its == address)
-        self.went(oldest)
+    def _close_oldest(self, address: str) -> None:
+        """Close the oldest unauthenticated connection of an address."""
+        oldest = next(one for one, its in self._unauthenticated.items() if its == address)
+        self.forget(oldest)
         oldest.cut()
 
 
 class Connection(H11Protocol):
-    """One of them: its requests, each in its time."""
+    """HTTP connection whose requests have timeouts."""
 
     all: ClassVar[Connections]
-    _due: asyncio.TimerHandle | None = None
-    _silent = False
+    _deadline: asyncio.TimerHandle | None = None
+    _idle = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Somebody is there and has so long to say what is wanted."""
+        """Register the connection, and start the timeout of its first request."""
         super().connection_made(transport)
-        self._within(HEAD)
-        self.all.came(self, self.client[0] if self.client else "")
+        self._set_deadline(HEAD_TIMEOUT)
+        self.all.register(self, self.client[0] if self.client else "")
 
     def data_received(self, data: bytes) -> None:
-        """A piece of a request."""
-        if self._silent:
-            self._silent = False
-            self._within(HEAD)
+        """Handle a piece of a request."""
+        if self._idle:
+            self._idle = False
+            self._set_deadline(HEAD_TIMEOUT)
         before = self.cycle
         super().data_received(data)
         if self.cycle is not before:
-            self._asked()
+            self._request_received()
 
-    def _asked(self) -> None:
-        """A request's head is there."""
-        if self.all.knows({key.decode("latin-1"): value.decode("latin-1") for key, value in self.headers}):
-            self.all.is_known(self)
+    def _request_received(self) -> None:
+        """Handle the complete head of a request."""
+        if self.all.is_token({key.decode("latin-1"): value.decode("latin-1") for key, value in self.headers}):
+            self.all.authenticate(self)
         if not self.cycle.response_complete:
-            self._within(ANSWER)
+            self._set_deadline(ANSWER_TIMEOUT)
 
     def on_response_complete(self) -> None:
-        """An answer was handed to the system, or is on its way there."""
+        """Start the next timeout after an answer was handed to the system."""
         answered = self.cycle
-        self._silent = True
-        self._within(ANSWER if self.transport.get_write_buffer_size() else SILENCE)
+        self._idle = True
+        self._set_deadline(ANSWER_TIMEOUT if self.transport.get_write_buffer_size() else KEEP_ALIVE)
         super().on_response_complete()
         if self.cycle is not answered:  # the next request was there already
-            self._silent = False
-            self._asked()
+            self._idle = False
+            self._request_received()
 
     def send_400_response(self, msg: str) -> None:
-        """What came is no request; while something is being answered there is no place for saying so."""
+        """Answer data that is not a request; while another answer is being sent, close the connection instead."""
         if self.cycle is None or self.cycle.response_complete:
             try:
                 super().send_400_response(msg)
@@ -312,37 +313,38 @@ class Connection(H11Protocol):
         self.cut()
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        """Stop counting a connection that becomes a page's WebSocket, or is refused at once."""
-        self._within(None)
-        self.all.went(self)
+        """Stop counting a connection that becomes a WebSocket, or is refused at once."""
+        self._set_deadline(None)
+        self.all.forget(self)
         super().handle_websocket_upgrade(event)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget a connection that is closed."""
-        self._within(None)
-        self.all.went(self)
+        """Forget a closed connection."""
+        self._set_deadline(None)
+        self.all.forget(self)
         super().connection_lost(exc)
 
     def cut(self) -> None:
-        """End it now; what it has not taken is lost."""
-        self._within(None)
+        """Close the connection at once; unsent data are lost."""
+        self._set_deadline(None)
         if self.transport.get_write_buffer_size():
             self.transport.abort()
         else:
             self.transport.close()
 
-    def _within(self, seconds: float | None) -> None:
-        """What is awaited of it has to come within this time; None: nothing is."""
-        if self._due is not None:
-            self._due.cancel()
-        self._due = None if seconds is None else self.loop.call_later(seconds, self.cut)
+    def _set_deadline(self, seconds: float | None) -> None:
+        """Close the connection after this time, in seconds, unless the deadline is set again; None for no deadline."""
+        if self._deadline is not None:
+            self._deadline.cancel()
+        self._deadline = None if seconds is None else self.loop.call_later(seconds, self.cut)
 
 
 class PageSocket(WebSocketsSansIOProtocol):
-    """A page's WebSocket."""
+    """WebSocket of a page."""
 
     def send_receive_event_to_app(self) -> None:
-        """Hand a whole message on; a text that is not UTF-8 ends the line, and no terminal has to be told of it."""
+        """Pass on a complete message; close the connection if its text is not UTF-8, without an error on the terminal.
+        """
         if self.curr_msg_data_type == "text" and not self.close_sent:
             try:
                 b"".join(self.frames).decode()
@@ -354,26 +356,26 @@ class PageSocket(WebSocketsSansIOProtocol):
         super().send_receive_event_to_app()
 
     async def run_asgi(self) -> None:
-        """Serve the page. What it does not take although it was sent away does not stay here for ever."""
+        """Serve the page, and do not wait forever for a disconnected page to receive its data."""
         await super().run_asgi()
         self._end_soon()
 
     def keepalive_timeout(self) -> None:
-        """End a page that does not answer, and may not read either."""
+        """Close the connection of a page that does not answer."""
         super().keepalive_timeout()
         self._end_soon()
 
     def _end_soon(self) -> None:
-        """Who closes a connection waits for ever until all was taken that was sent; not here."""
+        """Abort the connection after a timeout if unsent data remain; closing it would wait forever."""
         if self.transport.get_write_buffer_size():
-            self.loop.call_later(UNREAD, self.transport.abort)
+            self.loop.call_later(CLOSE_TIMEOUT, self.transport.abort)
 
 
 class PatientServer(uvicorn.Server):
-    """uvicorn's server with a long queue before it, of which it takes few at once."""
+    """Server of uvicorn with a long queue of connections, of which it accepts few at a time."""
 
     async def startup(self, sockets: Any = None) -> None:
-        """Listen. asyncio takes as many connections at once as it lets wait; here these are two numbers."""
+        """Listen with separate limits for queued and accepted connections, which asyncio sets equal."""
         await super().startup(sockets)
         for one in sockets or ():
             one.listen(QUEUE)

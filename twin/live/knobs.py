@@ -36,7 +36,7 @@ class _KnobKind:
         Of the perturbation in a job's file.
     unit : str
         Of the values.
-    reach : float
+    extent : float
         Largest value of the slider at first, either way.
     limit : float
         Largest value that may be typed.
@@ -44,7 +44,7 @@ class _KnobKind:
 
     key: str
     unit: str
-    reach: float
+    extent: float
     limit: float
 
 
@@ -77,7 +77,7 @@ class Knob:
         Of the values.
     value : float
         At the start.
-    reach : float
+    extent : float
         The slider's ends at the start, either way.
     limit : float
         Largest value that may be typed.
@@ -89,7 +89,7 @@ class Knob:
     axis: str
     unit: str
     value: float
-    reach: float
+    extent: float
     limit: float
 
 
@@ -121,18 +121,18 @@ def knobs_of(nodes: Mapping[str, NodeInfo], job: JobSpec) -> dict[str, Knob]:
         for kind, what in KINDS.items():
             if what.key not in info.allows:
                 continue
-            given = _given(plain.get(node, {}), kind)
+            given = _job_quantities(plain.get(node, {}), kind)
             unit = _unit(given.values(), what.unit)
             for axis in dict.fromkeys((*axes_of(kind), *given)):
                 value = _number(given.get(axis), unit, 0.0)
                 size = 1.0 if what.unit == unit else unit_ratio(what.unit, unit)
-                reach = max(what.reach * size, 2.0 * abs(value))
+                extent = max(what.extent * size, 2.0 * abs(value))
                 name = knob_name(node, kind, axis)
-                out[name] = Knob(name, node, kind, axis, unit, value, reach, what.limit * size)
+                out[name] = Knob(name, node, kind, axis, unit, value, extent, what.limit * size)
     return out
 
 
-def _given(what: Mapping[str, Any], kind: str) -> dict[str, Any]:
+def _job_quantities(what: Mapping[str, Any], kind: str) -> dict[str, Any]:
     """Axis -> quantity as the job's plain data have it."""
     value = what.get(KINDS[kind].key)
     if value is None:
@@ -176,7 +176,7 @@ def perturbation(
     InputError
         No such knob, or a value beyond its limit.
     """
-    out: dict[str, dict[str, Any]] = {node: _kept(what) for node, what in first.items()}
+    out: dict[str, dict[str, Any]] = {node: _without_knobs(what) for node, what in first.items()}
     by_axis: dict[tuple[str, str], dict[str, float]] = {}
     for name, value in values.items():
         knob = knobs.get(name)
@@ -192,14 +192,14 @@ def perturbation(
             by_axis.setdefault((knob.node, knob.kind), {})[knob.axis] = value
     for (node, kind), numbers in by_axis.items():
         unit = next(knobs[knob_name(node, kind, axis)].unit for axis in numbers)
-        _put(out.setdefault(node, {}), kind, numbers, unit)
+        _set_quantities(out.setdefault(node, {}), kind, numbers, unit)
     for node, pivot in pivots.items():
         if node in out and pivot != DEFAULT_PIVOT and {"rotate", "scale"} & set(out[node]):
             out[node]["pivot"] = pivot
     return out
 
 
-def _kept(what: Mapping[str, Any]) -> dict[str, Any]:
+def _without_knobs(what: Mapping[str, Any]) -> dict[str, Any]:
     """What has no knob: tables of nodes and of temperatures, that a body has a temperature of its own, radii, conic
     constants and indices.
     """
@@ -211,7 +211,7 @@ def _kept(what: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _put(what: dict[str, Any], kind: str, numbers: Mapping[str, float], unit: str) -> None:
+def _set_quantities(what: dict[str, Any], kind: str, numbers: Mapping[str, float], unit: str) -> None:
     def quantity(axis: str) -> str:
         return f"{numbers.get(axis, 0.0)!r} {unit}"
 
@@ -261,7 +261,7 @@ class FactorKnob:
         number = int(value) if self.whole and value == int(value) else value
         return with_unit(number, self.unit) if self.unit else number
 
-    def beginning(self, scalar: Any) -> FactorKnob:
+    def starting_at(self, scalar: Any) -> FactorKnob:
         """Begin the factor at a value of a run, which a distribution may have drawn from beyond the range."""
         value = _number(scalar, self.unit, self.value)
         return replace(self, value=value, low=min(self.low, value), high=max(self.high, value))
@@ -273,7 +273,7 @@ def factor_knobs(setup: StudySetup) -> tuple[FactorKnob, ...]:
     return tuple(factor for factor in turned if factor is not None)
 
 
-def base_with(setup: StudySetup, scalars: Mapping[str, Any]) -> Tree:
+def base_with_factors(setup: StudySetup, scalars: Mapping[str, Any]) -> Tree:
     """The study's base where factors have these values, and all that follows them does.
 
     Parameters

@@ -44,7 +44,7 @@ from twin.study.runs.base_job import PHYSICS
 
 BLIND = 7
 """Random stream of what is hidden, beside those of the monitor and of targets."""
-LOST = (*PHYSICS, ArithmeticError, ValueError)
+IMPOSSIBLE = (*PHYSICS, ArithmeticError, ValueError)
 """What says that a state cannot be."""
 
 
@@ -75,7 +75,7 @@ class LiveBench:
         self.twin = twin if named is None else InstrumentTwin.of(twin.resolved.with_job(named), like=twin)
         self._reader = lru_cache(maxsize=4)(self._new_reader)
         # while a course is played the knobs stand
-        self._standing = lru_cache(maxsize=2)(self._new_standing)
+        self._perturbed_twin = lru_cache(maxsize=2)(self._new_perturbed_twin)
 
     @cached_property
     def knobs(self) -> dict[str, Knob]:
@@ -93,7 +93,7 @@ class LiveBench:
         return crosstalk(self.twin.experiment, np.eye(2 * len(self.twin.experiment.path.channels)))
 
     @cached_property
-    def at_rest(self) -> AskedState:
+    def initial_state(self) -> AskedState:
         """The state in which the knobs begin."""
         job = self.twin.resolved.job
         return AskedState(
@@ -123,7 +123,7 @@ class LiveBench:
         if not self.monitored:
             self._designed  # noqa: B018
             self.clearances  # noqa: B018
-            self.state(self.at_rest)
+            self.state(self.initial_state)
             return
         experiment.nominal_focus  # noqa: B018
         advance("calibrate its spots")
@@ -133,7 +133,7 @@ class LiveBench:
         self._crosstalk  # noqa: B018
         self.clearances  # noqa: B018
         advance("compile")
-        self.state(self.at_rest)
+        self.state(self.initial_state)
 
     def greeting(self) -> dict[str, Any]:
         """What a page has to know before it asks for a state."""
@@ -152,7 +152,7 @@ class LiveBench:
             "nodes": nodes,
             "knobs": [asdict(knob) for knob in self.knobs.values()],
             "frames": twin.resolved.frames,
-            "seed": self.at_rest.seed,
+            "seed": self.initial_state.seed,
             "parameters": [_label(p) for p in self._parameters],
             "angle": _label(parameters.ANGLE) if len(twin.cameras) == 2 else None,
             "ground": [_label(p) for p in parameters.GROUND] if experiment.ground is not None else [],
@@ -162,7 +162,7 @@ class LiveBench:
             none: dict[str, Any] = {"channels": [], "rows": 0, "columns": 0, "pitch_um": 0.0, "white": 1, "offset": 0.0}
             asked_nothing: dict[str, Any] = {"estimators": [], "judged": "", "disturbances": "", "course": None}
             return {**common, **none, **asked_nothing, "images": images, "designed": self._designed}
-        run = self._run(self.at_rest, {})[0]
+        run = self._run(self.initial_state, {})[0]
         stated_motion = experiment.disturbances
         return {
             **common,
@@ -175,7 +175,7 @@ class LiveBench:
             "estimators": list(run.estimators),
             "judged": run.judged,
             "disturbances": "" if stated_motion is None else stated_motion.name,
-            "course": None if job.course is None else _played(job.course),
+            "course": None if job.course is None else _course_data(job.course),
         }
 
     @property
@@ -201,13 +201,15 @@ class LiveBench:
         InputError
             No such knob, or a value that a job's file could not have.
         """
-        return self._standing(tuple(asked.knobs.items()), tuple(asked.pivots.items()))
+        return self._perturbed_twin(tuple(asked.knobs.items()), tuple(asked.pivots.items()))
 
-    def _new_standing(self, knobs: Sequence[tuple[str, float]], pivots: Sequence[tuple[str, str]]) -> InstrumentTwin:
-        return self.twin.perturbed(perturbation(dict(knobs), dict(pivots), self.knobs, self._moved_at_first))
+    def _new_perturbed_twin(
+        self, knobs: Sequence[tuple[str, float]], pivots: Sequence[tuple[str, str]]
+    ) -> InstrumentTwin:
+        return self.twin.perturbed(perturbation(dict(knobs), dict(pivots), self.knobs, self._job_perturbations))
 
     @cached_property
-    def _moved_at_first(self) -> Mapping[str, Any]:
+    def _job_perturbations(self) -> Mapping[str, Any]:
         """``perturb`` of the job's file."""
         moved: Mapping[str, Any] = self.twin.resolved.job.plain().get("perturb", {})
         return moved
@@ -227,16 +229,16 @@ class LiveBench:
             cannot be has ``problem`` in place of readings.
         """
         began = time.perf_counter()
-        told: dict[str, Any] = {"type": "state", "n": asked.n, "t": asked.t}
+        message: dict[str, Any] = {"type": "state", "n": asked.n, "t": asked.t}
         try:
             if not self.monitored:
-                return {**told, **self._traced(asked), "ms": _ms(began)}, None
+                return {**message, **self._traced(asked), "ms": _elapsed_ms(began)}, None
             run, after, placed = self._run(asked, self._hidden(asked))
-        except LOST as error:
-            return {**told, **self._lost(asked, error), "ms": _ms(began)}, None
-        told |= self._told(run, asked, placed)
-        told["ms"] = _ms(began)
-        return told, after
+        except IMPOSSIBLE as error:
+            return {**message, **self._problem_of(asked, error), "ms": _elapsed_ms(began)}, None
+        message |= self._state_data(run, asked, placed)
+        message["ms"] = _elapsed_ms(began)
+        return message, after
 
     def _traced(self, asked: AskedState) -> dict[str, Any]:
         """What is told of a state of an instrument without a monitor: truth, image quality, motions."""
@@ -269,7 +271,7 @@ class LiveBench:
         frames = self._reader(asked.frames, asked.seed).before if asked.noise else None
         return self._shown(frames, self.twin.experiment.nominal_photons)
 
-    def _lost(self, asked: AskedState, error: Exception) -> dict[str, Any]:
+    def _problem_of(self, asked: AskedState, error: Exception) -> dict[str, Any]:
         """Why there is no such state."""
         if isinstance(error, SpotError):
             channels = self.twin.experiment.path.channels
@@ -377,28 +379,28 @@ class LiveBench:
         )
         return run, after, found.light.placed
 
-    def _told(self, run: RenderRun, asked: AskedState, placed: PlacedBodies) -> dict[str, Any]:
+    def _state_data(self, run: RenderRun, asked: AskedState, placed: PlacedBodies) -> dict[str, Any]:
         experiment = self.twin.experiment
         instrument = experiment.instrument
-        told: dict[str, Any] = {"readings": stated(run.recovered_dict())}
+        message: dict[str, Any] = {"readings": stated(run.recovered_dict())}
         if not isinstance(asked, BlindState):
-            told["truth"] = run.truth_dict()
-            told["motions"] = motions(instrument, run.state, placed)
+            message["truth"] = run.truth_dict()
+            message["motions"] = motions(instrument, run.state, placed)
         else:
-            told["guess"] = self._guess(asked)
+            message["guess"] = self._guess(asked)
         light = run.photons_after.sum(axis=(1, 2)) / run.photons_before.sum(axis=(1, 2))
-        told["light"] = [float(share) for share in light]
-        told["warnings"] = [*self._warnings(run, light), *doubted(run), *contradiction(run)]
-        told["collisions"] = [
+        message["light"] = [float(share) for share in light]
+        message["warnings"] = [*self._warnings(run, light), *doubted(run), *contradiction(run)]
+        message["collisions"] = [
             f"{o.first} reaches {1e3 * o.depth:.3g} mm into {o.second}" for o in self.clearances.overlaps(placed)
         ]
-        return told
+        return message
 
     def _guess(self, asked: AskedState) -> dict[str, Any]:
         """What the knobs, as a guess of what is hidden, would have done: the expected image, and the spots in it."""
         try:
             made = self._reader(asked.frames, asked.seed).read(self.states(asked), noise=False)
-        except LOST as error:
+        except IMPOSSIBLE as error:
             return {"problem": str(error)}
         return {"spots": made.recovery.after[0].tolist(), "image": self._shown(None, made.light.photons[0])}
 
@@ -414,11 +416,11 @@ class LiveBench:
         return out
 
 
-def _ms(began: float) -> float:
+def _elapsed_ms(began: float) -> float:
     return 1e3 * (time.perf_counter() - began)
 
 
-def _played(course: CourseSpec) -> dict[str, Any]:
+def _course_data(course: CourseSpec) -> dict[str, Any]:
     """Times of a course in seconds, as a file writes them, and the number of the one that the job shows in full."""
     return {"times": list(course.times), "names": list(map(moment, course.times)), "shown": course.shown}
 
@@ -484,7 +486,7 @@ def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> s
     ValueError
         Too few states, or something changed that a course cannot change.
     """
-    steps = _thinned(kept)
+    steps = _limited_times(kept)
     if len(steps) < FEWEST:
         raise ValueError(f"a course has at least {FEWEST} different times; move a knob while recording")
     first = steps[0][1]
@@ -503,7 +505,7 @@ def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> s
     return _head() + dump_yaml(plain)
 
 
-def _thinned(kept: Sequence[tuple[float, AskedState]]) -> list[tuple[float, AskedState]]:
+def _limited_times(kept: Sequence[tuple[float, AskedState]]) -> list[tuple[float, AskedState]]:
     """Times that ascend in milliseconds, no more than a course may have, the first and the last among them."""
     out: list[tuple[float, AskedState]] = []
     for seconds, state in kept:

@@ -27,13 +27,13 @@ Text = Annotated[str, Field(max_length=200)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class _Said(BaseModel):
+class _PageMessage(BaseModel):
     """Nothing else may stand in a message."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
-class AskedState(_Said):
+class AskedState(_PageMessage):
     """A state of the knobs.
 
     Attributes
@@ -79,7 +79,7 @@ class BlindState(AskedState):
     blind: int
 
 
-class AskedView(_Said):
+class AskedView(_PageMessage):
     """A picture of one camera in the last state.
 
     Attributes
@@ -104,7 +104,7 @@ class AskedView(_Said):
     field: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
 
 
-class Factors(_Said):
+class Factors(_PageMessage):
     """Build the instrument with other values of a study's factors; for all pages.
 
     Attributes
@@ -117,7 +117,7 @@ class Factors(_Said):
     values: Annotated[dict[Text, Number], Field(max_length=100)]
 
 
-class Blind(_Said):
+class Blind(_PageMessage):
     """Hide motions that are drawn, or end it and show them.
 
     Attributes
@@ -130,7 +130,7 @@ class Blind(_Said):
     on: bool
 
 
-class Record(_Said):
+class Record(_PageMessage):
     """Begin to keep every state that is shown, or end.
 
     Attributes
@@ -143,7 +143,7 @@ class Record(_Said):
     on: bool
 
 
-class Save(_Said):
+class Save(_PageMessage):
     """A job file of a state, or a job with a course of what was recorded.
 
     Attributes
@@ -185,7 +185,7 @@ def read_message(text: str | bytes) -> Message:
         raise BadMessage(f"not a message: {where or 'the text'}: {first['msg']}"[:400]) from None
 
 
-def packed(told: Mapping[str, Any], images: Mapping[str, np.ndarray]) -> bytes:
+def packed(data: Mapping[str, Any], images: Mapping[str, np.ndarray]) -> bytes:
     """A binary message of the program.
 
     Parameters
@@ -195,7 +195,7 @@ def packed(told: Mapping[str, Any], images: Mapping[str, np.ndarray]) -> bytes:
     images : Mapping[str, np.ndarray]
         Name -> uint16 (C, H, W).
     """
-    whole = {**told, "images": {name: list(image.shape) for name, image in images.items()}}
+    whole = {**data, "images": {name: list(image.shape) for name, image in images.items()}}
     text = json.dumps(whole, allow_nan=False, separators=(",", ":")).encode()
     text += b" " * (-(4 + len(text)) % 8)
     pixels = [np.ascontiguousarray(image, "<u2").tobytes() for image in images.values()]

@@ -17,13 +17,13 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from twin.live.clients import POLICY_VIOLATION, Client, Desk, Goodbye
+from twin.live.clients import POLICY_VIOLATION, Client, Disconnected, LiveApi
 from twin.live.computer import Computer
 from twin.live.guard import (
-    AT_ONCE,
+    ACCEPT_BACKLOG,
     EVERYWHERE,
     HEADERS,
-    SILENCE,
+    KEEP_ALIVE,
     Connections,
     Guard,
     PageSocket,
@@ -32,7 +32,7 @@ from twin.live.guard import (
 )
 from twin.live.messages import LARGEST_MESSAGE
 
-LINGER = 10.0
+IDLE_TIMEOUT = 10.0
 """Seconds without any page after which the server ends, so that a page may be loaded again."""
 TYPES = {
     "html": "text/html",
@@ -64,8 +64,8 @@ class LiveServer:
     """
 
     def __init__(self, computer: Computer, guard: Guard, stay: bool = False) -> None:
-        self.desk, self.guard, self.stay = Desk(computer), guard, stay
-        self.connections = Connections(guard.knows_cookie)
+        self.api, self.guard, self.stay = LiveApi(computer), guard, stay
+        self.connections = Connections(guard.has_token_cookie)
         self._last: asyncio.TimerHandle | None = None
         self._uvicorn: uvicorn.Server | None = None
         self._failed: BaseException | None = None
@@ -113,10 +113,10 @@ class LiveServer:
             ws_per_message_deflate=False,
             ws_ping_interval=20.0,
             ws_ping_timeout=30.0,
-            timeout_keep_alive=int(SILENCE),
+            timeout_keep_alive=int(KEEP_ALIVE),
             timeout_graceful_shutdown=2,
             h11_max_incomplete_event_size=1 << 15,
-            backlog=AT_ONCE,
+            backlog=ACCEPT_BACKLOG,
         )
         self._uvicorn = PatientServer(config)
         # it ends in order and then repeats the signal, which here is no accident
@@ -132,7 +132,7 @@ class LiveServer:
 
     @contextlib.asynccontextmanager
     async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(make()) for make in (self.desk.work, self.desk.watch)]
+        tasks = [asyncio.create_task(make()) for make in (self.api.serve_requests, self.api.watch_process)]
         for task in tasks:
             task.add_done_callback(self._ended)
         try:
@@ -140,7 +140,7 @@ class LiveServer:
         finally:
             for task in tasks:
                 task.cancel()
-            self.desk.computer.leave()
+            self.api.computer.leave()
 
     def _ended(self, task: asyncio.Task[None]) -> None:
         """What the server is for cannot go on: nothing is left to serve."""
@@ -159,18 +159,16 @@ class LiveServer:
 
     async def _session(self, request: Request) -> Response:
         """Whether a page that lost its line may come back."""
-        return JSONResponse(
-            {"instrument": self.desk.computer.opened.greeting["instrument"], "states": self.desk.states}
-        )
+        return JSONResponse({"instrument": self.api.computer.opened.greeting["instrument"], "states": self.api.states})
 
     async def _scene(self, request: Request) -> Response:
-        return Response(self.desk.computer.opened.scene, media_type=TYPES["glb"])
+        return Response(self.api.computer.opened.scene, media_type=TYPES["glb"])
 
     async def _live(self, ws: WebSocket) -> None:
         """One page, from its coming to its going."""
         try:
-            client = self.desk.enter()
-        except Goodbye as bye:
+            client = self.api.connect()
+        except Disconnected as bye:
             await ws.accept()
             await ws.close(bye.code, str(bye))
             return
@@ -178,15 +176,15 @@ class LiveServer:
             self._last.cancel()
             self._last = None
         await ws.accept()
-        client.tell({"type": "hello", **self.desk.computer.opened.greeting})
-        if self.desk.trouble:
-            client.tell(self.desk.trouble)
+        client.queue_json({"type": "hello", **self.api.computer.opened.greeting})
+        if self.api.process_trouble:
+            client.queue_json(self.api.process_trouble)
         reading = asyncio.create_task(self._read(ws, client))
         sending = asyncio.create_task(client.send(ws.send_text, ws.send_bytes))
         try:
             done, _ = await asyncio.wait({reading, sending}, return_when=asyncio.FIRST_COMPLETED)
             error = next(iter(done)).exception()
-            if isinstance(error, Goodbye):
+            if isinstance(error, Disconnected):
                 with contextlib.suppress(Exception):
                     async with asyncio.timeout(1.0):
                         await ws.close(error.code, str(error))
@@ -194,21 +192,21 @@ class LiveServer:
             for task in (reading, sending):
                 task.cancel()
             await asyncio.gather(reading, sending, return_exceptions=True)
-            self.desk.leave(client)
-            if not self.stay and not self.desk.clients and self._last is None:
-                self._last = asyncio.get_running_loop().call_later(LINGER, self.stop)
+            self.api.disconnect(client)
+            if not self.stay and not self.api.clients and self._last is None:
+                self._last = asyncio.get_running_loop().call_later(IDLE_TIMEOUT, self.stop)
 
     async def _read(self, ws: WebSocket, client: Client) -> None:
         while True:
-            said = await ws.receive()
-            if said["type"] == "websocket.disconnect":
+            message = await ws.receive()
+            if message["type"] == "websocket.disconnect":
                 return
-            text = said.get("text")
+            text = message.get("text")
             if text is None:
-                raise Goodbye(POLICY_VIOLATION, "a page sends texts")
-            client.take(text)
+                raise Disconnected(POLICY_VIOLATION, "a page sends texts")
+            client.receive(text)
             if client.busy:
-                self.desk.wake()
+                self.api.notify()
 
 
 def _file(name: str) -> Response:
@@ -239,19 +237,19 @@ class Gate:
         if len(headers) != len(scope["headers"]) and [k for k, _ in scope["headers"]].count(b"host") > 1:
             headers["host"] = ""
         socket_wanted = scope["type"] == "websocket"
-        reached = (scope.get("server") or ("", None))[0]
-        why = self.guard.refuses(headers, socket_wanted, reached)
-        if why and not socket_wanted and self._brings_token(scope):
-            why = self.guard.refuses_host(headers, reached)
-        if why and socket_wanted:
+        local_address = (scope.get("server") or ("", None))[0]
+        refusal_reason = self.guard.refusal(headers, socket_wanted, local_address)
+        if refusal_reason and not socket_wanted and self._brings_token(scope):
+            refusal_reason = self.guard.host_refusal(headers, local_address)
+        if refusal_reason and socket_wanted:
             # closed before it is accepted: the browser gets status 403
-            await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": why})
+            await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": refusal_reason})
             return
         status = 403
-        if not why and not socket_wanted and scope["method"] not in ("GET", "HEAD"):
-            status, why = 405, "this server only shows"
-        if why:
-            answer = PlainTextResponse(f"refused: {why}\n", status, headers={"connection": "close"})
+        if not refusal_reason and not socket_wanted and scope["method"] not in ("GET", "HEAD"):
+            status, refusal_reason = 405, "this server only shows"
+        if refusal_reason:
+            answer = PlainTextResponse(f"refused: {refusal_reason}\n", status, headers={"connection": "close"})
             await answer(scope, receive, _with_headers(send))
             return
         await self.app(scope, receive, send if socket_wanted else _with_headers(send))
@@ -259,7 +257,7 @@ class Gate:
     def _brings_token(self, scope: Scope) -> bool:
         if scope["path"] != "/":
             return False
-        return self.guard.knows(Request(scope).query_params.get("token", ""))
+        return self.guard.is_token(Request(scope).query_params.get("token", ""))
 
 
 def _with_headers(send: Send) -> Callable[[Message], Awaitable[None]]:

@@ -22,19 +22,19 @@ from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 from twin.framework.owned_files import digest
 from twin.framework.run_folder import Manifest, read_manifest
-from twin.live.knobs import FactorKnob, base_with, factor_knobs
+from twin.live.knobs import FactorKnob, base_with_factors, factor_knobs
 from twin.live.messages import MOST_FRAMES
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import StudySetup, resolve_study
 
 PROGRAM = "twin.live"
 CONFIG, REPORT = "config.yaml", "report.html"
-OPENED = (
+ALLOWED = (
     "an instrument, a camera, a job or a measurement of one, a study of jobs, or a run folder of twin.render, "
     "twin.recover, twin.uncertainty, twin.orbit monitor or such a study"
 )
 """What may be given."""
-NAMED = 3
+MOST_NAMED = 3
 """Run folders that are named where a folder of them was given."""
 
 
@@ -69,7 +69,7 @@ class Source:
     study: StudySetup | None = None
     factors: tuple[FactorKnob, ...] = ()
     scalars: Mapping[str, Any] | None = None
-    own_noise: bool = False
+    has_own_seed: bool = False
 
     def with_factors(self, values: Mapping[str, float]) -> ResolvedJob:
         """The job with other values of factors, as a run of the study has it, values that follow them included.
@@ -91,8 +91,8 @@ class Source:
             if name not in known:
                 raise InputError(unknown("no such factor", name, known).at())
         scalars = {**(self.scalars or {}), **{name: known[name].scalar(value) for name, value in values.items()}}
-        made: ResolvedJob = validate(ResolvedJob, YamlFile("", base_with(self.study, scalars), {}))
-        return made.with_render(made.frames, self.resolved.job.render.seed) if self.own_noise else made
+        made: ResolvedJob = validate(ResolvedJob, YamlFile("", base_with_factors(self.study, scalars), {}))
+        return made.with_render(made.frames, self.resolved.job.render.seed) if self.has_own_seed else made
 
 
 def read_source(what: str, run: int | None = None) -> Source:
@@ -112,14 +112,14 @@ def read_source(what: str, run: int | None = None) -> Source:
         It cannot be read, is not valid, or is nothing that can be opened.
     """
     if what in (*library_names(INSTRUMENTS), *library_names(CAMERAS)):
-        _no_runs(what, run)
+        _require_no_run(what, run)
         return Source(resolve_job(validate(JobSpec, YamlFile("", {"instrument": what}, {}))), about=what)
     path = Path(what)
     if path.name == CONFIG and read_manifest(path.parent) is not None:
         path = path.parent
     source = _of_folder(path, run) if path.is_dir() else _of_file(path, run)
     name = path.resolve().name if run is None else f"{path.resolve().name}, run {run}"
-    return _for_a_page(replace(source, name=name))
+    return _limited_to_page(replace(source, name=name))
 
 
 def _of_folder(folder: Path, run: int | None) -> Source:
@@ -142,8 +142,8 @@ def _no_config(folder: Path, manifest: Manifest | None) -> Issue:
         inside = sorted(one.name for one in folder.iterdir() if (one / CONFIG).is_file())
     except OSError:
         inside = []
-    meant = names_text(str(folder / name) for name in inside[:NAMED])
-    hint = f"one of the run folders in it, as {meant}" if inside else OPENED
+    meant = names_text(str(folder / name) for name in inside[:MOST_NAMED])
+    hint = f"one of the run folders in it, as {meant}" if inside else ALLOWED
     return Issue(f"this is not a run folder: it has no {CONFIG}", str(folder), allowed=hint)
 
 
@@ -164,7 +164,7 @@ def _of_file(file: Path, run: int | None, manifest: Manifest | None = None) -> S
     name = "" if kind is None else kind.name
     if name == "study":
         return _of_study(file, run)
-    _no_runs(str(file), run)
+    _require_no_run(str(file), run)
     if name == "job":
         return Source(resolve(file), about="a job of the monitor")
     if name == "measurement":
@@ -179,7 +179,7 @@ def _of_file(file: Path, run: int | None, manifest: Manifest | None = None) -> S
     return Source(read_for(PROGRAM, file, resolve), about="a job of the monitor")
 
 
-def _no_runs(what: str, run: int | None) -> None:
+def _require_no_run(what: str, run: int | None) -> None:
     if run is not None:
         raise InputError(Issue("--run chooses a run of a study, and this is none", what, found=f"--run {run}"))
 
@@ -204,7 +204,7 @@ def _nothing_to_show(place: Path, what: str, folder: Path, data: Any = None) -> 
     elif name in library_names(INSTRUMENTS):
         remedies.append(f"python -m {PROGRAM} {name} opens its instrument")
     told = "; ".join(["this is " + what + ", which holds no state of a monitor that could be shown", *remedies])
-    return Issue(told, str(place), allowed=OPENED)
+    return Issue(told, str(place), allowed=ALLOWED)
 
 
 def _is_instrument(file: Path) -> bool:
@@ -222,7 +222,7 @@ def _of_measurement(file: Path) -> Source:
         text = (
             "this measurement was read by the geometry of the cameras alone, without an instrument that could be shown"
         )
-        raise InputError(Issue(text, str(file), allowed=OPENED))
+        raise InputError(Issue(text, str(file), allowed=ALLOWED))
     note = (
         "frames were measured; the page renders those of the instrument as designed, and the knobs are a guess of what "
         "moved"
@@ -282,18 +282,18 @@ def _of_study(file: Path, run: int | None) -> Source:
         raise InputError(Issue(text, str(file), found=f"--run {run}", allowed=f"0 to {plan.runs - 1}"))
     one, scalars = plan.run(run), {column.name: column.cell(run) for column in plan.columns}
     try:
-        resolved = validate(ResolvedJob, YamlFile("", base_with(setup, scalars), {}))
+        resolved = validate(ResolvedJob, YamlFile("", base_with_factors(setup, scalars), {}))
     except InputError as error:
         raise setup.blamed(error) from None
     if one.seed is not None:
         resolved = resolved.with_render(resolved.frames, one.seed)
-    factors = tuple(factor.beginning(scalars[factor.name]) for factor in factors)
+    factors = tuple(factor.starting_at(scalars[factor.name]) for factor in factors)
     values = ", ".join(f"{key} {value}" for key, value in scalars.items())
-    about, own_noise = f"run {run} of the study {name}: {values}", one.seed is not None
-    return Source(resolved, about=about, study=setup, factors=factors, scalars=scalars, own_noise=own_noise)
+    about, has_own_seed = f"run {run} of the study {name}: {values}", one.seed is not None
+    return Source(resolved, about=about, study=setup, factors=factors, scalars=scalars, has_own_seed=has_own_seed)
 
 
-def _for_a_page(source: Source) -> Source:
+def _limited_to_page(source: Source) -> Source:
     """The source, and what a page changes of it told."""
     frames = source.resolved.frames
     if frames <= MOST_FRAMES:

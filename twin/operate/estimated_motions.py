@@ -20,7 +20,7 @@ from analysis.monitor.disturbances import Disturbances
 from optics.geometry.tree import Body, Motion
 from optics.numerics.number_tree import FrozenMap
 from optics.thermal.heat import Temperature
-from scenes.models.disturbances import HEAT, Component, joint_disturbances, joint_files, state_of, usual_pivot
+from scenes.models.disturbances import HEAT, Component, joint_disturbances, joint_files, state_of, default_pivot
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.disturbances import MOST_JOINT
@@ -216,7 +216,7 @@ def merge_components(motions: EstimatedMotions, instrument: Instrument) -> tuple
             else np.zeros(3)
         )
         for axis in np.flatnonzero(np.abs(away) > 0.0).tolist():
-            shift = index_of(component.body, "shift", axis, usual_pivot(nodes[component.body]))
+            shift = index_of(component.body, "shift", axis, default_pivot(nodes[component.body]))
             entries.append((shift, k, float(away[axis])))
     table = np.zeros((len(components), len(motions.components)))
     for row, column, value in entries:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from analysis.arrays import Array
 from optics.numerics.array_math import covariance_root
-from scenes.models.disturbances import Component, StatedMotions, causes_of, drawn_motions, states_of
+from scenes.models.disturbances import Component, DisturbancePrior, causes_of, drawn_motions, states_of
 from scenes.specs.operation import OperationSetup
 from scenes.yaml.yaml_file import dump_yaml
 from twin.framework.procedure import Advance
@@ -122,7 +122,7 @@ class Life:
 
 
 def drawn_life(
-    stated: StatedMotions,
+    stated: DisturbancePrior,
     times: Moments,
     zero: int,
     seed: int,
@@ -166,7 +166,7 @@ def drawn_life(
 
 
 def _jumps(
-    stated: StatedMotions, cause: str, motions: Sequence[int], times: Moments, rng: np.random.Generator
+    stated: DisturbancePrior, cause: str, motions: Sequence[int], times: Moments, rng: np.random.Generator
 ) -> Iterator[Step]:
     """Yield the steps of a cause whose law has jumps at a mean interval; the motions of one body step together."""
     mean_interval = stated.laws[motions[0]].jump
@@ -179,7 +179,7 @@ def _jumps(
             yield Step(int(times[0]) + round(second * MICRO), cause, body, "", _step(stated, own, rng))
 
 
-def _step(stated: StatedMotions, where: Sequence[int], rng: np.random.Generator) -> Array:
+def _step(stated: DisturbancePrior, where: Sequence[int], rng: np.random.Generator) -> Array:
     """Return random sizes (M,) of a step of some motions in SI units, correlated as stated; zero for the others."""
     out = np.zeros(len(stated.components))
     root = covariance_root(stated.correlation[np.ix_(where, where)])

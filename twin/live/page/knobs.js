@@ -14,11 +14,11 @@ const tidy = (value, step) => Number(value.toFixed(Math.max(0, Math.min(12, 2 - 
 
 class Row {
   // a slider, a number and what belongs to it; `take` is called with every value
-  constructor({ label, unit, value, reach, low, limit, long }, take, done) {
+  constructor({ label, unit, value, extent, low, limit, long }, take, done) {
     this.value = value;
     this.take = take;
-    const low_ = low ?? -reach;
-    this.step = (reach - low_) / 1000;
+    const low_ = low ?? -extent;
+    this.step = (extent - low_) / 1000;
     this.slider = element('input', { type: 'range' });
     this.slider.setAttribute('aria-label', `${label} in ${unit || 'units'}`);
     this.number = field();
@@ -32,7 +32,7 @@ class Row {
     const name = element('span', { className: 'label', title: `${label} [${unit}]` }, label.split(' ').slice(long ? 0 : 1).join(' ') || label, ' ', element('small', {}, unit));
     this.box = element('div', { className: long ? 'knob long' : 'knob' }, name, this.slider, this.number, reset, more, this.ends);
     this.first = value;
-    this.range(low_, reach, this.step);
+    this.range(low_, extent, this.step);
     this.show(value);
     this.slider.addEventListener('input', () => this.turn(tidy(Number(this.slider.value), this.step)));
     this.slider.addEventListener('change', done);
@@ -188,7 +188,7 @@ export class Knobs {
   row(knob, long = false) {
     const label = long ? knob.name.replace(/^base\//, '') : `${knob.node} ${knob.axis || { scale: 'growth', temperature: 'change' }[knob.kind]}`;
     const row = new Row(
-      { label, unit: knob.unit, value: this.knobs[knob.name] ?? 0, reach: knob.reach, limit: knob.limit, long },
+      { label, unit: knob.unit, value: this.knobs[knob.name] ?? 0, extent: knob.extent, limit: knob.limit, long },
       (value) => this.turn(knob.name, value), () => this.settled());
     row.first = this.first.knobs[knob.name] ?? 0;
     row.box.dataset.knob = knob.name;
@@ -298,7 +298,7 @@ export class Knobs {
         if (!names.length && this.pending) { this.rebuild(this.pending); this.pending = null; }
       };
       const now = names.length ? (this.knobs[names[0][0]] ?? 0) / names[0][1] : factor.now;
-      const row = new Row({ label: factor.name, unit: factor.unit, value: now, reach: factor.high, low: factor.low, long: true }, take, done);
+      const row = new Row({ label: factor.name, unit: factor.unit, value: now, extent: factor.high, low: factor.low, long: true }, take, done);
       row.first = factor.value;
       if (factor.whole) row.range(factor.low, factor.high, 1);
       return row.box;

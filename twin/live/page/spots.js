@@ -152,13 +152,13 @@ export class Spots {
   }
 
   cross(pen, [x, y], colour, arm) {
-    const reach = arm * (window.devicePixelRatio || 1);
+    const extent = arm * (window.devicePixelRatio || 1);
     pen.strokeStyle = colour;
     pen.lineWidth = 1.4 * (window.devicePixelRatio || 1);
     pen.beginPath();
     for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
-      pen.moveTo(x + 0.35 * reach * dx, y + 0.35 * reach * dy);
-      pen.lineTo(x + 1.5 * reach * dx, y + 1.5 * reach * dy);
+      pen.moveTo(x + 0.35 * extent * dx, y + 0.35 * extent * dy);
+      pen.lineTo(x + 1.5 * extent * dx, y + 1.5 * extent * dy);
     }
     pen.stroke();
   }

@@ -21,7 +21,7 @@ from analysis.monitor.limits import Quantity, quantities
 from analysis.monitor.parameters import ANGLE, ANGLE_GROUP, CAMERA_PARAMETERS, GROUND, GROUND_GROUP
 from analysis.monitor.state_space import HeatInputs
 from optics.thermal.heat import Temperature
-from scenes.models.disturbances import HEAT, StatedMotions
+from scenes.models.disturbances import HEAT, DisturbancePrior
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.operation import OperationSetup, read_operation
@@ -117,7 +117,7 @@ def traced_model(
 
 
 def heat_inputs(
-    stated: StatedMotions, thermal: ThermalModel, sensors: Sequence[str], sigma: float
+    stated: DisturbancePrior, thermal: ThermalModel, sensors: Sequence[str], sigma: float
 ) -> HeatInputs | None:
     """Return the readings of temperature sensors as functions of the stated temperatures; None if no sensor reads any.
 
