@@ -224,8 +224,7 @@ def _positions(budget: ErrorBudget, images: np.ndarray, frames: int) -> np.ndarr
 
 
 def line_end_shift(budget: ErrorBudget) -> float:
-    """Return the displacement of the line of sight at the line CCD's end by a rotation ROLL, in pixels of the line CCD.
-    """
+    """Return the displacement of the line of sight at the line CCD's end by a rotation ROLL, in its pixels."""
     experiment = budget.experiment
     camera = next(iter(experiment.instrument.cameras))
     state = {f"{BASE}/{camera}/focal_plane": Motion(rotate=(0.0, 0.0, ROLL))}

@@ -438,8 +438,7 @@ def beam_end(bench: Bench, states: Callable[[np.ndarray], list[State]], start: f
 
 
 def joint_states(bench: Bench, changes: Mapping[str, np.ndarray]) -> list[State]:
-    """Return states in which every camera has changes (S, 4), in table units, as far as motions produce them exactly.
-    """
+    """Return states in which every camera has changes (S, 4), in table units, as exactly as motions can."""
     states: list[dict[str, Motion]] = [{} for _ in next(iter(changes.values()))]
     for camera, wanted in changes.items():
         units = [motion_of(camera, name, bench.geometry(camera))[1] for name in NAMES]

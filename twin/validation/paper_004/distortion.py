@@ -445,8 +445,7 @@ def _show(context: Context, tests: Sequence[SpotTest]) -> None:
 
 
 def _statistics(raw: Array, compensated: Array) -> list[Cell]:
-    """Return RMS, mean and maximum over the points of each test (T, N), and their reductions, as medians of the tests.
-    """
+    """Return RMS, mean and maximum over the points of each test (T, N), with reductions, as medians of the tests."""
     out: list[Cell] = []
     for size in (lambda v: np.sqrt(np.mean(v**2, axis=1)), lambda v: np.mean(v, axis=1), lambda v: np.max(v, axis=1)):
         before, after = size(raw), size(compensated)
