@@ -7,7 +7,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("optics", "analysis", "scenes", "twin")
-OPENINGS = re.compile(r"(Of|The same|As|Its|What|Whether)\b")
+OPENINGS = re.compile(r"(Of|The same|As|Its|What|Whether)\b(?!-)")
 """Words that begin a fragment; a docstring begins with a verb in the imperative or a noun phrase."""
 
 
