@@ -25,7 +25,7 @@ from analysis.orbit.forward_intersection import level_axes
 
 _SHOWN = 0.25
 """Smallest part of a combination, relative to its largest, that is listed."""
-_TAKING = 6
+_MOST_UNKNOWNS = 6
 """Largest number of unknowns of one combination that are listed."""
 _NOTHING = 1e-3
 """Ratio of the prior's sigma to that of the observations below which the observations determine nothing."""
@@ -141,7 +141,7 @@ def open_combinations(adjustment: BlockAdjustment) -> tuple[OpenCombination, ...
     for vector in np.concatenate([echelon(space) for space in spaces], axis=1).T:
         vector = vector / np.sqrt(vector @ prior @ vector)
         members = np.flatnonzero(np.abs(vector) >= _SHOWN * np.abs(vector).max())
-        members = members[np.argsort(-np.abs(vector[members]), kind="stable")][:_TAKING]
+        members = members[np.argsort(-np.abs(vector[members]), kind="stable")][:_MOST_UNKNOWNS]
         change = vector * sizes * np.sign(vector[members[0]])
         sigma_ratio = float(np.sqrt(max(float(vector @ data @ vector), 0.0)))
         combinations.append(

@@ -396,7 +396,7 @@ def mixture(mean: Array, covariance: Array, hints: Sequence[Hint], moved: Sequen
     return mean + shift, 0.5 * (out + out.T)
 
 
-def hinted_variance(
+def undetected_variance(
     score: Sequence[Array], information: Sequence[Array], gap: Array, bodies: Sequence[JumpingBody], window: int
 ) -> list[Array]:
     """Return the variance that a smoother adds for undetected jumps, (N, r) for each body.

@@ -68,11 +68,11 @@ from analysis.monitor.filter_state import (
     Whitened,
     bad_reading,
     chance_good,
-    hinted_variance,
     jump_evidence,
     jumping_bodies,
     may_be_bad,
     mixture,
+    undetected_variance,
 )
 from analysis.monitor.jump_detection import (
     UNOBSERVABLE,
@@ -700,7 +700,7 @@ _PIECE = 400
 """Number of readings whose covariances are held at once."""
 
 
-def with_hinted_jumps(
+def with_indicated_jumps(
     how: SeriesFilter, knowing: SeriesFilter, start: FilterState, observed: Sequence[Observed], left: Sequence[Array]
 ) -> tuple[FilterState, list[Array]]:
     """Return the start state and the shares of undetected jumps, with the jumps that all readings indicate.
@@ -748,7 +748,7 @@ def with_hinted_jumps(
     place = {k: i for i, k in enumerate(how.walking.tolist())}
     out = np.array(left)
     for body, more in zip(
-        how.jumping_bodies, hinted_variance(score, information, gap, how.jumping_bodies, how.window), strict=True
+        how.jumping_bodies, undetected_variance(score, information, gap, how.jumping_bodies, how.window), strict=True
     ):
         out[:, [place[k] for k in body.motions]] += more
     return how.with_random_walk(start, out[0] - left[0], first), list(out)

@@ -265,7 +265,7 @@ class Camera:
 
     @property
     def is_afocal(self) -> bool:
-        """Whether parallel light leaves the camera parallel, so that it has no image."""
+        """True if parallel light leaves the camera parallel, so that it forms no image."""
         return not self.focal_length < _AFOCAL * (float(np.sum(np.abs(np.diff(self.vertices)))) or 1.0)
 
     @property

@@ -526,12 +526,12 @@ def search(
         drawn = number > int(steps > 1)
         initial = drawn_start(merit, start, variables, np.random.default_rng([seed, number])) if drawn else start
 
-        def tell(step: int, _: int, done: int = done) -> None:
+        def report(step: int, _: int, done: int = done) -> None:
             if advance is not None:
                 advance(done + step, total)
 
         try:
-            design, problem = descend(merit, start, before, initial, variables, count, iterations, tell), ""
+            design, problem = descend(merit, start, before, initial, variables, count, iterations, report), ""
         except DesignError as error:
             design, problem, first = None, str(error), first or error
         attempts.append(Attempt(drawn, count, design, problem))

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.filter_state import FilterState, Innovation, Observed
 from analysis.monitor.jump_detection import Jump, Step, Steps, steps
-from analysis.monitor.kalman_filter import SeriesFilter, smoothed, with_hinted_jumps
+from analysis.monitor.kalman_filter import SeriesFilter, smoothed, with_indicated_jumps
 from analysis.monitor.series_smoother import SeriesChanges
 from analysis.monitor.state_space import StateSpace
 
@@ -73,7 +73,9 @@ def follow(how: SeriesFilter, observed: Sequence[Observed], wanted: ArrayLike) -
     knowing = replace(how, steps=(*how.steps, *map(Step.of, jumps)), window=0)
     good = [k for k in range(len(observed)) if k not in bad]
     taken = [observed[k] for k in good]
-    begin, left = with_hinted_jumps(how, knowing, knowing.start(earliest), taken, [beliefs[k].undetected for k in good])
+    begin, left = with_indicated_jumps(
+        how, knowing, knowing.start(earliest), taken, [beliefs[k].undetected for k in good]
+    )
     late = smoothed(knowing, begin, taken, times, left, knowing.parameters_of)
     return Followed(series_of(filtered), series_of(late), tuple(innovations), jumps, beliefs[-1], tuple(bad))
 

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.analysis.disturbance_prior import disturbances
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.kalman_filter import SeriesFilter, smoothed, with_hinted_jumps
+from analysis.monitor.kalman_filter import SeriesFilter, smoothed, with_indicated_jumps
 from tests.analysis.followed_series import follow, of_shifts, whole_steps
-from tests.analysis.stated_motions import disturbances
 from tests.tiers import quick
 
 NOISE, EVERY = 0.3, 400.0
@@ -121,7 +121,7 @@ def test_a_hint_adds_to_the_walk_where_it_is() -> None:
         knowing = replace(how, window=0)
         nothing = [np.zeros(3)] * len(times)
         read = of_shifts(times, shifts, noise)
-        found = np.array(with_hinted_jumps(how, knowing, knowing.start(times[0]), read, nothing)[1])[1:]
+        found = np.array(with_indicated_jumps(how, knowing, knowing.start(times[0]), read, nothing)[1])[1:]
         return found * (np.diff(times) / EVERY)[:, None]
 
     quiet, hint = more(0.0), more(0.9)

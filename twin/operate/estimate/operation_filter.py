@@ -27,7 +27,7 @@ from analysis.monitor.kalman_filter import (
     detection_power,
     smooth_jointly,
     smoothed,
-    with_hinted_jumps,
+    with_indicated_jumps,
 )
 from analysis.monitor.limits import Quantity
 from optics.numerics.backend import load_backend, one_blas_thread
@@ -573,7 +573,7 @@ class Operation:
         filter_state = (entry_filter.start(self._begin()) if start is None else start).filter_state
         filter_state = _without_search(filter_state)
         knowing = replace(entry_filter.series_filter, steps=steps, window=0)
-        filter_state, with_hints = with_hinted_jumps(
+        filter_state, with_hints = with_indicated_jumps(
             entry_filter.series_filter, knowing, filter_state, observed, list(left)
         )
         return knowing, filter_state, observed, with_hints
