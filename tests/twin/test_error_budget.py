@@ -96,7 +96,7 @@ def test_half_the_glass_path_halves_the_error(budget):
 
 def test_a_line_of_several_numbers_is_told_in_times_of_what_is_stated(backend, budget):
     both = make(backend, causes={"prism_0_rotation": {"shift": "3 um"}})
-    assert both.input_of("prism_0_rotation") == (1.0, "times stated")
+    assert both.input_of("prism_0_rotation") == (1.0, "times the prior")
     assert (
         both.input_of("prism_180_rotation") == budget.input_of("prism_180_rotation") == (pytest.approx(68.0), "arcsec")
     )

@@ -120,7 +120,7 @@ def test_a_state_is_the_same_alone_and_among_others_one_of_which_is_lost(gf7_pai
         assert np.isnan(lost.mtf_along_track[k]).all()
         np.testing.assert_allclose(kept.wfe[k], quality.cameras["backward"].wfe[0], atol=1e-9)
     assert "mirrors" in lost.reasons[0] or "no ray" in lost.reasons[0]
-    assert "cuts" in lost.reasons[2]
+    assert "vignettes" in lost.reasons[2]
     assert not any(kept.reasons)
     written = QUALITY(several)["before"]["cameras"][CAMERA]
     assert written["wfe_rms_waves"] is None

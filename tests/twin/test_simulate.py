@@ -58,7 +58,7 @@ def test_trajectory_says_which_velocity_it_has(folder: Path) -> None:
     to it, 0.4 km/s at 40 deg, which taken for the other would turn an aberration of 5 arcsec by 0.27 arcsec."""
     path = read(folder / "artefacts" / "trajectory.json")
     assert path["schema"] == "trajectory 2"
-    assert "turning Earth" in path["reference_frames"]["velocity_m_per_s"]
+    assert "rotating Earth" in path["reference_frames"]["velocity_m_per_s"]
     assert "stars" in path["reference_frames"]["inertial_velocity_m_per_s"]
     time, place, fixed, inertial = (
         np.array(path[k]) for k in ("orbit_s", "position_m", "velocity_m_per_s", "inertial_velocity_m_per_s")

@@ -147,7 +147,7 @@ _MOST_WAVES = 1e6
 """Wavefront error above which a value is not that of an image, in waves rms."""
 
 _FEW, _APART = quadrature.even_disk(500), 0.02
-"""Points of the stop by which the area of shadows is held to their outlines, and by how much they may differ."""
+"""Points of the stop for a check of the area of shadows against their outlines, and the allowed difference."""
 
 AT_ONCE = 40
 """States traced in one launch, to limit memory: 40 take 60 MB."""
@@ -554,7 +554,7 @@ class _CameraBench:
         covers: np.ndarray | None = None
         if self.model.edges:
             free = shadow.no_shadows(len(owner)) if shadows is None else shadows
-            edges = shadow.SeenEdges.of(beams, self.model, self.name, self.backend)
+            edges = shadow.PupilEdges.of(beams, self.model, self.name, self.backend)
             outlines = edges.outlines(LINE_SIDES) + StopOutlines((), tuple(np.moveaxis(free.pieces, 1, 0)))
             shadows = free.and_edges(edges.outlines, f"edges of {name}")
             covers = ~covered(shadows.pieces, np.stack([self.nodes.x, self.nodes.y], axis=-1), SMALLEST)

@@ -20,7 +20,7 @@ from analysis.monitor.recovery import joint
 from analysis.spots.likelihood import image_bound
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
-from scenes.models.disturbances import motions_of_spec
+from scenes.models.disturbances import prior_of_spec
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.disturbances import DisturbancesSpec
@@ -147,10 +147,7 @@ def information_of(
     rows = quantity_rows(instrument, ground)
     return [
         Information(
-            disturbances_of(motions_of_spec(spec, instrument), path, thermal, instrument, backend),
-            noise,
-            rows,
-            brightest,
+            disturbances_of(prior_of_spec(spec, instrument), path, thermal, instrument, backend), noise, rows, brightest
         )
         for spec in prior
     ]

@@ -136,8 +136,8 @@ class SpotFocus:
 
 
 MAP_TERMS, ROUGH_TERMS = 15, 66
-"""Zernike terms (to orders 4 and 10) of the map from the aperture to direction cosines. Beside the first the rest is
-below 1e-7 of it where surfaces are smooth; figures of prisms and mirrors that have fine structure get the others.
+"""Numbers of Zernike terms (to orders 4 and 10) of the map from the aperture to direction cosines. The first number
+leaves a residual below 1e-7 for smooth surfaces; figures of prisms and mirrors with fine structure need the second.
 """
 
 SMOOTH = 1e-6

@@ -34,7 +34,7 @@ from optics.numerics.number_tree import Path, leaves
 from optics.raytrace.aim import RayFan, aim, transverse_axes
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import RayTangents, jvp, make_rays, trace, vjp
-from scenes.models.disturbances import Component, StatedMotions, states_of
+from scenes.models.disturbances import Component, DisturbancePrior, states_of
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.disturbances import TimeLawSpec
@@ -324,7 +324,7 @@ STEPS = {"temperature": 0.1, "gradient": 0.1, "index_gradient": 1e-6, "radius": 
 
 
 def disturbances_of(
-    prior: StatedMotions, path: MonitorPath, thermal: ThermalModel, instrument: Instrument, backend: Backend
+    prior: DisturbancePrior, path: MonitorPath, thermal: ThermalModel, instrument: Instrument, backend: Backend
 ) -> Disturbances:
     """Return the motions of a prior with their derivatives, for the analysis.
 
@@ -334,7 +334,7 @@ def disturbances_of(
 
     Parameters
     ----------
-    prior : StatedMotions
+    prior : DisturbancePrior
         Motions of the prior.
     path : MonitorPath
         Optical path of the monitor.
@@ -426,7 +426,7 @@ SMALL: Mapping[str, float] = {"rotate": 1e-6, "shift": 1e-6, "scale": 1e-6, "fig
 
 
 def derivative_changes(
-    prior: StatedMotions, path: MonitorPath, sight: LineSight, thermal: ThermalModel, built: Sequence[State]
+    prior: DisturbancePrior, path: MonitorPath, sight: LineSight, thermal: ThermalModel, built: Sequence[State]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the differences of the derivatives of ``disturbances_of`` between instruments as built and as designed.
 
@@ -434,7 +434,7 @@ def derivative_changes(
 
     Parameters
     ----------
-    prior : StatedMotions
+    prior : DisturbancePrior
         M motions of the prior, about an instrument as built.
     path : MonitorPath
         Optical path of the monitor, D spot coordinates.
@@ -519,7 +519,7 @@ def motion_models(
     sight: LineSight,
     cameras: Mapping[str, CameraCalibration],
     thermal: ThermalModel,
-    prior: StatedMotions | None,
+    prior: DisturbancePrior | None,
     disturbances: Disturbances | None,
 ) -> dict[str, MotionModel]:
     """Return the motion model of each estimator that retraces.
@@ -536,7 +536,7 @@ def motion_models(
         Calibration of the cameras, in the order of the spots.
     thermal : ThermalModel
         Thermal model of the instrument.
-    prior : StatedMotions | None
+    prior : DisturbancePrior | None
         Motions of the prior; None for none.
     disturbances : Disturbances | None
         The same motions with their derivatives.
@@ -559,7 +559,7 @@ def motion_models(
 # Models call functions of this module, since a run is pickled for the process that draws it.
 
 
-def _prior_states(prior: StatedMotions, thermal: ThermalModel, amounts: np.ndarray) -> list[State]:
+def _prior_states(prior: DisturbancePrior, thermal: ThermalModel, amounts: np.ndarray) -> list[State]:
     """Return the states of the prior's amounts (S, P), in standard deviations."""
     return states_of(amounts * prior.sigma, prior.components, thermal)
 

@@ -23,7 +23,7 @@ from optics.numerics.backend import Backend, one_blas_thread
 from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import NodalDeformation
 from optics.waves.diffraction import UnsampledImageError
-from scenes.models.disturbances import StatedMotions, check_heat, stated_motions
+from scenes.models.disturbances import DisturbancePrior, check_heat, disturbance_prior
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.job_state import (
@@ -352,7 +352,7 @@ class MonitorExperiment:
         return ground_geometry(self.instrument, self.nominal_truth.principal_distance)
 
     @cached_property
-    def stated(self) -> StatedMotions | None:
+    def stated(self) -> DisturbancePrior | None:
         """Motions of the job's prior, by component; None without a prior.
 
         Raises
@@ -360,7 +360,7 @@ class MonitorExperiment:
         InputError
             The prior names a body that the instrument does not have, or that cannot move or be heated in this way.
         """
-        prior = stated_motions(self.resolved, self.instrument)
+        prior = disturbance_prior(self.resolved, self.instrument)
         if prior is not None:
             check_heat(self.resolved, prior, self.thermal)
         return prior

@@ -111,7 +111,7 @@ class Reading:
         """Value, sigma and unit as text."""
         return f"{self.shown(self.value)} ± {self.shown(self.sigma)} {self.parameter.unit}"
 
-    def place(self, nested: dict[str, Any]) -> dict[str, Any]:
+    def group_in(self, nested: dict[str, Any]) -> dict[str, Any]:
         """Return the reading's group in JSON files as `ReadingTable.groups` nests them; it is added if missing.
 
         Parameters
@@ -141,13 +141,13 @@ class ReadingTable:
     ----------
     rows : tuple of Reading
         Readings, ordered by group, change and estimator.
-    left : mapping
+    ground_residuals : mapping
         Estimator -> residual ground errors after a correction by its readings, RMS over the line, (S,): further keys of
         its group in files.
     """
 
     rows: tuple[Reading, ...]
-    left: Mapping[str, Mapping[str, Any]]
+    ground_residuals: Mapping[str, Mapping[str, Any]]
 
     def __iter__(self) -> Iterator[Reading]:
         """Iterate over the rows."""
@@ -161,8 +161,11 @@ class ReadingTable:
         state : int
             Number of the state.
         """
-        left = {e: {key: float(value[state]) for key, value in errors.items()} for e, errors in self.left.items()}
-        return ReadingTable(tuple(row.each(lambda number: float(number[state])) for row in self.rows), left)
+        residuals = {
+            e: {key: float(value[state]) for key, value in errors.items()}
+            for e, errors in self.ground_residuals.items()
+        }
+        return ReadingTable(tuple(row.each(lambda number: float(number[state])) for row in self.rows), residuals)
 
     @property
     def rms(self) -> ReadingTable:
@@ -214,21 +217,21 @@ class ReadingTable:
         """
         out: dict[str, Any] = {"cameras": {}}
         for row in self.rows:
-            key, group = row.parameter.key, row.place(out)
+            key, group = row.parameter.key, row.group_in(out)
             if truth:
                 group.setdefault(truth, {}).setdefault(key, plain(row.true))
             read = group.setdefault(row.estimator, {})
             read[key] = plain(row.value)
             read[f"{key}_sigma"], read[f"{key}_sigma_noise"] = plain(row.sigma), plain(row.noise)
-        for estimator, left in self.left.items():
-            out[GROUND_GROUP][estimator] |= {key: plain(value) for key, value in left.items()}
+        for estimator, residuals in self.ground_residuals.items():
+            out[GROUND_GROUP][estimator] |= {key: plain(value) for key, value in residuals.items()}
         return out
 
     def true(self) -> dict[str, Any]:
         """Return the true changes as JSON files nest them: as `groups`, without estimators."""
         out: dict[str, Any] = {"cameras": {}}
         for row in self.rows:
-            group = row.place(out)
+            group = row.group_in(out)
             if row.parameter.key not in group:
                 group[row.parameter.key] = plain(row.true)
         return out
@@ -247,11 +250,13 @@ class ReadingTable:
             replace(same[0], **{name: np.concatenate([getattr(row, name) for row in same]) for name in names})
             for same in zip(*(part.rows for part in parts), strict=True)
         )
-        left = {
-            estimator: {key: np.concatenate([part.left[estimator][key] for part in parts]) for key in errors}
-            for estimator, errors in parts[0].left.items()
+        residuals = {
+            estimator: {
+                key: np.concatenate([part.ground_residuals[estimator][key] for part in parts]) for key in errors
+            }
+            for estimator, errors in parts[0].ground_residuals.items()
         }
-        return ReadingTable(rows, left)
+        return ReadingTable(rows, residuals)
 
 
 def plain(number: Any) -> Any:
@@ -327,10 +332,10 @@ def reading_table(
         readings = {e: (g.error_m, g.sigma_m, g.sigma_noise_m) for e, g in estimates.ground.items()}
         error = None if truth is None or ground is None else truth.ground_error(ground)
         add(GROUND_GROUP, parameters.GROUND, error, readings)
-    left = {
+    residuals = {
         e: {"left_plan_rms_m": g.plan_rms_m, "left_height_rms_m": g.height_rms_m} for e, g in estimates.ground.items()
     }
-    return ReadingTable(tuple(rows), left)
+    return ReadingTable(tuple(rows), residuals)
 
 
 def _sigma(combination: np.ndarray, covariance: np.ndarray) -> np.ndarray:

@@ -56,7 +56,7 @@ class BudgetLine:
     value : float
         Input of the line, 3 sigma; 1 if the components of a cause have different sigmas.
     unit : str
-        Unit of the input; "times stated" if the components of a cause have different sigmas.
+        Unit of the input; "times the prior" if the components of a cause have different sigmas.
     allowed : float
         Input for an error of 0.1 arcsec, in the unit of ``value``.
     """
@@ -161,7 +161,7 @@ class ErrorBudget:
             raise ValueError(f"error budget: no cause {cause!r}; there are {', '.join(self.causes)}")
         first = components[0]
         if any((c.sigma, c.unit) != (first.sigma, first.unit) for c in components):
-            return 1.0, "times stated"
+            return 1.0, "times the prior"
         return 3.0 * first.sigma / first.unit_size, first.unit
 
     def states(self, causes: Sequence[str], trials: int, stream: int) -> list[State]:

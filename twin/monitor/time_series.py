@@ -383,7 +383,7 @@ _AS_GOOD = 3.0
 """Difference of log likelihood ratios, a factor 20 of likelihood, below which the spots do not discriminate two bodies.
 """
 MOST_BETWEEN, LARGEST_BETWEEN = 7, 400
-"""Times between two of a course, and in all, at which it is smoothed, too."""
+"""Largest number of smoothed times between two times of a course, and in total."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -523,7 +523,7 @@ def _photons(photons: ArrayLike) -> NDArray[np.float64]:
     return light
 
 
-def coarse_step_warnings(noise: NoiseModel, whose: str) -> tuple[str, ...]:
+def coarse_step_warnings(noise: NoiseModel, detector_name: str) -> tuple[str, ...]:
     """Return a warning if the noise does not cover the steps of the grey values at low signal; otherwise none.
 
     It depends on the detector's numbers alone.
@@ -532,15 +532,15 @@ def coarse_step_warnings(noise: NoiseModel, whose: str) -> tuple[str, ...]:
     ----------
     noise : NoiseModel
         Noise model of the detector.
-    whose : str
+    detector_name : str
         Name of the detector for the reader.
     """
     few = float(noise.frame_variance_dn2(noise.dark_level_dn + FEW)) - ROUNDING_VARIANCE
     if few >= COARSE**2:
         return ()
     return (
-        f"{whose} has coarse grey values: its noise is {math.sqrt(few):.2g} DN at {FEW:g} DN of light, less than "
-        f"{COARSE:g}; rounding errors are then equal in all frames, do not average out and are correlated between "
+        f"{detector_name} has coarse grey values: its noise is {math.sqrt(few):.2g} DN at {FEW:g} DN of light, less "
+        f"than {COARSE:g}; rounding errors are then equal in all frames, do not average out and are correlated between "
         "neighbouring pixels, while σ assumes independent ones; increase system_gain_dn_per_e, with a sufficient "
         "bit_depth",
     )

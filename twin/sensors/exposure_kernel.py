@@ -568,8 +568,8 @@ _TAIL = (
     -0.000200214257, 0.000100950558, 0.00134934322, -0.00367342844, 0.00573950773, -0.0076224613, 0.00943887047,
     1.00167406, 2.83297682,
 )  # fmt: skip
-"""Giles, Approximating the erfinv function, GPU Computing Gems (2012), single precision: polynomials of w - 2.5 and of
-the root of w less 3, w = -log(4 t (1 - t)).
+"""Coefficients of Giles, Approximating the erfinv function, GPU Computing Gems (2012), single precision: polynomials of
+w - 2.5 and of sqrt(w) - 3, with w = -log(4 t (1 - t)).
 """
 
 

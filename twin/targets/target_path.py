@@ -34,7 +34,7 @@ from optics.waves.optical_transfer import with_enough_nodes
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import DEGREE, VIGNETTED_RESIDUAL, VIGNETTED_RINGS, PupilFunction, fit_pupils
 from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, coloured, line_body
-from scenes.models.shadow import ImagingShadows, SeenEdges, TracedBeams
+from scenes.models.shadow import ImagingShadows, PupilEdges, TracedBeams
 
 RINGS = 14
 """Rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond those of mirrors and figures."""
@@ -50,7 +50,7 @@ WORST_PLACED = 5e-3
 
 MAP_POINTS = 7
 MAP_ORDER = 4
-"""Chief rays per axis, and order of the polynomial through them, of the local mapping from angles to the image."""
+"""Chief rays per axis for the local mapping from angles to the image, and the order of its polynomial."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +248,7 @@ class TargetPath:
                 size = placed.scale[0, placed.index[f"{self.root}/{name}"]].real
                 return np.asarray(traced.hit(cut[name]) / size)
 
-            valid = valid & self.model.uncut(met)
+            valid = valid & self.model.unvignetted(met)
         if edges and self.shadows is not None:
             valid = valid & ~covered(self.shadow_pieces(state, directions), points, SMALLEST)
         require_rays(valid, "the imaging path")
@@ -366,7 +366,7 @@ class TargetPath:
         owner = np.zeros(len(directions), dtype=int)
         beams = TracedBeams(self.assembly, placed, owner, systems, rays, directions, nodes)
         bodies = np.zeros((len(directions), 0, 3, 2)) if self.shadows is None else self.shadows.cast(beams).pieces
-        edges = SeenEdges.of(beams, self.model, self.name, self.backend)
+        edges = PupilEdges.of(beams, self.model, self.name, self.backend)
         outlines = edges.outlines(LINE_SIDES) + StopOutlines((), tuple(np.moveaxis(bodies, 1, 0)))
         illuminated = edges.passed[-1] & ~covered(bodies, np.stack([nodes.x, nodes.y], axis=-1), SMALLEST)
         field = self._field(rays, systems, places, colour)
@@ -417,7 +417,7 @@ class TargetPath:
         if not self.model.edges:
             return shadows, 0.0
         other_shadows = () if shadows is None else tuple(np.moveaxis(shadows, 1, 0))
-        edges = SeenEdges.of(beams, self.model, self.name, self.backend)
+        edges = PupilEdges.of(beams, self.model, self.name, self.backend)
         return converged_shadows(edges.outlines, len(directions), other_shadows)
 
     def local_map(self, state: State, direction: np.ndarray, extent: float) -> LocalMap:
