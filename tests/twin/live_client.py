@@ -27,7 +27,7 @@ class StandIn:
         self.opened = Opened({"instrument": "stand-in", "channels": []}, b"glb")
         self.seconds, self.bytes_each = seconds, bytes_each
         self.asked: list[tuple[str, Any]] = []
-        self.condition, self.ending, self.pid, self.started = "runs", "the process that computes ended", 4321, 0
+        self.condition, self.ending, self.pid, self.started = "runs", "the computing process ended", 4321, 0
 
     def leave(self) -> None:
         pass

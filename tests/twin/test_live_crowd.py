@@ -251,7 +251,7 @@ def test_a_request_of_another_site_is_refused(site) -> None:
     headers = {"host": "127.0.0.1:5", "cookie": f"space_camera_twin_5={SECRET}"}
     headers |= {} if site is None else {"sec-fetch-site": site}
     found = Guard.of(SECRET, "127.0.0.1", 5).refusal(headers)
-    assert found == ("" if site in (None, "none", "same-origin") else "the page comes from elsewhere")
+    assert found == ("" if site in (None, "none", "same-origin") else "the request comes from another site")
 
 
 @pytest.mark.second

@@ -64,6 +64,6 @@ def test_a_process_that_cannot_start_says_why() -> None:
         with pytest.raises(CannotStart, match="killed by SIGKILL"):
             process.start(lambda part: process.kill())
         threading.Thread(target=kill, daemon=True).start()
-        with pytest.raises(CannotStart, match="3 times when it was started again"):
+        with pytest.raises(CannotStart, match="3 times during its restart"):
             asyncio.run(process.restart())
         ended.set()

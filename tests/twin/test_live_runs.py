@@ -208,7 +208,7 @@ def test_a_measurement_opens_its_instrument_as_designed(tmp_path):
     for name in (folder, folder / "config.yaml"):
         source = read_source(str(name))
         assert source.resolved == setup.model
-        assert "frames were measured" in source.notes[0]
+        assert "the measured frames are not shown" in source.notes[0]
     assert source.resolved.instrument.monitor.area_ccd.exposure == pytest.approx(0.02)
     assert source.resolved.disturbances is not None
     assert source.resolved.disturbances.name == "launch"
@@ -240,7 +240,7 @@ def test_a_run_of_uncertainty_opens_its_job(tmp_path):
 
 @pytest.mark.second
 def test_an_orbit_of_drawn_motions_is_no_course():
-    with pytest.raises(InputError, match="there is no course that could be shown"):
+    with pytest.raises(InputError, match="there is no course to show"):
         read_source(str(SCENES / "orbit" / "loop.yaml"))
 
 

@@ -387,7 +387,7 @@ class Fragile(StandIn):
     async def ask(self, kind: str, question: Any) -> Any:
         if question[0].n == 1 and self.times:
             self.times -= 1
-            raise ComputerLost("the process that computes ended (killed by SIGKILL)")
+            raise ComputerLost("the computing process ended (killed by SIGKILL)")
         return await super().ask(kind, question)
 
 

@@ -416,7 +416,8 @@ def verdict(comparison: Comparison) -> list[str]:
         inputs = f"{len(found.inputs)} input{'s' * (len(found.inputs) != 1)}" if found.inputs else "no input"
         if found.same:
             parts.append(
-                f"run {name} has the same results as {comparison.names[0]} ({inputs} changed, {found.compared} compared)"
+                f"run {name} has the same results as {comparison.names[0]} "
+                f"({inputs} changed, {found.compared} compared)"
             )
             continue
         what = [f"{len(found.numbers)} numbers"] * bool(found.numbers) + [f"{len(found.arrays)} images"] * bool(

@@ -70,8 +70,10 @@ RELATIVE_OF_SIGMAS = 1e-6
 more.
 """
 PIXEL_SHARE, GREY_LEVELS = 1e-4, 2
-"""Share of the pixels, and grey levels, by which recorded frames may differ on another processor: pixels whose expectation
-lies at the boundary between two numbers of photons."""
+"""Share of the pixels, and grey levels, by which recorded frames may differ on another processor.
+
+These pixels have an expectation at the boundary between two numbers of photons.
+"""
 PICTURE_LEVELS = 4
 """Largest difference of drawn pictures, in grey levels of 255: edges are drawn by partly covered pixels."""
 RELATIVE_OF_GEOMETRY = 1e-6

@@ -36,35 +36,40 @@ def main(
         ),
     ],
     run: Annotated[
-        int | None, typer.Option(min=0, help="Of a study: number of the run to begin with, from 0. Default: its base.")
+        int | None,
+        typer.Option(min=0, help="Number of a study's run to begin with, from 0. Default: the study's base."),
     ] = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="To listen on; 0 takes one that is free.")] = PORT,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the server; 0 takes a free one.")] = PORT,
     host: Annotated[
-        str, typer.Option(help="Address to listen on. Others than this machine can reach it if it is not 127.0.0.1.")
+        str, typer.Option(help="Address of the server. Other machines can reach it if it is not 127.0.0.1.")
     ] = "127.0.0.1",
-    stay: Annotated[bool, typer.Option("--stay", help="Go on when the last page is closed; end with Ctrl-C.")] = False,
+    stay: Annotated[
+        bool, typer.Option("--stay", help="Keep running when the last page is closed; end with Ctrl-C.")
+    ] = False,
     backend: BackendName = "llvm",
     quiet: Quiet = False,
 ) -> None:
-    """Open an instrument as a page in the browser: sliders for every body, the spots as the CCDs see them, the readings
-    of all estimators beside the truth, a strip chart, and the instrument in three dimensions.
+    """Open an instrument as a page in the browser.
 
-    Every state takes the way of the main job: what the page shows is what twin.render writes for the same knobs, seed
-    and frames; the page saves that job, and what was recorded as a course.
+    The page has sliders for every body, the spots on the CCDs, the readings of all estimators beside the truth, a strip
+    chart, and the instrument in three dimensions.
+
+    Every state is computed as by the main job: the page shows what twin.render writes for the same knobs, seed
+    and frames; the page saves that job, and recorded states as a course.
 
     Example: `python -m twin.live gf7_pair`
 
-    Of a job with a course the course can be played: `python -m twin.live scenes/examples/orbit.yaml`, or launch.yaml
+    The course of a job can be played: `python -m twin.live scenes/examples/orbit.yaml`, or launch.yaml
     and heat_soak.yaml beside it. A study's factors become knobs:
     `python -m twin.live scenes/examples/study_aperture.yaml`.
 
-    Run folders are opened, too, by name or by their config.yaml: of twin.render in the state that it shows, with the
+    Run folders can be opened, too, by name or by their config.yaml: those of twin.render in their state, with the
     same frames and readings; of a study with its factors, and with --run in the state of one of its runs; of
     twin.uncertainty, and of twin.recover with the instrument as designed; of twin.orbit monitor as a course. Of any
     other it says what it holds and what can be opened in its place.
 
-    The command prints an address; open it in a browser on this machine. The address holds a token: whoever has it can
-    turn the knobs. The environment variable TWIN_LIVE_TOKEN sets a token that stays when the command is started again.
+    The command prints an address; open it in a browser on this machine. The address contains a token: anybody who
+    has it can adjust the knobs. The environment variable TWIN_LIVE_TOKEN sets a token that stays valid after a restart.
     The command ends ten seconds after the last page is closed, or with Ctrl-C.
 
     It needs what the extra `live` installs: bash setup.sh --live

@@ -40,10 +40,10 @@ POLICY_VIOLATION, TRY_AGAIN = 1008, 1013
 """Codes with which a WebSocket is closed."""
 
 
-RESTARTED_TEXT = "{}; it is started again, and the knobs stay"
+RESTARTED_TEXT = "{}; it is being restarted, and the knobs are kept"
 STOPPED_TEXT = (
-    "the process that computes ({pid}) was stopped by a signal; `kill -CONT {pid}` lets it go on, after "
-    "{seconds:.0f} s it is started again; the knobs stay"
+    "the computing process ({pid}) was stopped by a signal; `kill -CONT {pid}` resumes it, otherwise it is "
+    "restarted after {seconds:.0f} s; the knobs are kept"
 )
 """Messages to the pages about the computing process."""
 
@@ -165,7 +165,7 @@ class Client:
         except messages.BadMessage as error:
             self.bad += 1
             if self.bad > BAD_MESSAGES:
-                raise Disconnected(POLICY_VIOLATION, "too many messages that are none") from None
+                raise Disconnected(POLICY_VIOLATION, "too many invalid messages") from None
             self.queue_json({"type": "refused", "problem": str(error)})
             return
         self._handle(message, now)
@@ -251,7 +251,7 @@ class Client:
                         picture, self._picture = self._picture, None
                         await as_text(picture)
             except TimeoutError:
-                raise Disconnected(TRY_AGAIN, "the line is too slow") from None
+                raise Disconnected(TRY_AGAIN, "the connection is too slow") from None
 
 
 def _hiding(state: messages.AskedState, seed: int) -> messages.BlindState:
@@ -375,7 +375,7 @@ class LiveApi:
         self._announce("ended", RESTARTED_TEXT.format(problem))
         if request.asked is self._suspect_message:
             client.queue_json(
-                {"type": "refused", "problem": f"{problem} twice over the same {request.kind}, which is left out"}
+                {"type": "refused", "problem": f"{problem} twice during the same {request.kind}, which is skipped"}
             )
         else:
             self._suspect_message = request.asked

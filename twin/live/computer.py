@@ -259,7 +259,7 @@ class Computer:
                 return
             except ComputerLost as error:
                 if attempt == ATTEMPTS or self._shutting_down:
-                    raise CannotStart(f"{error}, {attempt} times when it was started again") from error
+                    raise CannotStart(f"{error}, {attempt} times during its restart") from error
 
     async def restart(self) -> None:
         """Replace a process that ended by a new one.
@@ -320,9 +320,9 @@ class Computer:
         """Description of how the process ended."""
         code = None if self._process is None else self._process.exitcode
         if code is None:
-            return "the process that computes ended"
+            return "the computing process ended"
         how = f"exit code {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
-        return f"the process that computes ended ({how})"
+        return f"the computing process ended ({how})"
 
     @property
     def pid(self) -> int | None:

@@ -140,12 +140,12 @@ class Guard:
         plain = local_address.removeprefix("::ffff:")
         own = _host_text(f"[{plain}]" if ":" in plain else plain, self.port)
         if host not in self.hosts and not (plain and host == own):
-            return "this server has another name"
+            return "the Host header does not name this server"
         origin = headers.get("origin")
         if origin is not None and origin.lower() != f"http://{host}":
-            return "the page comes from elsewhere"
+            return "the request comes from another site"
         if headers.get("sec-fetch-site", "none") not in ("same-origin", "none"):
-            return "the page comes from elsewhere"
+            return "the request comes from another site"
         return ""
 
     def refusal(self, headers: Mapping[str, str], socket: bool = False, local_address: str = "") -> str:
@@ -162,7 +162,7 @@ class Guard:
         """
         why = self.host_refusal(headers, local_address)
         if not why and socket and "origin" not in headers:
-            why = "no origin"
+            why = "the Origin header is missing"
         if not why and not self.has_token_cookie(headers):
             why = "open the address that the command printed"
         return why
@@ -343,8 +343,7 @@ class PageSocket(WebSocketsSansIOProtocol):
     """WebSocket of a page."""
 
     def send_receive_event_to_app(self) -> None:
-        """Pass on a complete message; close the connection if its text is not UTF-8, without an error on the terminal.
-        """
+        """Pass on a complete message; silently close the connection if its text is not UTF-8."""
         if self.curr_msg_data_type == "text" and not self.close_sent:
             try:
                 b"".join(self.frames).decode()

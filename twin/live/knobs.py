@@ -1,7 +1,8 @@
-"""Knobs of the live twin: what of an instrument can be turned, a study's factors, and what their values perturb.
+"""Knobs of the live twin: adjustable motions of an instrument, a study's factors, and the resulting perturbations.
 
-A knob is called as a script or a course's table calls the motion: ``base/forward/M2 shift z``. Its value is a number in
-the knob's unit, and what it does is what a job's file does that writes this number with this unit, to the last bit.
+A knob has the name of its motion in scripts and in a course's tables: ``base/forward/M2 shift z``. Its value is a
+number in the knob's unit; it has exactly the effect of a job's file that contains this number with this unit, to the
+last bit.
 """
 
 from __future__ import annotations
@@ -22,24 +23,26 @@ from twin.study.runs.setup import StudySetup
 
 AXES = ("x", "y", "z")
 FIGURE_TERMS = tuple(f"Z{j}" for j in range(4, 16))
-"""Noll's terms of a figure that have knobs: defocus to secondary spherical aberration's neighbours. Piston and tilts
-are rigid motions."""
+"""Noll's terms of a figure that have knobs: from defocus to the neighbours of secondary spherical aberration.
+
+Piston and tilts are rigid motions.
+"""
 
 
 @dataclass(frozen=True)
 class _KnobKind:
-    """What all knobs of one kind have in common.
+    """Common properties of all knobs of one kind.
 
     Attributes
     ----------
     key : str
-        Of the perturbation in a job's file.
+        Key of the perturbation in a job's file.
     unit : str
-        Of the values.
+        Unit of the values.
     extent : float
-        Largest value of the slider at first, either way.
+        Initial half range of the slider.
     limit : float
-        Largest value that may be typed.
+        Largest absolute value that may be typed.
     """
 
     key: str
@@ -56,31 +59,31 @@ KINDS: Mapping[str, _KnobKind] = {
     "temperature": _KnobKind("temperature", "K", 1.0, 1000.0),
     "gradient": _KnobKind("temperature", "mK/m", 50.0, 1_000_000.0),
 }
-"""By name. Limits are those of a job's file."""
+"""Name of a kind -> its properties. Limits are those of a job's file."""
 
 
 @dataclass(frozen=True)
 class Knob:
-    """One number that can be turned.
+    """One adjustable number.
 
     Attributes
     ----------
     name : str
-        ``base/forward/M2 shift z``.
+        Name, such as ``base/forward/M2 shift z``.
     node : str
-        The body.
+        Path of the body.
     kind : str
-        One of ``KINDS``.
+        Key in ``KINDS``.
     axis : str
-        ``x``, ``Z5``; empty where there is one only.
+        Axis or term, such as ``x`` or ``Z5``; empty if there is only one.
     unit : str
-        Of the values.
+        Unit of the values.
     value : float
-        At the start.
+        Initial value.
     extent : float
-        The slider's ends at the start, either way.
+        Initial half range of the slider.
     limit : float
-        Largest value that may be typed.
+        Largest absolute value that may be typed.
     """
 
     name: str
@@ -94,26 +97,26 @@ class Knob:
 
 
 def axes_of(kind: str) -> tuple[str, ...]:
-    """What knobs of a kind are called after it."""
+    """Return the axes or terms of the knobs of a kind."""
     if kind in ("rotate", "shift", "gradient"):
         return AXES
     return FIGURE_TERMS if kind == "figure" else ("",)
 
 
 def knob_name(node: str, kind: str, axis: str) -> str:
-    """``base/forward/M2 shift z``, ``base/forward temperature``."""
+    """Return the name of a knob, such as ``base/forward/M2 shift z`` or ``base/forward temperature``."""
     return f"{node} {kind} {axis}" if axis else f"{node} {kind}"
 
 
 def knobs_of(nodes: Mapping[str, NodeInfo], job: JobSpec) -> dict[str, Knob]:
-    """All knobs of an instrument by their names, set as a job perturbs it.
+    """Return all knobs of an instrument by name, with the values of a job.
 
     Parameters
     ----------
     nodes : Mapping[str, NodeInfo]
-        Path -> what may be done to it.
+        Path of a body -> its possible perturbations.
     job : JobSpec
-        Whose ``perturb`` is where the knobs begin.
+        Job whose ``perturb`` gives the initial values.
     """
     out = {}
     plain = job.plain().get("perturb", {})
@@ -133,7 +136,7 @@ def knobs_of(nodes: Mapping[str, NodeInfo], job: JobSpec) -> dict[str, Knob]:
 
 
 def _job_quantities(what: Mapping[str, Any], kind: str) -> dict[str, Any]:
-    """Axis -> quantity as the job's plain data have it."""
+    """Return axis -> quantity of a kind in the job's plain data."""
     value = what.get(KINDS[kind].key)
     if value is None:
         return {}
@@ -149,7 +152,7 @@ def _job_quantities(what: Mapping[str, Any], kind: str) -> dict[str, Any]:
 
 
 def _unit(quantities: Iterable[Any], usual: str) -> str:
-    """The unit of quantities when all that are not zero have the same one, so that their numbers stay as written."""
+    """Return the common unit of all non-zero quantities, so that numbers stay as written; else the usual one."""
     parts = [split_quantity(q) for q in quantities]
     units = {part[1] for part in parts if part is not None and part[0] != 0}
     return units.pop() if len(units) == 1 else usual
@@ -158,23 +161,23 @@ def _unit(quantities: Iterable[Any], usual: str) -> str:
 def perturbation(
     values: Mapping[str, float], pivots: Mapping[str, str], knobs: Mapping[str, Knob], first: Mapping[str, Any]
 ) -> dict[str, dict[str, Any]]:
-    """What knobs come to: ``perturb`` of a job's file, for every body that any of them moves or that the job moves.
+    """Return ``perturb`` of a job's file for values of knobs, for every body that a knob or the job moves.
 
     Parameters
     ----------
     values : Mapping[str, float]
-        Name of a knob -> its value; others stand at zero.
+        Name of a knob -> its value; the others are zero.
     pivots : Mapping[str, str]
-        Body -> name of the point about which it turns and grows; others keep the job's.
+        Body -> name of its pivot; the others keep the job's.
     knobs : Mapping[str, Knob]
-        All of the instrument's.
+        All knobs of the instrument.
     first : Mapping[str, Any]
-        ``perturb`` of the job in which the knobs begin, whose deformations by tables of nodes stay.
+        ``perturb`` of the initial job, whose deformations by tables of nodes are kept.
 
     Raises
     ------
     InputError
-        No such knob, or a value beyond its limit.
+        A knob does not exist, or a value exceeds its limit.
     """
     out: dict[str, dict[str, Any]] = {node: _without_knobs(what) for node, what in first.items()}
     by_axis: dict[tuple[str, str], dict[str, float]] = {}
@@ -200,8 +203,9 @@ def perturbation(
 
 
 def _without_knobs(what: Mapping[str, Any]) -> dict[str, Any]:
-    """What has no knob: tables of nodes and of temperatures, that a body has a temperature of its own, radii, conic
-    constants and indices.
+    """Return the parts of a perturbation that have no knob.
+
+    They are tables of nodes and of temperatures, a body's own temperature, radii, conic constants and indices.
     """
     turned = {kind.key for kind in KINDS.values()}
     out = {key: value for key, value in what.items() if key not in (*turned, "pivot")}
@@ -212,6 +216,8 @@ def _without_knobs(what: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _set_quantities(what: dict[str, Any], kind: str, numbers: Mapping[str, float], unit: str) -> None:
+    """Set the quantities of one kind in a perturbation."""
+
     def quantity(axis: str) -> str:
         return f"{numbers.get(axis, 0.0)!r} {unit}"
 
@@ -229,23 +235,23 @@ def _set_quantities(what: dict[str, Any], kind: str, numbers: Mapping[str, float
 
 @dataclass(frozen=True)
 class FactorKnob:
-    """A study's factor that is a number.
+    """Numeric factor of a study.
 
     Attributes
     ----------
     name : str
-        As the study calls it.
+        Name of the factor in the study.
     unit : str
-        Of the numbers; empty for pure numbers.
+        Unit of the numbers; empty for pure numbers.
     low, high : float
-        The study's smallest and largest value.
+        Smallest and largest value of the study.
     value : float
-        Where it begins: in the study's base, for a ratio 1, or in the run that was opened.
+        Initial value: of the study's base (1 for a ratio), or of the opened run.
     whole : bool
-        Whether it counts.
+        Whether the values are whole numbers.
     knobs : Mapping[str, float]
-        Knob of a body -> how many of its units one of the factor's is; empty for what changes the instrument itself,
-        which is then built anew.
+        Knob of a body -> number of its units in one unit of the factor; empty for a factor that changes the instrument
+        itself, which is then built again.
     """
 
     name: str
@@ -257,36 +263,36 @@ class FactorKnob:
     knobs: Mapping[str, float]
 
     def scalar(self, value: float) -> Any:
-        """A value as a study's file writes it."""
+        """Return a value as a study's file writes it."""
         number = int(value) if self.whole and value == int(value) else value
         return with_unit(number, self.unit) if self.unit else number
 
     def starting_at(self, scalar: Any) -> FactorKnob:
-        """Begin the factor at a value of a run, which a distribution may have drawn from beyond the range."""
+        """Return the factor with the value of a run, which a distribution may have drawn from beyond the range."""
         value = _number(scalar, self.unit, self.value)
         return replace(self, value=value, low=min(self.low, value), high=max(self.high, value))
 
 
 def factor_knobs(setup: StudySetup) -> tuple[FactorKnob, ...]:
-    """Knobs of those of a study's factors that are numbers."""
+    """Return the knobs of the numeric factors of a study."""
     turned = (_factor(name, factor, setup) for name, factor in setup.study.factors.items())
     return tuple(factor for factor in turned if factor is not None)
 
 
 def base_with_factors(setup: StudySetup, scalars: Mapping[str, Any]) -> Tree:
-    """The study's base where factors have these values, and all that follows them does.
+    """Return the study's base with given values of factors, and everything that follows from them.
 
     Parameters
     ----------
     setup : StudySetup
         The study.
     scalars : Mapping[str, Any]
-        Factor -> value as a study's file writes it; the others leave the base as it is.
+        Factor -> value as a study's file writes it; the others leave the base unchanged.
 
     Raises
     ------
     InputError
-        a value that cannot be.
+        A value is not possible.
     """
     factors = {name: _fixed(setup.study.factors[name], scalar) for name, scalar in scalars.items()}
     one = setup.study.model_copy(update={"factors": factors, "design": DesignSpec(kind="grid")})
@@ -294,13 +300,13 @@ def base_with_factors(setup: StudySetup, scalars: Mapping[str, Any]) -> Tree:
 
 
 def _fixed(factor: FactorSpec, scalar: Any) -> FactorSpec:
-    """The factor with this value alone."""
+    """Return the factor with this value alone."""
     kept = {"key": factor.key, "keys": factor.keys, "scales": factor.scales}
     return FactorSpec.model_validate({**{k: v for k, v in kept.items() if v}, "values": (scalar,)})
 
 
 def _factor(name: str, factor: FactorSpec, setup: StudySetup) -> FactorKnob | None:
-    """The knob of a factor; None where it is no number."""
+    """Return the knob of a factor; None if it is not numeric."""
     numbers = factor.numbers()
     if not numbers.numeric or not len(numbers):
         return None
@@ -320,7 +326,7 @@ def _factor(name: str, factor: FactorSpec, setup: StudySetup) -> FactorKnob | No
 
 
 def _number(value: Any, unit: str, otherwise: float) -> float:
-    """A quantity in a unit."""
+    """Return a quantity as a number in a unit."""
     if isinstance(value, int | float):
         return float(value)
     part = split_quantity(value)
@@ -332,7 +338,7 @@ def _number(value: Any, unit: str, otherwise: float) -> float:
 
 
 def _knobs(places: tuple[KeyPath, ...], unit: str) -> dict[str, float]:
-    """Knobs that stand for the places of a factor; none where any is something else."""
+    """Return the knobs of a factor's keys; none if any key is not a knob."""
     out = {}
     for place in places:
         found = _knob(place)
@@ -344,7 +350,7 @@ def _knobs(places: tuple[KeyPath, ...], unit: str) -> dict[str, float]:
 
 
 def _knob(place: KeyPath) -> tuple[str, str] | None:
-    """Name and unit of the knob that a place in a resolved job is."""
+    """Return name and unit of the knob that corresponds to a key of a resolved job."""
     match place:
         case ("job", "perturb", str(node), ("rotate" | "shift") as kind, int(axis)):
             return knob_name(node, kind, AXES[axis]), KINDS[kind].unit

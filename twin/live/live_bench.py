@@ -1,8 +1,8 @@
-"""What the live twin computes: an instrument that is kept built and calibrated, one state after the other.
+"""Computation of the live twin: a built and calibrated instrument, evaluated state by state.
 
-A state takes the way of the main job (`twin.main_job.render_job`) with the same seed and the same random streams, so
-that what the page shows is what `python -m twin.render` would write for the knobs' job. What was done at
-the knobs becomes files that `python -m twin.render` repeats.
+A state is computed as in the main job (`twin.main_job.render_job`), with the same seed and random streams, so that the
+page shows what `python -m twin.render` would write for the job of the knobs. States can be saved as files that `python
+-m twin.render` repeats.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ from twin.sensors.area_detector import coarse_warnings
 from twin.study.runs.base_job import PHYSICS
 
 BLIND = 7
-"""Random stream of what is hidden, beside those of the monitor and of targets."""
+"""Random stream of the hidden motions, beside those of the monitor and of targets."""
 IMPOSSIBLE = (*PHYSICS, ArithmeticError, ValueError)
-"""What says that a state cannot be."""
+"""Exceptions that mean that a state is physically impossible."""
 
 
 IMAGES: Mapping[str, tuple[list[str], str]] = {
@@ -55,16 +55,16 @@ IMAGES: Mapping[str, tuple[list[str], str]] = {
     "MTF at Nyquist along the line": (["mtf_along_line", "centre"], ""),
     "MTF at Nyquist along the track": (["mtf_along_track", "centre"], ""),
 }
-"""What the page tells of the images of a camera without a monitor -> where quality.json has it, and its unit."""
+"""Quantity of image quality on the page, for a camera without a monitor -> its path in quality.json, and its unit."""
 
 
 class LiveBench:
-    """An instrument on which knobs are turned. It keeps what was worked out, and no state of the knobs.
+    """Instrument whose knobs are adjusted. It caches everything that does not depend on the knobs.
 
     Parameters
     ----------
     twin
-        The instrument, perturbed as the knobs stand at first.
+        The instrument with its initial perturbation.
     """
 
     def __init__(self, twin: InstrumentTwin) -> None:
@@ -79,12 +79,12 @@ class LiveBench:
 
     @cached_property
     def knobs(self) -> dict[str, Knob]:
-        """All knobs by their names."""
+        """All knobs by name."""
         return knobs_of(self.twin.experiment.instrument.nodes, self.twin.resolved.job)
 
     @cached_property
     def clearances(self) -> Clearances:
-        """Which bodies may come into each other."""
+        """Pairs of bodies that may collide."""
         return Clearances.of(self.twin.experiment.instrument)
 
     @cached_property
@@ -94,7 +94,7 @@ class LiveBench:
 
     @cached_property
     def initial_state(self) -> AskedState:
-        """The state in which the knobs begin."""
+        """Initial state of the knobs."""
         job = self.twin.resolved.job
         return AskedState(
             n=0,
@@ -107,16 +107,16 @@ class LiveBench:
 
     @property
     def monitored(self) -> bool:
-        """Whether there are spots to be shown; without a monitor the page shows the trace and the cameras' images."""
+        """Whether the instrument has a monitor; without one the page shows the trace and the cameras' image quality."""
         return self.twin.experiment.monitored
 
     def warm(self, advance: Callable[[str], None] = lambda part: None) -> None:
-        """Work out everything that does not depend on the knobs, and compile every kernel.
+        """Compute everything that does not depend on the knobs, and compile every kernel.
 
         Parameters
         ----------
         advance : Callable[[str], None]
-            Told of each part when it begins.
+            Called with each part when it begins.
         """
         experiment = self.twin.experiment
         advance("trace the unperturbed instrument")
@@ -136,7 +136,7 @@ class LiveBench:
         self.state(self.initial_state)
 
     def greeting(self) -> dict[str, Any]:
-        """What a page has to know before it asks for a state."""
+        """Return the data that a page needs before its first request."""
         twin, experiment = self.twin, self.twin.experiment
         job = twin.resolved.job
         nodes = {
@@ -180,26 +180,27 @@ class LiveBench:
 
     @property
     def _parameters(self) -> Sequence[parameters.Parameter]:
+        """Parameters of a camera shown on the page."""
         return tuple(parameters.CAMERA_PARAMETERS.values()) if self.monitored else parameters.ESTIMATED
 
     @cached_property
     def _designed(self) -> dict[str, Any]:
-        """Image quality as designed."""
+        """Image quality of the nominal instrument."""
         return self._quality({})
 
     def _quality(self, state: State) -> dict[str, Any]:
-        """Contents of quality.json of a state."""
+        """Return the content of quality.json of a state."""
         job, experiment = self.twin.resolved.job, self.twin.experiment
         obstructed = job.render.obstructed
         return quality_dicts(experiment.instrument, experiment.backend, [state], obstructed)[0]
 
     def perturbed(self, asked: AskedState) -> InstrumentTwin:
-        """The instrument as the knobs stand.
+        """Return the instrument perturbed by the knobs.
 
         Raises
         ------
         InputError
-            No such knob, or a value that a job's file could not have.
+            A knob does not exist, or a job's file could not have its value.
         """
         return self._perturbed_twin(tuple(asked.knobs.items()), tuple(asked.pivots.items()))
 
@@ -215,7 +216,7 @@ class LiveBench:
         return moved
 
     def state(self, asked: AskedState) -> tuple[dict[str, Any], np.ndarray | None]:
-        """What a state of the knobs comes to.
+        """Compute a state of the knobs.
 
         Parameters
         ----------
@@ -224,9 +225,9 @@ class LiveBench:
 
         Returns
         -------
-        tuple[dict[str, Any], np.ndarray | None]
-            Plain data for the page, and the images after, uint16 (C, H, W); None where there are none. A state that
-            cannot be has ``problem`` in place of readings.
+        tuple[dict[str, Any], ndarray | None]
+            Plain data for the page, and the images after the perturbation, uint16 (C, H, W); None without images. An
+            impossible state has ``problem`` in place of readings.
         """
         began = time.perf_counter()
         message: dict[str, Any] = {"type": "state", "n": asked.n, "t": asked.t}
@@ -241,7 +242,7 @@ class LiveBench:
         return message, after
 
     def _traced(self, asked: AskedState) -> dict[str, Any]:
-        """What is told of a state of an instrument without a monitor: truth, image quality, motions."""
+        """Return the data of a state of an instrument without a monitor: truth, image quality and motions."""
         experiment, state = self.twin.experiment, self.states(asked)
         placed = experiment.instrument.assembly.place([state])
         quality = self._quality(state)
@@ -261,32 +262,34 @@ class LiveBench:
             "quality": quality,
             "motions": motions(experiment.instrument, state, placed),
             "warnings": list(run.warnings),
-            "collisions": [f"{o.first} reaches {1e3 * o.depth:.3g} mm into {o.second}" for o in overlaps],
+            "collisions": [f"{o.first} overlaps {o.second} by {1e3 * o.depth:.3g} mm" for o in overlaps],
         }
 
     def before(self, asked: AskedState) -> np.ndarray:
-        """Images before the perturbation, uint16 (C, H, W); none without a monitor."""
+        """Return the images before the perturbation, uint16 (C, H, W); empty without a monitor."""
         if not self.monitored:
             return np.zeros((0, 0, 0), np.uint16)
         frames = self._reader(asked.frames, asked.seed).before if asked.noise else None
         return self._shown(frames, self.twin.experiment.nominal_photons)
 
     def _problem_of(self, asked: AskedState, error: Exception) -> dict[str, Any]:
-        """Why there is no such state."""
+        """Return the reason why a state is impossible."""
         if isinstance(error, SpotError):
             channels = self.twin.experiment.path.channels
             reasons = [f"{channels[i % len(channels)].key}: {reason}" for i, reason in error.reasons.items()]
             return {"problem": "a spot cannot be measured", "causes": reasons}
         lines = [line.strip().removeprefix("input: ") for line in str(error).splitlines() if line.strip()]
-        return {"problem": "this state cannot be", "causes": lines[:6]}
+        return {"problem": "this state is impossible", "causes": lines[:6]}
 
     def states(self, asked: AskedState) -> State:
-        """Body -> motion of the knobs and of the course's time.
+        """Return body -> motion of the knobs and of the course's time.
 
         Raises
         ------
         InputError
-            As `perturbed`; TemperatureError: beyond what materials are known for.
+            See `perturbed`.
+        TemperatureError
+            A temperature is outside the range for which a material is known.
         """
         perturbed = self.perturbed(asked)
         job, experiment = perturbed.resolved.job, perturbed.experiment
@@ -297,7 +300,7 @@ class LiveBench:
         return experiment.thermal.state(fields, experiment.motions(job, asked.time))
 
     def _hidden(self, asked: AskedState) -> State:
-        """The motions that are drawn for a blind guess; none without."""
+        """Return the hidden motions of a blind guess; empty without any."""
         experiment = self.twin.experiment
         if not isinstance(asked, BlindState) or experiment.stated is None:
             return {}
@@ -309,12 +312,13 @@ class LiveBench:
         return () if stated is None else stated.components
 
     def _drawn(self, asked: BlindState) -> np.ndarray:
+        """Return the random amounts of the hidden motions."""
         stated = self.twin.experiment.stated
         assert stated is not None
         return stated.draw(np.random.default_rng(stream(asked.blind, BLIND)), 1)[0]
 
     def hidden(self, asked: BlindState) -> dict[str, Any]:
-        """What was drawn for a blind guess, the largest in its sigma first, and what it truly did."""
+        """Return the hidden motions of a blind guess, the most significant first, and the resulting truth."""
         state = self._hidden(asked)
         if not state:
             return {}
@@ -336,8 +340,10 @@ class LiveBench:
         }
 
     def seed_of(self, asked: int) -> int:
-        """The seed that a page means. The job's own may be larger than what a number of a page holds exactly, as that
-        of a study's run is; the page is then told its last bits, by which it is known again.
+        """Return the seed meant by a page.
+
+        The job's own seed, such as that of a study's run, may exceed the numbers that a page represents exactly. The
+        page then has its last bits, by which it is recognised.
         """
         own = self.twin.resolved.job.render.seed
         return own if asked == own & LARGEST_SEED else asked
@@ -346,7 +352,7 @@ class LiveBench:
         return StateReader(self.twin.experiment, frames, self.seed_of(seed), self.twin.resolved.job.analysis.centroid)
 
     def _shown(self, frames: np.ndarray | None, photons: np.ndarray) -> np.ndarray:
-        """What the page shows of a state, uint16 (C, H, W): the first of its frames, or the rounded expected image."""
+        """Return the image of a state on the page, uint16 (C, H, W): its first frame, or the rounded expected image."""
         if frames is not None:
             return frames[:, 0]
         experiment = self.twin.experiment
@@ -354,6 +360,7 @@ class LiveBench:
         return np.rint(np.clip(expected, 0, experiment.detector.max_dn)).astype(np.uint16)
 
     def _run(self, asked: AskedState, hidden: State) -> tuple[RenderRun, np.ndarray, PlacedBodies]:
+        """Compute a state, and return its run, its images and the placed bodies."""
         experiment = self.twin.experiment
         # the knobs are a guess of what is hidden, which stands beside it and not on top of it
         state = hidden or self.states(asked)
@@ -380,6 +387,7 @@ class LiveBench:
         return run, after, found.light.placed
 
     def _state_data(self, run: RenderRun, asked: AskedState, placed: PlacedBodies) -> dict[str, Any]:
+        """Return the data of a state of an instrument with a monitor."""
         experiment = self.twin.experiment
         instrument = experiment.instrument
         message: dict[str, Any] = {"readings": stated(run.recovered_dict())}
@@ -392,12 +400,12 @@ class LiveBench:
         message["light"] = [float(share) for share in light]
         message["warnings"] = [*self._warnings(run, light), *doubted(run), *contradiction(run)]
         message["collisions"] = [
-            f"{o.first} reaches {1e3 * o.depth:.3g} mm into {o.second}" for o in self.clearances.overlaps(placed)
+            f"{o.first} overlaps {o.second} by {1e3 * o.depth:.3g} mm" for o in self.clearances.overlaps(placed)
         ]
         return message
 
     def _guess(self, asked: AskedState) -> dict[str, Any]:
-        """What the knobs, as a guess of what is hidden, would have done: the expected image, and the spots in it."""
+        """Return the expected images and spots of the knobs as a guess of the hidden motions."""
         try:
             made = self._reader(asked.frames, asked.seed).read(self.states(asked), noise=False)
         except IMPOSSIBLE as error:
@@ -405,6 +413,7 @@ class LiveBench:
         return {"spots": made.recovery.after[0].tolist(), "image": self._shown(None, made.light.photons[0])}
 
     def _warnings(self, run: RenderRun, light: np.ndarray) -> list[str]:
+        """Return warnings of coarse sampling, saturation and lost light."""
         detector, channels = self.twin.experiment.detector, self.twin.experiment.path.channels
         out = list(coarse_warnings(self.twin.resolved))
         saturated = np.ravel(detector.saturated(run.after).pixels)
@@ -417,23 +426,26 @@ class LiveBench:
 
 
 def _elapsed_ms(began: float) -> float:
+    """Return the time since a moment, in milliseconds."""
     return 1e3 * (time.perf_counter() - began)
 
 
 def _course_data(course: CourseSpec) -> dict[str, Any]:
-    """Times of a course in seconds, as a file writes them, and the number of the one that the job shows in full."""
+    """Return the times of a course in seconds, their texts, and the index of the one that the job shows in full."""
     return {"times": list(course.times), "names": list(map(moment, course.times)), "shown": course.shown}
 
 
 def _label(parameter: Parameter) -> Mapping[str, str]:
+    """Return key, symbol, unit and meaning of a parameter."""
     return {"key": parameter.key, "symbol": parameter.symbol, "unit": parameter.unit, "meaning": parameter.meaning}
 
 
 HEAD = "# Recorded with python -m twin.live; repeat it: python -m twin.render THIS_FILE\n"
+"""First line of a saved file."""
 
 
 def _head() -> str:
-    """What a recording says of where it was made, as a comment."""
+    """Return the comment that states where a file was recorded."""
     made, by = Provenance.here(), versions()
     kernels = ", ".join(dict.fromkeys(f"{one.name} {one.version} for {one.kernels}" for one in made.blas))
     return (
@@ -446,10 +458,11 @@ GUESSED = (
     "# Saved while motions were hidden: this job holds the guess of the knobs alone, so that twin.render gives the\n"
     "# spots of the guess and not those that were shown.\n"
 )
+"""Comment of a job that was saved while motions were hidden."""
 
 
 def job_text(bench: LiveBench, asked: AskedState) -> str:
-    """A job file of one state, which needs no other file. Of a course it shows the time that was looked at.
+    """Return a self-contained job file of one state; of a course it shows the selected time.
 
     Parameters
     ----------
@@ -461,7 +474,7 @@ def job_text(bench: LiveBench, asked: AskedState) -> str:
     Raises
     ------
     InputError
-        a value that a job's file could not have.
+        A job's file could not have a value.
     """
     resolved = bench.perturbed(asked).resolved.with_render(asked.frames, bench.seed_of(asked.seed))
     plain = resolved.plain()
@@ -472,19 +485,19 @@ def job_text(bench: LiveBench, asked: AskedState) -> str:
 
 
 def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> str:
-    """A job file with a course: every recorded state at its time, to the millisecond.
+    """Return a job file with every recorded state as a course, timed to the millisecond.
 
     Parameters
     ----------
     bench : LiveBench
         The instrument.
     kept : Sequence[tuple[float, AskedState]]
-        (seconds since the recording began, state), in the order in which they were shown.
+        (seconds since the recording began, state) in the order in which they were shown.
 
     Raises
     ------
     ValueError
-        Too few states, or something changed that a course cannot change.
+        There are too few states, or something changed that a course cannot change.
     """
     steps = _limited_times(kept)
     if len(steps) < FEWEST:
@@ -493,7 +506,9 @@ def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> s
     if any(step.time is not None for _, step in steps):
         raise ValueError("a course of the job was shown; it is in the job's own file")
     if any(step.pivots != first.pivots for _, step in steps):
-        raise ValueError("a course turns each body about one pivot at all times; record again without changing pivots")
+        raise ValueError(
+            "a course rotates each body about one pivot at all times; record again without changing pivots"
+        )
     knobs = bench.knobs
     fixed, moving = _split([dict(step.knobs) for _, step in steps], knobs)
     resolved = bench.twin.resolved.with_render(first.frames, bench.seed_of(first.seed))
@@ -506,7 +521,10 @@ def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> s
 
 
 def _limited_times(kept: Sequence[tuple[float, AskedState]]) -> list[tuple[float, AskedState]]:
-    """Times that ascend in milliseconds, no more than a course may have, the first and the last among them."""
+    """Return states at ascending times in milliseconds, at most as many as a course may have.
+
+    The first and the last state are among them.
+    """
     out: list[tuple[float, AskedState]] = []
     for seconds, state in kept:
         rounded = round(seconds, 3)
@@ -523,12 +541,12 @@ def _limited_times(kept: Sequence[tuple[float, AskedState]]) -> list[tuple[float
 def _split(
     states: Sequence[Mapping[str, float]], knobs: Mapping[str, Knob]
 ) -> tuple[dict[str, float], dict[str, list[float]]]:
-    """Knobs that stand still, and those that move with their value at each time.
+    """Return the values of constant knobs, and those of moving knobs at each time.
 
     Raises
     ------
     ValueError
-        a figure moves.
+        A figure moves.
     """
     names = dict.fromkeys(name for state in states for name in state)
     moving = {}
@@ -538,7 +556,7 @@ def _split(
         if all(a == b for a, b in pairwise(values)):
             fixed[name] = values[0]
         elif knobs[name].kind == "figure":
-            raise ValueError(f"{name}: a course holds motions and temperatures, no figure; save the job instead")
+            raise ValueError(f"{name}: a course holds motions and temperatures, not figures; save the job instead")
         else:
             moving[name] = values
     if not moving:
@@ -554,7 +572,7 @@ def _split(
 def _courses(
     moving: Mapping[str, Sequence[float]], pivots: Mapping[str, str], knobs: Mapping[str, Knob], count: int
 ) -> dict[str, Any]:
-    """``temperature`` and ``motion`` of a course."""
+    """Return ``temperature`` and ``motion`` of a course."""
     out: dict[str, dict[str, dict[str, Any]]] = {}
     for name in moving:
         knob = knobs[name]

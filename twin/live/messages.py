@@ -1,8 +1,8 @@
-"""What page and program say to each other.
+"""Messages between page and program.
 
-The page sends JSON texts, each one of `Message`; nothing in them names a file. The program answers with JSON texts and,
+The page sends JSON texts, each one of `Message`; none of them names a file. The program answers with JSON texts and,
 for a state's images, with one binary message: four bytes (little endian) with the length of a JSON text, the text,
-spaces up to a multiple of eight bytes, and the images that the text lists under ``images``, uint16, little endian.
+spaces up to a multiple of eight bytes, and the images listed under ``images`` in the text, uint16, little endian.
 """
 
 from __future__ import annotations
@@ -16,44 +16,45 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 LARGEST_MESSAGE = 1 << 16
-"""Bytes of a message of the page."""
+"""Largest size of a message of the page, in bytes."""
 MOST_KNOBS = 400
-"""Knobs off zero at once."""
+"""Largest number of knobs that are not zero."""
 MOST_FRAMES = 64
+"""Largest number of frames of an exposure."""
 LARGEST_SEED = 2**53 - 1
-"""What a number in JSON holds exactly."""
+"""Largest whole number that a number in JSON represents exactly."""
 
 Text = Annotated[str, Field(max_length=200)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class _PageMessage(BaseModel):
-    """Nothing else may stand in a message."""
+    """Message of a page, without additional keys."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
 class AskedState(_PageMessage):
-    """A state of the knobs.
+    """Request of a state of the knobs.
 
     Attributes
     ----------
     n : int
-        Its number, counted by the page.
-    t : Number
-        The page's clock when it was asked for, which is sent back.
-    knobs : dict[Text, Number]
-        Name -> value, of those that are not at zero.
-    pivots : dict[Text, Text]
-        Body -> name of the point about which it turns.
+        Number of the request, counted by the page.
+    t : float
+        Time of the request by the page's clock, which is sent back.
+    knobs : dict[str, float]
+        Name -> value of every knob that is not zero.
+    pivots : dict[str, str]
+        Body -> name of its pivot.
     noise : bool
-        Frames with noise, or the expected image.
+        Frames with noise, instead of the expected image.
     frames : int
-        Of each exposure.
+        Number of frames of each exposure.
     seed : int
-        Of the noise.
+        Seed of the noise.
     time : int | None
-        Number of a time of the job's course; None for the job's single state.
+        Index of a time of the job's course; None for the job's single state.
     """
 
     type: Literal["state"] = "state"
@@ -68,32 +69,32 @@ class AskedState(_PageMessage):
 
 
 class BlindState(AskedState):
-    """A state of the knobs while something is hidden. The program makes it; it is never read from a page.
+    """Request of a state while motions are hidden. The program makes it; it is never read from a page.
 
     Attributes
     ----------
     blind : int
-        Seed of what is drawn.
+        Seed of the hidden motions.
     """
 
     blind: int
 
 
 class AskedView(_PageMessage):
-    """A picture of one camera in the last state.
+    """Request of a picture of one camera in the latest state.
 
     Attributes
     ----------
     n : int
-        Its number.
+        Number of the request.
     state : AskedState
-        Of the knobs.
-    view : Literal['wavefront', 'spot', 'mtf', 'focus', 'target']
-        Which picture.
-    camera : Text
-        Of which camera.
+        State of the knobs.
+    view : str
+        ``wavefront``, ``spot``, ``mtf``, ``focus`` or ``target``.
+    camera : str
+        Name of the camera.
     field : float
-        Along the line, as a share of the half field.
+        Field along the line, as a share of the half field.
     """
 
     type: Literal["view"] = "view"
@@ -105,11 +106,11 @@ class AskedView(_PageMessage):
 
 
 class Factors(_PageMessage):
-    """Build the instrument with other values of a study's factors; for all pages.
+    """Request to build the instrument with other values of a study's factors, for all pages.
 
     Attributes
     ----------
-    values : dict[Text, Number]
+    values : dict[str, float]
         Factor -> number in its unit.
     """
 
@@ -118,12 +119,12 @@ class Factors(_PageMessage):
 
 
 class Blind(_PageMessage):
-    """Hide motions that are drawn, or end it and show them.
+    """Request to hide random motions, or to reveal them.
 
     Attributes
     ----------
     on : bool
-        Begin, or reveal.
+        Hide (true) or reveal (false).
     """
 
     type: Literal["blind"] = "blind"
@@ -131,12 +132,12 @@ class Blind(_PageMessage):
 
 
 class Record(_PageMessage):
-    """Begin to keep every state that is shown, or end.
+    """Request to begin recording every shown state, or to end the recording.
 
     Attributes
     ----------
     on : bool
-        Begin (what was kept is forgotten), or end.
+        Begin and drop an earlier recording (true), or end (false).
     """
 
     type: Literal["record"] = "record"
@@ -144,14 +145,14 @@ class Record(_PageMessage):
 
 
 class Save(_PageMessage):
-    """A job file of a state, or a job with a course of what was recorded.
+    """Request of a job file of a state, or of a job with the recorded states as a course.
 
     Attributes
     ----------
-    what : Literal['job', 'course']
-        which.
+    what : str
+        ``job`` or ``course``.
     state : AskedState
-        Of the knobs.
+        State of the knobs.
     """
 
     type: Literal["save"] = "save"
@@ -164,16 +165,16 @@ _MESSAGE: TypeAdapter[Message] = TypeAdapter(Annotated[Message, Field(discrimina
 
 
 class BadMessage(ValueError):
-    """A message of a page that is none."""
+    """Invalid message of a page."""
 
 
 def read_message(text: str | bytes) -> Message:
-    """A message of a page.
+    """Read a message of a page.
 
     Raises
     ------
     BadMessage
-        It is none; the text says where.
+        The message is not valid; the text says where.
     """
     if len(text) > LARGEST_MESSAGE:
         raise BadMessage(f"the message has {len(text)} bytes, more than {LARGEST_MESSAGE}")
@@ -182,18 +183,18 @@ def read_message(text: str | bytes) -> Message:
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(str(part) for part in first["loc"])[:200]
-        raise BadMessage(f"not a message: {where or 'the text'}: {first['msg']}"[:400]) from None
+        raise BadMessage(f"invalid message: {where or 'the text'}: {first['msg']}"[:400]) from None
 
 
 def packed(data: Mapping[str, Any], images: Mapping[str, np.ndarray]) -> bytes:
-    """A binary message of the program.
+    """Return a binary message of the program.
 
     Parameters
     ----------
-    told : Mapping[str, Any]
+    data : Mapping[str, Any]
         Plain data.
-    images : Mapping[str, np.ndarray]
-        Name -> uint16 (C, H, W).
+    images : Mapping[str, ndarray]
+        Name -> (C, H, W) image of type uint16.
     """
     whole = {**data, "images": {name: list(image.shape) for name, image in images.items()}}
     text = json.dumps(whole, allow_nan=False, separators=(",", ":")).encode()
@@ -204,14 +205,14 @@ def packed(data: Mapping[str, Any], images: Mapping[str, np.ndarray]) -> bytes:
 
 @dataclass(frozen=True, eq=False)
 class Opened:
-    """An instrument that is ready.
+    """Instrument that is ready.
 
     Attributes
     ----------
     greeting : dict[str, Any]
-        What a page has to know.
+        Data that a page needs before its first request.
     scene : bytes
-        Binary glTF of it as designed.
+        Binary glTF of the nominal instrument.
     """
 
     greeting: dict[str, Any]

@@ -1,4 +1,4 @@
-"""The server of the live twin: its page, the scene, one WebSocket for each page, and the gate before everything."""
+"""Server of the live twin: its page, the scene, one WebSocket for each page, and the access control."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from twin.live.guard import (
 from twin.live.messages import LARGEST_MESSAGE
 
 IDLE_TIMEOUT = 10.0
-"""Seconds without any page after which the server ends, so that a page may be loaded again."""
+"""Time without any page after which the server ends, in seconds; a page may be reloaded within it."""
 TYPES = {
     "html": "text/html",
     "css": "text/css",
@@ -41,26 +41,28 @@ TYPES = {
     "svg": "image/svg+xml",
     "glb": "model/gltf-binary",
 }
+"""Suffix of a file -> its media type."""
 _TWIN = Path(__file__).parents[1]
 PARTS = {file.name: file for file in (_TWIN / "live" / "page").iterdir()} | {
     "scroll.css": _TWIN / "framework" / "scroll.css",
     "three.min.js": _TWIN / "pictures" / "viewer" / "three.min.js",
 }
-"""Everything that can be asked for by name; no path of a request is ever one of the file system."""
+"""All files that can be requested, by name; no path of a request is used as one of the file system."""
 
 
 class LiveServer:
-    """One server. It ends with Ctrl-C or when the last page is closed, and raises CannotStart if the process that
-    computes ended and cannot be started again.
+    """Server of the live twin, which ends with Ctrl-C or when the last page is closed.
+
+    It raises CannotStart if the computing process ended and cannot be restarted.
 
     Parameters
     ----------
     computer
-        started.
+        Handle of the started computing process.
     guard
-        Who may speak to it.
+        Access control.
     stay
-        Go on when the last page is closed.
+        Do not end when the last page is closed.
     """
 
     def __init__(self, computer: Computer, guard: Guard, stay: bool = False) -> None:
@@ -83,21 +85,21 @@ class LiveServer:
 
     @property
     def started(self) -> bool:
-        """Whether it answers."""
+        """Whether the server answers."""
         return self._uvicorn is not None and self._uvicorn.started
 
     def run(self, listening: socket.socket) -> None:
-        """Serve until Ctrl-C, or until it is told to stop.
+        """Serve until Ctrl-C, or until it is stopped.
 
         Parameters
         ----------
         listening : socket.socket
-            Bound and not yet accepting.
+            Bound socket that does not accept connections yet.
 
         Raises
         ------
         BaseException
-            What ended one of its tasks.
+            Exception that ended one of its tasks.
         """
         config = uvicorn.Config(
             self.app,
@@ -126,12 +128,13 @@ class LiveServer:
             raise self._failed
 
     def stop(self) -> None:
-        """End in order."""
+        """End the server in order."""
         if self._uvicorn is not None:
             self._uvicorn.should_exit = True
 
     @contextlib.asynccontextmanager
     async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
+        """Run the scheduler and the watch of the process while the application runs."""
         tasks = [asyncio.create_task(make()) for make in (self.api.serve_requests, self.api.watch_process)]
         for task in tasks:
             task.add_done_callback(self._ended)
@@ -143,7 +146,7 @@ class LiveServer:
             self.api.computer.leave()
 
     def _ended(self, task: asyncio.Task[None]) -> None:
-        """What the server is for cannot go on: nothing is left to serve."""
+        """Stop the server after an error of one of its tasks."""
         if not task.cancelled() and (error := task.exception()) is not None:
             self._failed = error
             self.stop()
@@ -155,17 +158,17 @@ class LiveServer:
 
     async def _part(self, request: Request) -> Response:
         name = request.path_params["name"]
-        return _file(name) if name in PARTS else PlainTextResponse("nothing is here\n", 404)
+        return _file(name) if name in PARTS else PlainTextResponse("not found\n", 404)
 
     async def _session(self, request: Request) -> Response:
-        """Whether a page that lost its line may come back."""
+        """Answer a page that lost its connection and wants to return."""
         return JSONResponse({"instrument": self.api.computer.opened.greeting["instrument"], "states": self.api.states})
 
     async def _scene(self, request: Request) -> Response:
         return Response(self.api.computer.opened.scene, media_type=TYPES["glb"])
 
     async def _live(self, ws: WebSocket) -> None:
-        """One page, from its coming to its going."""
+        """Serve one page from its connection to its end."""
         try:
             client = self.api.connect()
         except Disconnected as bye:
@@ -197,6 +200,7 @@ class LiveServer:
                 self._last = asyncio.get_running_loop().call_later(IDLE_TIMEOUT, self.stop)
 
     async def _read(self, ws: WebSocket, client: Client) -> None:
+        """Receive the messages of a page."""
         while True:
             message = await ws.receive()
             if message["type"] == "websocket.disconnect":
@@ -210,26 +214,26 @@ class LiveServer:
 
 
 def _file(name: str) -> Response:
-    """Answer with a part of the page."""
+    """Return a part of the page as an answer."""
     return Response(PARTS[name].read_bytes(), media_type=TYPES[name.rpartition(".")[2]])
 
 
 class Gate:
-    """Before everything else: refuses what the guard refuses, and gives every answer its headers.
+    """Middleware that refuses requests by the guard, and adds the headers to every answer.
 
     Parameters
     ----------
     app
-        Behind it.
+        Application behind it.
     guard
-        Who may pass.
+        Access control.
     """
 
     def __init__(self, app: ASGIApp, guard: Guard) -> None:
         self.app, self.guard = app, guard
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request, or one WebSocket that is asked for."""
+        """Handle one request, or one request of a WebSocket."""
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
@@ -247,7 +251,7 @@ class Gate:
             return
         status = 403
         if not refusal_reason and not socket_wanted and scope["method"] not in ("GET", "HEAD"):
-            status, refusal_reason = 405, "this server only shows"
+            status, refusal_reason = 405, "only GET and HEAD are allowed"
         if refusal_reason:
             answer = PlainTextResponse(f"refused: {refusal_reason}\n", status, headers={"connection": "close"})
             await answer(scope, receive, _with_headers(send))
@@ -255,12 +259,15 @@ class Gate:
         await self.app(scope, receive, send if socket_wanted else _with_headers(send))
 
     def _brings_token(self, scope: Scope) -> bool:
+        """Return whether a request for the page has the token in its address."""
         if scope["path"] != "/":
             return False
         return self.guard.is_token(Request(scope).query_params.get("token", ""))
 
 
 def _with_headers(send: Send) -> Callable[[Message], Awaitable[None]]:
+    """Return a send function that adds the headers to the start of a response."""
+
     async def wrapped(message: Message) -> None:
         if message["type"] == "http.response.start":
             added = [(key.lower().encode(), value.encode()) for key, value in HEADERS.items()]
@@ -271,12 +278,12 @@ def _with_headers(send: Send) -> Callable[[Message], Awaitable[None]]:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A socket on a host and a port; port 0 takes a free one.
+    """Return a socket bound to a host and a port; port 0 takes a free one.
 
     Raises
     ------
     OSError
-        Somebody listens there already, or there is no such host.
+        The port is in use, or the host does not exist.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     out = socket.socket(family, socket.SOCK_STREAM)
@@ -292,16 +299,16 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def addresses(host: str, port: int, words: str) -> list[str]:
-    """Lines that a command prints: where its page is, from this machine and, if it listens everywhere, from others.
+    """Return the printed lines with the page's address on this machine and, if reachable, from other machines.
 
     Parameters
     ----------
     host : str
-        That was asked for.
+        Requested host.
     port : int
-        On which it listens.
+        Port of the server.
     words : str
-        After the question mark of the address.
+        Query of the address, after the question mark.
     """
     everywhere = host in EVERYWHERE
     shown = "127.0.0.1" if everywhere else f"[{host}]" if ":" in host else host

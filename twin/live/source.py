@@ -1,5 +1,7 @@
-"""What the live twin is opened with: an instrument, a job, a measurement, a study whose factors become knobs, or a run
-folder of any command whose instrument can be shown.
+"""Sources that the live twin can open.
+
+They are an instrument, a job, a measurement, a study whose factors become knobs, or a run folder of any command whose
+instrument can be shown.
 """
 
 from __future__ import annotations
@@ -33,33 +35,33 @@ ALLOWED = (
     "an instrument, a camera, a job or a measurement of one, a study of jobs, or a run folder of twin.render, "
     "twin.recover, twin.uncertainty, twin.orbit monitor or such a study"
 )
-"""What may be given."""
+"""Description of the sources that can be opened."""
 MOST_NAMED = 3
-"""Run folders that are named where a folder of them was given."""
+"""Largest number of run folders named in an error about a folder of run folders."""
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """What was opened.
+    """Opened source.
 
     Attributes
     ----------
     resolved : ResolvedJob
         The job.
     name : str
-        Of the file or run folder, with the number of a study's run; empty for an instrument of the library.
+        Name of the file or run folder, with the number of a study's run; empty for an instrument of the library.
     about : str
-        What it is, in a few words.
+        Short description.
     notes : tuple[str, ...]
-        In what the page differs from what was opened, sentences.
+        Sentences on differences between the page and the source.
     study : StudySetup | None
-        Whose base, or run, it is; None for others.
+        Study whose base, or run, it is; None for other sources.
     factors : tuple[FactorKnob, ...]
-        Those of the study that are numbers.
+        Numeric factors of the study.
     scalars : Mapping[str, Any] | None
-        Factor -> its value in the run of the study that was opened; None for its base.
-    own_noise : bool
-        That run has a seed of its own, which is the job's then.
+        Factor -> its value in the opened run; None for the base.
+    has_own_seed : bool
+        Whether the opened run has a seed of its own, which is then the job's.
     """
 
     resolved: ResolvedJob
@@ -72,17 +74,17 @@ class Source:
     has_own_seed: bool = False
 
     def with_factors(self, values: Mapping[str, float]) -> ResolvedJob:
-        """The job with other values of factors, as a run of the study has it, values that follow them included.
+        """Return the job with other values of factors, as a run of the study has it, including dependent values.
 
         Parameters
         ----------
         values : Mapping[str, float]
-            Factor -> number in its unit; others keep those of the base, or of the run that was opened.
+            Factor -> number in its unit; the others keep those of the base, or of the opened run.
 
         Raises
         ------
         InputError
-            No such factor, or a value that cannot be.
+            A factor does not exist, or a value is not possible.
         """
         if self.study is None or not values:
             return self.resolved
@@ -96,7 +98,7 @@ class Source:
 
 
 def read_source(what: str, run: int | None = None) -> Source:
-    """Read what the live twin is opened with.
+    """Read a source of the live twin.
 
     Parameters
     ----------
@@ -109,7 +111,7 @@ def read_source(what: str, run: int | None = None) -> Source:
     Raises
     ------
     InputError
-        It cannot be read, is not valid, or is nothing that can be opened.
+        The source cannot be read, is not valid, or cannot be opened.
     """
     if what in (*library_names(INSTRUMENTS), *library_names(CAMERAS)):
         _require_no_run(what, run)
@@ -123,7 +125,7 @@ def read_source(what: str, run: int | None = None) -> Source:
 
 
 def _of_folder(folder: Path, run: int | None) -> Source:
-    """From a run folder."""
+    """Return the source of a run folder."""
     config, manifest = folder / CONFIG, read_manifest(folder)
     if not config.is_file():
         raise InputError(_no_config(folder, manifest))
@@ -131,11 +133,12 @@ def _of_folder(folder: Path, run: int | None) -> Source:
     notes = list(source.notes)
     listed = None if manifest is None else manifest.sha256.get(CONFIG)
     if listed is not None and listed != digest(config):
-        notes.append(f"{config} was changed after the run: the page shows what it says now, and not what the run did")
+        notes.append(f"{config} was changed after the run: the page shows its present content, not that of the run")
     return replace(source, about=f"{folder.name}: {source.about}", notes=tuple(notes))
 
 
 def _no_config(folder: Path, manifest: Manifest | None) -> Issue:
+    """Return the error about a folder without a config.yaml."""
     if manifest is not None:
         return _nothing_to_show(folder, f"a run folder of {manifest.program}", folder)
     try:
@@ -148,16 +151,16 @@ def _no_config(folder: Path, manifest: Manifest | None) -> Issue:
 
 
 def _of_file(file: Path, run: int | None, manifest: Manifest | None = None) -> Source:
-    """From a file; a run's config.yaml is told by what it holds.
+    """Return the source of a file; the kind of a run's config.yaml is recognised by its content.
 
     Parameters
     ----------
     file : Path
-        To be read.
+        File to read.
     run : int | None
-        Of a study.
+        Number of a study's run.
     manifest : Manifest | None
-        Of the run folder that the file is the config.yaml of; None for any other file.
+        Manifest of the run folder whose config.yaml the file is; None for any other file.
     """
     data = read_yaml(file).data
     kind = kind_of(data)
@@ -180,19 +183,20 @@ def _of_file(file: Path, run: int | None, manifest: Manifest | None = None) -> S
 
 
 def _require_no_run(what: str, run: int | None) -> None:
+    """Raise InputError if a run is chosen of a source that is not a study."""
     if run is not None:
-        raise InputError(Issue("--run chooses a run of a study, and this is none", what, found=f"--run {run}"))
+        raise InputError(Issue("--run chooses a run of a study, but this is not a study", what, found=f"--run {run}"))
 
 
 def _run_of(kind: FileKind | None, manifest: Manifest) -> str:
-    """Whose run folder it is, in words."""
+    """Return the kind of a run folder in words."""
     if kind is not None and kind.command.startswith(manifest.program):
         return f"the run folder of {kind.what} ({kind.command})"
     return f"a run folder of {manifest.program}"
 
 
 def _nothing_to_show(place: Path, what: str, folder: Path, data: Any = None) -> Issue:
-    """Why a run folder cannot be opened, and what can be done."""
+    """Return why a run folder cannot be opened, with remedies."""
     remedies = []
     if (folder / REPORT).is_file():
         remedies.append(f"its results are in {folder / REPORT}")
@@ -203,11 +207,12 @@ def _nothing_to_show(place: Path, what: str, folder: Path, data: Any = None) -> 
         remedies.append(f"python -m {PROGRAM} {found[0]} opens an instrument that it made")
     elif name in library_names(INSTRUMENTS):
         remedies.append(f"python -m {PROGRAM} {name} opens its instrument")
-    told = "; ".join(["this is " + what + ", which holds no state of a monitor that could be shown", *remedies])
+    told = "; ".join(["this is " + what + ", which contains no state of a monitor to show", *remedies])
     return Issue(told, str(place), allowed=ALLOWED)
 
 
 def _is_instrument(file: Path) -> bool:
+    """Return whether a file is an instrument."""
     try:
         kind = kind_of(read_yaml(file).data)
     except InputError:
@@ -216,37 +221,37 @@ def _is_instrument(file: Path) -> bool:
 
 
 def _of_measurement(file: Path) -> Source:
-    """The instrument of measured frames, to which nothing happens: what happened is what was asked."""
+    """Return the unperturbed instrument of measured frames; the perturbation is what was to be measured."""
     model = MeasurementSetup.read(file).model
     if model is None:
-        text = (
-            "this measurement was read by the geometry of the cameras alone, without an instrument that could be shown"
-        )
+        text = "this measurement uses the geometry of the cameras alone, without an instrument to show"
         raise InputError(Issue(text, str(file), allowed=ALLOWED))
     note = (
-        "frames were measured; the page renders those of the instrument as designed, and the knobs are a guess of what "
-        "moved"
+        "the measured frames are not shown: the page renders the nominal instrument, and the knobs are a guess of "
+        "the motions"
     )
     return Source(model, about="a measurement", notes=(note,))
 
 
 def _of_orbit(file: Path) -> Source:
-    """A monitored orbit as a course, its motions in steps among it."""
+    """Return a monitored orbit as a course that includes its stepwise motions."""
     setup = MonitorSetup.read(file)
     if setup.test.course is None:
-        problem = "the motions of this orbit are drawn, and there is no course that could be shown"
+        problem = "the motions of this orbit are random, so that it has no course to show"
         raise setup.test.error(problem, ("mechanisms", "readings"), allowed="a course")
-    note = "changes are told against the instrument as designed, and not against the reference time of the orbit's test"
+    note = "changes are relative to the nominal instrument, not to the reference time of the orbit's test"
     return Source(_with_motions(setup), about="a monitored orbit", notes=(note,))
 
 
 def _with_motions(setup: MonitorSetup) -> ResolvedJob:
-    """The job of a monitored orbit with the mounts' motions at each of its times, which its file gives as functions.
+    """Return the job of a monitored orbit with the mounts' motions at each of its times.
+
+    In its file these motions are functions of time.
 
     Raises
     ------
     InputError
-        a body turns about another pivot than under ``perturb``.
+        A body has another pivot than under ``perturb``.
     """
     resolved, test = setup.resolved, setup.test
     if not test.motion:
@@ -265,13 +270,11 @@ def _with_motions(setup: MonitorSetup) -> ResolvedJob:
 
 
 def _of_study(file: Path, run: int | None) -> Source:
+    """Return the base of a study, or one of its runs."""
     setup = resolve_study(file)
     if setup.study.base.command != "render":
         found, allowed = setup.study.base.command, "a study of base: {command: render}"
-        raise setup.error(
-            Problem("this study varies no job of a monitor, whose states could be shown", found, allowed),
-            ("base", "command"),
-        )
+        raise setup.error(Problem("this study does not vary a job of a monitor", found, allowed), ("base", "command"))
     factors, name = factor_knobs(setup), setup.study.name
     if run is None:
         resolved: ResolvedJob = validate(ResolvedJob, YamlFile("", setup.base, {}))
@@ -294,8 +297,8 @@ def _of_study(file: Path, run: int | None) -> Source:
 
 
 def _limited_to_page(source: Source) -> Source:
-    """The source, and what a page changes of it told."""
+    """Return the source with a note on the limits of the page."""
     frames = source.resolved.frames
     if frames <= MOST_FRAMES:
         return source
-    return replace(source, notes=(*source.notes, f"the page takes {MOST_FRAMES} frames in place of {frames}"))
+    return replace(source, notes=(*source.notes, f"the page uses {MOST_FRAMES} frames instead of {frames}"))

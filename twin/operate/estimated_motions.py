@@ -20,7 +20,7 @@ from analysis.monitor.disturbances import Disturbances
 from optics.geometry.tree import Body, Motion
 from optics.numerics.number_tree import FrozenMap
 from optics.thermal.heat import Temperature
-from scenes.models.disturbances import HEAT, Component, joint_disturbances, joint_files, state_of, default_pivot
+from scenes.models.disturbances import HEAT, Component, default_pivot, joint_disturbances, joint_files, state_of
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.disturbances import MOST_JOINT

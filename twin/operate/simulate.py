@@ -134,7 +134,7 @@ def drawn_life(
 
     Parameters
     ----------
-    stated : StatedMotions
+    stated : DisturbancePrior
         The motions and their time laws.
     times : (T,) ndarray of int64
         Microseconds of TAI since 2000, ascending.

@@ -24,7 +24,7 @@ class Row {
     this.number = field();
     stepped(this.number, () => this.step, (value) => tidy(value, this.step));
     this.number.setAttribute('aria-label', `${label} in ${unit || 'units'}, as a number`);
-    const reset = element('button', { textContent: '↺', title: 'back to where it began' });
+    const reset = element('button', { textContent: '↺', title: 'reset to the initial value' });
     const more = element('button', { textContent: '…', title: 'range and step' });
     [this.low, this.high, this.steps] = [field(), field(), field()];
     this.ends = element('div', { className: 'ends', hidden: true },

@@ -209,7 +209,7 @@ class Live {
     this.trouble = problem;
     if (problem) {
       this.note(problem);
-      this.status(state === 'stopped' ? 'computing is stopped' : 'computing is started again', true);
+      this.status(state === 'stopped' ? 'computation is stopped' : 'computation is being restarted', true);
       return;
     }
     if (shown) byId('problem').hidden = true;

@@ -41,7 +41,7 @@ export class Scene {
   async load() {
     const kind = typeof THREE === 'undefined' ? null : graphics();
     if (!kind) {
-      this.root.textContent = 'This browser shows no three-dimensional pictures (WebGL 2 is missing).';
+      this.root.textContent = 'This browser cannot show the 3-D view (WebGL 2 is missing).';
       return;
     }
     if (!this.renderer) this.start(kind);

@@ -125,7 +125,7 @@ def heat_inputs(
 
     Parameters
     ----------
-    stated : StatedMotions
+    stated : DisturbancePrior
         All M stated components of motion and temperature.
     thermal : ThermalModel
         Thermal model of the instrument.
