@@ -185,14 +185,14 @@ class _Sentences(Formatter):
         *words, digits = format_spec.split(" ")
         for word in words:
             if isinstance(value, Mapping) and word in _UNITS:
-                value = {name: one / _UNITS[word] for name, one in value.items()}
+                value = {name: item / _UNITS[word] for name, item in value.items()}
                 continue
             value = list(value.values()) if isinstance(value, Mapping) else value
             value = _STATISTICS[word](value) if word in _STATISTICS else np.asarray(value) / _UNITS[word]
         if isinstance(value, Mapping):
-            return ", ".join(f"{name} {one:{digits}}" for name, one in value.items())
+            return ", ".join(f"{name} {item:{digits}}" for name, item in value.items())
         if isinstance(value, list | tuple | np.ndarray):
-            return ", ".join(format(one, digits) for one in value)
+            return ", ".join(format(item, digits) for item in value)
         return format(value, digits)
 
 
@@ -563,8 +563,8 @@ class Check(Spec):
             limit += f" One-sided: any value that is {'less' if self.comparison == 'at most' else 'more'} agrees."
         limit += f" The alternative, {self.against}, is {self.tells:.3g} away."
         text = "\n".join(part for part in (sentence(self.how, facts) + how, chosen, reason, limit) if part)
-        found = self._result(measured, sigma, verdict, text)
-        return replace(found, implied=None if self.printed is not None else goal, power=allowed, inputs=ranges)
+        result = self._result(measured, sigma, verdict, text)
+        return replace(result, implied=None if self.printed is not None else goal, power=allowed, inputs=ranges)
 
     def worse(self, *results: CheckResult) -> CheckResult:
         """Return the result of a statement in several forms: the first unexpected one, otherwise the first."""

@@ -119,8 +119,8 @@ class Context:
 
     def figure(self, name: str, drawing: str | bytes, **facts: object) -> None:
         """Add a drawing, SVG or PNG, with the title and caption from the group's file."""
-        said = self._said(name, facts)
-        self.add(SvgFigure(name, *said, drawing) if isinstance(drawing, str) else PngFigure(name, *said, drawing))
+        texts = self._said(name, facts)
+        self.add(SvgFigure(name, *texts, drawing) if isinstance(drawing, str) else PngFigure(name, *texts, drawing))
 
     def table(self, name: str, rows: Sequence[Sequence[Cell]], **facts: object) -> None:
         """Add a table with the title, caption and heads from the group's file."""
@@ -275,9 +275,11 @@ class Printed:
         if prefix not in self.groups:
             known = nearest(prefix, self.groups)
             raise InputError(Issue(f"no group {prefix!r}", self.content.file, key=("groups",), suggestion=known))
-        found = self.groups[prefix]
-        rows = tuple(found.rows.values())
-        return CheckGroup(prefix, found.title, found.seconds, rows, run, found.fast_seconds, found.artefacts)
+        group_rows = self.groups[prefix]
+        rows = tuple(group_rows.rows.values())
+        return CheckGroup(
+            prefix, group_rows.title, group_rows.seconds, rows, run, group_rows.fast_seconds, group_rows.artefacts
+        )
 
     def _named(self, data: Any) -> Any:
         """Return the data with the id and the shared sentences inserted into each row.

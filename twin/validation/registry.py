@@ -47,8 +47,8 @@ def __getattr__(name: str) -> Any:
     from twin.validation.group import CheckGroup
 
     others = ExtensionTable[CheckGroup]("check_groups", {}, CheckGroup)
-    found = globals()[name] = (*(named.get() for named in _GROUPS), *others.values())
-    return found
+    groups = globals()[name] = (*(named.get() for named in _GROUPS), *others.values())
+    return groups
 
 
 class UnknownCheck(Exception):

@@ -19,11 +19,11 @@ def names_in_files() -> list[str]:
     The files are read as text. An unknown id is therefore reported before anything that computes is imported, and
     before the YAML is parsed, which takes a second.
     """
-    found: list[str] = []
+    ids: list[str] = []
     for file in sorted(FOLDER.glob(f"paper_*/{FILE}")):
-        for own, further in _ROW.findall(file.read_text("utf-8")):
-            found += [own] if own else [name.strip() for name in further.split(",")]
-    return found
+        for row_id, further in _ROW.findall(file.read_text("utf-8")):
+            ids += [row_id] if row_id else [name.strip() for name in further.split(",")]
+    return ids
 
 
 def matches(identifier: str, prefix: str) -> bool:

@@ -209,37 +209,37 @@ def _run_group(
     experiments: dict[str, MonitorExperiment],
 ) -> GroupRun:
     group = selection.group
-    own = None if folder is None else folder / FILES / group.prefix
-    if own is not None:
-        own.mkdir(parents=True)
+    group_folder = None if folder is None else folder / FILES / group.prefix
+    if group_folder is not None:
+        group_folder.mkdir(parents=True)
     checks = {check.id: check for check in group.checks}
-    found = {name: checks[name].without_comparison() for name in selection.ids if checks[name].not_checkable}
-    wanted = selection.ids - set(found)
-    context = Context(backend, seed, wanted, checks, fast, advance, own, experiments, group.artefacts)
+    results_by_id = {name: checks[name].without_comparison() for name in selection.ids if checks[name].not_checkable}
+    wanted = selection.ids - set(results_by_id)
+    context = Context(backend, seed, wanted, checks, fast, advance, group_folder, experiments, group.artefacts)
     begin = last = time.monotonic()
     why = "the group gave no result for it"
     advance(0.0, "start")
     try:
         for result in group.run(context) if wanted else ():
             now = time.monotonic()
-            _keep(replace(result, seconds=now - last), found, group, wanted)
+            _keep(replace(result, seconds=now - last), results_by_id, group, wanted)
             last = now
     except Exception as error:
         why = _sentence(error)
-        if wanted <= found.keys():  # raised after the last answer, which nothing else would show
-            found.popitem()
+        if wanted <= results_by_id.keys():  # raised after the last answer, which nothing else would show
+            results_by_id.popitem()
     results = []
     for check in group.checks:
-        if check.id in found:
-            results.append(found[check.id])
+        if check.id in results_by_id:
+            results.append(results_by_id[check.id])
         elif check.id in selection.ids:
             results.append(replace(check.failed(why), seconds=time.monotonic() - last))
             last = time.monotonic()
-    files = _files(own)
+    files = _files(group_folder)
     return GroupRun(group, tuple(results), tuple(context.artefacts), time.monotonic() - begin, files)
 
 
-def _keep(result: CheckResult, found: dict[str, CheckResult], group: CheckGroup, wanted: frozenset[str]) -> None:
+def _keep(result: CheckResult, results: dict[str, CheckResult], group: CheckGroup, wanted: frozenset[str]) -> None:
     """Add a result to the results of its group.
 
     Raises
@@ -249,10 +249,10 @@ def _keep(result: CheckResult, found: dict[str, CheckResult], group: CheckGroup,
     """
     if result.id not in group.ids:
         raise ValueError(f"the group {group.prefix} answered {result.id}, which it does not hold")
-    if result.id in found:
+    if result.id in results:
         raise ValueError(f"the group {group.prefix} answered {result.id} twice")
     if result.id in wanted:
-        found[result.id] = result
+        results[result.id] = result
 
 
 def _sentence(error: Exception) -> str:
@@ -262,13 +262,15 @@ def _sentence(error: Exception) -> str:
     return f"{type(error).__name__}: {text} (in {place.name}, {Path(place.filename).name}:{place.lineno})"
 
 
-def _files(own: Path | None) -> tuple[str, ...]:
+def _files(group_folder: Path | None) -> tuple[str, ...]:
     """Return the files that a group put into its folder, relative to the run folder; an empty folder is removed."""
-    if own is None:
+    if group_folder is None:
         return ()
-    files = tuple(sorted(p.relative_to(own.parents[1]).as_posix() for p in own.rglob("*") if p.is_file()))
+    files = tuple(
+        sorted(p.relative_to(group_folder.parents[1]).as_posix() for p in group_folder.rglob("*") if p.is_file())
+    )
     if not files:
-        for place in (own, own.parent):
+        for place in (group_folder, group_folder.parent):
             if not any(place.iterdir()):
                 place.rmdir()
     return files

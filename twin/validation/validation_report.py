@@ -98,26 +98,26 @@ def _limits(result: CheckResult) -> tuple[str, str, str]:
 
 def _chosen(validation: Validation) -> Iterator[str]:
     """Yield the lines that list the chosen inputs and their admissible ranges."""
-    found = [result for result in validation.results if result.inputs]
-    if not found:
+    results = [result for result in validation.results if result.inputs]
+    if not results:
         return
     yield "## Chosen inputs"
     yield ""
     yield "What the paper does not print and these rows need, and where each may be moved before its row fails."
     yield ""
-    for result in found:
+    for result in results:
         yield f"- `{result.id}`: {_cell('; '.join(i.text for i in result.inputs))}"
     yield ""
 
 
 def _corrections(validation: Validation) -> Iterator[str]:
     """Yield the lines that list all rows without agreement, with the reason."""
-    found = [result for result in validation.results if result.verdict not in AGREED.values()]
-    if not found:
+    results = [result for result in validation.results if result.verdict not in AGREED.values()]
+    if not results:
         return
     yield "## Corrections, refutations, the undecided and gaps"
     yield ""
-    for result in found:
+    for result in results:
         lines = result.how.splitlines()
         # how it was measured, reason, comparison; without a comparison only the reason
         reason = lines[-2] if len(lines) > 1 else lines[0]
@@ -179,8 +179,8 @@ def verdict(validation: Validation) -> str:
     if strange:
         expected = f"{len(strange)} of the verdicts {'is' if len(strange) == 1 else 'are'} not as expected: "
         expected += f"look at {', '.join(strange)}"
-    told, _ = answer(f"{count} check{'' if count == 1 else 's'}: {counts or 'no verdict'}", expected)
-    return told
+    text, _ = answer(f"{count} check{'' if count == 1 else 's'}: {counts or 'no verdict'}", expected)
+    return text
 
 
 def _papers(validation: Validation) -> Iterator[Section]:

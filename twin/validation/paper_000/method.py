@@ -103,8 +103,8 @@ class Passes:
     def pitch_error(self, normals: Mapping[str, np.ndarray]) -> dict[str, tuple[float, float]]:
         """Line -> mean error of fitted unit normals (passes, 3) toward the line of sight, and its sigma, arcsec."""
         out = {}
-        for line, found in normals.items():
-            turns = (found - self.normal(line)) @ self.ahead(line) / ARCSEC
+        for line, normal in normals.items():
+            turns = (normal - self.normal(line)) @ self.ahead(line) / ARCSEC
             out[line] = mean_of(turns)
         return out
 
@@ -261,11 +261,11 @@ def twisted_passes(context: Context) -> tuple[Passes, Passes]:
     """Simulate measurements with the forward array rotated by ±`TWIST` about its line of sight."""
     look, setup, count = np.radians(25.0), setup_of(TEST), context.count(full=300, fast=80)
     streams = np.random.SeedSequence([context.seed, 2]).spawn(2)
-    one, other = (
+    positive, negative = (
         repeated(setup, stream, count, turns={"forward": (twist * np.sin(look), 0.0, twist * np.cos(look))})
         for twist, stream in zip((TWIST, -TWIST), streams, strict=True)
     )
-    return one, other
+    return positive, negative
 
 
 @one_blas_thread()
@@ -314,7 +314,7 @@ def _least(planes: Planes) -> CheckResult:
         slopes = [least_slopes(m.strips[line].points, m.station.position) for m in passes.measured]
         normals[line] = np.array([np.array([*s, -1.0]) / np.sqrt(s @ s + 1.0) for s in slopes])
     solved = {line: np.array([fits[k].normal for fits in planes.corrected]) for k, line in enumerate(LINES)}
-    errors = [passes.pitch_error(found) for found in (normals, solved)]
+    errors = [passes.pitch_error(candidate) for candidate in (normals, solved)]
     texts = [
         ", ".join(f"{line} {mean:+.3f}″ ± {sigma:.3f}″" for line, (mean, sigma) in error.items()) for error in errors
     ]
@@ -325,15 +325,15 @@ def _least(planes: Planes) -> CheckResult:
 
 
 def _vanishing(planes: Planes) -> CheckResult:
-    found = 0.0
+    largest = 0.0
     for m, fits in zip(planes.passes.measured, planes.corrected, strict=True):
         for line, fit in zip(LINES, fits, strict=True):
             points, station = m.strips[line].points, m.station.position
             slopes = np.array(fit.coefficients[:2])
             at = numerical_derivatives(slopes, points, station)
             beside = numerical_derivatives(slopes * (1.0 + ARCSEC), points, station)
-            found = max(found, float(np.linalg.norm(at) / np.linalg.norm(beside)))
-    return planes.row("000.eq3", found, implied=0.0)
+            largest = max(largest, float(np.linalg.norm(at) / np.linalg.norm(beside)))
+    return planes.row("000.eq3", largest, implied=0.0)
 
 
 def _derivatives(planes: Planes) -> CheckResult:
@@ -351,10 +351,10 @@ def _printed_plane(planes: Planes) -> CheckResult:
     turn, away = {}, {}
     for k, line in enumerate(LINES):
         true = passes.normal(line)
-        found = np.array([fits[k].normal for fits in planes.printed])
-        turn[line] = np.degrees(np.arccos(np.clip(np.abs(found @ true), 0.0, 1.0)))
+        plane_normals = np.array([fits[k].normal for fits in planes.printed])
+        turn[line] = np.degrees(np.arccos(np.clip(np.abs(plane_normals @ true), 0.0, 1.0)))
         arm = passes.points[line] - passes.flight.station
-        away[line] = f"{np.sqrt(np.mean((arm @ found[0]) ** 2)) / 1e3:.0f} km"
+        away[line] = f"{np.sqrt(np.mean((arm @ plane_normals[0]) ** 2)) / 1e3:.0f} km"
     true = passes.normal("forward")
     half = float(np.degrees(np.arccos(abs(true @ (np.array([-1.0, -1.0, 1.0]) * true)))))
     return planes.row("000.eq5", *mean_of(turn["forward"]), 0.0, [half], away=away)
@@ -395,8 +395,8 @@ def _angle(planes: Planes, which: int, identifier: str) -> CheckResult:
 
 def _arccos(planes: Planes) -> CheckResult:
     exact = np.array([[_exact(fits[0], fits[1]), _exact(fits[1], fits[2])] for fits in planes.corrected])
-    found = float(np.max(np.abs(planes.angles - exact))) / ARCSEC
-    return planes.row("000.eq6.arccos", found, implied=0.0, least=np.sqrt(2.0 * np.finfo(np.float64).eps))
+    difference = float(np.max(np.abs(planes.angles - exact))) / ARCSEC
+    return planes.row("000.eq6.arccos", difference, implied=0.0, least=np.sqrt(2.0 * np.finfo(np.float64).eps))
 
 
 def _exact(a: PlaneFit, b: PlaneFit) -> float:
@@ -555,12 +555,12 @@ def _outlook(context: Context, passes: Passes) -> Iterator[CheckResult]:
         off = along[:, names.index(name)] - true
         row = f"000.outlook.{name}"
         yield context.row(row, *mean_of(off / ARCSEC), 0.0, passes=passes, true=true, off=off)
-    found = []
+    values = []
     for m in passes.measured:
         line, nadir = planes_of(m, "corrected", ("multispectral", "nadir"))
-        found.append(off_axis_angle(line, nadir).printed[0])
+        values.append(off_axis_angle(line, nadir).printed[0])
     look = flight.look["multispectral"]
-    off = np.array(found) - look
+    off = np.array(values) - look
     expected = (flight.dihedral["multispectral"] - look) / ARCSEC
     row = "000.outlook.unsigned"
     yield context.row(row, *mean_of(off / ARCSEC), 0.0, [expected], passes=passes, look=look, off=off)

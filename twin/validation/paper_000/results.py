@@ -39,12 +39,14 @@ LIMIT = 3.44
 
 
 @drawing("table1-000", 4.2)
-def differences_svg(figure: Figure, same: Array, own: Array, printed: tuple[float, float]) -> None:
+def differences_svg(figure: Figure, same: Array, independent: Array, printed: tuple[float, float]) -> None:
     """Scatter of alpha and beta, both (passes, 2), arcsec, and the printed pair."""
     axes = figure.subplots()
     axes.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
     axes.axvline(0.0, color=LIGHT, lw=0.8, zorder=0)
-    axes.plot(*own.T, "o", color=ORANGE, ms=3.5, mew=0, alpha=0.7, label="points of their own, light left in planes")
+    axes.plot(
+        *independent.T, "o", color=ORANGE, ms=3.5, mew=0, alpha=0.7, label="points of their own, light left in planes"
+    )
     axes.plot(*same.T, "s", color=BLUE, ms=3.0, mew=0, label="same points, light corrected in both")
     label = f"printed: {printed[0]}″, {printed[1]}″"
     axes.plot(*printed, "D", color=VERMILION, ms=8, mec=INK, mew=0.8, label=label)
@@ -72,10 +74,10 @@ class Differences:
 def differences(planes: Passes, resection: Passes) -> Differences:
     """Both methods on measurements that may be the same."""
     by_planes = [intersection_angles(*planes_of(m, "tls")) for m in planes.measured]
-    found = np.array([section.angles(PAIRS) for section in resection.sections])
+    resected = np.array([section.angles(PAIRS) for section in resection.sections])
     claimed = [section.angle_covariance(PAIRS) for section in resection.sections]
     return Differences(
-        (found - np.array([a.values for a in by_planes])) / ARCSEC,
+        (resected - np.array([a.values for a in by_planes])) / ARCSEC,
         np.sqrt(np.mean([np.diag(a.covariance) for a in by_planes], axis=0)) / ARCSEC,
         np.sqrt(np.mean([np.diag(c) for c in claimed], axis=0)) / ARCSEC,
     )
@@ -105,11 +107,11 @@ def make_data(context: Context) -> Data:
     count = context.count(full=800, fast=120)
     first, second, third = np.random.SeedSequence([context.seed, 5]).spawn(3)
     setup = setup_of(TEST, points=POINT_SIGMA)
-    own = repeated(setup, second, count)
+    independent = repeated(setup, second, count)
     repeats = repeated(setup, third, count, corrected=False)
     # one precise orbit for both methods
-    moved = tuple(_at(m, o.station.position) for m, o in zip(repeats.measured, own.measured, strict=True))
-    return Data(repeated(setup_of(TEST), first, count), own, Passes(repeats.flight, moved))
+    moved = tuple(_at(m, o.station.position) for m, o in zip(repeats.measured, independent.measured, strict=True))
+    return Data(repeated(setup_of(TEST), first, count), independent, Passes(repeats.flight, moved))
 
 
 def _at(measured: Measurement, position: Array) -> Measurement:
@@ -121,7 +123,7 @@ def run_table_1(context: Context) -> Iterator[CheckResult]:
     """All checks of Table 1."""
     context.progress(0.1, "measure ground points for both methods")
     data = make_data(context)
-    same, own = differences(data.same, data.same), differences(data.light, data.own)
+    same, independent = differences(data.same, data.same), differences(data.light, data.own)
     for k, (name, printed) in enumerate(PRINTED_ARCSEC.items()):
         sigma = float(same.spread[k])
         variance = same.planes_sigma[k] ** 2 - same.resection_sigma[k] ** 2
@@ -134,15 +136,19 @@ def run_table_1(context: Context) -> Iterator[CheckResult]:
         facts["times"] = printed / sigma
         yield context.row(f"000.table1.{name}", sigma, noise, float(np.sqrt(max(variance, 0.0))), **facts)
     for k, name in enumerate(PRINTED_ARCSEC):
-        bias, spread, count = float(np.mean(own.values[:, k])), float(own.spread[k]), len(own.values)
+        bias, spread, count = (
+            float(np.mean(independent.values[:, k])),
+            float(independent.spread[k]),
+            len(independent.values),
+        )
         noise = spread * np.sqrt(1.0 / count + SIGMAS**2 / (2.0 * (count - 1)))
         reach = partial(_reach, abs(bias), SIGMAS * spread)
-        facts = {"own": own, "point": POINT_SIGMA, "bias": bias, "spread": spread}
+        facts = {"own": independent, "point": POINT_SIGMA, "bias": bias, "spread": spread}
         yield context.row(f"000.table1.{name}_own", reach(1.0), noise, inputs=_points(reach), **facts)
-    yield _pair(context, data, own)
+    yield _pair(context, data, independent)
     yield from _accuracy(context, data)
     context.progress(0.9, "draw")
-    context.figure("table1", differences_svg(same.values, own.values, (ALPHA, BETA)), point=POINT_SIGMA)
+    context.figure("table1", differences_svg(same.values, independent.values, (ALPHA, BETA)), point=POINT_SIGMA)
 
 
 def _reach(bias: float, spread: float, factor: float) -> float:
@@ -161,7 +167,7 @@ def _points(response: Callable[[float], float]) -> list[Chosen]:
     ]
 
 
-def _pair(context: Context, data: Data, own: Differences) -> CheckResult:
+def _pair(context: Context, data: Data, independent: Differences) -> CheckResult:
     """Both angles have the nadir plane: what makes one larger makes the other smaller."""
     measured, flight = data.light.measured[0], data.light.flight
     # the station is common and drops out, the points of the two methods are not
@@ -173,8 +179,8 @@ def _pair(context: Context, data: Data, own: Differences) -> CheckResult:
     pair = np.array([ALPHA, BETA])
     facts: dict[str, Any] = {
         "correlation": covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]),
-        "own": own,
-        "distance": _distance(pair - np.mean(own.values, axis=0), np.cov(own.values.T)),
+        "own": independent,
+        "distance": _distance(pair - np.mean(independent.values, axis=0), np.cov(independent.values.T)),
         "pair": (ALPHA, BETA),
         "apart": _distance(pair * [-1.0, 1.0] - bias, covariance),
         "limit": LIMIT,
@@ -200,8 +206,8 @@ def _accuracy(context: Context, data: Data) -> Iterator[CheckResult]:
         ("000.accuracy", data.own, "taken out of the points"),
         ("000.accuracy.light", data.light, "left in"),
     ):
-        found = np.array([intersection_angles(*planes_of(m, "tls")).values for m in passes.measured])
-        off = (found - values_of(passes.flight.dihedral)) / ARCSEC
+        angles = np.array([intersection_angles(*planes_of(m, "tls")).values for m in passes.measured])
+        off = (angles - values_of(passes.flight.dihedral)) / ARCSEC
         mean, spread, rms = np.mean(off, axis=0), np.std(off, axis=0), np.sqrt(np.mean(off**2, axis=0))
         worst = int(np.argmax(rms))
         inputs = _points(partial(_rms, float(mean[worst]), float(spread[worst])))
@@ -418,29 +424,29 @@ def run_figures(context: Context) -> Iterator[CheckResult]:
     """All checks of Figs. 3 to 5."""
     context.progress(0.0, "move station and points")
     passes = make_passes(context)
-    found = [answers(m, passes.flight) for m in passes.measured]
+    all_answers = [answers(m, passes.flight) for m in passes.measured]
     context.progress(0.4, "the same elsewhere")
     there = make_passes(context, ELSEWHERE, 1)
     other = answers(there.measured[0], there.flight)
     places = _places(context)
     for sentence in SENTENCES:
         if sentence.row.id in context.selected:
-            yield _row(sentence, passes, found, other, places)
-    yield _ordinate(context, found, places)
+            yield _row(sentence, passes, all_answers, other, places)
+    yield _ordinate(context, all_answers, places)
     if "000.fig4.single" in context.selected:
         yield _single(context, passes)
     context.progress(0.9, "draw")
-    _show(context, found[0], places)
+    _show(context, all_answers[0], places)
 
 
 def _row(
-    sentence: Sentence, passes: Passes, found: list[Answers], other: Answers, places: Mapping[Place, Answers]
+    sentence: Sentence, passes: Passes, all_answers: list[Answers], other: Answers, places: Mapping[Place, Answers]
 ) -> CheckResult:
-    values = np.array([sentence.measure(a.rises, a.growth) for a in found])
-    mean = {axis: np.mean([a.rises[sentence.what, sentence.angle, axis] for a in found]) for axis in AXES}
+    values = np.array([sentence.measure(a.rises, a.growth) for a in all_answers])
+    mean = {axis: np.mean([a.rises[sentence.what, sentence.angle, axis] for a in all_answers]) for axis in AXES}
     place = _place([sentence], places)
     facts: dict[str, Any] = {
-        "found": found,
+        "found": all_answers,
         "mean": {axis: f"{value:+.3f}″" for axis, value in mean.items()},
         "place": place,
         "other": sentence.measure(other.rises, other.growth),
@@ -471,14 +477,16 @@ def _explained(sentence: Sentence, passes: Passes, other: Answers) -> list[float
     return []
 
 
-def _ordinate(context: Context, found: list[Answers], places: Mapping[Place, Answers]) -> CheckResult:
+def _ordinate(context: Context, all_answers: list[Answers], places: Mapping[Place, Answers]) -> CheckResult:
     signs = [s for s in SENTENCES if s.kind == "signs"]
     share, other = (
-        float(np.mean([s.holds({k: sign * v for k, v in a.rises.items()}, a.growth) for s in signs for a in found]))
+        float(
+            np.mean([s.holds({k: sign * v for k, v in a.rises.items()}, a.growth) for s in signs for a in all_answers])
+        )
         for sign in (1.0, -1.0)
     )
     count = sum(len(s.axes + s.others) for s in signs)
-    facts: dict[str, Any] = {"sentences": signs, "signs": count, "found": found, "other": other}
+    facts: dict[str, Any] = {"sentences": signs, "signs": count, "found": all_answers, "other": other}
     return context.row("000.fig3.ordinate", share, None, 1.0, inputs=[_place(signs, places)], **facts)
 
 

@@ -153,8 +153,8 @@ def measured(context: Context) -> BudgetImages:
     spec = spec.model_copy(update={"trials": trials, "all_together": together})
     context.progress(0.0, f"build {spec.instrument}")
     budget = ErrorBudget(spec, resolve_budget(spec), context.backend, context.seed)
-    every = bool(context.selected & {"001.eq12", "001.table4.root_sum"})
-    wanted = [name for name in budget.lines if every or f"001.table3.{name}" in context.selected]
+    all_lines = bool(context.selected & {"001.eq12", "001.table4.root_sum"})
+    wanted = [name for name in budget.lines if all_lines or f"001.table3.{name}" in context.selected]
     lines = {}
     for i, name in enumerate(wanted):
         context.progress(0.05 + 0.4 * i / len(wanted), name)

@@ -147,12 +147,12 @@ class MonitorImages:
         self.experiment = experiment
         self.cameras = tuple(experiment.calibration.cameras)
         self.motions = list(states)
-        every = list(states.values())
+        state_list = list(states.values())
         context.progress(0.2, "trace the truth")
-        self.truth: Truth = experiment.sight.truth(every)
+        self.truth: Truth = experiment.sight.truth(state_list)
         context.progress(0.5, "render and measure the spots")
         how = ObservationOptions(shared_detector(experiment, FRAMES, context.seed), use_prior=False)
-        pieces = [found.recovery for found in observe(experiment, every, how)]
+        pieces = [observation.recovery for observation in observe(experiment, state_list, how)]
         self.before = np.concatenate([p.before for p in pieces])
         self.after = np.concatenate([p.after for p in pieces])
         self.covariance = np.concatenate([p.shift_covariance for p in pieces])
@@ -182,9 +182,9 @@ class MonitorImages:
 
     def reading(self, camera: str, motion: str, parameter: str) -> Measured:
         """Return the reading of one state by the printed formula of a single change, in SI units."""
-        found = self.estimates().parameters[camera]["paper_single"]
+        estimate = self.estimates().parameters[camera]["paper_single"]
         state, k = self.motions.index(motion), PARAMETERS.index(parameter)
-        return float(found.vector[state, k]), float(found.sigma[state, k])
+        return float(estimate.vector[state, k]), float(estimate.sigma[state, k])
 
     def true(self, camera: str, motion: str, parameter: str) -> float:
         """Return the traced change of one of PARAMETERS, in SI units."""
@@ -318,10 +318,10 @@ def _ratios_svg(figure: Figure, ratios: Mapping[str, tuple[str, float]]) -> None
     axes.tick_params(axis="y", length=0)
 
 
-def _show_ratios(context: Context, name: str, found: Mapping[str, float]) -> None:
+def _show_ratios(context: Context, name: str, ratios: Mapping[str, float]) -> None:
     """Draw what was measured of the selected rows, id -> value, that are 1 where a formula is right."""
-    checks = {i: context.check(i) for i in found if i in context.selected}
-    exact = {i: (check.equation, found[i]) for i, check in checks.items() if check.printed == 1.0}
+    checks = {i: context.check(i) for i in ratios if i in context.selected}
+    exact = {i: (check.equation, ratios[i]) for i, check in checks.items() if check.printed == 1.0}
     if exact:
         context.figure(name, _ratios_svg(exact))
 
@@ -357,8 +357,8 @@ def run(context: Context) -> Iterator[CheckResult]:
     shown = {i: ratio for i, ratio in ratios.items() if i in context.selected}
     if shown:
         _show_ratios(context, "ratios", {i: ratio.value for i, ratio in shown.items()})
-        numbers = {i: [float(one) for pair in ratio.cameras.values() for one in pair] for i, ratio in shown.items()}
-        rows: list[list[Cell]] = [[i, *own] for i, own in numbers.items()]
+        numbers = {i: [float(value) for pair in ratio.cameras.values() for value in pair] for i, ratio in shown.items()}
+        rows: list[list[Cell]] = [[i, *values] for i, values in numbers.items()]
         context.table("cameras", rows)
 
 
@@ -495,10 +495,10 @@ class JointMotions(MonitorImages):
 
         def share(camera: str) -> Measured:
             left, right, sigma = self.spots(camera, "+".join(PARAMETERS), axis)
-            found = parts(left, right)[part], sigma / np.sqrt(2.0)
+            separated_part = parts(left, right)[part], sigma / np.sqrt(2.0)
             left, right, sigma = self.spots(camera, single, axis)
             alone = 0.5 * (abs(left) + abs(right)) * np.sign(left), sigma / np.sqrt(2.0)
-            return quotient(found, alone)
+            return quotient(separated_part, alone)
 
         return self.ratio(share)
 
@@ -519,9 +519,9 @@ class JointMotions(MonitorImages):
             change = self.truth.cameras[camera]
             true = np.stack([getattr(change, p)[self.mixtures] for p in PARAMETERS], axis=-1) / UNITS
             design = np.column_stack([true, np.ones(len(true))])
-            found = parameters[camera][estimator]
-            solution, *_ = np.linalg.lstsq(design, found.vector[self.mixtures] / UNITS, rcond=None)
-            noise = np.mean((found.sigma[self.mixtures] / UNITS) ** 2, axis=0)
+            estimates = parameters[camera][estimator]
+            solution, *_ = np.linalg.lstsq(design, estimates.vector[self.mixtures] / UNITS, rcond=None)
+            noise = np.mean((estimates.sigma[self.mixtures] / UNITS) ** 2, axis=0)
             matrices.append(solution[:4].T)
             variances.append(np.outer(noise, np.diagonal(np.linalg.inv(design.T @ design))[:4]))
         sigma = np.sqrt(np.sum(variances, axis=0)) / len(self.cameras)
@@ -532,11 +532,11 @@ class JointMotions(MonitorImages):
 
         The slope is over all mixtures; the residual is in radians.
         """
-        found = self.estimates().angle[estimator]
-        true, read = self.truth.angle_change[self.mixtures], found.change_rad[self.mixtures]
+        estimate = self.estimates().angle[estimator]
+        true, read = self.truth.angle_change[self.mixtures], estimate.change_rad[self.mixtures]
         offset = true - true.mean()
         slope = float(offset @ read / (offset @ offset))
-        sigma = float(np.sqrt(np.mean(found.sigma_rad[self.mixtures] ** 2) / (offset @ offset)))
+        sigma = float(np.sqrt(np.mean(estimate.sigma_rad[self.mixtures] ** 2) / (offset @ offset)))
         return slope, sigma, rms(read - read.mean() - slope * offset)
 
 

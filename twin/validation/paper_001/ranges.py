@@ -95,8 +95,8 @@ class Bench:
         for piece, photons in path.iterate_photons(states, chunk=chunk):
             mean = self.experiment.expected_frames(photons).reshape(-1, rows, columns)
             windows, corner = _windows(mean, self._measure.path.shape)
-            found = measure_spots(windows, self.frames, calibration, "ml", cores())
-            place = np.stack([found.row, found.column], axis=-1) + corner
+            spots = measure_spots(windows, self.frames, calibration, "ml", cores())
+            place = np.stack([spots.row, spots.column], axis=-1) + corner
             out[piece] = place.reshape(-1, len(path.channels), 2)
         return out
 
@@ -130,21 +130,21 @@ class Bench:
             before, after, geometry = start[:, pair], end[:, pair], self.geometry(name)
             # without the calibrated gradients over the field
             bare = replace(geometry, d_f_per_alpha_m=0.0, d_gamma_per_beta=0.0)
-            found = {
+            readings = {
                 PRINTED: monitor_formulas.paper_single(before, after, nothing, geometry),
                 JOINT: monitor_formulas.paper_joint(before, after, nothing, geometry),
                 CORRECTED: monitor_formulas.derived(before, after, nothing, bare),
                 CALIBRATED: monitor_formulas.derived(before, after, nothing, geometry),
             }
-            out[name] = {form: parameters.vector * PER_SI for form, parameters in found.items()}
+            out[name] = {form: parameters.vector * PER_SI for form, parameters in readings.items()}
         return out
 
     def truth(self, states: Sequence[State]) -> dict[str, np.ndarray]:
         """Camera -> (S, 4) traced changes in the units of ``monitoring.PARAMETERS``."""
-        found = self.experiment.sight.truth(states)
+        changes = self.experiment.sight.truth(states)
         return {
             name: np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f], axis=-1) * PER_SI
-            for name, c in found.cameras.items()
+            for name, c in changes.cameras.items()
         }
 
 
@@ -195,9 +195,9 @@ class Curves:
 
     def merged(self, size: np.ndarray, value: Mapping[str, np.ndarray]) -> Curves:
         """With more points."""
-        every = np.concatenate([self.size, size])
-        order = np.argsort(every)
-        return Curves(every[order], {n: np.concatenate([v, value[n]])[order] for n, v in self.value.items()})
+        sizes = np.concatenate([self.size, size])
+        order = np.argsort(sizes)
+        return Curves(sizes[order], {n: np.concatenate([v, value[n]])[order] for n, v in self.value.items()})
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,9 +222,9 @@ class Domain:
     def limit(self, name: str) -> tuple[float, str]:
         """Largest size within a limit, and whence it is known: "images", "trace" or why there is none."""
         for curves, whence in ((self.images, "images"), (self.traced, "trace")):
-            found = curves.crossing(name)
-            if found is not None:
-                return found, whence
+            crossing = curves.crossing(name)
+            if crossing is not None:
+                return crossing, whence
         return self.lost, self.lost_why
 
 
@@ -378,9 +378,9 @@ def single_range(bench: Bench, wide: Bench, parameter: str, sign: int, count: in
         return out
 
     def rendered(size: np.ndarray) -> Mapping[str, np.ndarray]:
-        every = states(size)
-        place = wide.positions(every)
-        moved = bench.traced(every) - traced_origin
+        all_states = states(size)
+        place = wide.positions(all_states)
+        moved = bench.traced(all_states) - traced_origin
         gap[0] = max(gap[0], float(np.max(np.abs(place - origin - moved))))
         return shares(size, origin, place, raw)
 
@@ -409,8 +409,8 @@ def _joined(parts: Mapping[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
     """Form -> (N, 2), ascending in the change."""
     out = {}
     for form, pieces in parts.items():
-        every = np.concatenate(pieces)
-        out[form] = every[np.argsort(every[:, 0])]
+        joined = np.concatenate(pieces)
+        out[form] = joined[np.argsort(joined[:, 0])]
     return out
 
 
@@ -419,8 +419,8 @@ def beam_end(bench: Bench, states: Callable[[np.ndarray], list[State]], start: f
 
     def fault(size: float) -> str:
         try:
-            some = states(np.array([size]))
-            bench.traced(some)
+            trial_states = states(np.array([size]))
+            bench.traced(trial_states)
         except BeamMissedError:
             return CUT
         except (AimError, np.linalg.LinAlgError):
@@ -432,8 +432,8 @@ def beam_end(bench: Bench, states: Callable[[np.ndarray], list[State]], start: f
         return far, "not followed farther"
     while bad / good > 1.01:
         middle = math.sqrt(good * bad)
-        found = fault(middle)
-        good, bad, why = (good, middle, found) if found else (middle, bad, why)
+        reason = fault(middle)
+        good, bad, why = (good, middle, reason) if reason else (middle, bad, why)
     return good, why
 
 
@@ -532,8 +532,8 @@ def separation(experiment: MonitorExperiment, bench: Bench, trials: int, seed: i
     states = joint_states(bench, wanted)
     truth = bench.truth(states)
     how = ObservationOptions(shared_detector(experiment, bench.frames, seed), use_prior=False)
-    seen = [found.recovery for found in observe(experiment, states, how)]
-    parts = [bench.readings(found.before, found.after) for found in seen]
+    seen = [observation.recovery for observation in observe(experiment, states, how)]
+    parts = [bench.readings(observation.before, observation.after) for observation in seen]
     readings = {c: {form: np.concatenate([part[c][form] for part in parts]) for form in FORMS} for c in bench.cameras}
     gain: dict[str, dict[str, np.ndarray]] = {form: {} for form in FORMS}
     sigma: dict[str, dict[str, np.ndarray]] = {form: {} for form in FORMS}

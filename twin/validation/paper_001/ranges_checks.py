@@ -86,19 +86,19 @@ def ranges_of(
 
 
 def _singles(context: Context, resolved: ResolvedJob, bench: ranges.Bench, data: Data) -> Iterator[CheckResult]:
-    found = {INSTRUMENT: ranges_of(context, resolved, bench, 0.02, 0.4 if context.fast else 0.2)}
+    ranges_by_instrument = {INSTRUMENT: ranges_of(context, resolved, bench, 0.02, 0.4 if context.fast else 0.2)}
     if not context.fast:
         other = resolve_job(JobSpec(instrument=OTHER))
         second = ranges.Bench(ranges.variant(other, context.backend, next(iter(other.instrument.cameras))))
-        found[OTHER] = ranges_of(context, other, second, 0.22, 0.2)
-    _show_singles(context, found, data)
+        ranges_by_instrument[OTHER] = ranges_of(context, other, second, 0.22, 0.2)
+    _show_singles(context, ranges_by_instrument, data)
     geometry = bench.geometry(bench.cameras[0])
-    own = found[INSTRUMENT]
+    reference_ranges = ranges_by_instrument[INSTRUMENT]
     local = bench.experiment.instrument.cameras[bench.cameras[0]].line_principal_distance
-    _show_causes(context, own, geometry, local, data)
+    _show_causes(context, reference_ranges, geometry, local, data)
     for equation, name in _BY_EQUATION.items():
-        yield _range(context, f"001.{equation}.range", own[name], geometry)
-    yield _small(context, own)
+        yield _range(context, f"001.{equation}.range", reference_ranges[name], geometry)
+    yield _small(context, reference_ranges)
 
 
 def limit_of(both: Sequence[ranges.Range], form: str, kind: str) -> tuple[float, str]:
@@ -146,10 +146,10 @@ def _range(context: Context, identifier: str, both: list[ranges.Range], geometry
     return context.row(identifier, limit * per, None, window, explained, **facts)
 
 
-def _small(context: Context, own: Mapping[str, list[ranges.Range]]) -> CheckResult:
+def _small(context: Context, reference_ranges: Mapping[str, list[ranges.Range]]) -> CheckResult:
     worst, where = 0.0, ""
     for name in ("d_beta", "d_alpha", "d_gamma"):
-        for r in own[name]:
+        for r in reference_ranges[name]:
             true = r.raw[PRINTED][:, 0] * r.sign
             inside = r.raw[PRINTED][:, 0] <= r.window
             arctan, linear = (true + r.raw[form][:, 1] for form in (PRINTED, JOINT))
@@ -182,8 +182,8 @@ def _joint(context: Context, data: Data) -> Iterator[CheckResult]:
     corners = ranges.corners(bench, context.count(8, 4))
     trials = context.count(240, 40)
     context.progress(0.65, f"{trials} random changes with noise")
-    found = ranges.separation(experiment, bench, trials, context.seed)
-    _show_joint(context, corners, found, data)
+    separation = ranges.separation(experiment, bench, trials, context.seed)
+    _show_joint(context, corners, separation, data)
     facts: dict[str, Any] = {"trials": trials, "box": ranges.BOX_TEXT, "bench": bench}
     explained = _box_limits(bench.geometry(bench.cameras[0]))
     for k, name in enumerate(NAMES):
@@ -193,16 +193,16 @@ def _joint(context: Context, data: Data) -> Iterator[CheckResult]:
             "whence": whence,
             "corrected": corners.text(ranges.key(CORRECTED, name)),
             "calibrated": corners.text(ranges.key(CALIBRATED, name)),
-            "diagonal": [found.mean(form, name, name)[0] for form in (JOINT, CORRECTED)],
-            "scatter": found.scatter[CORRECTED][k],
+            "diagonal": [separation.mean(form, name, name)[0] for form in (JOINT, CORRECTED)],
+            "scatter": separation.scatter[CORRECTED][k],
             "unit": " µm" if name == "d_f" else "″",
         }
         row = f"001.table1.range.{name}"
         yield context.row(row, share, None, 1.0, explained.get(name, ()), **facts, **more)
-    facts["f_by_alpha"] = found.mean(CORRECTED, "d_f", "d_alpha")[0]
-    facts["gamma_by_beta"] = found.mean(CORRECTED, "d_gamma", "d_beta")[0]
+    facts["f_by_alpha"] = separation.mean(CORRECTED, "d_f", "d_alpha")[0]
+    facts["gamma_by_beta"] = separation.mean(CORRECTED, "d_gamma", "d_beta")[0]
     for read, changed, scale in (("d_alpha", "d_f", 1e3), ("d_beta", "d_gamma", 1.0)):
-        value, sigma = found.mean(CORRECTED, read, changed)
+        value, sigma = separation.mean(CORRECTED, read, changed)
         yield context.row(f"001.table1.range.{read}.by_{changed}", value * scale, sigma * scale, 0.0, **facts)
 
 
@@ -263,10 +263,10 @@ def _defocus(context: Context, resolved: ResolvedJob, bench: ranges.Bench, data:
 
 def _returns(context: Context, resolved: ResolvedJob, bench: ranges.Bench, data: Data) -> Iterator[CheckResult]:
     context.progress(0.92, "other kinds of return")
-    found = ranges.responses(resolved, context.backend, bench)
+    responses = ranges.responses(resolved, context.backend, bench)
     rows: list[list[Cell]] = []
     listed = {}
-    for r in found:
+    for r in responses:
         across, along, note = float(r.across.mean()), float(r.along.mean()), ranges.RETURNS[r.kind][1]
         rows.append([r.kind, across, along, *(float(g) for g in r.gain), note])
         listed[r.kind] = {
@@ -303,18 +303,18 @@ def _four(value: float) -> str:
 
 def _thinned(points: np.ndarray) -> np.ndarray:
     """Remove points (N, 2) that nearly coincide with the previous one."""
-    kept = [0]
+    indices = [0]
     for i in range(1, len(points)):
-        if points[i, 0] > 1.25 * points[kept[-1], 0]:
-            kept.append(i)
-    return points[kept]
+        if points[i, 0] > 1.25 * points[indices[-1], 0]:
+            indices.append(i)
+    return points[indices]
 
 
 @drawing("ranges-001-singles", 7.4)
-def singles_svg(figure: Figure, own: Mapping[str, Sequence[ranges.Range]]) -> None:
+def singles_svg(figure: Figure, reference_ranges: Mapping[str, Sequence[ranges.Range]]) -> None:
     """Draw a panel per parameter: error over the true change, both on logarithmic axes."""
     for axes, name in zip(figure.subplots(2, 2).ravel(), _ORDER, strict=True):
-        both = own[name]
+        both = reference_ranges[name]
         per, unit, _ = _shown(name)
         first = both[0]
         low, high = first.raw[PRINTED][0, 0] * per, first.lost * per
@@ -371,12 +371,12 @@ def defocus_svg(figure: Figure, pupil: ranges.PupilStudy, curves: ranges.Curves,
     left, right = figure.subplots(1, 2)
     grid = np.array([-0.3, 0.3])
     for axis, name, length, sign in ((0, "d_alpha", focal[0], -1.0), (1, "d_beta", focal[1], 1.0)):
-        own = np.equal(pupil.offset[:, 1 - axis], 0.0)
-        slope = 1e-6 * pupil.slope[own, NAMES.index(name)]
+        on_axis = np.equal(pupil.offset[:, 1 - axis], 0.0)
+        slope = 1e-6 * pupil.slope[on_axis, NAMES.index(name)]
         colour = _OF_PARAMETER[name]
         left.plot(1e3 * grid, sign * 1e-6 * grid / length**2 / ARCSEC, "-", color=colour, lw=1.0)
         label = f"{SYMBOLS[name]}, sub-aperture along {'XY'[axis]}"
-        left.plot(1e3 * pupil.offset[own, axis], slope, "os"[axis], color=colour, ms=5.0, label=label)
+        left.plot(1e3 * pupil.offset[on_axis, axis], slope, "os"[axis], color=colour, ms=5.0, label=label)
     left.plot([], [], "-", color=GREY, lw=1.0, label="theory, ±h/f²")
     left.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
     left.set_xlabel("sub-aperture off the pupil's middle, h [mm]")
@@ -421,7 +421,11 @@ def field_svg(figure: Figure, points: Sequence[ranges.FieldPoint]) -> None:
 
 
 def _show_causes(
-    context: Context, own: Mapping[str, list[ranges.Range]], geometry: MonitorGeometry, local: float, data: Data
+    context: Context,
+    reference_ranges: Mapping[str, list[ranges.Range]],
+    geometry: MonitorGeometry,
+    local: float,
+    data: Data,
 ) -> None:
     """Add the limits of every formula by itself; the local focal length is along the line at its centre, metres."""
     f, f_x = focal_lengths(geometry)
@@ -439,9 +443,9 @@ def _show_causes(
     rows: list[list[Cell]] = []
     listed = []
     for name, form, theory, text in causes:
-        errors = own[name][0].raw[form]
-        inside = errors[errors[:, 0] <= own[name][0].window]
-        share = own[name][0].sign * inside[:, 1] / inside[:, 0]
+        errors = reference_ranges[name][0].raw[form]
+        inside = errors[errors[:, 0] <= reference_ranges[name][0].window]
+        share = reference_ranges[name][0].sign * inside[:, 1] / inside[:, 0]
         bend = float(np.ptp(share))
         by_cause = "" if theory is None else f"{100 * theory:.3f} %"
         rows.append([SYMBOLS[name], form, f"{100 * share[-1]:.3f} %", by_cause, f"{100 * bend:.1e} %", text])
@@ -451,12 +455,14 @@ def _show_causes(
     context.table("causes", rows)
 
 
-def _show_singles(context: Context, found: Mapping[str, Mapping[str, list[ranges.Range]]], data: Data) -> None:
+def _show_singles(
+    context: Context, ranges_by_instrument: Mapping[str, Mapping[str, list[ranges.Range]]], data: Data
+) -> None:
     """Add the domains of every formula by itself."""
     rows: list[list[Cell]] = []
-    listed: dict[str, dict[str, Any]] = {instrument: {} for instrument in found}
-    for instrument, name in ((instrument, name) for instrument in found for name in NAMES):
-        both = found[instrument][name]
+    listed: dict[str, dict[str, Any]] = {instrument: {} for instrument in ranges_by_instrument}
+    for instrument, name in ((instrument, name) for instrument in ranges_by_instrument for name in NAMES):
+        both = ranges_by_instrument[instrument][name]
         per, unit, _ = _shown(name)
         ends = min(r.window for r in both), min(r.lost for r in both)
         entry: dict[str, Any] = {f"area_ccd_ends_at_{unit}": ends[0] * per, f"beam_cut_at_{unit}": ends[1] * per}
@@ -469,22 +475,24 @@ def _show_singles(context: Context, found: Mapping[str, Mapping[str, list[ranges
         listed[instrument][name] = entry
     data["single_changes"] = listed
     context.table("domains", rows)
-    first = next(iter(found))
-    context.figure("domains-figure", singles_svg(found[first]), instrument=first)
+    first = next(iter(ranges_by_instrument))
+    context.figure("domains-figure", singles_svg(ranges_by_instrument[first]), instrument=first)
 
 
-def _show_joint(context: Context, corners: ranges.Corners, found: ranges.Separation, data: Data) -> None:
+def _show_joint(context: Context, corners: ranges.Corners, separation: ranges.Separation, data: Data) -> None:
     """All four at once."""
     rows: list[list[Cell]] = []
     for form in (JOINT, CORRECTED, CALIBRATED):
         for read in NAMES:
-            gains = (found.mean(form, read, changed)[0] * _shown(read)[0] / _shown(changed)[0] for changed in NAMES)
+            gains = (
+                separation.mean(form, read, changed)[0] * _shown(read)[0] / _shown(changed)[0] for changed in NAMES
+            )
             cells = (f"{round(gain, 5) + 0.0:.5f}".replace("-", "\N{MINUS SIGN}") for gain in gains)
             boxes = (corners.text(ranges.key(form, read, fine)) for fine in (False, True))
             rows.append([form, f"{SYMBOLS[read]} [{_shown(read)[1]}]", *cells, *boxes])
-    context.table("joint", rows, trials=found.trials, box=ranges.BOX_TEXT)
+    context.table("joint", rows, trials=separation.trials, box=ranges.BOX_TEXT)
     gain, sigma = (
-        {form: [[found.mean(form, r, c)[part] for c in NAMES] for r in NAMES] for form in FORMS} for part in (0, 1)
+        {form: [[separation.mean(form, r, c)[part] for c in NAMES] for r in NAMES] for form in FORMS} for part in (0, 1)
     )
     limits = {name: corners.limit(name) for name in corners.images.value}
     data["all_at_once"] = {

@@ -74,25 +74,25 @@ def run(context: Context) -> Iterator[CheckResult]:
         yield context.row(f"001.table2.claimed.{name}", value, explained=explained, times=claimed / value)
     if not any(".claimed." not in identifier for identifier in context.selected):
         return
-    found = measured(context)
+    measurement = measured(context)
     differences: dict[str, tuple[float, float]] = {}
-    for series in laboratory.series_per_axis(found.setup.spec):
-        row = _mean_difference(context, found, series)
+    for series in laboratory.series_per_axis(measurement.setup.spec):
+        row = _mean_difference(context, measurement, series)
         differences[series.axis] = float(row.measured or 0.0), float(row.sigma or 0.0)
         yield row
-    yield _z_columns(context, found)
-    yield from _relations(context, found)
+    yield _z_columns(context, measurement)
+    yield from _relations(context, measurement)
     worst, spread = max(differences.values())
     text = ", ".join(f"about {axis} {value:.3f}" for axis, (value, _) in differences.items())
     facts: dict[str, Any] = {
-        "found": found,
+        "found": measurement,
         "text": text,
         "printed": {axis: printed_mean_difference(axis) for axis in differences},
     }
     for name in ("mean_error", "below_1"):
-        sigma = spread / math.sqrt(len(found.real))
+        sigma = spread / math.sqrt(len(measurement.real))
         yield context.row(f"001.table2.{name}", worst, sigma, inputs=[_errors(worst)], **facts)
-    _show(context, found)
+    _show(context, measurement)
 
 
 def printed_mean_difference(axis: str) -> float:
@@ -100,17 +100,17 @@ def printed_mean_difference(axis: str) -> float:
     return mean_difference(ANGLES if axis == "Z" else MIRROR_1[axis], MIRROR_2[axis])
 
 
-def _mean_difference(context: Context, found: Measured, series: laboratory.Series) -> CheckResult:
+def _mean_difference(context: Context, measurement: Measured, series: laboratory.Series) -> CheckResult:
     """Check the last line of Table 2 for one axis by the mean over the benches.
 
     The noise is the standard deviation of one bench under the errors that the scene declares.
     """
-    axis, spec = series.axis, found.setup.spec
-    perfect, result = found.ideal[axis], found.real[0][axis]
-    means = np.array([table[axis].mean_difference for table in found.real])
+    axis, spec = series.axis, measurement.setup.spec
+    perfect, result = measurement.ideal[axis], measurement.real[0][axis]
+    means = np.array([table[axis].mean_difference for table in measurement.real])
     spread = laboratory.declared_spread(spec, series, float(np.max(result.sigma)) / math.sqrt(2.0))
     facts: dict[str, Any] = {
-        "found": found,
+        "found": measurement,
         "result": result,
         "rows": series.steps + 1,
         "means": means,
@@ -126,21 +126,21 @@ def _mean_difference(context: Context, found: Measured, series: laboratory.Serie
     return context.row(f"001.table2.{axis.lower()}", value, sigma, inputs=[_errors(value)], **facts)
 
 
-def _z_columns(context: Context, found: Measured) -> CheckResult:
-    spec, real = found.setup.spec, found.real
+def _z_columns(context: Context, measurement: Measured) -> CheckResult:
+    spec, real = measurement.setup.spec, measurement.real
     first, second = (np.array([table["Z"].columns[k] for table in real]) / ARCSEC for k in (0, 1))
-    one = np.array(MIRROR_1["Z"])
+    mirror_1 = np.array(MIRROR_1["Z"])
     scale = real[0]["Z"].scale
     # each of two instruments has the unrest of a reading and of its reading at zero; equal means within half a digit
     unrest = 2.0 * spec.errors.reading / ARCSEC
-    chance = math.erf(0.005 / (unrest * math.sqrt(2.0))) ** len(one) if unrest > 0.0 else 0.0
+    chance = math.erf(0.005 / (unrest * math.sqrt(2.0))) ** len(mirror_1) if unrest > 0.0 else 0.0
     apart = np.max(np.abs(scale * first - second), axis=1)
     facts: dict[str, Any] = {
         "scale": scale,
-        "one": one,
-        "twice": one[1] * 2.0 / math.sqrt(3.0),
+        "one": mirror_1,
+        "twice": mirror_1[1] * 2.0 / math.sqrt(3.0),
         "chance": chance,
-        "rate": np.polyfit(ANGLES, one, 1)[0],
+        "rate": np.polyfit(ANGLES, mirror_1, 1)[0],
         "sine": math.sqrt(0.75),
         "first": first,
         "end": second[:, -1],
@@ -156,27 +156,27 @@ def _errors(measured: float) -> Chosen:
     return Chosen.power("errors of the bench (scenes/lab/principle_experiment.yaml), times", 1.0, "1", measured)
 
 
-def _relations(context: Context, found: Measured) -> Iterator[CheckResult]:
+def _relations(context: Context, measurement: Measured) -> Iterator[CheckResult]:
     """Section 3.1.1's relations on the ideal bench, where nothing but they can differ."""
     for axis in "XYZ":
-        result, component = found.ideal[axis], column_component(axis)
+        result, component = measurement.ideal[axis], column_component(axis)
         between = 2.0 * result.series.half_angle
         read = float(result.readings[1, -1, component] / result.series.angles[-1])
         facts: dict[str, Any] = {"series": result.series, "between": between, "read": read, "own": "XY"[component]}
         row = f"001.table2.relation.{axis.lower()}"
         yield context.row(row, read / autocollimator.relation_factor(axis, 2, between), **facts)
-    result = found.ideal["Z"]
+    result = measurement.ideal["Z"]
     read = float(result.readings[0, -1, 1] / result.series.angles[-1])
     expected = [autocollimator.relation_factor("Z", 1, 0.0)]
     yield context.row("001.table2.relation.mirror_1_z", read, explained=expected, series=result.series)
 
 
-def _show(context: Context, found: Measured) -> None:
+def _show(context: Context, measurement: Measured) -> None:
     context.progress(0.95, "draw")
-    table = found.real[0]
+    table = measurement.real[0]
     columns = [table["X"].series.angles, *(column for axis in "XYZ" for column in table[axis].columns)]
     context.table("table2", [[round(float(v) / ARCSEC, 4) for v in row] for row in zip(*columns, strict=True)])
-    context.figure("bench", bench_png(found.reader, [table]))
+    context.figure("bench", bench_png(measurement.reader, [table]))
 
 
 DPI = 130
@@ -248,7 +248,7 @@ def _bench(axes: Axes, path: AutocollimatorPath) -> None:
             axes.annotate(f"{name}$_{unit}$", _plan(0.122 * vector), color=colour, ha="center", va="center")
     axes.add_patch(Circle((0.0, 0.0), 1e3 * (spec.mirrors.radius + 0.03), fill=False, color=GREY, lw=1.0, ls="--"))
     axes.annotate("turntable", (140.0, 175.0), color=GREY, ha="center")
-    title = f"From above (X toward you), mirrors {np.degrees(bench.between):.0f}° apart; mm"
+    title = f"From above (X toward you), mirrors {np.degrees(bench.mirror_angle):.0f}° apart; mm"
     axes.set(aspect="equal", title=title, xlabel="Z", ylabel="−Y")
     axes.grid(color=LIGHT, lw=0.5)
 

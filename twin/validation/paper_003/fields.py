@@ -128,11 +128,11 @@ def flights_of(campaigns: Sequence[Campaign]) -> Flights:
     latitude = np.array([p.latitude for p in first.passes])
     rows: dict[str, list[np.ndarray]] = {}
     fits = []
-    for one in campaigns:
-        alone = {p.name: calibrated_alone(one, p) for p in one.passes}
-        schemes, before = scheme_errors(one, alone), laboratory_errors(one)
-        floor = {p.name: check_point_errors(one, p, one.truth, p.bias) for p in one.passes}
-        true = np.array([p.bias for p in one.passes])
+    for campaign in campaigns:
+        alone = {p.name: calibrated_alone(campaign, p) for p in campaign.passes}
+        schemes, before = scheme_errors(campaign, alone), laboratory_errors(campaign)
+        floor = {p.name: check_point_errors(campaign, p, campaign.truth, p.bias) for p in campaign.passes}
+        true = np.array([p.bias for p in campaign.passes])
         bias = np.array([alone[n].bias(n) for n in names])
         sigma = np.array([[alone[n].sigma[f"{n} {axis}"] for axis in BIAS] for n in names])
         new = {
@@ -148,7 +148,7 @@ def flights_of(campaigns: Sequence[Campaign]) -> Flights:
             "plan_floor": values_of(floor, "plan_rms"),
             "height_floor": values_of(floor, "height_rms"),
         }
-        new["expected"] = _expected(one, names, new["plan_floor"])
+        new["expected"] = _expected(campaign, names, new["plan_floor"])
         new["true_amplitude"], new["true_significance"] = _slopes(latitude, true)
         for key, value in new.items():
             rows.setdefault(key, []).append(value)
@@ -183,11 +183,11 @@ def _slopes(latitude: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndar
     return best[0], np.abs(best[0]) / sigma
 
 
-def _above(one: FieldPass) -> float:
+def _above(field_pass: FieldPass) -> float:
     """Height of the flight above the check points, metres."""
-    earth = one.data.earth
-    flight = float(earth.geodetic(one.trajectory.position(0.0))[2])
-    return flight - float(np.mean(earth.geodetic(one.check_ground)[2]))
+    earth = field_pass.data.earth
+    flight = float(earth.geodetic(field_pass.trajectory.position(0.0))[2])
+    return flight - float(np.mean(earth.geodetic(field_pass.check_ground)[2]))
 
 
 def lines_of(part: str) -> list[int]:
@@ -226,12 +226,12 @@ class Quality:
 
 def quality_of(setup: CalibrationSetup, campaigns: Sequence[Campaign]) -> Quality:
     """Third differences of every pass; truth from the true trajectories."""
-    rows = [[_pass(setup, p) for p in one.passes] for one in campaigns]
+    rows = [[_pass(setup, p) for p in campaign.passes] for campaign in campaigns]
     return Quality(*(np.array([[p[k] for p in row] for row in rows]) for k in range(7)))
 
 
-def _pass(setup: CalibrationSetup, one: FieldPass) -> tuple[np.ndarray, ...]:
-    errors, measured, true = setup.test.errors, one.measured, one.trajectory
+def _pass(setup: CalibrationSetup, field_pass: FieldPass) -> tuple[np.ndarray, ...]:
+    errors, measured, true = setup.test.errors, field_pass.measured, field_pass.trajectory
     fixes, looks = (
         _readings(measured.first, measured.last, v) for v in (errors.gps.interval, errors.star_tracker.interval)
     )
@@ -254,20 +254,20 @@ def _readings(first: float, last: float, interval: float) -> np.ndarray:
 
 
 def _quality(context: Context, campaigns: Sequence[Campaign], setup: CalibrationSetup) -> Iterator[CheckResult]:
-    found = quality_of(setup, campaigns)
-    errors, passes = setup.test.errors, found.orbit.shape[0] * found.orbit.shape[1]
-    facts: dict[str, Any] = {"found": found, "passes": passes, "campaigns": campaigns}
+    quality = quality_of(setup, campaigns)
+    errors, passes = setup.test.errors, quality.orbit.shape[0] * quality.orbit.shape[1]
+    facts: dict[str, Any] = {"found": quality, "passes": passes, "campaigns": campaigns}
     worst, sigma = median_of(
-        np.max([v.max(axis=1) / v.min(axis=1) for v in (found.orbit, found.attitude)], axis=(0, 2))
+        np.max([v.max(axis=1) / v.min(axis=1) for v in (quality.orbit, quality.attitude)], axis=(0, 2))
     )
     inputs = [Chosen.power("noise of the worst field over that of the best, times", 1.0, "1", worst)]
     yield context.row("003.table2", worst, sigma, 10.0, inputs=inputs, **facts)
-    ratio = found.attitude_sigma / found.attitude_jump
+    ratio = quality.attitude_sigma / quality.attitude_jump
     yield context.row("003.table2.white", np.mean(ratio), np.std(ratio) / np.sqrt(ratio.size), 1.0, **facts)
     noise, drift = rms(errors.gps.noise), rms(errors.gps.drift)
-    implied, true = rms(found.orbit_sigma), rms(found.orbit_error)
+    implied, true = rms(quality.orbit_sigma), rms(quality.orbit_error)
     # the slow error hardly changes during a pass: one value each
-    sigma = implied / true / float(np.sqrt(2.0 * found.orbit_error.size))
+    sigma = implied / true / float(np.sqrt(2.0 * quality.orbit_error.size))
     facts |= {"implied_m": implied, "true": true, "noise": noise, "drift": drift}
     explained = [noise / float(np.hypot(noise, drift))]
     yield context.row("003.table2.orbit", implied / true, sigma, 1.0, explained, **facts)
@@ -278,8 +278,8 @@ def _quality(context: Context, campaigns: Sequence[Campaign], setup: Calibration
         worse = changed(setup, errors=errors.model_copy(update={"star_tracker": tracker}))
         seed = np.random.SeedSequence(context.seed, spawn_key=(3, 4))
         again = quality_of(worse, [source_of(worse, seed)])
-        truth = rms(again.attitude_error) / rms(found.attitude_error)
-        shown = again.attitude_sigma / rms(found.attitude_sigma)
+        truth = rms(again.attitude_error) / rms(quality.attitude_error)
+        shown = again.attitude_sigma / rms(quality.attitude_sigma)
         sigma = np.std(shown) / np.sqrt(shown.size)
         yield context.row("003.table2.equal", float(np.mean(shown)), sigma, truth, [1.0], slow=SLOW, truth=truth)
 
@@ -308,8 +308,8 @@ def _biases(context: Context, flights: Flights) -> Iterator[CheckResult]:
 def _slope(context: Context, flights: Flights, number: int, k: int) -> CheckResult:
     amplitude = np.array([row[k].amplitude for row in flights.fits]) / ARCSEC
     true = flights.true_amplitude[:, k] / ARCSEC
-    own = [row[k].amplitude_sigma for row in flights.fits]
-    facts: dict[str, Any] = {"flights": flights, "own": own, "away": amplitude - true}
+    sigmas = [row[k].amplitude_sigma for row in flights.fits]
+    facts: dict[str, Any] = {"flights": flights, "own": sigmas, "away": amplitude - true}
     return context.row(f"003.fig{number}", amplitude.mean(), mean_of(amplitude - true)[1], true.mean(), **facts)
 
 
@@ -333,15 +333,15 @@ def _interior(context: Context, flights: Flights, number: int, parts: tuple[str,
 
 
 @drawing("paper-003-schemes", 4.6)
-def schemes_svg(figure: Figure, found: Flights, plan: float, height: float) -> None:
+def schemes_svg(figure: Figure, flights: Flights, plan: float, height: float) -> None:
     """Draw the RMS in plan and height on logarithmic axes with the limits; scheme 0 is before calibration."""
     panels = figure.subplots(1, 2)
     names = ["0\nlaboratory", "1\n1 field", "2\n2 fields", "3\n4 fields", "4\n6 fields", "5\nits own"]
     for axes, what, limit in zip(panels, ("plan", "height"), (plan, height), strict=True):
-        before, table = getattr(found, f"{what}_before"), getattr(found, what)
+        before, table = getattr(flights, f"{what}_before"), getattr(flights, what)
         values = np.concatenate([before[:, None], table], axis=1)
         low, middle, high = np.percentile(values, [5.0, 50.0, 95.0], axis=0)
-        for k, name in enumerate(found.fields):
+        for k, name in enumerate(flights.fields):
             place = np.arange(values.shape[1]) + 0.11 * (k - 3)
             bars = np.stack([middle[:, k] - low[:, k], high[:, k] - middle[:, k]])
             style: dict[str, Any] = {"color": _COLOURS[k % 7], "fmt": _MARKERS[k % 7], "ms": 4.5, "lw": 1.1}
@@ -359,19 +359,19 @@ def schemes_svg(figure: Figure, found: Flights, plan: float, height: float) -> N
 
 
 @drawing("paper-003-latitude", 3.8)
-def latitude_svg(figure: Figure, found: Flights) -> None:
+def latitude_svg(figure: Figure, flights: Flights) -> None:
     """Three angles: estimates, truth and fits."""
-    degrees = np.degrees(found.latitude)
-    reach = np.linspace(found.latitude.min() - 0.03, found.latitude.max() + 0.03, 61)
+    degrees = np.degrees(flights.latitude)
+    reach = np.linspace(flights.latitude.min() - 0.03, flights.latitude.max() + 0.03, 61)
     for k, (axes, axis) in enumerate(zip(figure.subplots(1, 3), BIAS, strict=True)):
-        one = found.fits[0][k]
-        for fits in found.fits[1 : 1 + _CURVES]:
-            curve = fits[k].curve(reach) - fits[k].constant + one.constant
+        fit = flights.fits[0][k]
+        for fits in flights.fits[1 : 1 + _CURVES]:
+            curve = fits[k].curve(reach) - fits[k].constant + fit.constant
             axes.plot(np.degrees(reach), curve / ARCSEC, color=GREY, lw=0.5, alpha=0.35)
-        axes.plot(np.degrees(reach), one.curve(reach) / ARCSEC, color=VERMILION, lw=1.5, label="fit")
-        axes.plot(degrees, found.true_bias[0, :, k] / ARCSEC, "x", color=INK, ms=6, label="truth", zorder=4)
+        axes.plot(np.degrees(reach), fit.curve(reach) / ARCSEC, color=VERMILION, lw=1.5, label="fit")
+        axes.plot(degrees, flights.true_bias[0, :, k] / ARCSEC, "x", color=INK, ms=6, label="truth", zorder=4)
         axes.errorbar(
-            degrees, found.bias[0, :, k] / ARCSEC, found.bias_sigma[0, :, k] / ARCSEC,
+            degrees, flights.bias[0, :, k] / ARCSEC, flights.bias_sigma[0, :, k] / ARCSEC,
             fmt="o", color=BLUE, ms=4.5, lw=1.2, capsize=2, label="estimated, 1σ",
         )  # fmt: skip
         axes.set(title=f"{axis} [arcsec]", xlabel="latitude [deg]")
@@ -391,23 +391,23 @@ def run(context: Context) -> Iterator[CheckResult]:
 
     campaigns = flown(setup, [stream(seed, k) for k in range(count)], step)
     context.progress(0.6, "calibrate and test")
-    found = flights_of(campaigns)
+    flights = flights_of(campaigns)
     if context.wants("003.table2"):
         yield from _quality(context, campaigns, setup)
-    yield from _biases(context, found)
+    yield from _biases(context, flights)
     for number, k in ((4, 0), (5, 1), (6, 2)):
-        yield _slope(context, found, number, k)
-    yield _interior(context, found, 4, ("x", "y"), "principal points")
-    yield _interior(context, found, 5, ("f",), "principal distances")
-    yield from _schemes(context, found, setup)
-    yield from _findings(context, found)
+        yield _slope(context, flights, number, k)
+    yield _interior(context, flights, 4, ("x", "y"), "principal points")
+    yield _interior(context, flights, 5, ("f",), "principal distances")
+    yield from _schemes(context, flights, setup)
+    yield from _findings(context, flights)
     limits = setup.test.limits
     if context.wants("003.before", "003.scale50000", *(f"003.scheme{k}" for k in SCHEMES)):
-        context.figure("schemes", schemes_svg(found, limits.plan, limits.height))
-        _show_accuracy(context, found)
+        context.figure("schemes", schemes_svg(flights, limits.plan, limits.height))
+        _show_accuracy(context, flights)
     if context.wants("003.table3", "003.fig4", "003.fig5", "003.fig6"):
-        context.figure("latitude", latitude_svg(found))
-        _show_biases(context, found)
+        context.figure("latitude", latitude_svg(flights))
+        _show_biases(context, flights)
 
 
 def _schemes(context: Context, flights: Flights, setup: CalibrationSetup) -> Iterator[CheckResult]:
@@ -501,20 +501,20 @@ def _findings(context: Context, flights: Flights) -> Iterator[CheckResult]:
         yield context.row(f"003.{name}", value, sigma, implied, (), inputs, values=values, share=share, **facts)
 
 
-def _show_accuracy(context: Context, found: Flights) -> None:
+def _show_accuracy(context: Context, flights: Flights) -> None:
     rows: list[list[Cell]] = []
     for k, scheme in SCHEMES.items():
-        for what, values in (("plan", found.plan[:, k - 1]), ("height", found.height[:, k - 1])):
+        for what, values in (("plan", flights.plan[:, k - 1]), ("height", flights.height[:, k - 1])):
             fields = (float(v) for v in np.median(values, axis=0))
             rows.append([f"{k}, {scheme}", what, *fields, float(np.median(values.mean(axis=1)))])
     context.table("accuracy", rows)
 
 
-def _show_biases(context: Context, found: Flights) -> None:
+def _show_biases(context: Context, flights: Flights) -> None:
     rows: list[list[Cell]] = []
-    for k, name in enumerate(found.fields):
-        pairs = np.stack([found.bias[0, k], found.true_bias[0, k]], axis=1) / ARCSEC
-        rows.append([name, float(np.degrees(found.latitude[k])), *pairs.ravel().tolist()])
+    for k, name in enumerate(flights.fields):
+        pairs = np.stack([flights.bias[0, k], flights.true_bias[0, k]], axis=1) / ARCSEC
+        rows.append([name, float(np.degrees(flights.latitude[k])), *pairs.ravel().tolist()])
     context.table("biases", rows)
 
 

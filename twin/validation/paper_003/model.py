@@ -116,7 +116,7 @@ def all_errors(value: float) -> Chosen:
 
 def true_sensors(
     setup: CalibrationSetup,
-    one: FieldPass,
+    field_pass: FieldPass,
     trajectory: Platform | None = None,
     interior: Mapping[str, np.ndarray] = FrozenMap(),
 ) -> dict[str, Sensor]:
@@ -141,8 +141,8 @@ def true_sensors(
         other = {"principal_distance": spec.principal_distance + float(f), "principal_point": point}
         lines[line] = spec.model_copy(update=other)
     cameras = line_cameras(payload.model_copy(update={"lines": FrozenMap(lines)}))
-    path = one.trajectory if trajectory is None else trajectory
-    known = one.data.sensors
+    path = field_pass.trajectory if trajectory is None else trajectory
+    known = field_pass.data.sensors
     return {k: replace(known[k], camera=cameras[k], trajectory=path, effects=NO_EFFECTS) for k in LINES}
 
 
@@ -184,7 +184,7 @@ def rays_at(sensor: Sensor, attitude: Platform, pitch: float, line: np.ndarray, 
     )
 
 
-def derivatives(setup: CalibrationSetup, one: FieldPass, bias: np.ndarray) -> tuple[str, str, float]:
+def derivatives(setup: CalibrationSetup, field_pass: FieldPass, bias: np.ndarray) -> tuple[str, str, float]:
     """Compare the coefficients of the error equations with finite changes of the rigorous sensor.
 
     Each unknown of the sensor is changed slightly; the resulting misclosure of the unchanged model is minus its
@@ -205,36 +205,36 @@ def derivatives(setup: CalibrationSetup, one: FieldPass, bias: np.ndarray) -> tu
         Line and unknown with the largest deviation, and its largest difference relative to the largest coefficient.
     """
     payload = changed_payload(setup.test, setup.camera)
-    ground, still = one.check_ground, np.zeros(3)
-    found = []
+    ground, still = field_pass.check_ground, np.zeros(3)
+    ratios = []
     for line in LINES:
         model, pitch = line_model(payload, line), setup.camera.pitch_of(line)
-        base = true_sensors(setup, one, Turned(one.trajectory, bias))[line]
-        seen = places_seen(setup, one, line, np.zeros(3), bias)
-        by = partials(model, rays_at(base, one.trajectory, pitch, *seen), ground, bias, still)
+        base = true_sensors(setup, field_pass, Turned(field_pass.trajectory, bias))[line]
+        seen = places_seen(setup, field_pass, line, np.zeros(3), bias)
+        by = partials(model, rays_at(base, field_pass.trajectory, pitch, *seen), ground, bias, still)
         for k, name in enumerate((*INTERIOR, *BIAS)):
             step = _STEP.get(name, _TURN)
             sides = []
             for sign in (1.0, -1.0):
                 change = np.zeros(6)
                 change[k] = sign * step
-                seen = places_seen(setup, one, line, change[:3], bias + change[3:])
-                sides.append(misclosure(model, rays_at(base, one.trajectory, pitch, *seen), ground, bias, still))
+                seen = places_seen(setup, field_pass, line, change[:3], bias + change[3:])
+                sides.append(misclosure(model, rays_at(base, field_pass.trajectory, pitch, *seen), ground, bias, still))
             coefficient = -(sides[0] - sides[1]) / (2.0 * step)
             expected = by.interior[:, :, k] if k < 3 else by.bias[:, :, k - 3]
-            found.append((line, name, float(np.abs(coefficient - expected).max() / np.abs(coefficient).max())))
-    return max(found, key=lambda entry: entry[2])
+            ratios.append((line, name, float(np.abs(coefficient - expected).max() / np.abs(coefficient).max())))
+    return max(ratios, key=lambda entry: entry[2])
 
 
 def places_seen(
-    setup: CalibrationSetup, one: FieldPass, line: str, interior: np.ndarray, bias: np.ndarray
+    setup: CalibrationSetup, field_pass: FieldPass, line: str, interior: np.ndarray, bias: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return lines and pixels of the check points in a line with changed f, x, y (3,) and an attitude bias (3,).
 
     They are those of the rigorous sensor.
     """
-    turned = Turned(one.trajectory, bias)
-    return true_sensors(setup, one, turned, {line: interior})[line].image(one.check_ground)
+    turned = Turned(field_pass.trajectory, bias)
+    return true_sensors(setup, field_pass, turned, {line: interior})[line].image(field_pass.check_ground)
 
 
 def exact_campaign(setup: CalibrationSetup, seed: np.random.SeedSequence) -> Campaign:
@@ -244,25 +244,25 @@ def exact_campaign(setup: CalibrationSetup, seed: np.random.SeedSequence) -> Cam
 
 def recovered(campaign: Campaign, pitch: float) -> tuple[float, str]:
     """Largest error of a calibration of exact points, pixels of image motion, and which unknown has it."""
-    one = campaign.passes[0]
-    found = calibrated_alone(campaign, one)
+    field_pass = campaign.passes[0]
+    adjustment = calibrated_alone(campaign, field_pass)
     worst, which = 0.0, ""
-    for name, error in errors_of(campaign, one, found).items():
-        pixels = abs(error) * (found.cameras["nadir"].interior[0] if name in BIAS else 1.0) / pitch
+    for name, error in errors_of(campaign, field_pass, adjustment).items():
+        pixels = abs(error) * (adjustment.cameras["nadir"].interior[0] if name in BIAS else 1.0) / pitch
         if pixels >= worst:
             worst, which = float(pixels), name
     return worst, which
 
 
-def errors_of(campaign: Campaign, one: FieldPass, found: Adjustment | Stepwise) -> dict[str, float]:
+def errors_of(campaign: Campaign, field_pass: FieldPass, adjustment: Adjustment | Stepwise) -> dict[str, float]:
     """Unknown, without a field -> estimated minus true, metres and radians."""
-    value = dict(zip(found.names, found.values, strict=True))
+    value = dict(zip(adjustment.names, adjustment.values, strict=True))
     out = {
         f"{line} {name}": float(value[f"{line} {name}"] - true)
         for line in LINES
         for name, true in zip(INTERIOR, campaign.truth[line].interior, strict=True)
     }
-    return out | {n: float(value[f"{one.name} {n}"] - t) for n, t in zip(BIAS, one.bias, strict=True)}
+    return out | {n: float(value[f"{field_pass.name} {n}"] - t) for n, t in zip(BIAS, field_pass.bias, strict=True)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,24 +298,24 @@ class Rank:
 
 def rank_of(setup: CalibrationSetup, campaign: Campaign) -> Rank:
     """Compute the null vectors of one field, and apply the first of them to the sensor."""
-    one = campaign.passes[0]
-    own = campaign.independent
-    found = adjust([one.control], own.laboratory, own.noise, gauge=GAUGE)
-    loose = adjust([one.control], own.laboratory, own.noise, gauge=Gauge(held=("nadir x",)))
-    first = dict(zip(found.open[0].names, found.open[0].change, strict=True)) if found.open else {}
+    field_pass = campaign.passes[0]
+    independent = campaign.independent
+    adjustment = adjust([field_pass.control], independent.laboratory, independent.noise, gauge=GAUGE)
+    loose = adjust([field_pass.control], independent.laboratory, independent.noise, gauge=Gauge(held=("nadir x",)))
+    first = dict(zip(adjustment.open[0].names, adjustment.open[0].change, strict=True)) if adjustment.open else {}
     size = 1e-4 / max(abs(first.get("nadir x", 1.0)), 1e-12)
-    turn = np.array([first.get(f"{one.name} {n}", 0.0) for n in BIAS]) * size
+    turn = np.array([first.get(f"{field_pass.name} {n}", 0.0) for n in BIAS]) * size
     moved, alone = [], []
     for line in LINES:
         inner = np.array([first.get(f"{line} {n}", 0.0) for n in INTERIOR]) * size
         start, both, inside = (
-            np.stack(places_seen(setup, one, line, a, b))
+            np.stack(places_seen(setup, field_pass, line, a, b))
             for a, b in ((np.zeros(3), np.zeros(3)), (inner, turn), (inner, np.zeros(3)))
         )
         moved.append(both - start)
         alone.append(inside - start)
     sizes = (rms(np.hypot(*np.concatenate(v, axis=1))) for v in (moved, alone))
-    return Rank(len(found.names), found.open, loose.sigma["nadir y"], *sizes)
+    return Rank(len(adjustment.names), adjustment.open, loose.sigma["nadir y"], *sizes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,19 +336,19 @@ class Walk:
     after: Mapping[int, float]
 
 
-def walked(campaign: Campaign, one: FieldPass, rounds: tuple[int, ...] = (1, 10, 100)) -> Walk:
+def walked(campaign: Campaign, field_pass: FieldPass, rounds: tuple[int, ...] = (1, 10, 100)) -> Walk:
     """Both solutions of one field, and how far the stepwise one is after some rounds."""
-    given = [one.control], campaign.laboratory, campaign.noise
-    together = adjust(*given, gauge=GAUGE)
+    observations = [field_pass.control], campaign.laboratory, campaign.noise
+    together = adjust(*observations, gauge=GAUGE)
     free = np.array([name not in GAUGE.held for name in together.names])
     sigma = np.sqrt(np.diag(together.covariance))[free]
 
-    def distance(found: Stepwise) -> np.ndarray:
-        return np.asarray(np.abs(found.values - together.values)[free] / sigma)
+    def distance(solution: Stepwise) -> np.ndarray:
+        return np.asarray(np.abs(solution.values - together.values)[free] / sigma)
 
-    found = stepwise(*given, held=GAUGE.held, tolerance=TOLERANCE)
-    after = {n: float(distance(stepwise(*given, held=GAUGE.held, rounds=n)).max()) for n in rounds}
-    return Walk(found, together, float(distance(found).max()), FrozenMap(after))
+    solution = stepwise(*observations, held=GAUGE.held, tolerance=TOLERANCE)
+    after = {n: float(distance(stepwise(*observations, held=GAUGE.held, rounds=n)).max()) for n in rounds}
+    return Walk(solution, together, float(distance(solution).max()), FrozenMap(after))
 
 
 @dataclass(frozen=True, eq=False)
@@ -384,19 +384,19 @@ class _Spots:
 
 def rendered_marks(setup: CalibrationSetup, campaign: Campaign, seed: np.random.SeedSequence) -> dict[str, FoundMarks]:
     """Line -> its marks, four in each window over the first field of a campaign, found by their centroids."""
-    one = campaign.passes[0]
-    height = setup.test.fields[one.name].height
-    sensors = true_sensors(setup, one)
+    field_pass = campaign.passes[0]
+    height = setup.test.fields[field_pass.name].height
+    sensors = true_sensors(setup, field_pass)
     optics = optics_of(setup.camera, LINES, setup.test.line_time, setup.detectors)
     rows: dict[str, list[FoundMarks]] = {k: [] for k in LINES}
     for k, place in enumerate(PLACES):
-        nadir, own = sensors["nadir"], stream(seed, k)
+        nadir, rng = sensors["nadir"], stream(seed, k)
         point = nadir.ground(np.array([-nadir.first_line_time / nadir.line_time]), np.array([place]), height)
         lon, lat, _ = (float(np.ravel(v)[0]) for v in nadir.earth.geodetic(point))
         frame = GroundFrame(lon, lat)
         spec = TerrainSpec.model_validate({**_TERRAIN, "height": f"{height} m"})
-        terrain = Terrain.fractal(spec, 3000.0, stream(own, 0))
-        shift = np.random.default_rng(stream(own, 1)).uniform(-10.0, 10.0, (2, 4))
+        terrain = Terrain.fractal(spec, 3000.0, stream(rng, 0))
+        shift = np.random.default_rng(stream(rng, 1)).uniform(-10.0, 10.0, (2, 4))
         east = 0.5 * _APART * np.array([-1.0, 1.0, -1.0, 1.0]) + shift[0]
         north = 0.5 * _APART * np.array([-1.0, -1.0, 1.0, 1.0]) + shift[1]
         ground = frame.itrs(east, north, terrain.height(east, north))
@@ -409,8 +409,8 @@ def rendered_marks(setup: CalibrationSetup, campaign: Campaign, seed: np.random.
             at += [window.first_line, window.first_pixel]
             rows[name].append(FoundMarks(at[:, 0], at[:, 1], _matched(sensor.image(ground), at, ground)))
     return {
-        k: FoundMarks(*(np.concatenate([getattr(r, part) for r in found]) for part in ("line", "pixel", "ground")))
-        for k, found in rows.items()
+        k: FoundMarks(*(np.concatenate([getattr(r, part) for r in positions]) for part in ("line", "pixel", "ground")))
+        for k, positions in rows.items()
     }
 
 
@@ -419,12 +419,12 @@ def missed(setup: CalibrationSetup, campaign: Campaign, marks: dict[str, FoundMa
 
     The model has the true interior orientation and bias, the measured attitude and the known ground.
     """
-    one = campaign.passes[0]
+    field_pass = campaign.passes[0]
     out = {}
-    for name, found in marks.items():
-        sensor, pitch = one.data.sensors[name], setup.camera.pitch_of(name)
-        rays = rays_at(sensor, one.measured, pitch, found.line, found.pixel)
-        out[name] = misclosure(campaign.truth[name], rays, found.ground, one.bias, np.zeros(3)) / pitch
+    for name, line_marks in marks.items():
+        sensor, pitch = field_pass.data.sensors[name], setup.camera.pitch_of(name)
+        rays = rays_at(sensor, field_pass.measured, pitch, line_marks.line, line_marks.pixel)
+        out[name] = misclosure(campaign.truth[name], rays, line_marks.ground, field_pass.bias, np.zeros(3)) / pitch
     return out
 
 
@@ -496,13 +496,13 @@ class FromImages:
         # variance of a sum of squares of correlated normal errors is twice the trace of the squared covariance
         mean = float(np.trace(part)) / len(where)
         spread = float(np.sqrt(2.0 * np.trace(part @ part))) / len(where)
-        found = float(np.sqrt(np.mean([self.error[n] ** 2 for n in names])))
-        return found, spread / (2.0 * float(np.sqrt(mean)))
+        value = float(np.sqrt(np.mean([self.error[n] ** 2 for n in names])))
+        return value, spread / (2.0 * float(np.sqrt(mean)))
 
 
 def calibrated(campaign: Campaign) -> tuple[FromImages, ...]:
     """Every field by itself."""
-    return tuple(_field(campaign, one) for one in campaign.passes)
+    return tuple(_field(campaign, field_pass) for field_pass in campaign.passes)
 
 
 def matching(campaign: Campaign) -> tuple[float, int, int]:
@@ -512,61 +512,69 @@ def matching(campaign: Campaign) -> tuple[float, int, int]:
     """
     assert campaign.images is not None
     patches = [patch.judgements for field in campaign.images for patch in field.patches]
-    every = [one for sorts in patches for lines in sorts.values() for one in lines.values()]
-    control = [one for sorts in patches for one in sorts["control"].values()]
-    right = np.array([one.degrees_of_freedom // 2 for one in control])
-    square = float(sum(n * np.sum(np.nan_to_num(one.rms) ** 2) for n, one in zip(right, control, strict=True)))
+    all_lines = [line_matches for sorts in patches for lines in sorts.values() for line_matches in lines.values()]
+    control = [line_matches for sorts in patches for line_matches in sorts["control"].values()]
+    right = np.array([line_matches.degrees_of_freedom // 2 for line_matches in control])
+    square = float(
+        sum(n * np.sum(np.nan_to_num(line_matches.rms) ** 2) for n, line_matches in zip(right, control, strict=True))
+    )
     rms = float(np.sqrt(square / max(2 * int(right.sum()), 1)))
-    return rms, sum(one.matched for one in every), sum(one.wrong_matched for one in every)
+    return (
+        rms,
+        sum(line_matches.matched for line_matches in all_lines),
+        sum(line_matches.wrong_matched for line_matches in all_lines),
+    )
 
 
-def _field(campaign: Campaign, one: FieldPass) -> FromImages:
-    together = calibrated_alone(campaign, one)
-    way = stepwise([one.control], campaign.laboratory, campaign.noise, held=GAUGE.held, tolerance=TOLERANCE)
+def _field(campaign: Campaign, field_pass: FieldPass) -> FromImages:
+    together = calibrated_alone(campaign, field_pass)
+    way = stepwise([field_pass.control], campaign.laboratory, campaign.noise, held=GAUGE.held, tolerance=TOLERANCE)
     free = [n for n in together.names if n not in GAUGE.held]
-    error = {n: v for n, v in errors_of(campaign, one, way).items() if n not in GAUGE.held}
+    error = {n: v for n, v in errors_of(campaign, field_pass, way).items() if n not in GAUGE.held}
     where = [together.names.index(n) for n in free]
     value = dict(zip(way.names, way.values, strict=True))
     cameras = {
         line: camera.with_interior([value[f"{line} {k}"] for k in INTERIOR])
         for line, camera in campaign.laboratory.items()
     }
-    bias = np.array([value[f"{one.name} {n}"] for n in BIAS])
-    after = check_point_errors(campaign, one, cameras, bias)
+    bias = np.array([value[f"{field_pass.name} {n}"] for n in BIAS])
+    after = check_point_errors(campaign, field_pass, cameras, bias)
     return FromImages(
-        one.name,
-        int(one.control.control.sum()),
-        len(one.check_ground),
+        field_pass.name,
+        int(field_pass.control.control.sum()),
+        len(field_pass.check_ground),
         way,
         together,
         error,
         together.covariance[np.ix_(where, where)],
-        laboratory_errors(campaign)[one.name],
+        laboratory_errors(campaign)[field_pass.name],
         after,
     )
 
 
-def summary(found: FromImages, names: tuple[str, ...]) -> str:
+def summary(from_images: FromImages, names: tuple[str, ...]) -> str:
     """Return errors and sigmas of some unknowns of a field as text."""
-    sigma = dict(zip(found.error, np.sqrt(np.diag(found.covariance)).tolist(), strict=True))
+    sigma = dict(zip(from_images.error, np.sqrt(np.diag(from_images.covariance)).tolist(), strict=True))
     parts = []
     for n in names:
         scale, unit, digits = (ARCSEC, "″", 2) if n in BIAS else (1e-6, " µm", 1)
-        parts.append(f"{n} {found.error[n] / scale:+.{digits}f} ± {sigma[n] / scale:.{digits}f}{unit}")
-    return f"{found.name}, {found.control} control points: {', '.join(parts)}."
+        parts.append(f"{n} {from_images.error[n] / scale:+.{digits}f} ± {sigma[n] / scale:.{digits}f}{unit}")
+    return f"{from_images.name}, {from_images.control} control points: {', '.join(parts)}."
 
 
 @drawing("paper-003-open", 3.4)
 def open_svg(figure: Figure, rank: Rank, walk: Walk) -> None:
     """Draw bars of the undetermined combination, and sigmas over rounds."""
     left, right = figure.subplots(1, 2)
-    one = rank.open[0]
-    names = [n if n.split()[-1] in "fxy" else n.split()[-1] for n in one.names]
-    angle = [n.split()[-1] not in "fxy" for n in one.names]
-    size = [float(c) * (_FOCAL if a else 1.0) * 1e3 for c, a in zip(one.change, angle, strict=True)]
+    combination = rank.open[0]
+    names = [n if n.split()[-1] in "fxy" else n.split()[-1] for n in combination.names]
+    angle = [n.split()[-1] not in "fxy" for n in combination.names]
+    size = [float(c) * (_FOCAL if a else 1.0) * 1e3 for c, a in zip(combination.change, angle, strict=True)]
     place = np.arange(len(names))
     left.barh(place, size, color=[VERMILION if a else BLUE for a in angle], height=0.6)
-    labels = [f"{c / ARCSEC:+.0f}″" if a else f"{c * 1e3:+.2f} mm" for c, a in zip(one.change, angle, strict=True)]
+    labels = [
+        f"{c / ARCSEC:+.0f}″" if a else f"{c * 1e3:+.2f} mm" for c, a in zip(combination.change, angle, strict=True)
+    ]
     for k, label in enumerate(labels):
         left.text(0.5 * size[k], k, label, ha="center", va="center", color="white", fontsize=9.0)
     left.set_yticks(place, names)
@@ -603,7 +611,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 def _exact(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResult]:
     setup = exact_and_images()
     campaign = exact_campaign(setup, stream(seed, 0))
-    one = campaign.passes[0]
+    field_pass = campaign.passes[0]
     if "003.model" in context.selected:
         context.progress(0.02, "render marks")
         misses = missed(setup, campaign, rendered_marks(setup, campaign, stream(seed, 1)))
@@ -615,25 +623,25 @@ def _exact(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResu
         }
         yield context.row("003.model", max(largest.values()), implied=0.0, **facts)
     if "003.equations" in context.selected:
-        line, name, worst = derivatives(setup, one, one.bias)
-        yield context.row("003.equations", worst, implied=0.0, one=one, name=name, line=line)
+        line, name, worst = derivatives(setup, field_pass, field_pass.bias)
+        yield context.row("003.equations", worst, implied=0.0, one=field_pass, name=name, line=line)
     if "003.equations.exact" in context.selected:
         worst, name = recovered(campaign, setup.camera.pitch)
-        yield context.row("003.equations.exact", worst, implied=0.0, one=one, name=name)
+        yield context.row("003.equations.exact", worst, implied=0.0, one=field_pass, name=name)
 
 
 def _simulated(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResult]:
     setup = without_light(setup_of(FIELDS, (FIELD,)))
     campaign = source_of(setup, seed).independent
     if "003.model.rank" in context.selected:
-        found = rank_of(setup, campaign)
+        rank = rank_of(setup, campaign)
         facts: dict[str, Any] = {
-            "found": found,
-            "combinations": "; ".join(str(o) for o in found.open),
-            "pixels": found.weak_sigma / setup.camera.pitch,
+            "found": rank,
+            "combinations": "; ".join(str(o) for o in rank.open),
+            "pixels": rank.weak_sigma / setup.camera.pitch,
         }
-        yield context.row("003.model.rank", found.rank, None, float(UNKNOWNS), [UNKNOWNS - 1.0], **facts)
-        context.figure("open", open_svg(found, walked(campaign, campaign.passes[0], ROUNDS)))
+        yield context.row("003.model.rank", rank.rank, None, float(UNKNOWNS), [UNKNOWNS - 1.0], **facts)
+        context.figure("open", open_svg(rank, walked(campaign, campaign.passes[0], ROUNDS)))
     if "003.model.stepwise" in context.selected:
         walk = walked(campaign, campaign.passes[0])
         after = ", ".join(f"{v:.1f} after {n}" for n, v in walk.after.items())
@@ -659,10 +667,10 @@ def _yaw(context: Context, seed: np.random.SeedSequence) -> CheckResult:
     for k in range(count):
         context.progress(0.1 + 0.05 * k / count, f"fly campaign {k + 1} of {count}")
         campaign = source_of(setup, stream(seed, k)).independent
-        for one in campaign.passes:
-            found = calibrated_alone(campaign, one)
-            sigmas.append(found.sigma[f"{one.name} yaw"])
-            ratios.append((found.bias(one.name) - one.bias)[BIAS.index("yaw")] / sigmas[-1])
+        for field_pass in campaign.passes:
+            adjustment = calibrated_alone(campaign, field_pass)
+            sigmas.append(adjustment.sigma[f"{field_pass.name} yaw"])
+            ratios.append((adjustment.bias(field_pass.name) - field_pass.bias)[BIAS.index("yaw")] / sigmas[-1])
     facts: dict[str, Any] = {"ratios": ratios, "sigmas": sigmas}
     return context.row("003.model.bias.yaw", rms(ratios), float(np.sqrt(0.5 / len(ratios))), 1.0, **facts)
 
@@ -674,28 +682,28 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
         context.progress(0.15 + 0.8 * done / total, "render patches and match points")
 
     campaign = source_of(setup, seed, progress)
-    found = calibrated(campaign)
+    fields = calibrated(campaign)
     spec = setup.test.images
     assert spec is not None
-    count = f"{len(found)} field{'s' * (len(found) > 1)} of {len(spec.patches)}"
-    facts: dict[str, Any] = {"fields": count, "spec": spec, "images": 3 * len(found) * len(spec.patches)}
+    count = f"{len(fields)} field{'s' * (len(fields) > 1)} of {len(spec.patches)}"
+    facts: dict[str, Any] = {"fields": count, "spec": spec, "images": 3 * len(fields) * len(spec.patches)}
     if "003.model.points" in context.selected:
         error, matched, wrong = matching(campaign)
         limit = setup_of(FIELDS).test.errors.image
         yield context.row("003.model.points", error, None, limit, matched=matched, wrong=wrong, **facts)
-    facts["rounds"] = ", ".join(str(f.way.rounds) for f in found)
+    facts["rounds"] = ", ".join(str(f.way.rounds) for f in fields)
     for row, names, unit in (("bias", ROLL_PITCH, ARCSEC), ("interior", FREE_INTERIOR, 1e-6)):
-        worst, sigma = (value / unit for value in max(f.rms(names) for f in found))
-        errors = " ".join(summary(f, names) for f in found)
+        worst, sigma = (value / unit for value in max(f.rms(names) for f in fields))
+        errors = " ".join(summary(f, names) for f in fields)
         yield context.row(f"003.model.{row}", worst, sigma, inputs=[all_errors(worst)], errors=errors, **facts)
     for what in ("plan", "height"):
-        field = max(found, key=lambda f: getattr(f.after, f"{what}_rms"))
+        field = max(fields, key=lambda f: getattr(f.after, f"{what}_rms"))
         error, before = (float(getattr(e, f"{what}_rms")) for e in (field.after, field.before))
         sigma, limit = error / float(np.sqrt(2.0 * field.check)), getattr(setup.test.limits, what)
         inputs = [all_errors(error)]
         yield context.row(f"003.model.{what}", error, sigma, limit, (), inputs, field=field, before=before, **facts)
     rows = []
-    for f in found:
+    for f in fields:
         deviations = np.sqrt(np.diag(f.covariance))
         for k, (name, off) in enumerate(f.error.items()):
             called, scale = ("arcsec", ARCSEC) if name in BIAS else ("µm", 1e-6)

@@ -96,9 +96,9 @@ class Perspective:
             f, w = start * (1.0 + guess[0]), guess[1] if tilted else 0.0
             return np.asarray(where - f * (np.tan(turn - w) + np.tan(w)))
 
-        found = least_squares(rest, np.zeros(1 + tilted), x_scale=1e-3, xtol=1e-15, ftol=1e-15, gtol=1e-15)
-        f = start * (1.0 + float(found.x[0]))
-        return cls(f, f * float(np.tan(found.x[1])) if tilted else 0.0, rest(found.x))
+        fit = least_squares(rest, np.zeros(1 + tilted), x_scale=1e-3, xtol=1e-15, ftol=1e-15, gtol=1e-15)
+        f = start * (1.0 + float(fit.x[0]))
+        return cls(f, f * float(np.tan(fit.x[1])) if tilted else 0.0, rest(fit.x))
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,20 +155,20 @@ class SpotTest:
         columns = np.tan(self.true_turn)[:, None] ** np.array(powers)
         # what the camera images to W stands beside W + zero
         moved = -self.camera.f * self.zero * (1.0 + np.tan(self.true_turn) ** 2)
-        found = np.linalg.lstsq(columns, moved)[0]
-        return found, np.asarray(moved - columns @ found)
+        coefficients = np.linalg.lstsq(columns, moved)[0]
+        return coefficients, np.asarray(moved - columns @ coefficients)
 
     def errors(self, turn: Array, points: slice | NDArray[np.intp]) -> tuple[float, float]:
         """Error of f and RMS error of D, metres, of constant, f and p fitted to these points with these angles."""
-        found = [_fitted(self.place[points], turn[points]), _fitted(self.true_place[points], self.true_turn[points])]
-        (f, rest), (f_true, rest_true) = found
+        fits = [_fitted(self.place[points], turn[points]), _fitted(self.true_place[points], self.true_turn[points])]
+        (f, rest), (f_true, rest_true) = fits
         return f - f_true, rms(rest - rest_true)
 
 
 def _fitted(where: Array, turn: Array) -> tuple[float, Array]:
     columns = np.tan(turn)[:, None] ** np.arange(3)
-    found = np.linalg.lstsq(columns, where)[0]
-    return float(found[1]), np.asarray(where - columns @ found)
+    coefficients = np.linalg.lstsq(columns, where)[0]
+    return float(coefficients[1]), np.asarray(where - columns @ coefficients)
 
 
 def run(context: Context) -> Iterator[CheckResult]:
@@ -214,25 +214,25 @@ def lower(raw: float | np.floating, compensated: float | np.floating) -> float:
 
 def _table2(context: Context) -> Iterator[CheckResult]:
     """Check the printed columns of Table 2."""
-    raw, own = RAW, COMPENSATED
-    changed = raw != own
-    top = [np.eye(len(raw))[np.argmax(values)] for values in (raw, own)]
+    raw, compensated = RAW, COMPENSATED
+    changed = raw != compensated
+    top = [np.eye(len(raw))[np.argmax(values)] for values in (raw, compensated)]
     share = [np.full(len(raw), 1.0 / len(raw))] * 2
     # derivatives of each statistic by the entries, over the statistic
     kinds = (
-        ("reduction", rms(raw), rms(own), raw / np.sum(raw**2), own / np.sum(own**2)),
-        ("mean", np.mean(raw), np.mean(own), share[0] / np.mean(raw), share[1] / np.mean(own)),
-        ("largest", np.max(raw), np.max(own), top[0] / np.max(raw), top[1] / np.max(own)),
+        ("reduction", rms(raw), rms(compensated), raw / np.sum(raw**2), compensated / np.sum(compensated**2)),
+        ("mean", np.mean(raw), np.mean(compensated), share[0] / np.mean(raw), share[1] / np.mean(compensated)),
+        ("largest", np.max(raw), np.max(compensated), top[0] / np.max(raw), top[1] / np.max(compensated)),
     )
     facts: dict[str, Any] = {"points": raw, "changed": np.sum(changed), "share": 100.0 * np.mean(changed)}
-    facts |= {"worse": int(np.argmin(raw - own)) + 1, "worst": int(np.argmax(own)) + 1}
+    facts |= {"worse": int(np.argmin(raw - compensated)) + 1, "worst": int(np.argmax(compensated)) + 1}
     for name, first, second, before, after in kinds:
         value = lower(first, second)
         # the last digit stands for values within 0.1; a point that is the same in both columns has one rounding
         parts = np.where(changed, np.hypot(before, after), np.abs(before - after))
         sigma = (100.0 - value) * 0.1 / np.sqrt(12.0) * float(np.linalg.norm(parts))
         yield context.row(f"004.table2.{name}", value, sigma, first=first, second=second, **facts)
-    yield context.row("004.table2.bound", float(np.max(own)), **facts)
+    yield context.row("004.table2.bound", float(np.max(compensated)), **facts)
 
 
 Facts = Mapping[str, Any]
@@ -317,10 +317,10 @@ def _uneven(
     solve: Callable[[SpotTest, tuple[Array, Array]], Any],
 ) -> CheckResult:
     """Check the principal point by an equation over unevenly spaced points."""
-    found = np.array([solve(t, (t.place[UNEVEN], t.zeroed[UNEVEN])) for t in tests])
+    points = np.array([solve(t, (t.place[UNEVEN], t.zeroed[UNEVEN])) for t in tests])
     true, turn = np.array([t.part.p for t in tests]), tests[0].true_turn[UNEVEN]
-    scatter = MM * float(np.std(found - true, ddof=1))
-    value, truth = MM * float(np.mean(true) + np.mean(found - true)), MM * float(np.mean(true))
+    scatter = MM * float(np.std(points - true, ddof=1))
+    value, truth = MM * float(np.mean(true) + np.mean(points - true)), MM * float(np.mean(true))
     more: dict[str, Any] = {"uneven": turn, "scatter": scatter}
     return context.row(identifier, value, scatter / np.sqrt(len(tests)), truth, **facts, **more)
 
@@ -333,15 +333,15 @@ def _sensitivity(context: Context, tests: Sequence[SpotTest], facts: Facts) -> I
     whole = slice(None)
     raw = [np.asarray(t.run.raw.fit.angle) for t in tests]
     all_raw, inner = (np.array([t.errors(w, k) for t, w in zip(tests, raw, strict=True)]) for k in (whole, half))
-    own = rms([t.errors(t.turn, whole)[1] for t in tests])
+    with_compensation = rms([t.errors(t.turn, whole)[1] for t in tests])
     spots = rms([t.errors(t.true_turn, whole)[1] for t in tests])
-    by_spots, by_angles = spots**2, own**2 - spots**2
+    by_spots, by_angles = spots**2, with_compensation**2 - spots**2
     chosen = Chosen(
         "dividing error of scenes/lab/turntable.yaml, times", 1.0, "1",
         lambda factor: 100.0 * (1.0 - by_spots / (by_spots + factor**2 * by_angles)),
     )  # fmt: skip
-    more: dict[str, Any] = {"own": own, "spots": spots, "as_read": rms(all_raw[:, 1])}
-    share = 100.0 * (1.0 - by_spots / own**2)
+    more: dict[str, Any] = {"own": with_compensation, "spots": spots, "as_read": rms(all_raw[:, 1])}
+    share = 100.0 * (1.0 - by_spots / with_compensation**2)
     yield context.row("004.sensitivity.angle", share, None, 50.0, inputs=[chosen], **facts, **more)
     for name, column, over, under in (("field", 1, all_raw, inner), ("distance", 0, inner, all_raw)):
         top, bottom = rms(over[:, column]), rms(under[:, column])
@@ -349,9 +349,9 @@ def _sensitivity(context: Context, tests: Sequence[SpotTest], facts: Facts) -> I
         sigma = _ratio(over, under, column)
         yield context.row(f"004.sensitivity.{name}", top / bottom, sigma, 1.0, **facts, **more)
     few = rms([t.errors(t.turn, slice(k, None, FEW))[0] for t in tests for k in range(FEW)])
-    every = rms([t.errors(t.turn, whole)[0] for t in tests])
-    more = {"few": few, "every": every, "fewer": POINTS // FEW, "gain": FEW**0.5}
-    yield context.row("004.sensitivity.points", few / every, None, 1.0, **facts, **more)
+    total = rms([t.errors(t.turn, whole)[0] for t in tests])
+    more = {"few": few, "every": total, "fewer": POINTS // FEW, "gain": FEW**0.5}
+    yield context.row("004.sensitivity.points", few / total, None, 1.0, **facts, **more)
     rng = np.random.default_rng(np.random.SeedSequence(context.seed, spawn_key=(1,)))
     wrong = FIT_RMS_ARCSEC * ARCSEC
     error = UM * rms([t.errors(t.true_turn + rng.normal(0.0, wrong, len(t.turn)), whole)[1] for t in tests])
@@ -372,18 +372,18 @@ def _ratio(over: Array, under: Array, column: int) -> float:
 
 def _errors_of_tests(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[CheckResult]:
     """Check the remaining dividing error of the angles and the remaining error of the distortion."""
-    own, raw = (
+    compensated, raw = (
         np.array([np.std(angle(t) - t.true_turn) for t in tests]) / ARCSEC
         for angle in (lambda t: t.turn, lambda t: t.run.raw.fit.angle)
     )
-    value = float(np.max(own))
+    value = float(np.max(compensated))
     row = "004.turntable.compensated"
-    yield context.row(row, value, inputs=[dividing(value)], own=own, raw=raw, **facts)
-    raw, own = _errors(tests).T
-    value = float(np.max(own))
-    yield context.row("004.table2.accuracy", value, inputs=[dividing(value)], own=own, raw=raw, **facts)
+    yield context.row(row, value, inputs=[dividing(value)], own=compensated, raw=raw, **facts)
+    raw, compensated = _errors(tests).T
+    value = float(np.max(compensated))
+    yield context.row("004.table2.accuracy", value, inputs=[dividing(value)], own=compensated, raw=raw, **facts)
     runs = [t.run for t in tests]
-    less = 100.0 * (1.0 - own / raw)
+    less = 100.0 * (1.0 - compensated / raw)
     # known better than sigma, but the printed figure is of one table
     more: dict[str, Any] = {
         "less": less,
@@ -420,8 +420,8 @@ def _errors(tests: Sequence[SpotTest]) -> Array:
 
 
 def _show(context: Context, tests: Sequence[SpotTest]) -> None:
-    raw, own = RAW, COMPENSATED
-    changes = {"paper 004, Table 2": (raw[None], own[None])}
+    raw, compensated = RAW, COMPENSATED
+    changes = {"paper 004, Table 2": (raw[None], compensated[None])}
     kinds: dict[str, Callable[[SimulatedDistortion], tuple[Array, Array]]] = {
         "error of the distortion (needs the truth)": lambda r: (r.error(r.raw), r.error(r.compensated)),
         "distance from a smooth curve": lambda r: (r.raw.smooth.residual, r.compensated.smooth.residual),
@@ -433,7 +433,7 @@ def _show(context: Context, tests: Sequence[SpotTest]) -> None:
     rows: list[list[Cell]] = [[name, *_statistics(*both)] for name, both in changes.items()]
     context.table("table2", rows, points=POINTS, tests=tests)
     reduction = 0.01 * _PRINTED.number("distortion.reduction_percent")
-    context.figure("reduction", reduction_svg(_errors(tests), (rms(raw), rms(own)), reduction))
+    context.figure("reduction", reduction_svg(_errors(tests), (rms(raw), rms(compensated)), reduction))
     # error of the zero, p of (2), and p that the zero explains
     by_eq2 = [
         (t.zero / ARCSEC, MM * principal_distance_and_point(t.place, t.turn)[1], -MM * t.shifted(1, 2)[0][1])
@@ -485,9 +485,9 @@ def points_svg(figure: Figure, by_eq2: NDArray[np.float64], free: NDArray[np.flo
     second (T, 2) has p with a constant term and its sigma, in mm.
     """
     left, right = figure.subplots(1, 2)
-    zero, found, explained = by_eq2[np.argsort(by_eq2[:, 0])].T
+    zero, estimated, explained = by_eq2[np.argsort(by_eq2[:, 0])].T
     left.plot(zero, explained, color=GREY, lw=0.9, label="traced camera, zero wrong by so much")
-    left.plot(zero, found, "o", color=BLUE, ms=5.0, mec="white", mew=0.5, label="p of (2), rendered spots")
+    left.plot(zero, estimated, "o", color=BLUE, ms=5.0, mec="white", mew=0.5, label="p of (2), rendered spots")
     left.set_xlabel("error of the zero of W [arcsec]")
     left.set_ylabel("p [mm]")
     left.set_title("(2) as printed")

@@ -216,11 +216,11 @@ def _losses(factors: Mapping[str, float], value: float) -> list[Chosen]:
     The logarithm of each factor is proportional to the square of its size, as for small wavefront errors (Maréchal),
     diffusion and small motions.
     """
-    every = float(np.prod(list(factors.values())))
+    product = float(np.prod(list(factors.values())))
     wavefront = factors["wavefront"]
     return [
         Chosen("wavefront error as built, times", 1.0, "1", lambda factor: value * wavefront ** (factor**2 - 1.0)),
-        Chosen(_ALL_LOSSES, 1.0, "1", lambda factor: value * every ** (factor**2 - 1.0)),
+        Chosen(_ALL_LOSSES, 1.0, "1", lambda factor: value * product ** (factor**2 - 1.0)),
     ]
 
 
@@ -324,8 +324,8 @@ def _reached(context: Context, alignments: Sequence[SimulatedFocus], facts: Mapp
     more = {"before": _list(turns[:, 0], 2), "after": _list(turns[:, -1], 2), "level": plan.level}
     value = float(np.max(turns[:, -1]))
     yield context.row("004.alignment.level", value, inputs=[_theodolite(alignments, value)], **facts, **more)
-    kept = (far <= CONFOCAL_MM) & (turns <= LINE_LEVEL_ARCMIN)
-    rounds = np.where(kept.any(axis=1), np.argmax(kept, axis=1), far.shape[1])
+    within_limits = (far <= CONFOCAL_MM) & (turns <= LINE_LEVEL_ARCMIN)
+    rounds = np.where(within_limits.any(axis=1), np.argmax(within_limits, axis=1), far.shape[1])
     more = {"none": np.sum(rounds == 0), "once": np.sum(rounds == 1), "step": plan.mount.step}
     more["again"] = [_second_round(a) for a in alignments]
     needed = float(np.max(rounds))

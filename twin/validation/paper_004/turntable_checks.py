@@ -83,8 +83,8 @@ def run(context: Context) -> Iterator[CheckResult]:
     often = {name: sum(table.chosen == name for table in tables) for name in CLOSED_FORMS}
     names = {FIT_NAMES[name]: count for name, count in often.items() if count}
     facts: dict[str, Any] = {"tables": tables, "lines": lines, "chosen": chosen, "network": network, "names": names}
-    for name, found in (("interpolation", lines), ("fit", chosen)):
-        value = float(np.max(found))
+    for name, fitted in (("interpolation", lines), ("fit", chosen)):
+        value = float(np.max(fitted))
         yield context.row(f"004.turntable.{name}", value, inputs=[dividing(value)], **facts)
     if "004.turntable.network" in context.selected:
         yield _network(context, tables)
@@ -95,11 +95,11 @@ def _criterion(context: Context, series: Sequence[CalibrationSeries]) -> CheckRe
     """Check the rejection limit of the rule by the readings that it accepted and rejected."""
     readings, keep = (np.concatenate([getattr(s, name) for s in series]) for name in ("comparisons", "keep"))
     size = np.abs(readings - readings.mean(axis=1, keepdims=True)) / readings.std(axis=1, ddof=1, keepdims=True)
-    kept, rejected = float(np.max(size[keep])), float(np.min(size[~keep]))
+    largest_accepted, smallest_rejected = float(np.max(size[keep])), float(np.min(size[~keep]))
     # half a reading is expected beyond it, two-sided
     wanted = brentq(lambda x: REPEATS * erfc(x / np.sqrt(2.0)) - 0.5, 0.1, 5.0)
-    facts: dict[str, Any] = {"series": series, "size": size, "kept": kept, "gone": rejected}
-    return context.row("004.turntable.criterion", 0.5 * (kept + rejected), None, wanted, **facts)
+    facts: dict[str, Any] = {"series": series, "size": size, "kept": largest_accepted, "gone": smallest_rejected}
+    return context.row("004.turntable.criterion", 0.5 * (largest_accepted + smallest_rejected), None, wanted, **facts)
 
 
 def fit_table(spec: TurntableTestSpec, seed: int) -> FittedTable:
@@ -107,14 +107,14 @@ def fit_table(spec: TurntableTestSpec, seed: int) -> FittedTable:
     done = run_turntable(spec, seed, names=CLOSED_FORMS)
     series, held = done.series, done.held_out
     assert held is not None
-    found = {name: rms(done.held_out_residual(name)) for name in done.fits}
+    residual_rms = {name: rms(done.held_out_residual(name)) for name in done.fits}
     try:
         # without its cross-validation, which takes ten times as long and chooses nothing here
         network = fit_dividing_error(series.angle, series.mean, series.sigma, NETWORK, seed)
-        found[NETWORK] = rms(held.mean - network(held.angle))
+        residual_rms[NETWORK] = rms(held.mean - network(held.angle))
     except NotConvergedError:
         pass
-    return FittedTable(done.choice.chosen, {name: found.get(name, float("inf")) for name in FITS})
+    return FittedTable(done.choice.chosen, {name: residual_rms.get(name, float("inf")) for name in FITS})
 
 
 def _repeats(
@@ -131,14 +131,14 @@ def _repeats(
         "good": rejection_rate(REPEATS) * series[0].comparisons.size,
         "kept": np.median([s.mean_rms for s in series]),
     }
-    for name, found in values.items():
+    for name, repeats in values.items():
         identifier = f"004.turntable.{name}"
         if identifier in context.selected:
-            value, sigma = median_of(found)
+            value, sigma = median_of(repeats)
             chosen = context.check(identifier).basis == "chosen"
             inputs = _readings(spec, seeds[:FAST_TABLES], identifier, value) if chosen else []
             explained = [REPEAT_RMS_ARCSEC / REPEATS**0.5] if name.endswith("mean") else []
-            more: dict[str, Any] = {"found": found, "quartiles": np.percentile(found, [25.0, 75.0])}
+            more: dict[str, Any] = {"found": repeats, "quartiles": np.percentile(repeats, [25.0, 75.0])}
             yield context.row(identifier, value, sigma, None, explained, inputs, **facts, **more)
 
 
@@ -155,9 +155,9 @@ def _readings(spec: TurntableTestSpec, seeds: NDArray[np.integer], identifier: s
         ("scatter of a reading", scatter, _with_errors(spec, FURTHER, 1.0)),
         ("gross error", spec.reference.gross_error / ARCSEC, _with_errors(spec, 1.0, FURTHER)),
     ):
-        found = [np.max(TurntableModel(changed, int(seed)).calibrate().rms_before) / ARCSEC for seed in seeds]
+        largest = [np.max(TurntableModel(changed, int(seed)).calibrate().rms_before) / ARCSEC for seed in seeds]
         # both errors go into the RMS in square
-        growth = (float(np.median(found)) ** 2 - value**2) / (FURTHER**2 - 1.0)
+        growth = (float(np.median(largest)) ** 2 - value**2) / (FURTHER**2 - 1.0)
 
         def response(factor: float, growth: float = growth) -> float:
             return float(np.sqrt(max(value**2 + (factor**2 - 1.0) * growth, 0.0)))

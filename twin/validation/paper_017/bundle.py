@@ -93,12 +93,12 @@ def ratios(image: float, seed: np.random.SeedSequence) -> np.ndarray:
     )
 
 
-def limit(found: np.ndarray) -> float:
+def limit(height_ratios: np.ndarray) -> float:
     """Return the attitude error, in arcseconds, above which the bundle has the smaller errors.
 
     The ratios (3,) are those at `ERRORS`; their logarithms are nearly a parabola in the logarithm of the error.
     """
-    place, value = np.log(ERRORS), np.log(found)
+    place, value = np.log(ERRORS), np.log(height_ratios)
     fine = np.linspace(np.log(0.05), np.log(5.0), 2001)
     curve = np.polyval(np.polyfit(place, value, 2), fine)
     return float(np.exp(fine[np.argmin(np.abs(curve))]))
@@ -108,16 +108,16 @@ def run(context: Context) -> Iterator[CheckResult]:
     """Check the row."""
     count = context.count(STRIPS, FAST_STRIPS)
     root = np.random.SeedSequence(context.seed)
-    every = []
+    ratio_list = []
     for k in range(count):
         context.progress(k / (count + 1), "strips")
-        every.append(ratios(IMAGE, stream(root, k)))
+        ratio_list.append(ratios(IMAGE, stream(root, k)))
     context.progress(count / (count + 1), "a strip with better image points")
     fine = limit(ratios(FINE, stream(root, 0)))
-    limits = np.array([limit(one) for one in every])
+    limits = np.array([limit(ratio_row) for ratio_row in ratio_list])
     measured, sigma = mean_of(limits)
     at = np.log(STATED)
-    factor = float(np.exp(np.mean([np.interp(at, np.log(ERRORS), np.log(one)) for one in every])))
+    factor = float(np.exp(np.mean([np.interp(at, np.log(ERRORS), np.log(ratio_row)) for ratio_row in ratio_list])))
     drawn = draw_block(strip(IMAGE, 0.01), stream(root, count))
     # between the two the limit goes with a power of the image points' error
     power = np.log(measured / fine) / np.log(IMAGE / FINE)
@@ -129,7 +129,7 @@ def run(context: Context) -> Iterator[CheckResult]:
         "strips": count,
         "ties": TIES,
         "errors": [f"{error:g}″" for error in ERRORS],
-        "ratios": np.mean(every, axis=0),
+        "ratios": np.mean(ratio_list, axis=0),
     }
     inputs: list[Chosen | Supposed] = [
         Chosen.power("error of an image point", IMAGE, "px", measured, float(power)),
