@@ -86,14 +86,14 @@ def _describe(model: dict[str, Any]) -> None:
     text = model.get("description", "")
     model["description"] = text.split("\n\n")[0]
     listed = text.partition("\nAttributes\n----------\n")[2]
-    each = [(name, description) for names, description in _ATTRIBUTE.findall(listed) for name in names.split(", ")]
-    for name, description in each:
+    pairs = [(name, description) for names, description in _ATTRIBUTE.findall(listed) for name in names.split(", ")]
+    for name, description in pairs:
         item = model.get("properties", {}).get(name)
         if item is not None:
             description = " ".join(description.split())
             # A quantity of a file has the unit written beside it, not that of the attribute.
-            one = item.get("anyOf", [item])[0]
-            unit = item.get("description") or one.get("description") or one.get("items", {}).get("description")
+            first = item.get("anyOf", [item])[0]
+            unit = item.get("description") or first.get("description") or first.get("items", {}).get("description")
             item["description"] = f"{_SI_UNIT.sub('', description).rstrip('.')}: {unit}" if unit else description
 
 

@@ -19,7 +19,7 @@ from _pytest.mark.expression import Expression
 from typer._click.exceptions import MissingParameter
 
 from docs.site.command_pages import parser, programs
-from scenes.models.disturbances import motions_of_spec
+from scenes.models.disturbances import prior_of_spec
 from scenes.models.instrument_builder import build_instrument
 from scenes.schema import MODELS
 from scenes.specs.disturbances import DisturbancesSpec
@@ -137,7 +137,7 @@ def test_yaml_is_a_file_that_can_be_read(instrument, backend) -> None:
         if models[0] is JobSpec:
             checked_nodes(spec, instrument(spec.instrument).nodes)
         if models[0] is DisturbancesSpec:
-            motions_of_spec(spec, instrument("gf7_pair"))
+            prior_of_spec(spec, instrument("gf7_pair"))
         if models[0] is InstrumentSpec:
             build_instrument(spec, {site.camera: load_camera(site.camera) for site in spec.cameras.values()}, backend)
 

@@ -198,21 +198,23 @@ def requirements() -> list[Requirement]:
     except importlib.metadata.PackageNotFoundError:
         project = Path(__file__).resolve().parent.parent / "pyproject.toml"
         lines = tomllib.loads(project.read_text("utf-8"))["project"]["dependencies"] if project.exists() else []
-    every = map(Requirement, lines)
-    return [one for one in every if one.marker is None or one.marker.evaluate({"extra": ""})]
+    parsed = map(Requirement, lines)
+    return [spec for spec in parsed if spec.marker is None or spec.marker.evaluate({"extra": ""})]
 
 
 def _versions() -> list[Check]:
     """Check the installed version of each dependency."""
     checks = []
-    for one in requirements():
+    for spec in requirements():
         try:
-            found = importlib.metadata.version(one.name)
+            version = importlib.metadata.version(spec.name)
         except importlib.metadata.PackageNotFoundError:
-            checks.append(Check(one.name, "failed", f"not installed; pip install '{one.name}{one.specifier}'"))
+            checks.append(Check(spec.name, "failed", f"not installed; pip install '{spec.name}{spec.specifier}'"))
             continue
-        good = one.specifier.contains(found, prereleases=True)
-        checks.append(Check(one.name, *(("ok", found) if good else ("note", f"{found}, required {one.specifier}"))))
+        good = spec.specifier.contains(version, prereleases=True)
+        checks.append(
+            Check(spec.name, *(("ok", version) if good else ("note", f"{version}, required {spec.specifier}")))
+        )
     return checks
 
 
@@ -226,19 +228,19 @@ def _lock() -> list[Check]:
     if not FOLDER.is_dir():
         return []
     try:
-        found = differences(DISTRIBUTION)
+        comparison = differences(DISTRIBUTION)
     except (LockError, OSError) as error:
         return [Check("lock", "failed", f"cannot be read: {error}")]
-    parts = [f"{found.equal} packages as in docs/supply/lock"]
-    if found.other:
-        parts.append(f"other versions than locked: {'; '.join(found.other)}")
-    if found.missing:
-        parts.append(f"not installed: {', '.join(found.missing)}")
-    if found.other or found.missing:
+    parts = [f"{comparison.equal} packages as in docs/supply/lock"]
+    if comparison.other:
+        parts.append(f"other versions than locked: {'; '.join(comparison.other)}")
+    if comparison.missing:
+        parts.append(f"not installed: {', '.join(comparison.missing)}")
+    if comparison.other or comparison.missing:
         parts.append("to install the locked versions, delete .venv/installed and run bash setup.sh")
-    if found.unknown:
-        parts.append(f"not in the lock: {', '.join(found.unknown)}")
-    status: Status = "failed" if found.missing else "note" if found.other else "ok"
+    if comparison.unknown:
+        parts.append(f"not in the lock: {', '.join(comparison.unknown)}")
+    status: Status = "failed" if comparison.missing else "note" if comparison.other else "ok"
     return [Check("lock", status, "; ".join(parts))]
 
 

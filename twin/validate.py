@@ -157,16 +157,16 @@ def _run(
     with Progress(*columns, console=errors, disable=not errors.is_terminal, transient=True) as bar:
         task = bar.add_task("start", total=total)
 
-        begun, at = time.monotonic(), "start"
+        started, status = time.monotonic(), "start"
 
         def show(done: float, text: str) -> None:
             """Update the progress bar."""
-            nonlocal at
-            left = (time.monotonic() - begun) * (total - done) / done if done > 0.05 * total else total - done
-            at = f"{text}, about {cli.time_text(left)} left"
-            bar.update(task, completed=done, description=at)
+            nonlocal status
+            remaining = (time.monotonic() - started) * (total - done) / done if done > 0.05 * total else total - done
+            status = f"{text}, about {cli.time_text(remaining)} left"
+            bar.update(task, completed=done, description=status)
 
-        beat = cli.heartbeat(errors, lambda: at, silent=False)
+        beat = cli.heartbeat(errors, lambda: status, silent=False)
 
         if folder is None:
             with beat:

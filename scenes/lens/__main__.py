@@ -186,7 +186,7 @@ def read(
         made = camera_of(lens, name, load_backend("llvm"), Width(wide, step))
         _write(out, camera_text(made, lens).encode())
     with to_stdout(errors, f"the camera is complete in {out}"):
-        for line in made.told(lens):
+        for line in made.summary_lines(lens):
             sys.stdout.write(f"{printable(line)}\n")
         sys.stdout.write(f"{out}\n")
 

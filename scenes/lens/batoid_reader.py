@@ -398,14 +398,14 @@ def read_batoid(path: str | Path, wavelength: float) -> Prescription:
     if len(reader.surfaces) < 2:
         raise reader.error(("opticalSystem",), "too few surfaces", len(reader.surfaces), "optics and a detector")
     # batoid aims at a surface before the telescope; here the stop is the first surface that does something
-    acts = [k for k, surface in enumerate(reader.surfaces) if surface.interaction is not Interaction.PASS]
-    stop = acts[0] if acts else 0
+    active = [k for k, surface in enumerate(reader.surfaces) if surface.interaction is not Interaction.PASS]
+    stop = active[0] if active else 0
     notes = [*reader.notes, Note(0, "", "no stop in the light's way: taken to be the first surface")]
     if reader.ambient != 1.0:
         notes.append(Note(0, "inMedium", f"indices are relative to it, {reader.ambient:.9f}, and so are paths"))
     name, surfaces = str(system.get("name", "")) or Path(path).stem, tuple(reader.surfaces)
     # against another medium than that of the file's start the dispersion is another
-    known = {own.name: own for own in reader.named.values()} if reader.ambient == 1.0 else {}
+    glasses = {glass.name: glass for glass in reader.named.values()} if reader.ambient == 1.0 else {}
     return Prescription(
         name,
         str(path),
@@ -415,7 +415,7 @@ def read_batoid(path: str | Path, wavelength: float) -> Prescription:
         (wavelength,),
         field_kind="none",
         notes=tuple(notes),
-        glasses=FrozenMap(known),
+        glasses=FrozenMap(glasses),
     )
 
 

@@ -59,11 +59,15 @@ def unfolded(lens: Prescription) -> Prescription:
     InputError
         A surface behind a fold is not a surface of revolution.
     """
-    turn, shift, stop, notes = np.eye(3), np.zeros(3), lens.surfaces[lens.stop].name, []
-    kept: list[LensSurface] = []
+    flip, shift, stop, notes = np.eye(3), np.zeros(3), lens.surfaces[lens.stop].name, []
+    surfaces: list[LensSurface] = []
     for surface in lens.surfaces:
-        rotation, place, shape = turn @ surface.pose.rotation, turn @ surface.pose.translation + shift, surface.surface
-        if np.linalg.det(turn) < 0.0:
+        rotation, position, shape = (
+            flip @ surface.pose.rotation,
+            flip @ surface.pose.translation + shift,
+            surface.surface,
+        )
+        if np.linalg.det(flip) < 0.0:
             if shape.terms or shape.figure is not None:
                 problem = "a fold before a surface that is not a surface of revolution cannot be unfolded"
                 raise lens.error(problem, surface.line, surface.name, "an image square to the axis of the light")
@@ -72,18 +76,18 @@ def unfolded(lens: Prescription) -> Prescription:
                 surface.aperture, centre=(surface.aperture.centre[0], -surface.aperture.centre[1])
             )
             surface = replace(surface, aperture=edge, edges=tuple(map(flipped_y, surface.edges)))
-        surface = replace(surface, pose=Pose(rotation, place))
+        surface = replace(surface, pose=Pose(rotation, position))
         if surface.interaction is Interaction.REFLECT and shape.is_plane and shape.figure is None:
             mirror = np.eye(3) - 2.0 * np.outer(rotation[:, 2], rotation[:, 2])
-            turn, shift = mirror @ turn, place + mirror @ (shift - place)
+            flip, shift = mirror @ flip, position + mirror @ (shift - position)
             text = "a flat mirror, unfolded: its errors and its shadow are omitted; an edge may describe the shadow"
             notes.append(Note(surface.line, surface.name, text))
             surface = replace(surface, interaction=Interaction.PASS)
             if surface.name != stop and not surface.every_edge:
                 continue
-        kept.append(surface)
-    at = [surface.name for surface in kept].index(stop)
-    return replace(lens, surfaces=tuple(kept), stop=at).with_notes(*notes)
+        surfaces.append(surface)
+    at = [surface.name for surface in surfaces].index(stop)
+    return replace(lens, surfaces=tuple(surfaces), stop=at).with_notes(*notes)
 
 
 def with_flat_image(lens: Prescription) -> Prescription:
@@ -157,16 +161,16 @@ class ReadCamera:
     difference: float
     rays: int
 
-    def told(self, lens: Prescription) -> list[str]:
+    def summary_lines(self, lens: Prescription) -> list[str]:
         """Return the lines of a summary for the user."""
-        spec = self.camera
-        mirrors = sum(m.light is None for m in spec.mirrors.values())
-        faces = sum(m.light == "refracts" for m in spec.mirrors.values())
+        camera = self.camera
+        mirrors = sum(m.light is None for m in camera.mirrors.values())
+        faces = sum(m.light == "refracts" for m in camera.mirrors.values())
         parts = [f"{mirrors} mirrors"] + ([f"{faces} faces of lenses"] if faces else [])
-        angles = [f"{math.degrees(a):.4g}" for a in (spec.field.x, spec.field.y, spec.field_bias)]
+        angles = [f"{math.degrees(a):.4g}" for a in (camera.field.x, camera.field.y, camera.field_bias)]
         return [
-            f"{lens.name}: {', '.join(parts)}, stop {spec.stop}, f {spec.focal_length:.7g} m, entrance pupil "
-            f"{spec.entrance_pupil:.6g} m, field {angles[0]} x {angles[1]} deg about {angles[2]} deg",
+            f"{lens.name}: {', '.join(parts)}, stop {camera.stop}, f {camera.focal_length:.7g} m, entrance pupil "
+            f"{camera.entrance_pupil:.6g} m, field {angles[0]} x {angles[1]} deg about {angles[2]} deg",
             f"{self.rays} rays traced through both differ by at most {self.difference:.1e} m on the image",
             *(f"note: {note}" for note in self.notes),
         ]
@@ -211,11 +215,11 @@ def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) ->
     sources = {name: getattr(glass, "source", "") for name, glass in lens.glasses.items()}
     taken_from = "the glass of {} is used; --glasses FILE.agf replaces it"
     notes += [Note(0, name, taken_from.format(source)) for name, source in sources.items() if source]
-    surfaces, stop, origin, taken = _surfaces(lens, notes)
+    surfaces, stop, origin, names = _surfaces(lens, notes)
     bias, half_x, half_y = _field(lens, surfaces, notes)
-    where = {"z": written(_image(lens)[0], LENGTH)}
+    image_entry = {"z": written(_image(lens)[0], LENGTH)}
     if _image(lens)[1]:
-        where["tilt"] = written(_image(lens)[1], ANGLE)
+        image_entry["tilt"] = written(_image(lens)[1], ANGLE)
     plain: dict[str, Any] = {
         "name": name,
         "description": f"Read from {re.sub(r'[^ -~]', '?', lens.name)[:200]}.",
@@ -226,7 +230,7 @@ def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) ->
         "wavelength": written(lens.wavelength, LENGTH),
         "stop": stop,
         "mirrors": surfaces,
-        "image": where,
+        "image": image_entry,
         "line": {"pixels": 2, "pitch": format_quantity(width.pitch, LENGTH)},
     }
     if any("glass" in surface for surface in surfaces.values()):
@@ -251,7 +255,7 @@ def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) ->
         f"added with {plain['line']['pixels']} pixels of {format_quantity(width.pitch, LENGTH)}, which cover the field"
     )
     notes.append(Note(0, "line CCD", text))
-    model = _without_idle_edges(_derived(lens, plain, backend), lens, plain, taken, notes, backend)
+    model = _without_idle_edges(_derived(lens, plain, backend), lens, plain, names, notes, backend)
     compared = _compared(lens, origin, model, backend)
     if compared is None:
         return camera_of(_round_field(lens), name, backend, width)
@@ -260,7 +264,7 @@ def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) ->
         raise lens.error(
             "rays of the camera differ from those of the prescription", None, f"{difference:.2g} m", "at most 1 nm"
         )
-    return ReadCamera(model.spec, taken, tuple(notes), difference, rays)
+    return ReadCamera(model.spec, names, tuple(notes), difference, rays)
 
 
 def _round_field(lens: Prescription) -> Prescription:
@@ -367,32 +371,32 @@ def _image(lens: Prescription) -> tuple[float, float]:
 def _surfaces(lens: Prescription, notes: list[Note]) -> tuple[dict[str, Any], str, Prescription, dict[str, str]]:
     """Return the surfaces of a camera's file, the stop's name, the prescription of the same surfaces, and names."""
     out: dict[str, Any] = {}
-    taken: dict[str, str] = {}
-    stop, kept, count = "", [], dict.fromkeys(_LETTER.values(), 0)
+    names: dict[str, str] = {}
+    stop, surfaces, count = "", [], dict.fromkeys(_LETTER.values(), 0)
     for k, surface in enumerate(lens.surfaces[:-1]):
-        idle = surface.interaction is Interaction.PASS
-        if idle and k != lens.stop and not (surface.every_edge and surface.surface.is_plane):
+        is_dummy = surface.interaction is Interaction.PASS
+        if is_dummy and k != lens.stop and not (surface.every_edge and surface.surface.is_plane):
             notes.append(Note(surface.line, surface.name, "a dummy surface: omitted"))
             continue
-        kept.append(surface)
+        surfaces.append(surface)
         letter = _LETTER[surface.interaction]
         count[letter] += 1
-        name = "STOP" if idle and k == lens.stop else f"{letter}{count[letter]}"
+        name = "STOP" if is_dummy and k == lens.stop else f"{letter}{count[letter]}"
         if k == lens.stop:
             stop = name
             if surface.aperture is not None:
                 text = "the stop's outer edge is omitted: the entrance pupil determines it"
                 notes.append(Note(surface.line, surface.name, text))
                 surface = without_rim(surface)
-        taken[name] = surface.name
+        names[name] = surface.name
         out[name] = _written(lens, facing(surface))
     if lens.image.every_edge:
         text = "the image's edge is omitted: it limits the field, and vignettes no light within"
         notes.append(Note(lens.image.line, lens.image.name, text))
-    if not any(s.interaction is not Interaction.PASS for s in kept):
+    if not any(s.interaction is not Interaction.PASS for s in surfaces):
         raise lens.error("nothing in this file reflects or refracts light", lens.surfaces[0].line)
-    bare = replace(lens, surfaces=(*kept, lens.image), stop=list(taken).index(stop))
-    return out, stop, bare, taken
+    bare = replace(lens, surfaces=(*surfaces, lens.image), stop=list(names).index(stop))
+    return out, stop, bare, names
 
 
 def _written(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
@@ -402,9 +406,9 @@ def _written(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
     out: dict[str, Any] = {"z": written(z, LENGTH)}
     if x or y:
         out["decentre"] = [written(v, LENGTH) for v in (x, y)]
-    turn = rotation_vector(surface.pose.rotation)
-    if np.any(np.abs(turn) > 0.0):
-        out["rotate"] = [written(float(v), ANGLE) for v in turn]
+    rotation = rotation_vector(surface.pose.rotation)
+    if np.any(np.abs(rotation) > 0.0):
+        out["rotate"] = [written(float(v), ANGLE) for v in rotation]
     out["radius"] = written(1.0 / shape.curvature, LENGTH) if shape.curvature else "flat"
     if shape.conic:
         out["conic"] = shape.conic
@@ -431,8 +435,8 @@ def _behind(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
         return {"index": surface.index}
     if isinstance(known, CatalogueGlass):
         return {"glass": glass_entry(known)}
-    own = next((name for name, one in GLASSES.items() if one.index == known), None)
-    return {"index": surface.index} if own is None else {"glass": own}
+    catalogue_name = next((name for name, glass in GLASSES.items() if glass.index == known), None)
+    return {"index": surface.index} if catalogue_name is None else {"glass": catalogue_name}
 
 
 def _terms(lens: Prescription, surface: LensSurface, shape: Surface) -> dict[str, Any]:
@@ -543,9 +547,9 @@ def _beams(model: CameraModel, lens: Prescription, stop: np.ndarray, fields: int
 def _met(model: CameraModel, lens: Prescription, stop: np.ndarray, fields: int, backend: Backend) -> list[np.ndarray]:
     """Return the points (rays, 3) at which the rays of ``_beams`` meet each mirror, in its own frame."""
     rays = _beams(model, lens, stop, fields, backend)
-    every = range(len(model.mirrors))
-    traced = trace(backend, assemble(model.bare_assembly(apertures=False), ["imaging"]), rays, keep=every)
-    return [traced.hit(k)[0] for k in every]
+    mirrors = range(len(model.mirrors))
+    traced = trace(backend, assemble(model.bare_assembly(apertures=False), ["imaging"]), rays, keep=mirrors)
+    return [traced.hit(k)[0] for k in mirrors]
 
 
 def _compared(
@@ -556,61 +560,61 @@ def _compared(
     None if a field is fully vignetted.
     """
     bare = model.bare_assembly(apertures=False)
-    turn = 2.0 * np.pi * np.arange(_RIM) / _RIM
-    rim = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    angle = 2.0 * np.pi * np.arange(_RIM) / _RIM
+    rim = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     # Middle and rim of a vignetted beam may be missing.
     stop = np.concatenate([np.zeros((1, 2)), *([0.75 * rim, 0.9 * rim] if model.edges else []), rim])
-    rays, places, comes = _beams(model, lens, stop, 3, backend), [], []
+    rays, ends, arrived = _beams(model, lens, stop, 3, backend), [], []
     for assembly, sequence in ((bare, "imaging"), (origin.assembly(apertures=False), SEQUENCE)):
         traced = trace(backend, assemble(assembly, [sequence]), rays, world=True)
         position, _, path, valid = traced.numpy(traced.world)
-        places.append(np.concatenate([position[0], path[0, :, None]], axis=-1))
-        comes.append(valid[0])
-    through = comes[0]
+        ends.append(np.concatenate([position[0], path[0, :, None]], axis=-1))
+        arrived.append(valid[0])
+    through = arrived[0]
     if model.edges:
         # Rays that an edge blocks need not arrive, but some rays of every field have to.
-        met = _met(model, lens, stop, 3, backend)
-        through = through & model.uncut(lambda name: met[model.mirrors.index(name)])
+        hits = _met(model, lens, stop, 3, backend)
+        through = through & model.unvignetted(lambda name: hits[model.mirrors.index(name)])
         if not np.any(through.reshape(9, -1), axis=-1).all():
             return None
-        lost = not np.array_equal(*comes)
+        lost = not np.array_equal(*arrived)
     else:
-        lost = not (comes[0].all() and comes[1].all())
+        lost = not (arrived[0].all() and arrived[1].all())
     if lost:
         raise lens.error("rays of the full field do not come through", allowed="a smaller field or pupil")
-    places = [place[through] for place in places]
-    return float(np.max(np.abs(places[0] - places[1]))), len(places[0])
+    ends = [place[through] for place in ends]
+    return float(np.max(np.abs(ends[0] - ends[1]))), len(ends[0])
 
 
 def _without_idle_edges(
     model: CameraModel,
     lens: Prescription,
     plain: dict[str, Any],
-    taken: dict[str, str],
+    names: dict[str, str],
     notes: list[Note],
     backend: Backend,
 ) -> CameraModel:
     """Return the camera without clear apertures that block no light of its field."""
     if not model.edges:
         return model
-    turn = 2.0 * np.pi * np.arange(_FINE_RIM) / _FINE_RIM
-    rim = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    met = _met(model, lens, rim, 5, backend)
+    angle = 2.0 * np.pi * np.arange(_FINE_RIM) / _FINE_RIM
+    rim = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    points = _met(model, lens, rim, 5, backend)
     idle = 0
     for name, edges in model.edges.items():
-        place = met[model.mirrors.index(name)]
+        hits = points[model.mirrors.index(name)]
         needed = [
             edge.blocks or (isinstance(edge.shape, Circle) and edge.shape.inner > 0.0)
-            or not bool(np.all(edge.passes(place[:, 0], place[:, 1])))
+            or not bool(np.all(edge.passes(hits[:, 0], hits[:, 1])))
             for edge in edges
         ]  # fmt: skip
         idle += needed.count(False)
         surface = plain["mirrors"][name]
-        surface["edges"] = [edge for edge, kept in zip(surface["edges"], needed, strict=True) if kept]
+        surface["edges"] = [edge for edge, is_needed in zip(surface["edges"], needed, strict=True) if is_needed]
         if not surface["edges"]:
             del surface["edges"]
             if surface.get("light") == "passes" and name != model.spec.stop:
-                del plain["mirrors"][name], taken[name]
+                del plain["mirrors"][name], names[name]
     if not idle:
         return model
     notes.append(Note(0, "clear apertures", f"{idle} of them block no light of the field: omitted"))

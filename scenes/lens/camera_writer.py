@@ -34,17 +34,17 @@ from scenes.yaml.yaml_file import dump_yaml
 
 def prescription_of(model: CameraModel) -> Prescription:
     """Return the prescription of a camera as designed."""
-    spec, behind, index = model.spec, {}, 1.0
+    spec, index_behind, index = model.spec, {}, 1.0
     for name, mirror in spec.mirrors.items():
         index = spec.index_behind(name) if mirror.light == "refracts" else index
-        behind[name] = index
+        index_behind[name] = index
     surfaces = [
         LensSurface(
             name,
             model.mirror_pose(name),
             joined(model.surfaces[name]),
             LIGHT[mirror.light],
-            behind[name],
+            index_behind[name],
             *_cut(model, name),
         )
         for name, mirror in spec.mirrors.items()

@@ -120,16 +120,16 @@ class CodevSystem:
 def statements(lines: list[str]) -> list[Statement]:
     """Return the statements of a file: commands end at semicolons, & continues a line, ! starts a comment."""
     out: list[Statement | None] = []
-    pending, begun = "", 0
+    pending, first_line = "", 0
     for number, text in enumerate(lines, start=1):
-        text, begun = _cut(text, "!")[0], begun or number
+        text, first_line = _cut(text, "!")[0], first_line or number
         if text.rstrip().endswith("&"):
             pending += text.rstrip()[:-1] + " "
             continue
-        out += [statement_of(begun, part) for part in _cut(pending + text, ";")]
-        pending, begun = "", 0
-    out += [statement_of(begun, part) for part in _cut(pending, ";")]
-    return [one for one in out if one is not None]
+        out += [statement_of(first_line, part) for part in _cut(pending + text, ";")]
+        pending, first_line = "", 0
+    out += [statement_of(first_line, part) for part in _cut(pending, ";")]
+    return [statement for statement in out if statement is not None]
 
 
 def _cut(text: str, mark: str) -> list[str]:

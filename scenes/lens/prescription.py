@@ -114,24 +114,26 @@ def joined(surface: Surface) -> Surface:
     ValueError
         The figure is on a grid, or has a term beyond the known Noll indices.
     """
-    own = next((term for term in surface.terms if isinstance(term, ZernikeSag)), None)
-    if own is None:
+    sag = next((term for term in surface.terms if isinstance(term, ZernikeSag)), None)
+    if sag is None:
         return surface
-    rest = tuple(term for term in surface.terms if term is not own)
-    given = {j: float(a) for j, a in own.amplitudes.items() if a}
-    centre = (float(own.x0), float(own.y0))
+    rest = tuple(term for term in surface.terms if term is not sag)
+    amplitudes = {j: float(a) for j, a in sag.amplitudes.items() if a}
+    centre = (float(sag.x0), float(sag.y0))
     figure = surface.figure
-    shape = replace(surface, terms=rest, figure=ZernikeFigure(float(own.radius), centre, given) if given else None)
-    if figure is None or not given:
+    shape = replace(
+        surface, terms=rest, figure=ZernikeFigure(float(sag.radius), centre, amplitudes) if amplitudes else None
+    )
+    if figure is None or not amplitudes:
         return replace(shape, figure=figure) if figure is not None else shape
     if not isinstance(figure, ZernikeFigure):
         raise ValueError("Zernike terms of a sag beside a figure on a grid")
     total: dict[tuple[int, int], float] = {}
     assert isinstance(shape.figure, ZernikeFigure)
-    for one in (shape.figure, figure):
-        for pair, value in about_vertex(one).items():
+    for part in (shape.figure, figure):
+        for pair, value in about_vertex(part).items():
             total[pair] = total.get(pair, 0.0) + value
-    radius = max(one.radius + float(np.hypot(*one.centre)) for one in (shape.figure, figure))
+    radius = max(part.radius + float(np.hypot(*part.centre)) for part in (shape.figure, figure))
     terms = zernike_of({(a, b): c * radius ** (a + b) for (a, b), c in total.items()})
     return replace(shape, figure=ZernikeFigure(radius, (0.0, 0.0), terms))
 

@@ -257,12 +257,12 @@ def index_of(source: Source, glasses: Glasses, name: str, wavelength: float, lin
     InputError
         The glass is unknown, or its index is not known at the wavelength.
     """
-    found = of_makers(glasses, [name.strip("'\"").upper().partition("_")[2]]).get(glass_key(name))
-    if found is None:
+    index_at = of_makers(glasses, [name.strip("'\"").upper().partition("_")[2]]).get(glass_key(name))
+    if index_at is None:
         allowed = "common glasses of the named makers, and those of a catalogue given with --glasses FILE.agf"
         raise source.error("unknown glass", line, name, allowed)
     try:
-        return found(wavelength)
+        return index_at(wavelength)
     except ValueError as error:
         raise source.error(str(error), line) from None
 
@@ -345,23 +345,23 @@ class Chain:
         InputError
             It is a second stop.
         """
-        how = Interaction.REFLECT
+        interaction = Interaction.REFLECT
         if behind is not None:
-            how = Interaction.PASS if behind[0] == self.index else Interaction.REFRACT
+            interaction = Interaction.PASS if behind[0] == self.index else Interaction.REFRACT
             self.index, self.glass = behind
         if stop:
             if self.stop >= 0:
                 raise self.source.error("a second stop", line)
             self.stop = len(self.surfaces)
-        made = LensSurface(name, self.pose, shape, how, self.index, edges[0], line, self.glass, edges[1])
-        if how is Interaction.PASS and not made.every_edge and shape.is_plane and not (stop or last):
+        surface = LensSurface(name, self.pose, shape, interaction, self.index, edges[0], line, self.glass, edges[1])
+        if interaction is Interaction.PASS and not surface.every_edge and shape.is_plane and not (stop or last):
             return
         names, k = {s.name for s in self.surfaces}, 2
-        while made.name in names:
-            made, k = replace(made, name=f"{name}_{k}"), k + 1
-        self.surfaces.append(made)
+        while surface.name in names:
+            surface, k = replace(surface, name=f"{name}_{k}"), k + 1
+        self.surfaces.append(surface)
 
-    def prescription(self, keyword: str, distance: float, name: str, **said: Any) -> Prescription:
+    def prescription(self, keyword: str, distance: float, name: str, **attributes: Any) -> Prescription:
         """Return the prescription of the surfaces.
 
         Parameters
@@ -372,7 +372,7 @@ class Chain:
             Distance of the object, in metres.
         name : str
             Title of the file, empty for none.
-        said : Any
+        attributes : Any
             Further attributes of the prescription.
 
         Raises
@@ -393,7 +393,7 @@ class Chain:
             self.stop,
             object_distance=distance if abs(distance) < FARTHEST else math.inf,
             notes=tuple(source.notes),
-            **said,
+            **attributes,
         )
 
 
@@ -404,11 +404,12 @@ _CONSTANTS = 6
 
 def own_glasses() -> Glasses:
     """Return the twin's glasses and the common ones; fused silica also by its names in catalogues."""
-    own: dict[str, Callable[[float], float]] = {glass_key(name): glass for name, glass in common_glasses().items()}
-    own |= {glass_key(name): glass.index for name, glass in GLASSES.items()}
-    own |= dict.fromkeys(("SILICA", "FSILICA"), own[glass_key("fused silica")])
-    own["BK7"] = own[glass_key("N-BK7")]  # before arsenic was left out of it; the catalogue has one formula for both
-    return FrozenMap(own)
+    glasses: dict[str, Callable[[float], float]] = {glass_key(name): glass for name, glass in common_glasses().items()}
+    glasses |= {glass_key(name): glass.index for name, glass in GLASSES.items()}
+    glasses |= dict.fromkeys(("SILICA", "FSILICA"), glasses[glass_key("fused silica")])
+    # BK7 is N-BK7 before arsenic was removed from it; the catalogue has one formula for both.
+    glasses["BK7"] = glasses[glass_key("N-BK7")]
+    return FrozenMap(glasses)
 
 
 def read_catalogues(paths: Sequence[str | Path]) -> Glasses:

@@ -627,7 +627,7 @@ class CameraModel:
         assert outer is not None
         return outer
 
-    def uncut(self, met: Callable[[str], np.ndarray]) -> np.ndarray | bool:
+    def unvignetted(self, met: Callable[[str], np.ndarray]) -> np.ndarray | bool:
         """Return a mask of the rays that pass all edges, or True if the camera has no edges.
 
         Parameters

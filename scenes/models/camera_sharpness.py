@@ -128,7 +128,7 @@ class FieldBeams:
         Distance from the stated image plane upstream to the exit pupil, in metres.
     room : (F,) ndarray
         Distance from the last mirror along the chief ray to the stated image plane, in metres.
-    lit : (F, N) ndarray of bool or None
+    illuminated : (F, N) ndarray of bool or None
         Rays that are not vignetted; None if none is.
     """
 
@@ -140,7 +140,7 @@ class FieldBeams:
     path: np.ndarray
     exit_pupil: float
     room: np.ndarray
-    lit: np.ndarray | None = None
+    illuminated: np.ndarray | None = None
 
     @classmethod
     def trace(
@@ -177,28 +177,28 @@ class FieldBeams:
         heading = np.broadcast_to(directions[:, None], launch.shape)
         rays = make_rays(backend, launch.reshape(-1, 3), heading.reshape(-1, 3))
         last = len(model.mirrors) - 1
-        kept = {model.mirrors.index(name) for name in model.edges} | {last}
-        traced = trace(backend, assemble(bare, ["imaging"], states), rays, keep=kept, world=True)
+        stored = {model.mirrors.index(name) for name in model.edges} | {last}
+        traced = trace(backend, assemble(bare, ["imaging"], states), rays, keep=stored, world=True)
         assert traced.world is not None
         position, direction, path, valid = traced.numpy(traced.world)
         shape = launch.shape[:2]
-        lit = None
+        illuminated = None
         if model.edges:
-            valid = valid[0] & model.uncut(lambda name: traced.hit(model.mirrors.index(name))[0])
-            lit = valid.reshape(shape)[:, 1:]
-            dark = np.flatnonzero(np.sum(lit, axis=-1) < MIN_ILLUMINATED)
-            if dark.size:
-                found = f"field {field_text(spec, fields[dark[0]])}, {dark.size} of {len(fields)} fields tested"
+            valid = valid[0] & model.unvignetted(lambda name: traced.hit(model.mirrors.index(name))[0])
+            illuminated = valid.reshape(shape)[:, 1:]
+            empty = np.flatnonzero(np.sum(illuminated, axis=-1) < MIN_ILLUMINATED)
+            if empty.size:
+                found = f"field {field_text(spec, fields[empty[0]])}, {empty.size} of {len(fields)} fields tested"
                 key = ("mirrors", next(iter(model.edges)), "edges")
                 raise spec.error(
                     "edges block practically all light", key, found=found, allowed="a smaller field, or wider edges"
                 )
         if cut is not None:
             free = ~cut(np.array(fields), points[1:] / radius)
-            lit = free if lit is None else lit & free
+            illuminated = free if illuminated is None else illuminated & free
         require_rays(valid.reshape(shape), f"camera {spec.name}")
         position, direction = position.reshape(*shape, 3), direction.reshape(*shape, 3)
-        way = position[:, 0] - model.mirror_pose(model.mirrors[last]).apply(traced.hit(last).reshape(*shape, 3)[:, 0])
+        step = position[:, 0] - model.mirror_pose(model.mirrors[last]).apply(traced.hit(last).reshape(*shape, 3)[:, 0])
         return cls(
             spec,
             np.array(fields),
@@ -207,8 +207,8 @@ class FieldBeams:
             direction,
             path.reshape(shape),
             float(model.first_order.exit_pupil_distance[0]),
-            np.sum(way * direction[:, 0], axis=-1),
-            lit,
+            np.sum(step * direction[:, 0], axis=-1),
+            illuminated,
         )
 
     @classmethod
@@ -233,9 +233,9 @@ class FieldBeams:
     @property
     def share(self) -> np.ndarray:
         """Fraction of the transmitted light that each ray carries, (N,), or (F, N) where some rays are vignetted."""
-        if self.lit is None:
+        if self.illuminated is None:
             return self.nodes.share
-        share = self.nodes.share * self.lit
+        share = self.nodes.share * self.illuminated
         return np.asarray(share / np.sum(share, axis=-1, keepdims=True))
 
     def _away(self, plane: FocalPlane) -> np.ndarray:
@@ -255,7 +255,7 @@ class FieldBeams:
         to_sphere = path_to_sphere(position, self.direction, path, position[:, :1], self.exit_pupil)
         basis = zernike.basis(3, self.nodes.x, self.nodes.y)
         error = (to_sphere[:, :1] - to_sphere)[:, 1:] / self.camera.wavelength
-        if self.lit is not None:
+        if self.illuminated is not None:
             return np.stack([_levelled(one, basis, share) for one, share in zip(error, self.share, strict=True)])
         # The first three terms are orthonormal over the disk, and the rule is exact for their products.
         return np.asarray(error - (error * self.nodes.share) @ basis @ basis.T)
@@ -263,7 +263,7 @@ class FieldBeams:
     def errors(self, plane: FocalPlane) -> np.ndarray:
         """Return the rms wavefront error at each field, (F,), in waves."""
         squares = self.wavefronts(plane) ** 2
-        if self.lit is not None:
+        if self.illuminated is not None:
             return np.asarray(np.sqrt(np.sum(squares * self.share, axis=-1)))
         return np.asarray(np.sqrt(squares @ self.nodes.share))
 
@@ -292,11 +292,11 @@ class FieldBeams:
 
 def _levelled(error: np.ndarray, basis: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Return errors (N,) minus their weighted least-squares fit by the basis (N, 3); 0 where the weight is 0."""
-    lit = share > 0.0
-    root = np.sqrt(share[lit])
-    terms, *_ = np.linalg.lstsq(basis[lit] * root[:, None], error[lit] * root, rcond=None)
+    illuminated = share > 0.0
+    root = np.sqrt(share[illuminated])
+    terms, *_ = np.linalg.lstsq(basis[illuminated] * root[:, None], error[illuminated] * root, rcond=None)
     out = np.zeros(len(error))
-    out[lit] = error[lit] - basis[lit] @ terms
+    out[illuminated] = error[illuminated] - basis[illuminated] @ terms
     return out
 
 
@@ -334,16 +334,16 @@ def sharpness(camera: CameraSpec, backend: Backend) -> Sharpness:
         Some of the light does not come through.
     """
     beams = FieldBeams.trace(derive_camera(camera, backend), backend, _FEW_FIELDS, _RINGS)
-    own = FocalPlane.of(camera)
-    errors = beams.errors(own)
+    plane = FocalPlane.of(camera)
+    errors = beams.errors(plane)
     worst = int(np.argmax(errors))
-    found = Sharpness(float(errors[worst]), (float(beams.fields[worst, 0]), float(beams.fields[worst, 1])))
-    if found.worst <= BLURRED:
-        return found
+    result = Sharpness(float(errors[worst]), (float(beams.fields[worst, 0]), float(beams.fields[worst, 1])))
+    if result.worst <= BLURRED:
+        return result
     best = beams.best_plane()
     if not beams.reaches(best):
-        return found
-    return replace(found, plane=best, refocused=float(np.max(beams.errors(best))))
+        return result
+    return replace(result, plane=best, refocused=float(np.max(beams.errors(best))))
 
 
 def cameras_of(setup: Spec) -> Mapping[str, CameraSpec]:
@@ -362,11 +362,11 @@ def blur_warnings(setup: Spec, backend: Backend) -> tuple[str, ...]:
     out = []
     for camera in cameras_of(setup).values():
         try:
-            found = sharpness(camera, backend)
+            result = sharpness(camera, backend)
         except (InputError, AimError, BeamMissedError):
             continue
-        if found.worst > BLURRED:
-            out.append(_blurred(camera, found))
+        if result.worst > BLURRED:
+            out.append(_blurred(camera, result))
     return tuple(dict.fromkeys(out))
 
 
@@ -391,37 +391,37 @@ def no_cameras(cameras: Iterable[CameraSpec], backend: Backend) -> tuple[Issue, 
     out = []
     for camera in cameras:
         try:
-            found = sharpness(camera, backend)
+            result = sharpness(camera, backend)
         except (InputError, AimError, BeamMissedError):
             continue
-        best = found.worst if np.isnan(found.refocused) else min(found.worst, found.refocused)
+        best = result.worst if np.isnan(result.refocused) else min(result.worst, result.refocused)
         if best > NO_CAMERA:
             problem = (
-                f"these surfaces form no image: the wavefront error is {found.worst:.3g} waves rms at field "
-                f"{field_text(camera, found.field)}, {best:.3g} at the best focus"
+                f"these surfaces form no image: the wavefront error is {result.worst:.3g} waves rms at field "
+                f"{field_text(camera, result.field)}, {best:.3g} at the best focus"
             )
             allowed = "consistent radii, conics, terms and positions; python -m twin.camera shows the beams"
             out.append(camera.issue(problem, ("mirrors",), allowed=allowed))
     return tuple(dict.fromkeys(out))
 
 
-def _blurred(camera: CameraSpec, found: Sharpness) -> str:
+def _blurred(camera: CameraSpec, result: Sharpness) -> str:
     """Return the warning for a blurred camera, with the command that refocuses it."""
     file, inside = camera.source.file, camera.source.prefix
     # A run's config.yaml holds several cameras.
     chosen = f" --camera {inside[-1]}" if len(inside) > 1 else ""
-    what = (
+    problem = (
         f"camera {camera.name}{f' ({file})' if file else ''} is blurred as designed: its wavefront error is "
-        f"{found.worst:.3g} waves rms at field {field_text(camera, found.field)}, more than {BLURRED:g}"
+        f"{result.worst:.3g} waves rms at field {field_text(camera, result.field)}, more than {BLURRED:g}"
     )
-    if found.plane is None:
-        return f"{what}; refocusing does not help: its light has no focus after the last mirror"
-    shift = 1e3 * (found.plane.z - camera.image.z)
-    left = f"{found.refocused:.2g} waves"
+    if result.plane is None:
+        return f"{problem}; refocusing does not help: its light has no focus after the last mirror"
+    shift = 1e3 * (result.plane.z - camera.image.z)
+    left = f"{result.refocused:.2g} waves"
     remedy = f"python -m twin.camera {file or camera.name}{chosen} --refocus moves image.z by {shift:+.4g} mm"
-    if found.refocused <= BLURRED:
-        return f"{what}; {remedy} and leaves {left}"
-    return f"{what}; {remedy}, but leaves {left}: defocus is not the only error"
+    if result.refocused <= BLURRED:
+        return f"{problem}; {remedy} and leaves {left}"
+    return f"{problem}; {remedy}, but leaves {left}: defocus is not the only error"
 
 
 def field_text(camera: CameraSpec, field: tuple[float, float]) -> str:

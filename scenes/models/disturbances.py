@@ -123,7 +123,7 @@ class Component:
 
 
 @dataclass(frozen=True, eq=False)
-class StatedMotions:
+class DisturbancePrior:
     """Prior of the M disturbance components of an instrument.
 
     Attributes
@@ -157,14 +157,14 @@ class StatedMotions:
         sigma = self.sigma
         return np.asarray(sigma[:, None] * self.correlation * sigma)
 
-    def of_causes(self, names: Sequence[str]) -> StatedMotions:
+    def of_causes(self, names: Sequence[str]) -> DisturbancePrior:
         """Return the prior of some causes alone."""
-        own = [k for k, c in enumerate(self.components) if c.cause in names]
-        return StatedMotions(
+        selected = [k for k, c in enumerate(self.components) if c.cause in names]
+        return DisturbancePrior(
             self.name,
-            tuple(self.components[k] for k in own),
-            self.correlation[np.ix_(own, own)],
-            tuple(self.laws[k] for k in own),
+            tuple(self.components[k] for k in selected),
+            self.correlation[np.ix_(selected, selected)],
+            tuple(self.laws[k] for k in selected),
             self.jump_false_alarm,
         )
 
@@ -182,7 +182,7 @@ class StatedMotions:
         return np.asarray(unit @ covariance_root(self.correlation) * self.sigma)
 
 
-def stated_motions(resolved: ResolvedJob, instrument: Instrument) -> StatedMotions | None:
+def disturbance_prior(resolved: ResolvedJob, instrument: Instrument) -> DisturbancePrior | None:
     """Return the disturbance prior of a job's instrument, or None if the job has none.
 
     Raises
@@ -194,10 +194,10 @@ def stated_motions(resolved: ResolvedJob, instrument: Instrument) -> StatedMotio
     spec = resolved.disturbances
     if spec is None:
         return None
-    return motions_of_spec(spec, instrument, lambda *wrong: _issue_at(resolved, *wrong))
+    return prior_of_spec(spec, instrument, lambda *problem: _issue_at(resolved, *problem))
 
 
-def motions_of_spec(spec: DisturbancesSpec, instrument: Instrument, at: _Where | None = None) -> StatedMotions:
+def prior_of_spec(spec: DisturbancesSpec, instrument: Instrument, issue: _Where | None = None) -> DisturbancePrior:
     """Return the prior that a disturbances file gives for an instrument.
 
     Parameters
@@ -206,51 +206,51 @@ def motions_of_spec(spec: DisturbancesSpec, instrument: Instrument, at: _Where |
         Content of the file.
     instrument : Instrument
         Instrument whose bodies move.
-    at : callable or None
+    issue : callable or None
         Function that makes an issue of a problem at a key of a cause; by default an issue of the file itself.
 
     Raises
     ------
     InputError
-        The same faults as in ``stated_motions``.
+        The same faults as in ``disturbance_prior``.
     """
     spec = spec.with_tables()
-    where = at or (lambda cause, key, wrong: spec.issue(wrong, ("causes", cause, *key)))
+    issue_at = issue or (lambda cause, key, wrong: spec.issue(wrong, ("causes", cause, *key)))
     glass = {solid.path for solid in instrument.solids if solid.transparent}
     components: list[Component] = []
     laws: list[TimeLawSpec] = []
     blocks: list[np.ndarray] = []
-    issues, nodes = _strangers(spec, instrument, where), instrument.nodes
+    issues, nodes = _strangers(spec, instrument, issue_at), instrument.nodes
     for name, cause in spec.causes.items():
         bodies = [path for pattern in cause.bodies for path in nodes if _matches(pattern, path, instrument.cameras)]
-        own, faults = _of_cause(spec, name, cause, list(dict.fromkeys(bodies)), instrument, glass, where)
-        matrix, more = _correlation(name, cause, own, where)
+        members, faults = _of_cause(spec, name, cause, list(dict.fromkeys(bodies)), instrument, glass, issue_at)
+        matrix, correlation_faults = _correlation(name, cause, members, issue_at)
         # Where a component itself was refused, issues of its correlations would only repeat that.
-        issues += faults or (more if bodies else [])
+        issues += faults or (correlation_faults if bodies else [])
         # Correlations may name components of zero sigma, so that a single number can be set to zero.
-        moving = [k for k, c in enumerate(own) if c.sigma > 0.0]
-        components += [own[k] for k in moving]
+        moving = [k for k, c in enumerate(members) if c.sigma > 0.0]
+        components += [members[k] for k in moving]
         laws += [cause.time] * len(moving)
         blocks.append(matrix[np.ix_(moving, moving)])
     if spec.joint is not None:
-        own, matrix, faults = _of_joint(spec, spec.joint, instrument, glass)
-        components += own
-        laws += [spec.joint.time] * len(own)
+        members, matrix, faults = _of_joint(spec, spec.joint, instrument, glass)
+        components += members
+        laws += [spec.joint.time] * len(members)
         blocks.append(matrix)
         issues += faults
     if issues:
         raise InputError(*issues)
-    return StatedMotions(spec.name, tuple(components), block_diag(*blocks), tuple(laws), spec.jump_false_alarm)
+    return DisturbancePrior(spec.name, tuple(components), block_diag(*blocks), tuple(laws), spec.jump_false_alarm)
 
 
-def check_heat(resolved: ResolvedJob, stated: StatedMotions, thermal: ThermalModel) -> None:
+def check_heat(resolved: ResolvedJob, prior: DisturbancePrior, thermal: ThermalModel) -> None:
     """Check that the effect of the prior's temperatures can be computed: that the dn/dT of heated glasses is known.
 
     Parameters
     ----------
     resolved : ResolvedJob
         The job.
-    stated : StatedMotions
+    prior : DisturbancePrior
         Its prior.
     thermal : ThermalModel
         Thermal model of its instrument.
@@ -260,16 +260,16 @@ def check_heat(resolved: ResolvedJob, stated: StatedMotions, thermal: ThermalMod
     InputError
         The data of a material do not cover the temperatures.
     """
-    cause_of = {c.body: c.cause for c in stated.components if c.kind in HEAT}
-    warmer = {
-        body: Temperature(sum(c.sigma for c in stated.components if (c.body, c.kind) == (body, "temperature")))
+    cause_of = {c.body: c.cause for c in prior.components if c.kind in HEAT}
+    heated = {
+        body: Temperature(sum(c.sigma for c in prior.components if (c.body, c.kind) == (body, "temperature")))
         for body in cause_of
     }
     try:
-        thermal.check(warmer)
+        thermal.check(heated)
     except TemperatureError as error:
-        wrong = Problem(str(error), allowed=error.allowed)
-        raise InputError(_issue_at(resolved, cause_of[error.origin], ("temperature",), wrong)) from error
+        problem = Problem(str(error), allowed=error.allowed)
+        raise InputError(_issue_at(resolved, cause_of[error.origin], ("temperature",), problem)) from error
 
 
 def state_of(
@@ -432,7 +432,7 @@ def _of_cause(
     refused: dict[KeyPath, list[str]] = {}
     for path in bodies:
         info = instrument.nodes[path]
-        pivot = cause.pivot or usual_pivot(info)
+        pivot = cause.pivot or default_pivot(info)
         if pivot not in (ORIGIN, *info.pivots):
             turned.append(path)
         can = _possible(info, path in glass)
@@ -451,7 +451,7 @@ def _of_cause(
     return components, issues
 
 
-def usual_pivot(info: NodeInfo) -> str:
+def default_pivot(info: NodeInfo) -> str:
     """Return the pivot of a body where a file of disturbances names none: its centre if it has one, else its origin."""
     return "centre" if "centre" in info.pivots else ORIGIN
 
@@ -462,27 +462,27 @@ def _of_joint(
     """Return the components of `joint` that move, their correlations, and the issues found."""
     components: list[Component] = []
     issues: list[Issue] = []
-    said: dict[tuple[str, str, int], str] = {}
+    named: dict[tuple[str, str, int], str] = {}
     for name, sigma in joint.components.items():
         node, kind, what, about = component_parts(name)
         axis = noll(what) if kind == "figure" else max(AXES.find(what), 0) if what else 0
         try:
             path = find_node(node, instrument.nodes)
             info = instrument.nodes[path]
-            can = _possible(info, path in glass)
-            if _NEEDS.get(kind, kind) not in can:
-                raise Problem(f"{path} does not allow {kind}", allowed=names_text(sorted(can)) or "nothing")
+            allowed = _possible(info, path in glass)
+            if _NEEDS.get(kind, kind) not in allowed:
+                raise Problem(f"{path} does not allow {kind}", allowed=names_text(sorted(allowed)) or "nothing")
             if about and about not in info.known_pivots:
                 raise unknown(f"{path} has no such pivot", about, info.known_pivots)
-            if (path, kind, axis) in said:
+            if (path, kind, axis) in named:
                 raise Problem(
-                    "a component is named twice", shown(name), f"once; it is the same as {said[path, kind, axis]}"
+                    "a component is named twice", shown(name), f"once; it is the same as {named[path, kind, axis]}"
                 )
         except Problem as wrong:
             issues.append(spec.issue(wrong, (JOINT, "components", name)))
             continue
-        said[path, kind, axis] = name
-        pivot = about or usual_pivot(info)
+        named[path, kind, axis] = name
+        pivot = about or default_pivot(info)
         components.append(Component(JOINT, path, kind, axis, pivot, sigma / spec.sigmas))
     matrix = np.eye(len(joint.components)) if joint.correlation is None else np.array(joint.correlation)
     if (least := _least(matrix)) < INDEFINITE:
@@ -521,37 +521,37 @@ def _sigmas(cause: CauseSpec) -> Iterator[tuple[KeyPath, str, int, float]]:
 
 
 def _correlation(
-    name: str, cause: CauseSpec, own: Sequence[Component], where: _Where
+    name: str, cause: CauseSpec, components: Sequence[Component], where: _Where
 ) -> tuple[np.ndarray, list[Issue]]:
     """Return the correlation matrix of a cause's components and the issues found in it.
 
     ``correlations`` take precedence over ``together`` for a pair of components that both name.
     """
-    matrix, issues = np.eye(len(own)), []
+    matrix, issues = np.eye(len(components)), []
     if cause.together is not None:
-        for i, one in enumerate(own):
+        for i, component in enumerate(components):
             for j in range(i):
-                if (own[j].kind, own[j].axis) == (one.kind, one.axis):
+                if (components[j].kind, components[j].axis) == (component.kind, component.axis):
                     matrix[i, j] = matrix[j, i] = cause.together
         if _least(matrix) < INDEFINITE:
-            count = len({c.body for c in own})
+            count = len({c.body for c in components})
             allowed = f"at least {-1.0 / (count - 1):.4g} between {count} bodies"
             text = "bodies cannot all be so strongly anticorrelated"
             return matrix, [where(name, ("together",), Problem(text, shown(cause.together), allowed))]
-    known = {c.name: k for k, c in enumerate(own)}
-    said: dict[tuple[int, int], float] = {}
+    known = {c.name: k for k, c in enumerate(components)}
+    values_of: dict[tuple[int, int], float] = {}
     for n, group in enumerate(cause.correlations):
         key: KeyPath = ("correlations", n)
-        strange = [k for k, text in enumerate(group.between) if text not in known]
-        for k in strange:
-            wrong = unknown(f"no component of {name}", group.between[k], sorted(known))
-            issues.append(where(name, (*key, "between", k), wrong))
-        if strange:
+        unknown_components = [k for k, text in enumerate(group.between) if text not in known]
+        for k in unknown_components:
+            problem = unknown(f"no component of {name}", group.between[k], sorted(known))
+            issues.append(where(name, (*key, "between", k), problem))
+        if unknown_components:
             continue
         at = [known[text] for text in group.between]
         for i, j in combinations(range(len(at)), 2):
             value = group.table[i][j]
-            before = said.setdefault((min(at[i], at[j]), max(at[i], at[j])), value)
+            before = values_of.setdefault((min(at[i], at[j]), max(at[i], at[j])), value)
             if before != value:
                 text = f"the correlation of {group.between[i]} and {group.between[j]} is already {before:g}"
                 issues.append(where(name, key, Problem(text, shown(value), "one of them")))
@@ -562,8 +562,8 @@ def _correlation(
             "the correlation matrix, with these entries and those before them, is not positive definite: it has an "
             f"eigenvalue of {least:.3g}"
         )
-        wrong = Problem(text, allowed="smaller correlations, as between real quantities")
-        issues.append(where(name, ("correlations", _first_impossible(cause, known)), wrong))
+        problem = Problem(text, allowed="smaller correlations, as between real quantities")
+        issues.append(where(name, ("correlations", _first_impossible(cause, known)), problem))
     return matrix, issues
 
 
@@ -586,12 +586,12 @@ def _least(matrix: np.ndarray) -> float:
 Array = NDArray[np.float64]
 
 
-def drawn_motions(stated: StatedMotions, seconds: Array, source: Callable[[int], np.random.Generator]) -> Array:
+def drawn_motions(prior: DisturbancePrior, seconds: Array, source: Callable[[int], np.random.Generator]) -> Array:
     """Return random amounts (T, M) of all components over time, SI, without jumps.
 
     Parameters
     ----------
-    stated : StatedMotions
+    prior : DisturbancePrior
         Prior of the components with their laws of time.
     seconds : (T,) ndarray
         Increasing times in seconds, counted as the laws count them.
@@ -599,10 +599,10 @@ def drawn_motions(stated: StatedMotions, seconds: Array, source: Callable[[int],
         Function from the number of a cause to its random generator, so that the draws of one cause do not depend on the
         others.
     """
-    out = np.zeros((len(seconds), len(stated.components)))
-    for number, where in enumerate(causes_of(stated).values()):
-        course = drawn_course(stated.laws[where[0]], seconds, source(number), len(where))
-        out[:, where] = course @ covariance_root(stated.correlation[np.ix_(where, where)]) * stated.sigma[where]
+    out = np.zeros((len(seconds), len(prior.components)))
+    for number, where in enumerate(causes_of(prior).values()):
+        course = drawn_course(prior.laws[where[0]], seconds, source(number), len(where))
+        out[:, where] = course @ covariance_root(prior.correlation[np.ix_(where, where)]) * prior.sigma[where]
     return out
 
 
@@ -629,9 +629,9 @@ def drawn_course(law: TimeLawSpec, seconds: Array, rng: np.random.Generator, cou
         out = _drifting(law.drift, seconds, rng, count)
     else:
         # Real part of a random phasor that rotates once per period, and decorrelates if it drifts.
-        turn = (2.0 * math.pi / law.period * seconds)[:, None]
+        phase = (2.0 * math.pi / law.period * seconds)[:, None]
         along = _drifting(law.drift, seconds, rng, count)
-        out = along * np.cos(turn) + _drifting(law.drift, seconds, rng, count) * np.sin(turn)
+        out = along * np.cos(phase) + _drifting(law.drift, seconds, rng, count) * np.sin(phase)
     since = seconds - (law.since or 0.0)
     if law.trend is not None:
         out = out * (since / law.trend)[:, None]
@@ -647,18 +647,18 @@ def _drifting(drift: float | None, seconds: Array, rng: np.random.Generator, cou
     unit = rng.standard_normal((len(seconds), count))
     if drift is None:
         return np.broadcast_to(unit[:1], unit.shape)
-    kept = np.exp(-np.diff(seconds) / drift)
-    fresh = np.sqrt(-np.expm1(-2.0 * np.diff(seconds) / drift))
-    for k, (part, new) in enumerate(zip(kept, fresh, strict=True)):
+    decay = np.exp(-np.diff(seconds) / drift)
+    innovation = np.sqrt(-np.expm1(-2.0 * np.diff(seconds) / drift))
+    for k, (part, new) in enumerate(zip(decay, innovation, strict=True)):
         unit[k + 1] = part * unit[k] + new * unit[k + 1]
     return unit
 
 
-def causes_of(stated: StatedMotions) -> dict[str, list[int]]:
+def causes_of(prior: DisturbancePrior) -> dict[str, list[int]]:
     """Return the indices of the components of each cause."""
     out: dict[str, list[int]] = {}
-    for k, one in enumerate(stated.components):
-        out.setdefault(one.cause, []).append(k)
+    for k, component in enumerate(prior.components):
+        out.setdefault(component.cause, []).append(k)
     return out
 
 
@@ -681,7 +681,7 @@ def joint_disturbances(
 ) -> DisturbancesSpec:
     """Return a disturbances specification, with `joint`, of components with a given covariance.
 
-    ``motions_of_spec`` makes of it the components that move, in this order and with these standard deviations, and
+    ``prior_of_spec`` makes of it the components that move, in this order and with these standard deviations, and
     states drawn from it have this covariance.
 
     Parameters
@@ -714,21 +714,21 @@ def joint_disturbances(
     if np.min(np.diagonal(covariance), initial=0.0) < 0.0:
         raise ValueError("a variance is negative")
     sigma = np.sqrt(np.diagonal(covariance))
-    own = np.flatnonzero(sigma > 0.0).tolist()
-    correlation = covariance[np.ix_(own, own)] / np.outer(sigma[own], sigma[own])
+    moving = np.flatnonzero(sigma > 0.0).tolist()
+    correlation = covariance[np.ix_(moving, moving)] / np.outer(sigma[moving], sigma[moving])
     if np.max(np.abs(correlation - correlation.T), initial=0.0) > -INDEFINITE:
         raise ValueError("the covariance is not symmetric")
     correlation = np.clip(0.5 * (correlation + correlation.T), -1.0, 1.0)
     correlation = np.asarray(np.round(correlation, DIGITS), dtype=np.float64)
     np.fill_diagonal(correlation, 1.0)
-    if len(own) and np.linalg.eigvalsh(correlation)[0] < INDEFINITE:
+    if len(moving) and np.linalg.eigvalsh(correlation)[0] < INDEFINITE:
         raise ValueError("the covariance has a negative eigenvalue")
-    names = [_name(components[k], nodes) for k in own]
+    names = [_name(components[k], nodes) for k in moving]
     plain = {
         "name": name,
         "description": description,
         "joint": {
-            "components": {said: written_sigma(said, float(sigma[k])) for said, k in zip(names, own, strict=True)},
+            "components": {said: written_sigma(said, float(sigma[k])) for said, k in zip(names, moving, strict=True)},
             "correlation": correlation.tolist(),
             "time": (time or TimeLawSpec(kind="constant")).plain(),
             "reason": reason,
@@ -769,6 +769,6 @@ def joint_files(spec: DisturbancesSpec, stem: str, remark: str = "") -> dict[str
 
 def _name(component: Component, nodes: Mapping[str, NodeInfo]) -> str:
     """Return the name of a component, with its pivot where that is not the default."""
-    if component.kind in ABOUT and component.pivot != usual_pivot(nodes[component.body]):
+    if component.kind in ABOUT and component.pivot != default_pivot(nodes[component.body]):
         return f"{component.name} about {component.pivot}"
     return component.name

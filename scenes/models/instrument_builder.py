@@ -62,18 +62,18 @@ def as_built(drawn: Instrument) -> Instrument:
     InputError
         A node does not exist, or does not allow the motion or change; one issue for each fault, at its file and line.
     """
-    stated = drawn.spec.as_built
-    if not stated:
+    departures = drawn.spec.as_built
+    if not departures:
         return drawn
-    named = with_full_paths(stated, drawn.nodes, lambda problem, name: stated[name].issue(problem))
-    issues = [issue for path, what in named.items() for issue in perturbation_issues(what, drawn.nodes, path, what, ())]
+    moved = with_full_paths(departures, drawn.nodes, lambda problem, name: departures[name].issue(problem))
+    issues = [issue for path, what in moved.items() for issue in perturbation_issues(what, drawn.nodes, path, what, ())]
     if issues:
         raise InputError(*issues)
-    state = FrozenMap({path: what.motion() for path, what in named.items()})
+    state = FrozenMap({path: what.motion() for path, what in moved.items()})
     return replace(drawn, assembly=drawn.assembly.with_nominal(state), as_built=state)
 
 
-def squared_facets(instrument: Instrument, backend: Backend) -> State:
+def facet_alignment(instrument: Instrument, backend: Backend) -> State:
     """Return the rotations of the central prism's facets that return the beams to the middles of the area CCDs.
 
     On a drawing they are zero. The facets of a built instrument are rotated by them when its monitor is mounted, after
@@ -140,10 +140,10 @@ def build_instrument(
         The prisms cannot be placed as the file says, the cameras are too different, or ``as_built`` does not fit the
         instrument.
     """
-    named = tuple(camera_specs.items())
-    read = tuple((one.source.file, one.source.lines) for one in (spec, *camera_specs.values()) if isinstance(one, Spec))
+    cameras = tuple(camera_specs.items())
+    sources = tuple((s.source.file, s.source.lines) for s in (spec, *camera_specs.values()) if isinstance(s, Spec))
     try:
-        return _built(_Asked(spec, named, backend, free_beams, free_bodies, repr((spec, named)), read))
+        return _built(_BuildArguments(spec, cameras, backend, free_beams, free_bodies, repr((spec, cameras)), sources))
     except MisplacedError as error:
         key = error.key if error.channel is None else spec.key_of(*error.channel, error.key)
         issue = spec.issue(str(error), key, allowed=error.remedy)
@@ -156,7 +156,7 @@ def build_instrument(
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _BuildArguments:
     """Arguments of ``build_instrument`` in a form that can be looked up in a cache.
 
     Attributes
@@ -180,9 +180,9 @@ class _Asked:
 
 
 @lru_cache(maxsize=8)
-def _built(asked: _Asked) -> Instrument:
+def _built(built: _BuildArguments) -> Instrument:
     """Return the instrument, from the cache of those built last where possible."""
-    return _build(asked.spec, FrozenMap(asked.cameras), asked.backend, asked.free_beams, asked.free_bodies)
+    return _build(built.spec, FrozenMap(built.cameras), built.backend, built.free_beams, built.free_bodies)
 
 
 def _no_cameras(camera_specs: Mapping[str, object], backend: Backend) -> tuple[Issue, ...]:
@@ -227,7 +227,7 @@ def _build(
         given = spec.channels_of(name)
         distances = {channel: given[channel.name].prism_180.distance for channel in own}
         beams = monitor_chain.leaving_beams(model, distances, to_base, backend)
-        facets = monitor_chain.facet_places(spec, beams)
+        facets = monitor_chain.facet_positions(spec, beams)
         for channel in own:
             chain = monitor_chain.monitor_chain(
                 spec, channel, given[channel.name], beams[channel], facets[channel], to_base

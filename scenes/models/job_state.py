@@ -21,7 +21,7 @@ from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import PRINTED, SEEN, TERMS, NodalDeformation, NodesError, nodal_deformation
 from optics.thermal.nodal_temperature import Coverage, NodalTemperature, linear_part
 from optics.thermal.thermo_elastic import Displacement, FaceChange
-from scenes.models.disturbances import UNITS, StatedMotions
+from scenes.models.disturbances import UNITS, DisturbancePrior
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import Held, TemperatureError, ThermalModel
 from scenes.specs.job import JobSpec, PerturbationSpec
@@ -69,7 +69,7 @@ class HeatedFace:
 
     motion: Motion
     lost: float
-    unmeshed: float
+    mesh_error: float
 
     @property
     def figure_rms(self) -> float:
@@ -89,7 +89,7 @@ class HeatedBody:
         Spacing of the nodes, in metres.
     linear : Temperature
         Best linear fit, in the body's frame.
-    left : tuple[float, float]
+    residual : tuple[float, float]
         Residual of that fit over the body's volume: rms and largest absolute value, in kelvin.
     between : float
         Leave-one-out error of the interpolation at the nodes, in kelvin rms.
@@ -105,7 +105,7 @@ class HeatedBody:
     nodes: int
     spacing: float
     linear: Temperature
-    left: tuple[float, float]
+    residual: tuple[float, float]
     between: float
     coverage: Coverage | None
     faces: Mapping[str, HeatedFace]
@@ -137,17 +137,17 @@ class HeatedBody:
                 f"{1e3 * self.coverage.farthest:.3g} mm from the nearest node, whose departure from the linear part "
                 "is used there; provide nodes throughout the body"
             )
-        if self.between > max(SEEN_HEAT, PRINTED * self.left[0]):
+        if self.between > max(SEEN_HEAT, PRINTED * self.residual[0]):
             out.append(
                 f"{path}: the table is too coarse for its field: the leave-one-out error at its nodes is "
-                f"{self.between:.3g} K rms, and the nonlinear part {self.left[0]:.3g} K rms "
+                f"{self.between:.3g} K rms, and the nonlinear part {self.residual[0]:.3g} K rms "
                 f"({1e3 * self.spacing:.3g} mm between nodes); refine the mesh, or expect wrong effects on the images"
             )
         for face, change in self.faces.items():
             size = change.figure_rms
-            if change.unmeshed > max(SEEN, MESHED_TO * size):
+            if change.mesh_error > max(SEEN, MESHED_TO * size):
                 out.append(
-                    f"{face}: the finite elements represent the effect of the table to {1e9 * change.unmeshed:.3g} nm "
+                    f"{face}: the finite elements follow the table to {1e9 * change.mesh_error:.3g} nm "
                     f"rms only, of {1e9 * size:.3g} nm; provide displacements of a structural program (deformation)"
                 )
             if change.lost > max(SEEN, PRINTED * size):
@@ -185,9 +185,9 @@ def heated_body(thermal: ThermalModel, job: JobSpec, path: str, spec: TableTempe
     """
     key = ("perturb", path, "temperature")
     assert spec.table is not None
-    read = read_temperatures(spec.table, spec.unit, spec.field, spec.values, spec.sha256)
-    points = pose_of_frame(thermal.instrument, job, key, path, spec.frame).apply(read.points)
-    values = read.values - (thermal.reference if read.absolute else 0.0)
+    table = read_temperatures(spec.table, spec.unit, spec.field, spec.values, spec.sha256)
+    points = pose_of_frame(thermal.instrument, job, key, path, spec.frame).apply(table.points)
+    values = table.values - (thermal.reference if table.absolute else 0.0)
     try:
         coldest = int(np.argmin(values))
         if not thermal.reference + values[coldest] > 0.0:
@@ -220,8 +220,8 @@ def _heated(thermal: ThermalModel, path: str, nodes: NodalTemperature) -> Heated
                 f"{nodes.departure():.3g} K",
                 f"the nearest linear field, {_in_words(nodes.linear)}, and displacements of the structural program",
             )
-        left = float(np.sqrt(np.mean(nodes.departures**2))), nodes.departure()
-        return HeatedBody(len(nodes.points), nodes.spacing, nodes.linear, left, nodes.between, None, {}, 0.0)
+        residual = float(np.sqrt(np.mean(nodes.departures**2))), nodes.departure()
+        return HeatedBody(len(nodes.points), nodes.spacing, nodes.linear, residual, nodes.between, None, {}, 0.0)
     elastic, _ = fine
     coverage = nodes.coverage(elastic.places, elastic.volumes)
     if coverage.outside > 1.0 - LEAST_INSIDE:
@@ -236,7 +236,7 @@ def _heated(thermal: ThermalModel, path: str, nodes: NodalTemperature) -> Heated
         )
     linear, rest = linear_part(elastic.places, nodes.at(elastic.places), elastic.volumes)
     largest = float(np.max(np.abs(rest)))
-    left = float(np.sqrt(np.average(rest**2, weights=elastic.volumes))), largest
+    residual = float(np.sqrt(np.average(rest**2, weights=elastic.volumes))), largest
     index_path = thermal.index_path(path, linear, largest)
     if index_path > INDEX_WAVES * thermal.instrument.spec.autocollimator.wavelength:
         raise NodesError(
@@ -259,7 +259,7 @@ def _heated(thermal: ThermalModel, path: str, nodes: NodalTemperature) -> Heated
                 nodal = _at_nodes(thermal, path, solved[1])
                 motion, lost = nodal.motion(), nodal.rms(nodal.lost)
             faces[face] = HeatedFace(motion, lost, _apart(change, coarser[face], sizes[face]))
-    return HeatedBody(len(nodes.points), nodes.spacing, linear, left, nodes.between, coverage, faces, index_path)
+    return HeatedBody(len(nodes.points), nodes.spacing, linear, residual, nodes.between, coverage, faces, index_path)
 
 
 def _at_nodes(thermal: ThermalModel, path: str, moved: Displacement) -> NodalDeformation:
@@ -305,8 +305,8 @@ def heated_bodies(job: JobSpec, thermal: ThermalModel) -> dict[str, HeatedBody]:
     InputError
         A table does not describe its body.
     """
-    named = {path: what.heat for path, what in job.perturb.items() if what.heat.table is not None}
-    return {path: heated_body(thermal, job, path, spec) for path, spec in named.items()}
+    tables = {path: what.heat for path, what in job.perturb.items() if what.heat.table is not None}
+    return {path: heated_body(thermal, job, path, spec) for path, spec in tables.items()}
 
 
 def with_heat(fields: Mapping[str, Temperature], heated: Mapping[str, HeatedBody]) -> dict[str, Temperature]:
@@ -424,8 +424,8 @@ def deformations_of(job: JobSpec, instrument: Instrument) -> dict[str, NodalDefo
     InputError
         A table does not describe its body.
     """
-    named = {path: what.deformation for path, what in job.perturb.items() if what.deformation is not None}
-    return {path: deformed_face(instrument, job, path, table) for path, table in named.items()}
+    tables = {path: what.deformation for path, what in job.perturb.items() if what.deformation is not None}
+    return {path: deformed_face(instrument, job, path, table) for path, table in tables.items()}
 
 
 def on_deformed(
@@ -497,15 +497,15 @@ class Excess:
 
     @property
     def text(self) -> str:
-        """Text for messages: ``base/forward/M2 shift z (3 um, stated 0.3 um)``."""
+        """Text for messages: ``base/forward/M2 shift z (3 um, prior sigma 0.3 um)``."""
         if self.kind == "table":
-            return f"{self.body} {self.what} (not stated)"
+            return f"{self.body} {self.what} (not in the prior)"
         unit, size = UNITS[self.kind]
-        stated = f"stated {self.sigma / size:.3g} {unit}" if self.sigma else "not stated"
-        return f"{self.body} {self.what} ({self.amount / size:.3g} {unit}, {stated})"
+        prior = f"prior sigma {self.sigma / size:.3g} {unit}" if self.sigma else "not in the prior"
+        return f"{self.body} {self.what} ({self.amount / size:.3g} {unit}, {prior})"
 
 
-def beyond_statement(resolved: ResolvedJob, stated: StatedMotions | None) -> tuple[Excess, ...]:
+def beyond_prior(resolved: ResolvedJob, prior: DisturbancePrior | None) -> tuple[Excess, ...]:
     """Return the components of a job's perturbation above `LIKELY` standard deviations of the prior, body by body.
 
     Pivots are ignored: for a rotation about another point the angle counts.
@@ -514,16 +514,16 @@ def beyond_statement(resolved: ResolvedJob, stated: StatedMotions | None) -> tup
     ----------
     resolved : ResolvedJob
         The job.
-    stated : StatedMotions or None
+    prior : DisturbancePrior or None
         Its prior; None if it has none.
     """
-    return tuple(_excesses(resolved.job, _variances(stated)))
+    return tuple(_excesses(resolved.job, _variances(prior)))
 
 
-def _variances(stated: StatedMotions | None) -> Mapping[tuple[str, str], float]:
+def _variances(prior: DisturbancePrior | None) -> Mapping[tuple[str, str], float]:
     """Return the prior variance of each component, by body and name."""
     out: dict[tuple[str, str], float] = {}
-    for c in stated.components if stated is not None else ():
+    for c in prior.components if prior is not None else ():
         out[c.body, c.what] = out.get((c.body, c.what), 0.0) + c.sigma**2
     return out
 

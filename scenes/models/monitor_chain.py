@@ -112,8 +112,8 @@ def leaving_beams(
     """
     out: dict[Channel, LeavingBeam] = {}
     for distance in dict.fromkeys(distances.values()):
-        own = [channel for channel, at in distances.items() if at == distance]
-        out.update(zip(own, _leaving(model, own, distance, to_base, backend), strict=True))
+        channels = [channel for channel, at in distances.items() if at == distance]
+        out.update(zip(channels, _leaving(model, channels, distance, to_base, backend), strict=True))
     return {channel: out[channel] for channel in distances}
 
 
@@ -172,7 +172,7 @@ def _traced_out(
     return beams
 
 
-def facet_places(spec: InstrumentSpec, beams: Mapping[Channel, LeavingBeam]) -> dict[Channel, np.ndarray]:
+def facet_positions(spec: InstrumentSpec, beams: Mapping[Channel, LeavingBeam]) -> dict[Channel, np.ndarray]:
     """Return the middles of the facets that a camera's beams meet, in the base frame, in metres.
 
     The first facet of each corner of the block leans toward the origin of its beam and contains the apex, so that it is
@@ -196,12 +196,12 @@ def facet_places(spec: InstrumentSpec, beams: Mapping[Channel, LeavingBeam]) -> 
     corners: dict[tuple[float, float], list[tuple[Channel, np.ndarray, np.ndarray, float]]] = {}
     out = {}
     for channel, beam in beams.items():
-        up, given = beam.direction, spec.channels_of(channel.camera)[channel.name]
+        up, parts = beam.direction, spec.channels_of(channel.camera)[channel.name]
         side = np.sign(up[:2])
-        offset = side * np.array(given.spread)
+        offset = side * np.array(parts.spread)
         lean, height = up[:2] / up[2], 0.0
-        for n, (other, place, slope, top) in enumerate(corners.setdefault((side[0], side[1]), [])):
-            apart, least = float(norm(offset - place)), 0.5 * float(up[2]) * (channel.aperture + other.aperture)
+        for n, (other, position, slope, top) in enumerate(corners.setdefault((side[0], side[1]), [])):
+            apart, least = float(norm(offset - position)), 0.5 * float(up[2]) * (channel.aperture + other.aperture)
             if apart < least:
                 raise spec.error(
                     f"the facets of {channel.key} and {other.key} overlap: their beams meet the block only "
@@ -209,7 +209,7 @@ def facet_places(spec: InstrumentSpec, beams: Mapping[Channel, LeavingBeam]) -> 
                     spec.key_of(channel.camera, channel.name, (CENTRAL_KEY, "spread")),
                     allowed=f"a position at least {1e3 * least:.4g} mm from that of {other.key}",
                 )
-            across = float(inner(lean - slope, offset - place))
+            across = float(inner(lean - slope, offset - position))
             if across < 0.0:
                 raise spec.error(
                     f"the facets of {channel.key} and {other.key} obstruct one another: the steeper one has to be "
@@ -217,7 +217,7 @@ def facet_places(spec: InstrumentSpec, beams: Mapping[Channel, LeavingBeam]) -> 
                     spec.key_of(channel.camera, channel.name, (CENTRAL_KEY, "spread")),
                     allowed=f"a position on the other side of that of {other.key}",
                 )
-            level = top + float(inner(lean - slope, 0.5 * (offset + place)))
+            level = top + float(inner(lean - slope, 0.5 * (offset + position)))
             height = level if n == 0 else min(height, level)
         corners[side[0], side[1]].append((channel, offset, lean, height))
         out[channel] = apex + np.array([*offset, height - inner(offset, up[:2]) / up[2]])
@@ -225,7 +225,7 @@ def facet_places(spec: InstrumentSpec, beams: Mapping[Channel, LeavingBeam]) -> 
 
 
 def monitor_chain(
-    spec: InstrumentSpec, channel: Channel, given: ChannelParts, beam: LeavingBeam, centre: np.ndarray, to_base: Pose
+    spec: InstrumentSpec, channel: Channel, parts: ChannelParts, beam: LeavingBeam, centre: np.ndarray, to_base: Pose
 ) -> MonitorChain:
     """Place both prisms and the facet of a channel.
 
@@ -235,7 +235,7 @@ def monitor_chain(
         The instrument.
     channel : Channel
         The channel.
-    given : ChannelParts
+    parts : ChannelParts
         Its parts as the file describes them, with all defaults filled in.
     beam : LeavingBeam
         Its beam as it leaves the camera.
@@ -250,15 +250,15 @@ def monitor_chain(
         The central prism is too near the camera's beam for the rhomboid's displacement, or that displacement is too
         small for the rhomboid's width.
     """
-    up, made, small = beam.direction, given.prism_180, given.prism_0
+    up, large, small = beam.direction, parts.prism_180, parts.prism_0
     apex = np.array(spec.reference_prism.position)
     across = centre - beam.middle
     across = across - inner(across, up) * up
     whole = float(norm(across))
     toward = across / whole
     transfer = whole - small.shift
-    off = made.reflector.lateral_offset(made.width)
-    shortest = 2.0 * off + made.width
+    off = large.reflector.lateral_offset(large.width)
+    shortest = 2.0 * off + large.width
     if transfer < shortest:
         raise spec.error(
             f"the beam of {channel.key} passes only {1e3 * whole:.4g} mm from its facet of the central prism, which "
@@ -273,10 +273,10 @@ def monitor_chain(
     x_axes = {hand: (length * toward + hand * 2.0 * off * turned) / transfer for hand in (1.0, -1.0)}
     hand = min(x_axes, key=lambda h: abs(x_axes[h][1]))
     pose = Pose(_columns(x_axes[hand], up), beam.middle + 0.5 * transfer * toward)
-    pose = pose @ _turn(made.tilt, made.reflector.null_point(length, made.width))
+    pose = pose @ _turn(large.tilt, large.reflector.null_point(length, large.width))
     names = channel.prism_body(PRISM_180), channel.prism_elements(PRISM_180)
-    mount = Mount(names[0], into_camera @ pose, names[1], made.material, length, made.width, hand, made.angle_errors)
-    first = _made(spec, channel, PRISM_180, "width", made.reflector, mount)
+    mount = Mount(names[0], into_camera @ pose, names[1], large.material, length, large.width, hand, large.angle_errors)
+    first = _made(spec, channel, PRISM_180, "width", large.reflector, mount)
     pose = Pose(_columns(toward, -up), centre + small.distance * up - 0.5 * small.shift * toward)
     pose = pose @ _turn(small.tilt, small.reflector.null_point(small.shift, small.width))
     names = channel.prism_body(PRISM_0), channel.prism_elements(PRISM_0)
@@ -328,8 +328,8 @@ def check_prisms(spec: InstrumentSpec) -> None:
     wavelength = spec.autocollimator.wavelength
     kinds: dict[str, Reflector] = {}
     for camera in spec.cameras:
-        for channel, given in spec.channels_of(camera).items():
-            for name, prism in given.prisms.items():
+        for channel, parts in spec.channels_of(camera).items():
+            for name, prism in parts.prisms.items():
                 if kinds.setdefault(name, prism.reflector) is not prism.reflector:
                     raise spec.error(
                         f"{camera}/{channel} has a different kind of reflector than the channels before it",
@@ -337,18 +337,18 @@ def check_prisms(spec: InstrumentSpec) -> None:
                         found=prism.kind,
                         allowed="the same kind in all channels of an instrument, which are traced together",
                     )
-            face = given.return_face.aperture
-            for name, prism in given.prisms.items():
+            face = parts.return_face.aperture
+            for name, prism in parts.prisms.items():
                 key = spec.key_of(camera, channel, ("monitor", name))
-                known = glass(prism.material) if prism.reflector.transparent else None
-                if known is not None and not known.shortest <= wavelength <= known.longest:
+                medium = glass(prism.material) if prism.reflector.transparent else None
+                if medium is not None and not medium.shortest <= wavelength <= medium.longest:
                     raise spec.error(
                         f"the index of {prism.material} is not known at the monitor's wavelength of "
                         f"{1e9 * wavelength:.6g} nm",
                         (*key, "material"),
                         found=prism.material,
-                        allowed=f"a glass for that wavelength, or a wavelength from {1e9 * known.shortest:.6g} to "
-                        f"{1e9 * known.longest:.6g} nm",
+                        allowed=f"a glass for that wavelength, or a wavelength from {1e9 * medium.shortest:.6g} to "
+                        f"{1e9 * medium.longest:.6g} nm",
                     )
                 if prism.width < face:
                     raise spec.error(

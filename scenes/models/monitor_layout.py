@@ -17,7 +17,7 @@ from optics.materials.material import material
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
 from scenes.models.instrument_model import Instrument
-from scenes.models.obstruction import convex_hull, imaging_segments, rays_taken
+from scenes.models.obstruction import blocked_rays, convex_hull, imaging_segments
 from scenes.specs import instrument as instruments
 from scenes.specs import load
 from scenes.specs.camera import CameraSpec, MonitorDesignSpec, PrismChoiceSpec
@@ -385,7 +385,7 @@ class ImagingBeams:
             planes = convex_hull(corners).equations
             for c, beams in enumerate(self.segments.values()):
                 for k, rays in enumerate(beams):
-                    out[c, k] |= rays_taken(rays, planes)
+                    out[c, k] |= blocked_rays(rays, planes)
         return out
 
 

@@ -104,7 +104,7 @@ def _distances(triangles: np.ndarray) -> np.ndarray:
     return np.where(inside, above / np.where(inside, area, 1.0), to_edges)
 
 
-def way_apart(first: np.ndarray, second: np.ndarray, room: float = LEAST_GAP) -> tuple[int, float]:
+def separating_move(first: np.ndarray, second: np.ndarray, room: float = LEAST_GAP) -> tuple[int, float]:
     """Return the shortest move along an axis that separates the convex hull of one set of points from that of another.
 
     Parameters
@@ -122,13 +122,13 @@ def way_apart(first: np.ndarray, second: np.ndarray, room: float = LEAST_GAP) ->
         Axis (0 to 2) and signed distance along it, in metres.
     """
     faces = convex_hull((first[:, None] - second[None]).reshape(-1, 3)).equations
-    ways = []
+    moves = []
     for axis in range(3):
         for sign in (1.0, -1.0):
             slope = sign * faces[:, axis]
             ahead = slope > PARALLEL
-            ways.append((float(np.min((room - faces[ahead, 3]) / slope[ahead])), axis, sign))
-    least, axis, sign = min(ways)
+            moves.append((float(np.min((room - faces[ahead, 3]) / slope[ahead])), axis, sign))
+    least, axis, sign = min(moves)
     return axis, sign * least
 
 
@@ -167,7 +167,7 @@ def find_overlaps(instrument: Instrument) -> tuple[Overlap, ...]:
     out = []
     for i, j, gap in sorted(found, key=lambda one: one[2]):
         first, second = (known.poses[k].apply(known.corners[k]) for k in (i, j))
-        out.append(Overlap(known.paths[i], known.paths[j], -gap, way_apart(first, second)))
+        out.append(Overlap(known.paths[i], known.paths[j], -gap, separating_move(first, second)))
     return tuple(out)
 
 
@@ -242,14 +242,14 @@ class Clearances:
                 for now, then, own in zip(poses, self.poses, self.corners, strict=True)
             ]
         )
-        found = []
+        overlaps = []
         for (i, j), gap in zip(self.pairs, self.gaps, strict=True):
             if gap <= 0.0 or moved[i] + moved[j] < gap:
                 continue
-            left = separation(poses[i].apply(self.corners[i]), poses[j].apply(self.corners[j]))
-            if left < 0.0:
-                found.append(Overlap(self.paths[i], self.paths[j], -left))
-        return tuple(sorted(found, key=lambda overlap: -overlap.depth))
+            gap_now = separation(poses[i].apply(self.corners[i]), poses[j].apply(self.corners[j]))
+            if gap_now < 0.0:
+                overlaps.append(Overlap(self.paths[i], self.paths[j], -gap_now))
+        return tuple(sorted(overlaps, key=lambda overlap: -overlap.depth))
 
 
 def check_clearance(instrument: Instrument) -> None:
@@ -414,26 +414,26 @@ def find_obstructions(instrument: Instrument, backend: Backend) -> tuple[Obstruc
     for solid in instrument.solids:
         corners = placed.pose(solid.path).apply(solid_mesh(solid, placed).vertices)
         solids[solid.path] = convex_hull(corners).equations
-    found: dict[tuple[str, str], Obstruction] = {}
+    obstructions: dict[tuple[str, str], Obstruction] = {}
     for camera in instrument.cameras:
         for segments in imaging_segments(instrument, backend, camera):
             for path, planes in solids.items():
-                taken = rays_taken(segments, planes)
-                if not taken.any():
+                blocked = blocked_rays(segments, planes)
+                if not blocked.any():
                     continue
-                used = float(np.mean(taken & _used(instrument, path, segments)))
-                new = Obstruction(path, f"{camera}/imaging", float(np.mean(taken)), used)
-                if (new.beam, path) not in found or found[new.beam, path].share < new.share:
-                    found[new.beam, path] = new
+                used = float(np.mean(blocked & _used(instrument, path, segments)))
+                item = Obstruction(path, f"{camera}/imaging", float(np.mean(blocked)), used)
+                if (item.beam, path) not in obstructions or obstructions[item.beam, path].share < item.share:
+                    obstructions[item.beam, path] = item
     for beam in monitor_beams(instrument, backend, _disk()):
         for path, planes in solids.items():
-            taken = rays_taken(beam.outside(path), planes)
-            if taken.any():
-                found[beam.channel.key, path] = Obstruction(path, beam.channel.key, float(np.mean(taken)))
-    return tuple(found[name] for name in sorted(found))
+            blocked = blocked_rays(beam.outside(path), planes)
+            if blocked.any():
+                obstructions[beam.channel.key, path] = Obstruction(path, beam.channel.key, float(np.mean(blocked)))
+    return tuple(obstructions[name] for name in sorted(obstructions))
 
 
-def rays_taken(segments: np.ndarray, planes: np.ndarray, touching: float = _TOUCHING) -> np.ndarray:
+def blocked_rays(segments: np.ndarray, planes: np.ndarray, touching: float = _TOUCHING) -> np.ndarray:
     """Return a mask (N,) of the rays that a convex body blocks.
 
     Parameters
@@ -502,13 +502,13 @@ def imaging_segments(instrument: Instrument, backend: Backend, camera: str, rays
     systems = assemble(assembly, [chain])
     traced = trace(backend, systems, make_rays(backend, position, direction), keep=range(len(chain)), world=True)
     assert traced.world is not None
-    places = [position[0]]
+    points_along = [position[0]]
     for k, name in enumerate(chain):
-        places.append(placed.pose(assembly.elements[name].body).apply(traced.hit(k)[0]))
-    everything = placed.translation[0] - places[-1].mean(axis=0)
-    reach = 2.0 * float(np.max(np.linalg.norm(everything, axis=-1)))
-    places.append(places[-1] + reach * traced.numpy(traced.world)[1][0])
-    return np.split(_segments(places), 3)
+        points_along.append(placed.pose(assembly.elements[name].body).apply(traced.hit(k)[0]))
+    everything = placed.translation[0] - points_along[-1].mean(axis=0)
+    length = 2.0 * float(np.max(np.linalg.norm(everything, axis=-1)))
+    points_along.append(points_along[-1] + length * traced.numpy(traced.world)[1][0])
+    return np.split(_segments(points_along), 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -602,10 +602,10 @@ def check_beams(instrument: Instrument, backend: Backend) -> None:
         choice = "a field, prisms and a pupil_offset with which the whole beam passes the mirrors of both cameras"
         raise MisplacedError(problem, ("monitor",), choice) from error
     issues = [_cut(instrument, backend, beam) for beam in beams if not beam.valid.all()]
-    for beam, what, plate, taken in _standing_in(instrument, beams, instrument.assembly.place(), _TOUCHING):
-        text = f"{what} blocks {_count(taken)} of the beam {beam.channel.key}"
+    for beam, name, plate, blocked in _standing_in(instrument, beams, instrument.assembly.place(), _TOUCHING):
+        text = f"{name} blocks {_count(blocked)} of the beam {beam.channel.key}"
         if plate is None:
-            where, choice = _way_out(instrument, beam.channel, what)
+            where, choice = _way_out(instrument, beam.channel, name)
         else:
             where = ("baffles", plate.name) if plate.name in instrument.spec.baffles else ("baffles",)
             choice = "a size and position beside the beam"
@@ -625,13 +625,13 @@ def moved_into_beams(instrument: Instrument, backend: Backend, state: State) -> 
         beams = monitor_beams(instrument, backend, _WHOLE, state)
     except AimError:
         return ()  # The spots themselves are lost; that is reported elsewhere with its cause.
-    together: dict[tuple[str, str], np.ndarray] = {}
-    for beam, what, _, taken in _standing_in(instrument, beams, instrument.assembly.place([state]), _TOUCHING_MOVED):
+    blocked_by: dict[tuple[str, str], np.ndarray] = {}
+    for beam, name, _, blocked in _standing_in(instrument, beams, instrument.assembly.place([state]), _TOUCHING_MOVED):
         # A baffle has several plates.
-        together[beam.channel.key, what] = taken | together.get((beam.channel.key, what), False)
+        blocked_by[beam.channel.key, name] = blocked | blocked_by.get((beam.channel.key, name), False)
     return tuple(
-        f"{key}: {what} has moved into the beam and would block {_count(taken)}; the spot is that of the whole beam"
-        for (key, what), taken in together.items()
+        f"{key}: {name} has moved into the beam and would block {_count(blocked)}; the spot is that of the whole beam"
+        for (key, name), blocked in blocked_by.items()
     )
 
 
@@ -643,24 +643,24 @@ def _standing_in(
     hulls = {path: convex_hull(corners).equations for path, corners in bodies.items()}
     for beam in beams:
         camera = instrument.cameras[beam.channel.camera]
-        within = len(camera.mirrors)  # segments inside the camera, at each end of the beam
+        inside_camera = len(camera.mirrors)  # segments inside the camera, at each end of the beam
         for path, planes in hulls.items():
             segments = beam.outside(path)
             if path.rpartition("/")[0] == f"{BASE}/{beam.channel.camera}":
                 # Substrates of the camera's own parts are unknown; the hull of its first mirror contains its light.
                 first = int(path.endswith(f"/{camera.mirrors[0]}"))
-                segments = beam.segments[:, within + first : -within - first]
+                segments = beam.segments[:, inside_camera + first : -inside_camera - first]
             low, high = segments.min(axis=(0, 2)), segments.max(axis=(0, 2))
             near = np.all((low <= bodies[path].max(axis=0)) & (high >= bodies[path].min(axis=0)), axis=-1)
             if not near.any():
                 continue
-            taken = rays_taken(segments[:, near], planes, touching)
-            if taken.any():
-                yield beam, path, None, taken
+            blocked = blocked_rays(segments[:, near], planes, touching)
+            if blocked.any():
+                yield beam, path, None, blocked
         for plate in instrument.baffles:
-            taken = _crossing(beam.segments, plate, placed)
-            if taken.any():
-                yield beam, f"a plate of {plate.name}", plate, taken
+            blocked = _crossing(beam.segments, plate, placed)
+            if blocked.any():
+                yield beam, f"a plate of {plate.name}", plate, blocked
 
 
 def _way_out(instrument: Instrument, channel: Channel, path: str) -> tuple[KeyPath, str]:
@@ -684,10 +684,10 @@ def _crossing(segments: np.ndarray, plate: Plate, placed: PlacedBodies) -> np.nd
     """Return a mask (N,) of the rays, segments (N, K, 2, 3), that cross a plate."""
     into = (placed.pose(plate.body) @ plate.pose).inverse()
     start, end = into.apply(segments[:, :, 0]), into.apply(segments[:, :, 1])
-    through = start[..., 2] * end[..., 2] < 0.0
-    share = np.where(through, start[..., 2] / np.where(through, start[..., 2] - end[..., 2], 1.0), 0.0)
-    at = start + share[..., None] * (end - start)
-    return np.asarray(np.any(through & plate.outline.contains(at[..., 0], at[..., 1]), axis=-1))
+    crosses = start[..., 2] * end[..., 2] < 0.0
+    fraction = np.where(crosses, start[..., 2] / np.where(crosses, start[..., 2] - end[..., 2], 1.0), 0.0)
+    point = start + fraction[..., None] * (end - start)
+    return np.asarray(np.any(crosses & plate.outline.contains(point[..., 0], point[..., 1]), axis=-1))
 
 
 def _cut(instrument: Instrument, backend: Backend, beam: MonitorBeam) -> Issue:

@@ -171,7 +171,7 @@ class SceneSurface:
 
 
 def mirror_surface(
-    element: Element, placed: PlacedBodies, finishes: Finishes, lit_side: float = 1.0, motion: Motion = AT_REST
+    element: Element, placed: PlacedBodies, finishes: Finishes, optical_side: float = 1.0, motion: Motion = AT_REST
 ) -> SceneSurface:
     """Return the surface of a reflecting element that is not a face of a solid.
 
@@ -183,7 +183,7 @@ def mirror_surface(
         Bodies of one state.
     finishes : Finishes
         Finishes of all kinds of surfaces.
-    lit_side : float
+    optical_side : float
         +1 if the optical side is +z, -1 if it is -z; the other one is the substrate's back.
     motion : Motion
         Motion of the mirror's body in that state, of which only the change of figure is used here.
@@ -207,8 +207,8 @@ def mirror_surface(
         surface,
         vertices,
         triangles,
-        front=optical if lit_side > 0.0 else rear,
-        back=rear if lit_side > 0.0 else optical,
+        front=optical if optical_side > 0.0 else rear,
+        back=rear if optical_side > 0.0 else optical,
         apertures=(aperture,),
         clearance=LEAST_CLEARANCE + apart,
     )
@@ -523,7 +523,7 @@ def build_scenery(
     ]
     on_glass = {name for surface in glass for name in surface.elements}
     surfaces = [
-        mirror_surface(element, placed, finishes, _lit_side(instrument, element), state.get(element.body, AT_REST))
+        mirror_surface(element, placed, finishes, _optical_side(instrument, element), state.get(element.body, AT_REST))
         for element in assembly.elements.values()
         if element.interaction is Interaction.REFLECT and element.name not in on_glass
     ]
@@ -537,7 +537,7 @@ def build_scenery(
     return Scenery(tuple(surfaces), tuple(detectors))
 
 
-def _lit_side(instrument: Instrument, element: Element) -> float:
+def _optical_side(instrument: Instrument, element: Element) -> float:
     """Return +1 if light meets a mirror from its +z side, -1 if from its -z side, by its neighbours in a sequence."""
     nominal = instrument.assembly.place()
     own = nominal.pose(element.body).inverse()

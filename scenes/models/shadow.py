@@ -32,7 +32,7 @@ from optics.waves.pupil_shadow import SMALLEST, separate
 from optics.waves.pupil_terms import products, to_terms
 from scenes.models.camera_model import CameraModel
 from scenes.models.instrument_model import Instrument
-from scenes.models.obstruction import convex_bodies, imaging_segments, rays_taken
+from scenes.models.obstruction import blocked_rays, convex_bodies, imaging_segments
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import BASE
 
@@ -107,10 +107,10 @@ class Shadows:
     @classmethod
     def of(cls, outlines: list[tuple[str, np.ndarray]], count: int) -> Shadows:
         """Return the shadows of bodies with outlines (B, V, 2) on ``count`` stops."""
-        lit = [(name, outline) for name, outline in outlines if np.any(area(outline) > SMALLEST)]
-        pieces, numbers = separate([outline for _, outline in lit])
-        pieces = pieces if lit else np.zeros((count, 0, 3, 2))
-        return cls.within(pieces, tuple(lit[k][0] for k in numbers))
+        casting = [(name, outline) for name, outline in outlines if np.any(area(outline) > SMALLEST)]
+        pieces, numbers = separate([outline for _, outline in casting])
+        pieces = pieces if casting else np.zeros((count, 0, 3, 2))
+        return cls.within(pieces, tuple(casting[k][0] for k in numbers))
 
     @classmethod
     def within(cls, pieces: np.ndarray, owners: tuple[str, ...]) -> Shadows:
@@ -123,7 +123,7 @@ class Shadows:
         Parameters
         ----------
         outlines : callable
-            Outlines of the edges, as ``SeenEdges.outlines`` returns them.
+            Outlines of the edges, as ``PupilEdges.outlines`` returns them.
         name : str
             Name under which ``shares`` lists the share that the edges block in addition to all bodies.
 
@@ -241,19 +241,19 @@ class ImagingShadows:
 
     def cast(self, beams: TracedBeams) -> Shadows:
         """Return the shadows in B pupils."""
-        found: list[tuple[str, np.ndarray]] = []
+        outlines: list[tuple[str, np.ndarray]] = []
         launched = beams.rays.launched
         bundle = _Bundle.parallel(launched, beams.heading, self._end(beams), beams.nodes)
         centre, size = self._spheres(beams.placed)
         for near in np.flatnonzero(bundle.may_meet(centre[beams.owner], size[beams.owner])):
             caster = self.casters[near]
-            found.append((caster.name, bundle.outline(_corners(caster, beams))))
+            outlines.append((caster.name, bundle.outline(_corners(caster, beams))))
         if self._inner:
             for k, (start, end) in enumerate(pairwise(self._hits(beams))):
                 bundle = _Bundle.between(start, end, beams.nodes)
                 for caster in self._inner.get(k, ()):
-                    found.append((caster.name, bundle.outline(_corners(caster, beams))))
-        return Shadows.of(found, len(launched))
+                    outlines.append((caster.name, bundle.outline(_corners(caster, beams))))
+        return Shadows.of(outlines, len(launched))
 
     def _spheres(self, placed: PlacedBodies) -> tuple[np.ndarray, np.ndarray]:
         """Return middles (S, C, 3) and radii (S, C) of spheres around all C casters, in the world."""
@@ -288,11 +288,11 @@ def no_shadows(count: int) -> Shadows:
     return Shadows.within(np.zeros((count, 0, 3, 2)), ())
 
 
-class SeenEdges(SurfaceEdges):
+class PupilEdges(SurfaceEdges):
     """Edges of a camera's surfaces in the pupils of B images, in a state of its assembly."""
 
     @classmethod
-    def of(cls, beams: TracedBeams, model: CameraModel, camera: str, backend: Backend) -> SeenEdges:
+    def of(cls, beams: TracedBeams, model: CameraModel, camera: str, backend: Backend) -> PupilEdges:
         """Return the edges of a camera.
 
         Parameters
@@ -326,7 +326,7 @@ def imaging_shadows(instrument: Instrument, camera: str, backend: Backend) -> Im
 
 
 def _between_mirrors(
-    every: Sequence[Caster], instrument: Instrument, backend: Backend, camera: str
+    casters: Sequence[Caster], instrument: Instrument, backend: Backend, camera: str
 ) -> dict[int, list[Caster]]:
     """Return the bodies near the nominal light from mirror to mirror (0: first to second) and to the image."""
     placed = instrument.assembly.place()
@@ -334,11 +334,11 @@ def _between_mirrors(
     inner = backward[:, :-1][:, ::-1]  # without the path from the scene, in the order of the light
     cube = _ROOM * np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
     out: dict[int, list[Caster]] = {}
-    for caster in every:
+    for caster in casters:
         corners = placed.pose(caster.body).apply(caster.corners)
         planes = ConvexHull((corners[:, None] + cube).reshape(-1, 3)).equations
         for k in range(inner.shape[1]):
-            if rays_taken(inner[:, k : k + 1], planes).any():
+            if blocked_rays(inner[:, k : k + 1], planes).any():
                 out.setdefault(k, []).append(caster)
     return out
 

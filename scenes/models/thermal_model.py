@@ -79,37 +79,37 @@ class Lens:
         """Point at which it is held, (3,), in the frame of the body that carries it, in metres."""
         return np.asarray(self.parent.apply(self.middle))
 
-    def grown(self, stretch: float) -> dict[str, Motion]:
+    def expanded(self, expansion: float) -> dict[str, Motion]:
         """Return the motions of the faces by a relative expansion of the lens about its middle."""
         return {
             face: Motion(
-                shift=triple(stretch * (pose.rotation.T @ (pose.translation - self.middle))), expansion=stretch
+                shift=triple(expansion * (pose.rotation.T @ (pose.translation - self.middle))), expansion=expansion
             )
             for face, pose in self.faces.items()
         }
 
-    def carried(self, turn: np.ndarray, move: np.ndarray, stretch: float) -> dict[str, Motion]:
+    def carried(self, rotation: np.ndarray, offset: np.ndarray, expansion: float) -> dict[str, Motion]:
         """Return the motions of the faces by the body that carries the lens.
 
         All arguments are in the frame of the carrier.
 
         Parameters
         ----------
-        turn : (3,) ndarray
+        rotation : (3,) ndarray
             Rotation vector of the lens about the point at which it is held, in radians.
-        move : (3,) ndarray
+        offset : (3,) ndarray
             Displacement of that point, in metres, without that by the carrier's uniform expansion.
-        stretch : float
+        expansion : float
             Relative expansion of the carrier, which moves the origins of the faces in the tree; the lens follows the
             displacement of its middle.
         """
         out = {}
         for face, pose in self.faces.items():
             arm = self.parent.rotation @ (pose.translation - self.middle)
-            inward = (self.parent.rotation @ pose.rotation).T
-            shift = move - stretch * arm + (rotation_matrix(turn) - np.eye(3)) @ arm
-            if np.any(turn) or np.any(shift):
-                out[face] = Motion(rotate=triple(inward @ turn), shift=triple(inward @ shift))
+            to_face = (self.parent.rotation @ pose.rotation).T
+            shift = offset - expansion * arm + (rotation_matrix(rotation) - np.eye(3)) @ arm
+            if np.any(rotation) or np.any(shift):
+                out[face] = Motion(rotate=triple(to_face @ rotation), shift=triple(to_face @ shift))
         return out
 
 
@@ -381,14 +381,14 @@ class ThermalModel:
 
     def known(self, path: str) -> TemperatureRange:
         """Return the temperatures for which the data of a body's material hold: expansion and, for glass, index."""
-        stuff = self.materials[path].known
+        data = self.materials[path].known
         if path in self.solids and self.solids[path].transparent:
             thermal = glass(self.solids[path].material).thermal
             if thermal is not None:
-                low, high = max(stuff.coldest, thermal.known.coldest), min(stuff.hottest, thermal.known.hottest)
-                source = stuff.source if (low, high) == (stuff.coldest, stuff.hottest) else thermal.known.source
+                low, high = (max(data.coldest, thermal.known.coldest), min(data.hottest, thermal.known.hottest))
+                source = data.source if (low, high) == (data.coldest, data.hottest) else thermal.known.source
                 return TemperatureRange(low, high, source)
-        return stuff
+        return data
 
     def coldest(self, path: str, field: Temperature) -> float:
         """Return the lowest absolute temperature of a field on a body, in kelvin.
@@ -470,33 +470,33 @@ class ThermalModel:
         """Return the motions by a body's fields: of its faces, then of the body itself and of what it carries."""
         if path in self.lenses:
             return self._warmed_lens(self.lenses[path], field, progress)
-        body, stuff = self._bodies[path], self.materials[path]
+        body, data = self._bodies[path], self.materials[path]
         pivot = _mount(body)
         about = np.array(body.pivots[pivot])
-        stretch = stuff.expansion * field.at(about)
-        stretches = stretch.tolist()
-        glassy = path in self.solids and self.solids[path].transparent
-        indices = self._indices(path, field) if glassy else repeat((0.0, (0.0, 0.0, 0.0)), len(stretches))
+        expansion = data.expansion * field.at(about)
+        expansions = expansion.tolist()
+        is_glass = path in self.solids and self.solids[path].transparent
+        indices = self._indices(path, field) if is_glass else repeat((0.0, (0.0, 0.0, 0.0)), len(expansions))
         out: dict[str, Sequence[Motion | None]] = {
             path: [
-                Motion(pivot=pivot, expansion=grown, index=change, index_gradient=slope)
-                for grown, (change, slope) in zip(stretches, indices, strict=True)
+                Motion(pivot=pivot, expansion=scale, index=change, index_gradient=slope)
+                for scale, (change, slope) in zip(expansions, indices, strict=True)
             ]
         }
         if path in self.solids or path in self.mirrors:
             # An expansion in the tree moves carried bodies without enlarging them; faces and footprints expand as well.
-            inside = tuple(Motion(expansion=grown) for grown in stretches)
+            inside = tuple(Motion(expansion=scale) for scale in expansions)
             out.update(dict.fromkeys(self._within(path), inside))
             return [*self._bent(path, field.gradient, progress), out]
         carried = self._carried_by(path)
         for lens in carried.lenses:
-            moves = zip(*carried_motion(stuff.expansion, field.gradient, lens.mount - about), stretches, strict=True)
+            moves = zip(*carried_motion(data.expansion, field.gradient, lens.mount - about), expansions, strict=True)
             faces = [lens.carried(*each) for each in moves]
-            out.update({face: [own.get(face) for own in faces] for face in lens.faces})
-        turn, move = carried_motion(stuff.expansion, field.gradient[:, None], carried.place - about)
+            out.update({face: [motions.get(face) for motions in faces] for face in lens.faces})
+        turn, move = carried_motion(data.expansion, field.gradient[:, None], carried.place - about)
         # The expansion in the tree moves the child's origin, but it is the child's mount that moves with this body.
         rotate = matvec(carried.inward, turn)
-        shift = matvec(carried.inward, move) + stretch[:, None, None] * carried.mount
+        shift = matvec(carried.inward, move) + expansion[:, None, None] * carried.mount
         moved = np.any(turn, axis=2) | np.any(shift, axis=2)
         for k in np.flatnonzero(np.any(moved, axis=0)).tolist():
             child, places = carried.bodies[k], zip(*(a[:, k].tolist() for a in (moved, rotate, shift)), strict=True)
@@ -525,13 +525,13 @@ class ThermalModel:
         """Return the motions and index changes that a lens's fields cause."""
         assert lens.glass is not None
         here = (self.reference + field.change).tolist()
-        grown = [lens.grown(stretch) for stretch in (lens.glass.expansion * field.at(lens.middle)).tolist()]
-        for own, temperature, gradient in zip(grown, here, field.gradient, strict=True):
+        motions = [lens.expanded(expansion) for expansion in (lens.glass.expansion * field.at(lens.middle)).tolist()]
+        for own, temperature, gradient in zip(motions, here, field.gradient, strict=True):
             index = lens.glass.change(self.reference, temperature), triple(lens.glass.slope(temperature) * gradient)
             own[lens.path] = replace(own[lens.path], index=index[0], index_gradient=index[1])
         return [
             *self._bent(lens.path, field.gradient, progress),
-            {face: [own[face] for own in grown] for face in lens.faces},
+            {face: [own[face] for own in motions] for face in lens.faces},
         ]
 
     def _indices(self, path: str, field: Temperatures) -> Iterator[tuple[float, tuple[float, float, float]]]:
@@ -626,9 +626,9 @@ class ThermalModel:
 
     def _elastic_material(self, path: str) -> Material:
         """Return the elastic material of a body."""
-        stuff = self.materials[path]
-        assert isinstance(stuff, Material)
-        return stuff
+        elastic = self.materials[path]
+        assert isinstance(elastic, Material)
+        return elastic
 
     def unit_displacements(self, path: str) -> Sequence[Displaced]:
         """Return the displacements of a body's material by gradients of 1 K/m along its x, y and z, in its frame.

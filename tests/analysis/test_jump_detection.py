@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2
+from tests.analysis.disturbance_prior import SpotNoise, disturbances
 
 from analysis.monitor import series_smoother
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.jump_detection import candidates
 from analysis.monitor.series_smoother import smooth_series
-from tests.analysis.stated_motions import SpotNoise, disturbances
 
 NOISE = 0.2
 """Of the shifts below, px."""
@@ -39,7 +39,9 @@ def test_false_alarms_of_series_without_a_jump_are_within_the_stated_rate() -> N
     chances = []
     for seed in range(200):
         told, times, shifts = toy(seed, false_alarm=0.5)
-        chances.append(min((j.chance for j in smooth_series(told, times, shifts, FOUR, [0.0]).jumps or ()), default=1.0))
+        chances.append(
+            min((j.chance for j in smooth_series(told, times, shifts, FOUR, [0.0]).jumps or ()), default=1.0)
+        )
     for rate in (0.5, 0.05):
         assert np.sum(np.array(chances) <= rate) <= binom.isf(1e-3, 200, rate)
     assert min(chances) < 0.5  # some alarm there is, so that the count above can fail

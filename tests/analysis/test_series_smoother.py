@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from tests.analysis.disturbance_prior import correlation_of, disturbances
 
 from analysis.monitor import series_smoother
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.series_smoother import smooth_series
 from analysis.spots.spot_positions import NoiseParts, SeriesNoise
 from tests.analysis.refusals import refuses
-from tests.analysis.stated_motions import correlation_of, disturbances
 
 WHITE, CONSTANT = TimeLaw(white=True), TimeLaw()
 DRIFT, SWING, BOTH = TimeLaw(drift_s=50.0), TimeLaw(period_s=90.0), TimeLaw(drift_s=200.0, period_s=70.0)
@@ -172,7 +172,9 @@ def test_refusals() -> None:
     with pytest.raises(ValueError, match="different laws"):
         smooth_series(replace(stated, correlation=mixed), [0.0, 1.0], shifts, noise_of(own, shared), [0.0])
     still = replace(stated, laws=(CONSTANT,) * 4)
-    refuses(ValueError, "need noise", smooth_series, still, [0.0, 1.0], shifts, noise_of(0.0 * own, 0.0 * shared), [0.0])
+    refuses(
+        ValueError, "need noise", smooth_series, still, [0.0, 1.0], shifts, noise_of(0.0 * own, 0.0 * shared), [0.0]
+    )
 
 
 def test_noise_of_a_series_of_images() -> None:

@@ -7,9 +7,9 @@ import pytest
 
 from optics.geometry.tree import Motion
 from scenes.models.camera_model import build_camera_under_test
-from scenes.models.disturbances import stated_motions
+from scenes.models.disturbances import disturbance_prior
 from scenes.models.instrument_builder import build_instrument
-from scenes.models.job_state import LIKELY, beyond_statement
+from scenes.models.job_state import LIKELY, beyond_prior
 from scenes.specs.instrument import as_built_file
 from scenes.specs.load import INSTRUMENTS, LIBRARY, load_cameras, load_instrument
 from scenes.specs.resolved import FocusSetup, resolve, resolve_camera
@@ -144,7 +144,7 @@ def beyond(tmp_path: Path, gf7_pair):
         job = tmp_path / "job.yaml"
         job.write_text(f"instrument: gf7_pair\nperturb: {perturb}\ndisturbances: {disturbances}\n", "utf-8")
         resolved = resolve(job)
-        return [e.text for e in beyond_statement(resolved, stated_motions(resolved, gf7_pair))]
+        return [e.text for e in beyond_prior(resolved, disturbance_prior(resolved, gf7_pair))]
 
     return texts
 
@@ -155,13 +155,13 @@ def test_amounts_are_held_against_those_stated(beyond) -> None:
         beyond("{base/forward/M2: {shift: [0 um, -6 um, 5.9 um], figure: {Z7: 19 nm}}, base: {temperature: 8 K}}") == []
     )
     assert beyond("{base/forward/M2: {shift: [0 um, -6.1 um, 3 um], figure: {Z22: 1 nm}}}") == [
-        "base/forward/M2 shift y (-6.1 um, stated 1.5 um)",
-        "base/forward/M2 figure Z22 (1 nm, not stated)",
+        "base/forward/M2 shift y (-6.1 um, prior sigma 1.5 um)",
+        "base/forward/M2 figure Z22 (1 nm, not in the prior)",
     ]
     assert beyond(
         "{base/forward/focal_plane/line: {rotate: [0 arcsec, 0 arcsec, 1 arcsec]}, base/forward: {scale: 1 ppm}}"
-    ) == ["base/forward/focal_plane/line rotate z (1 arcsec, not stated)"]
-    assert beyond("{base/forward/M2: {temperature: 1 K}}") == ["base/forward/M2 temperature (1 K, not stated)"]
+    ) == ["base/forward/focal_plane/line rotate z (1 arcsec, not in the prior)"]
+    assert beyond("{base/forward/M2: {temperature: 1 K}}") == ["base/forward/M2 temperature (1 K, not in the prior)"]
 
 
 def test_causes_of_one_component_add_up(beyond) -> None:
@@ -173,5 +173,5 @@ def test_causes_of_one_component_add_up(beyond) -> None:
 
 def test_without_a_statement_everything_is_beyond(beyond) -> None:
     assert beyond("{base/forward/M2: {shift: [0 um, 0 um, 1 nm]}}", "none") == [
-        "base/forward/M2 shift z (0.001 um, not stated)"
+        "base/forward/M2 shift z (0.001 um, not in the prior)"
     ]

@@ -202,18 +202,18 @@ def test_segments_through_a_body() -> None:
     s = np.linspace(0.0, 1.0, 4000)[:, None]
     points = segments[:, 0, :1] * (1.0 - s) + segments[:, 0, 1:] * s
     inside = Delaunay(corners).find_simplex(points) >= 0
-    taken = obstruction.rays_taken(segments, planes)
+    taken = obstruction.blocked_rays(segments, planes)
     seen = inside.any(axis=1)
     assert np.all(taken[seen])
     assert np.sum(taken & ~seen) <= 1  # one that the points step over
     assert 30 < seen.sum() < 270
     # two segments are taken when one of them is; a body that is only touched takes nothing
     both = np.stack([segments[:, 0], np.full((300, 2, 3), 9.0)], axis=1)
-    assert np.array_equal(obstruction.rays_taken(both, planes), taken)
+    assert np.array_equal(obstruction.blocked_rays(both, planes), taken)
     cube_planes = ConvexHull(cube()).equations
     along = np.array([[[[-2.0, 0.0, 0.5], [2.0, 0.0, 0.5]]], [[[-2.0, 0.0, 0.0], [-0.5, 0.0, 0.0]]]])
-    assert not obstruction.rays_taken(along, cube_planes).any()
-    assert obstruction.rays_taken(along - [0.0, 0.0, 1e-5], cube_planes).tolist() == [True, False]
+    assert not obstruction.blocked_rays(along, cube_planes).any()
+    assert obstruction.blocked_rays(along - [0.0, 0.0, 1e-5], cube_planes).tolist() == [True, False]
 
 
 def test_prisms_in_the_way(bare, backend) -> None:

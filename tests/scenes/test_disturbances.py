@@ -8,7 +8,7 @@ import pytest
 from optics.geometry.tree import Motion
 from optics.thermal.heat import Temperature
 from scenes.models import disturbances
-from scenes.models.disturbances import Component, StatedMotions, state_of, stated_motions
+from scenes.models.disturbances import Component, DisturbancePrior, disturbance_prior, state_of
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs import load
@@ -36,8 +36,8 @@ def spec(causes: str, head: str = HEAD) -> DisturbancesSpec:
     return validate(DisturbancesSpec, parse_yaml(head + causes, "own.yaml"))
 
 
-def stated(pair, causes: str) -> StatedMotions:
-    return disturbances.motions_of_spec(spec(causes), pair)
+def stated(pair, causes: str) -> DisturbancePrior:
+    return disturbances.prior_of_spec(spec(causes), pair)
 
 
 # --- what is stated ---------------------------------------------------------------------------------------------------
@@ -48,7 +48,7 @@ def stated(pair, causes: str) -> StatedMotions:
 def test_every_file_is_of_every_instrument_of_the_library(instrument, name, stem, tmp_path) -> None:
     (tmp_path / "job.yaml").write_text(f"instrument: {stem}\ndisturbances: {name}\n")
     resolved = resolve(tmp_path / "job.yaml")
-    found = stated_motions(resolved, instrument(stem))
+    found = disturbance_prior(resolved, instrument(stem))
     assert {c.cause for c in found.components} == set(resolved.disturbances.causes)
     assert found.correlation.shape == (len(found.components),) * 2
     assert np.all(found.sigma > 0.0)
@@ -61,7 +61,7 @@ def test_names_units_and_the_number_of_sigmas(pair) -> None:
   d: {bodies: base/forward/monitor/left/prism_0, index_gradient: 9e-7 1/m, reason: r}
   c: {bodies: [base/forward, base/backward], scale: 3 ppm, rotate: 3 arcsec, time: {drift: 6 h}, reason: r}
 """
-    found = disturbances.motions_of_spec(spec(text.lstrip("\n"), "sigmas: 3\n" + HEAD), pair)
+    found = disturbances.prior_of_spec(spec(text.lstrip("\n"), "sigmas: 3\n" + HEAD), pair)
     names = [c.name for c in found.components]
     assert names[:4] == [f"{m} {what}" for m in MIRRORS[:2] for what in ("shift z", "figure Z5")]
     assert names[12:19] == [
@@ -179,12 +179,12 @@ def test_none_states_nothing_and_a_name_stands_for_a_file(tmp_path) -> None:
 # --- what is refused --------------------------------------------------------------------------------------------------
 
 
-def stated_of_job(folder, instrument: str, disturbances: str, backend) -> StatedMotions | None:
+def stated_of_job(folder, instrument: str, disturbances: str, backend) -> DisturbancePrior | None:
     """Return what a job states to move of an instrument of one's own."""
     (folder / "other.yaml").write_text(instrument)
     (folder / "job.yaml").write_text(f"instrument: ./other.yaml\n{disturbances}")
     resolved = resolve(folder / "job.yaml")
-    return stated_motions(resolved, build_instrument(resolved.instrument, resolved.cameras, backend))
+    return disturbance_prior(resolved, build_instrument(resolved.instrument, resolved.cameras, backend))
 
 
 @pytest.mark.second
@@ -216,7 +216,7 @@ MATRIX = "  correlation: [[1, 0.8, 0], [0.8, 1, -0.3], [0, -0.3, 1]]\n"
 
 
 def test_components_stand_one_by_one(pair) -> None:
-    found = disturbances.motions_of_spec(spec("", f"sigmas: 2\n{JOINT}{THREE}{MATRIX}"), pair)
+    found = disturbances.prior_of_spec(spec("", f"sigmas: 2\n{JOINT}{THREE}{MATRIX}"), pair)
     assert [(c.cause, c.name, c.pivot) for c in found.components] == [
         ("joint", "base/forward/M2 shift z", "centre"),
         ("joint", "base/forward/M2 rotate x", "origin"),
@@ -228,7 +228,7 @@ def test_components_stand_one_by_one(pair) -> None:
 
 
 def test_what_does_not_move_is_left_out_with_its_correlations(pair) -> None:
-    found = disturbances.motions_of_spec(spec("", f"{JOINT}{THREE}{MATRIX}".replace("4 arcsec", "0 arcsec")), pair)
+    found = disturbances.prior_of_spec(spec("", f"{JOINT}{THREE}{MATRIX}".replace("4 arcsec", "0 arcsec")), pair)
     assert [c.what for c in found.components] == ["shift z", "conic"]
     np.testing.assert_array_equal(found.correlation, np.eye(2))
 
@@ -238,7 +238,7 @@ def test_radii_conic_constants_and_indices_reach_states(pair) -> None:
 causes:
   a: {bodies: base/*/M1, radius: 90 ppm, conic: 3.0e-5, figure: {Z5: 3 nm}, reason: r}
 """
-    found = disturbances.motions_of_spec(spec("", text), pair)
+    found = disturbances.prior_of_spec(spec("", text), pair)
     assert [(c.what, c.unit) for c in found.components[:3]] == [
         ("radius", "ppm"),
         ("conic", "ppm"),
@@ -266,7 +266,7 @@ def test_derivatives_by_radii_and_conic_constants(backend, pair) -> None:
 def test_assembled_is_of_cameras_alone(backend, name) -> None:
     assert name in load.library_names(load.CAMERAS)
     alone = load.load_instrument(name)
-    found = disturbances.motions_of_spec(
+    found = disturbances.prior_of_spec(
         load.load_disturbances("assembled"), build_instrument(alone, load.load_cameras(alone), backend)
     )
     sigma = {c.name: c.sigma / c.unit_size for c in found.components}
@@ -290,7 +290,7 @@ def covariance_of(sigma: np.ndarray, rng: np.random.Generator, rank: int) -> np.
 @pytest.mark.parametrize(("count", "rank"), [(6, 6), (6, 2), (60, 60), (60, 5)])
 def test_a_covariance_is_written_and_read_back(pair, tmp_path, count, rank) -> None:
     """In one file, and with many components in two; also one that leaves combinations without any spread."""
-    every = disturbances.motions_of_spec(load.load_disturbances("assembled"), pair).components
+    every = disturbances.prior_of_spec(load.load_disturbances("assembled"), pair).components
     rng = np.random.default_rng(count + rank)
     chosen = [every[k] for k in rng.permutation(len(every))[:count]]
     for k, one in enumerate(chosen):
@@ -303,7 +303,7 @@ def test_a_covariance_is_written_and_read_back(pair, tmp_path, count, rank) -> N
     assert set(files) == {"posterior.yaml", *(["posterior.csv"] if count > 12 else [])}
     for name, text in files.items():
         (tmp_path / name).write_text(text)
-    found = disturbances.motions_of_spec(load.load_disturbances(tmp_path / "posterior.yaml"), pair)
+    found = disturbances.prior_of_spec(load.load_disturbances(tmp_path / "posterior.yaml"), pair)
     assert [(c.name, c.pivot) for c in found.components] == [(c.name, c.pivot) for c in chosen]
     # correlations have twelve digits
     np.testing.assert_allclose(found.covariance, covariance, rtol=1e-12, atol=1e-12 * np.max(np.outer(sigma, sigma)))
@@ -346,7 +346,7 @@ def table_of(folder, rows) -> DisturbancesSpec:
 
 @pytest.mark.second
 def test_a_table_may_have_its_columns_in_any_order(pair, tmp_path) -> None:
-    found = disturbances.motions_of_spec(table_of(tmp_path, ["# a remark", *TABLE]), pair)
+    found = disturbances.prior_of_spec(table_of(tmp_path, ["# a remark", *TABLE]), pair)
     np.testing.assert_array_equal(found.correlation, [[1.0, 0.8, 0.0], [0.8, 1.0, -0.3], [0.0, -0.3, 1.0]])
     # config.yaml has them in itself
     (tmp_path / "job.yaml").write_text("instrument: gf7_pair\ndisturbances: ./own.yaml\n")
@@ -354,5 +354,5 @@ def test_a_table_may_have_its_columns_in_any_order(pair, tmp_path) -> None:
     assert "corr.csv" not in text
     (tmp_path / "config.yaml").write_text(text)
     (tmp_path / "corr.csv").unlink()
-    again = disturbances.motions_of_spec(resolve(tmp_path / "config.yaml").disturbances, pair)
+    again = disturbances.prior_of_spec(resolve(tmp_path / "config.yaml").disturbances, pair)
     np.testing.assert_array_equal(again.covariance, found.covariance)

@@ -16,7 +16,7 @@ from optics.geometry.aperture import Circle
 from optics.geometry.surface import Surface
 from optics.numerics.backend import load_backend
 from optics.numerics.number_tree import FrozenMap
-from scenes.models.disturbances import stated_motions
+from scenes.models.disturbances import disturbance_prior
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.meshes import sheet_mesh
@@ -395,7 +395,7 @@ def test_in_service_finds_its_bodies_in_both_instruments(instrument: str, tmp_pa
     """Every cause has bodies, and the causes share a few laws of time, each of which an estimate carries along."""
     setup = read_operation(written(tmp_path, SHORT.replace("gf7_pair", instrument)))
     built = build_instrument(setup.model.instrument, setup.model.cameras, load_backend())
-    stated = stated_motions(setup.model, built)
+    stated = disturbance_prior(setup.model, built)
     assert stated is not None
     assert {one.cause for one in stated.components} == set(setup.disturbances.causes)
     assert len({law.text for law in stated.laws}) == 6

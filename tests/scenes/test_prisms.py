@@ -23,7 +23,7 @@ from optics.raytrace import reflectors
 from optics.raytrace.assembly import Assembly
 from optics.thermal.heat import Temperature
 from optics.thermal.thermo_elastic import free_linear_field
-from scenes.models.obstruction import LEAST_GAP, find_obstructions, find_overlaps, rays_taken, separation
+from scenes.models.obstruction import LEAST_GAP, blocked_rays, find_obstructions, find_overlaps, separation
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.load import load_instrument
 from tests.optics.bench import run
@@ -329,7 +329,7 @@ def test_plates_and_frame_leave_room_to_the_beam_and_to_each_other(kind, width, 
         places = np.concatenate([places, places[-1:] + way])
         segments = np.stack([places[:-1], places[1:]], axis=1).transpose(2, 0, 1, 3)
         for path, corners in bodies.items():
-            assert not rays_taken(segments, ConvexHull(corners).equations).any(), path
+            assert not blocked_rays(segments, ConvexHull(corners).equations).any(), path
         # the whole beam meets every mirror within its clear aperture, which its plate surrounds
         for element, at in zip(parts.elements, places[1:-1], strict=True):
             local = placed.pose(element.body).inverse().apply(at)

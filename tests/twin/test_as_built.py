@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion, compose
-from scenes.models.instrument_builder import build_instrument, squared_facets
+from scenes.models.instrument_builder import build_instrument, facet_alignment
 from scenes.models.obstruction import convex_bodies
 from scenes.specs.instrument import as_built_file
 from scenes.specs.load import load_cameras, load_instrument
@@ -138,7 +138,7 @@ def test_facets_are_squared_to_cameras_as_built(backend, pair, tmp_path) -> None
     with pytest.raises(InputError, match=r"own.yaml:3: as_built.backward: the monitor does not work as the instrument"):
         render_job(resolve(job), backend)
     built = build_instrument(spec, load_cameras(spec), backend)
-    turns = squared_facets(built, backend)
+    turns = facet_alignment(built, backend)
     assert set(turns) == {channel.face_body for channel in built.channels}
     bodies = {body.path: body for body in built.assembly.tree.bodies}
     whole = read(tmp_path, as_built_file("own", "gf7_pair", compose(built.as_built, turns, bodies)))

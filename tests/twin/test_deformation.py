@@ -169,10 +169,7 @@ def test_what_a_table_of_temperatures_does_not_tell_is_said() -> None:
             {"between": 4e-3},
             "b: the table is too coarse for its field: the leave-one-out error at its nodes is 0.004 K rms",
         ),
-        (
-            {"faces": {"f": replace(face, unmeshed=2e-9)}},
-            "f: the finite elements represent the effect of the table to 2 nm rms only",
-        ),
+        ({"faces": {"f": replace(face, mesh_error=2e-9)}}, "f: the finite elements follow the table to 2 nm rms only"),
         ({"faces": {"f": replace(face, lost=4e-9)}}, "f: 4 nm rms of its change by the table are beyond Z"),
         (
             {"index_path": 3e-9},

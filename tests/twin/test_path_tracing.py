@@ -213,7 +213,7 @@ def rays(count: int = 4000) -> tuple[np.ndarray, np.ndarray]:
 def scene(assembly: Assembly, state: State) -> Scenery:
     placed = assembly.place([state])
     motion = state.get("mirror", AT_REST)
-    mirror = mirror_surface(assembly.elements["mirror"], placed, IDEAL, lit_side=-1.0, motion=motion)
+    mirror = mirror_surface(assembly.elements["mirror"], placed, IDEAL, optical_side=-1.0, motion=motion)
     grid = Detector("screen", 10, 10, (0.1, 0.1))
     return Scenery((mirror, detector_surface(grid, placed.pose("screen"), IDEAL, ("screen",))), (grid,))
 

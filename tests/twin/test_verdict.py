@@ -343,7 +343,7 @@ def test_a_job_that_moves_what_it_does_not_state_says_so(job) -> None:
     (warning,) = [text for text in judge(run).warnings if "the job moves" in text]
     within = job("{base/forward/M2: {shift: [0 um, 0 um, 1 um]}}", LAUNCH)
     assert not [text for text in judge(within).warnings if "the job moves" in text]
-    assert "base/central_prism/forward_left rotate x (1 arcsec, not stated), but there is no prior" in warning
+    assert "base/central_prism/forward_left rotate x (1 arcsec, not in the prior), but there is no prior" in warning
     assert "of forward" in warning
     assert "of backward" not in warning
 
@@ -370,16 +370,16 @@ GOLDEN = Path(__file__).resolve().parents[1] / "golden"
 WARNED_ELSEWHERE = {
     # verdicts without a warning in their record -> where it is made, or why there is none
     ("Sensitivity to a factor", "rbd_fast_agrees"): "twin.study.report.study_analysis",
-    ("block.json", "agrees"): "twin.orbit.block.block_report",
-    ("The loop closed and open", "stable"): "that of margins_hold",
+    ("Content of block.json", "agrees"): "twin.orbit.block.block_report",
+    ("Results with the loop closed and open", "stable"): "that of margins_hold",
     ("course.json", "sigma_holds"): "twin.monitor.time_series, and twin.main_job.systematics for single times",
     ("Coverage in random states", "sigma_holds"): "twin.uncertainty.uncertainty_report",
     ("focus.json of a measured series", "curves_agree"): "twin.laboratory.focus_report",
     ("turntable.json", "heldout_agrees"): "twin.laboratory.turntable_report",
-    ("The angles of one pass", "resection_agrees"): "twin.orbit.angle.angle_report",
-    ("Heights by values smoothed from the measurements at one interval", "agrees"): "a candidate",
-    ("Heights by values smoothed from the measurements at one interval", "shifts_agree"): "a candidate",
-    ("One start of the search and what came of it", "converged"): "a candidate",
+    ("Angles of one pass", "resection_agrees"): "twin.orbit.angle.angle_report",
+    ("Heights with values smoothed from the measurements at one interval", "agrees"): "a candidate",
+    ("Heights with values smoothed from the measurements at one interval", "shifts_agree"): "a candidate",
+    ("One start of the search and its result", "converged"): "a candidate",
     ("asbuilt.json", "settled"): "a number",
 }
 PER_SI = {

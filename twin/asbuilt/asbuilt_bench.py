@@ -13,7 +13,7 @@ from optics.geometry.tree import State
 from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
-from scenes.models.disturbances import StatedMotions, motions_of_spec
+from scenes.models.disturbances import DisturbancePrior, prior_of_spec
 from scenes.specs.asbuilt import AsBuiltSetup, MeasurementsSpec
 from scenes.specs.tolerance import OF_MONITOR, MeritSpec, ToleranceBudgetSpec, ToleranceSetup
 from scenes.yaml.errors import names_text, unknown
@@ -79,7 +79,7 @@ class AsBuiltBench(Site):
         if stated is None or not stated.components:
             allowed = "a disturbances file with standard deviations greater than zero, such as `assembled`"
             raise self.test.error("the prior has no motions", ("prior",), found=self.test.prior, allowed=allowed)
-        self.stated: StatedMotions = stated
+        self.stated: DisturbancePrior = stated
         self.parameters = Parameters.of(self.test, stated, self.experiment.instrument, self.experiment.thermal)
         self._beams: dict[tuple[tuple[float, float], ...], VariedBeams] = {}
         self.kinds = self._kinds(self.test.measurements, "measurements")
@@ -150,7 +150,7 @@ class AsBuiltBench(Site):
             readings = [kind.predict(views[after]) for kind, after in zip(kinds, afters, strict=True)]
             return np.concatenate(readings, axis=1)
 
-        return where_lit(read, len(values), (sum(len(kind.labels) for kind in kinds),))
+        return nan_where_lost(read, len(values), (sum(len(kind.labels) for kind in kinds),))
 
     def slope(
         self, values: np.ndarray, kinds: Sequence[MeasuredKind] | None = None, afters: Sequence[str | None] = ()
@@ -211,7 +211,7 @@ class AsBuiltBench(Site):
         prior = self.parameters.prior
         covariance = prior.covariance.copy()
         if self.setup.drawn is not None:
-            drawn = motions_of_spec(self.setup.drawn, self.experiment.instrument)
+            drawn = prior_of_spec(self.setup.drawn, self.experiment.instrument)
             drawn_index = {component.name: k for k, component in enumerate(drawn.components)}
             names = [component.name for component in self.stated.components]
             strange = sorted(set(drawn_index) - set(names))
@@ -252,13 +252,15 @@ class AsBuiltBench(Site):
 
     def merit_parts(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> np.ndarray:
         """Return the parts of the merits, (S, P), for parameters (S, K); NaN where the light is lost."""
-        return where_lit(
-            lambda rows: self.merits.parts_of(self.parameters.states(values[rows], after, of_some(further, rows))),
+        return nan_where_lost(
+            lambda rows: self.merits.parts_of(
+                self.parameters.states(values[rows], after, selected_moves(further, rows))
+            ),
             len(values),
             (self.merits.parts,),
         )
 
-    def merit_numbers(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> np.ndarray:
+    def merit_residuals(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> np.ndarray:
         """Return residuals (S, R) whose sum of squares a move minimises.
 
         It is the sum over the merits of the mean square over fields or points, in units of the requirement.
@@ -268,7 +270,7 @@ class AsBuiltBench(Site):
         PhysicalError
             The light of a state is lost.
         """
-        return self.merits.numbers_of(self.parameters.states(values, after, further))
+        return self.merits.residuals_of(self.parameters.states(values, after, further))
 
     @cached_property
     def actuators(self) -> Actuators:
@@ -287,7 +289,7 @@ class AsBuiltBench(Site):
 
     def merit_slope(self, values: np.ndarray, after: str | None) -> np.ndarray:
         """Return the derivatives (R, K) of the merits' residuals with respect to the parameters, at parameters (K,)."""
-        return self._by_parameters(values, lambda moved: self.merit_numbers(moved, after))
+        return self._by_parameters(values, lambda moved: self.merit_residuals(moved, after))
 
     @cached_property
     def actuator_steps(self) -> np.ndarray:
@@ -295,7 +297,9 @@ class AsBuiltBench(Site):
         return _SHARE * np.array([spec.range_si or 1.0 for spec in self.test.actuators.values()])
 
 
-def where_lit(work: Callable[[slice], np.ndarray], count: int, shape: tuple[int, ...], first: int = 0) -> np.ndarray:
+def nan_where_lost(
+    work: Callable[[slice], np.ndarray], count: int, shape: tuple[int, ...], first: int = 0
+) -> np.ndarray:
     """Evaluate a function of states, (S, *shape), with NaN for each state whose light is lost.
 
     Parameters
@@ -316,9 +320,9 @@ def where_lit(work: Callable[[slice], np.ndarray], count: int, shape: tuple[int,
             return np.full((1, *shape), np.nan)
     half = count // 2
     halves = ((half, first), (count - half, first + half))
-    return np.concatenate([where_lit(work, size, shape, start) for size, start in halves])
+    return np.concatenate([nan_where_lost(work, size, shape, start) for size, start in halves])
 
 
-def of_some(further: np.ndarray | None, rows: slice) -> np.ndarray | None:
+def selected_moves(further: np.ndarray | None, rows: slice) -> np.ndarray | None:
     """Return the moves of selected states; a move (C,) common to all states, or None, is returned unchanged."""
     return further if further is None or further.ndim == 1 else further[rows]

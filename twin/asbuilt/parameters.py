@@ -16,13 +16,13 @@ from analysis.instrument_state.state_estimate import StatePrior
 from optics.geometry.tree import State
 from optics.numerics.number_tree import FrozenMap
 from optics.thermal.heat import Temperature
-from scenes.models.disturbances import HEAT, Component, StatedMotions
+from scenes.models.disturbances import HEAT, Component, DisturbancePrior
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.asbuilt import AsBuiltSpec
 from scenes.specs.motion_text import short_name
 from scenes.specs.tolerance import amount_si
-from twin.tolerance.variations import BodyMove, VariedNumber, actuator_number, heat_moves, states_of
+from twin.tolerance.variations import BodyMove, VariedParameter, actuator_parameter, heat_moves, states_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class Parameters:
 
     Attributes
     ----------
-    stated : StatedMotions
+    stated : DisturbancePrior
         Components of the prior, M.
     words : tuple of str
         Description of each component with the shortest name of its body, (M,).
@@ -55,10 +55,10 @@ class Parameters:
         Standard deviations of these errors, SI.
     """
 
-    stated: StatedMotions
+    stated: DisturbancePrior
     words: tuple[str, ...]
-    numbers: tuple[VariedNumber, ...]
-    actuators: tuple[VariedNumber, ...]
+    numbers: tuple[VariedParameter, ...]
+    actuators: tuple[VariedParameter, ...]
     names: tuple[str, ...]
     gains: tuple[int, ...]
     gain_sigmas: np.ndarray
@@ -68,7 +68,9 @@ class Parameters:
     error_sigmas: np.ndarray
 
     @classmethod
-    def of(cls, test: AsBuiltSpec, stated: StatedMotions, instrument: Instrument, thermal: ThermalModel) -> Parameters:
+    def of(
+        cls, test: AsBuiltSpec, stated: DisturbancePrior, instrument: Instrument, thermal: ThermalModel
+    ) -> Parameters:
         """Return the parameters of a test.
 
         Raises
@@ -77,7 +79,7 @@ class Parameters:
             The body of an actuator does not exist or does not allow its motion.
         """
         actuators = tuple(
-            actuator_number(test, instrument, thermal, name, entry) for name, entry in test.actuators.items()
+            actuator_parameter(test, instrument, thermal, name, entry) for name, entry in test.actuators.items()
         )
         names = tuple(test.actuators)
         wanted = np.zeros((len(test.moves), len(names)))
@@ -92,7 +94,7 @@ class Parameters:
         return cls(
             stated,
             tuple(f"{short_name(entry.body, instrument.nodes)} {entry.what}" for entry in stated.components),
-            component_numbers(stated.components, instrument, thermal),
+            component_parameters(stated.components, instrument, thermal),
             actuators,
             names,
             gains,
@@ -192,9 +194,9 @@ def _upward(path: str) -> list[str]:
     return ["/".join(parts[:n]) for n in range(len(parts), 0, -1)]
 
 
-def component_numbers(
+def component_parameters(
     components: Sequence[Component], instrument: Instrument, thermal: ThermalModel
-) -> tuple[VariedNumber, ...]:
+) -> tuple[VariedParameter, ...]:
     """Return the effect of one SI unit of each component of a prior, thermal ones to the first order.
 
     Parameters
@@ -207,7 +209,9 @@ def component_numbers(
         Thermal model of the instrument.
     """
     warm = {component.body: Temperature() for component in components if component.kind in HEAT}
-    return tuple(VariedNumber(c.name, c.name, c.kind, c.sigma, _does(c, instrument, thermal, warm)) for c in components)
+    return tuple(
+        VariedParameter(c.name, c.name, c.kind, c.sigma, _does(c, instrument, thermal, warm)) for c in components
+    )
 
 
 def _does(

@@ -1,6 +1,6 @@
-"""First-order data of a camera, how its pixels sample the image, and which of its own parts stand in its light.
+"""First-order data of a camera, sampling by its pixels, and obscuration by its own parts.
 
-Rays of a camera by itself, from the scene to the image, are traced here for the layout as well.
+Rays of a camera without an instrument, from the scene to the image, are traced here for the layout as well.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ from twin.camera.camera_optics import CameraOptics, rim
 from twin.framework.record import Quantity, Record
 
 EARLIER = 6.0
-"""How far before its launch point light is looked at for what stands in it, metres."""
+"""Distance before the launch point of the light within which obstacles are searched, metres."""
 
 _FIELDS = tuple((x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0))
 _RAYS = 4000
-"""Number of rays, evenly over the stop, by which shares of a beam are counted: right to some 0.1 %."""
+"""Number of rays, evenly over the stop, by which fractions of a beam are counted, accurate to some 0.1 %."""
 
 
 @shows()
 @dataclass(frozen=True, eq=False)
 class RayPaths:
-    """Rays in the prescription frame.
+    """Ray paths in the prescription frame.
 
     Attributes
     ----------
-    names : tuple[str, ...]
-        What they meet, the image last, K.
-    points : np.ndarray
-        Where they begin and what they meet, (1 + K, F, N, 3), metres.
+    names : tuple of str
+        Surfaces that the rays meet, the image last, K.
+    points : (1 + K, F, N, 3) ndarray
+        Starting points and intersections with the surfaces, metres.
     """
 
     names: tuple[str, ...]
@@ -64,9 +64,9 @@ class RayPaths:
 def ray_paths(
     model: CameraModel, backend: Backend, fields: Sequence[tuple[float, float]], stop: np.ndarray, earlier: float = 0.0
 ) -> RayPaths:
-    """Rays of fields (shares of the half field) through points (N, 2) of the stop in units of its radius.
+    """Trace rays of fields (fractions of the half field) through points (N, 2) of the stop, in units of its radius.
 
-    They begin ``earlier`` metres before their launch points. No aperture limits them.
+    The rays begin ``earlier`` metres before their launch points. No aperture limits them.
     """
     spec = model.spec
     bare = model.bare_assembly(apertures=False)
@@ -85,15 +85,16 @@ def ray_paths(
 
 
 def obstacles(model: CameraModel) -> dict[str, Aperture]:
-    """What of a camera may stand in its own light, in each body's own x and y: mirrors and lenses with their edges, and
-    the line CCDs with as much of an edge.
+    """Return the outlines of the camera's parts that may block its light, in each body's x and y.
+
+    They are mirrors and lenses with their edges, and the line CCDs with an edge of equal width.
     """
     spec, margin = model.spec, model.spec.edge_margin
     out: dict[str, Aperture] = {}
     for name, edge in model.apertures.items():
         if spec.mirrors[name].light == "passes":
-            continue  # a stop's plate stands where its hole is not
-        # the other mirrors' clear apertures have the margin already
+            continue  # the plate of a stop lies outside its hole
+        # the clear apertures of the other mirrors include the margin
         out[name] = _body(model, name, Circle(edge.bounds[1] + margin) if name == spec.stop else edge)
     lines: list[tuple[LineSpec | BandSpec, float]] = [
         (spec.line, 0.0),
@@ -108,87 +109,88 @@ def obstacles(model: CameraModel) -> dict[str, Aperture]:
 
 
 def _body(model: CameraModel, name: str, edge: Aperture) -> Aperture:
-    """A surface with the outer edge and the hole that its file says, else with ``edge``."""
-    given = model.edges.get(name, ())
-    stated = [one.shape for one in given if not one.blocks and not one.rotation and isinstance(one.shape, Aperture)]
-    if stated:
-        edge = stated[0]
-    holes = [one.shape for one in given if one.blocks and isinstance(one.shape, Circle) and not any(one.shape.centre)]
+    """Return the outline of a surface with the outer edge and hole of its file, else ``edge``."""
+    edges = model.edges.get(name, ())
+    outlines = [one.shape for one in edges if not one.blocks and not one.rotation and isinstance(one.shape, Aperture)]
+    if outlines:
+        edge = outlines[0]
+    holes = [one.shape for one in edges if one.blocks and isinstance(one.shape, Circle) and not any(one.shape.centre)]
     if holes and isinstance(edge, Circle) and not any(edge.centre) and edge.inner < holes[0].radius < edge.radius:
         edge = Circle(edge.radius, edge.centre, holes[0].radius)
     return edge
 
 
 @dataclass(frozen=True)
-class InTheWay:
-    """What of a camera stands in its own light.
+class ObscurationData:
+    """Obscuration of a camera by its own parts.
 
     Attributes
     ----------
-    shares : Mapping[str, float]
-        Body -> share of a beam that it takes, the largest over the field; a body that takes nothing is not there.
-    holes : Mapping[str, float]
-        Mirror -> least radius of the hole about its middle that light needs which goes through it, metres: of mirrors
-        whose file states no hole and that no light is reflected at there.
+    shares : mapping
+        Body -> largest fraction of a beam over the field that it blocks; bodies that block nothing are omitted.
+    holes : mapping
+        Mirror -> least radius, metres, of a central hole that the light needs: for mirrors whose file specifies no hole
+        and that reflect no light there.
     """
 
     shares: Mapping[str, float]
     holes: Mapping[str, float]
 
 
-def obscuration(model: CameraModel, backend: Backend) -> InTheWay:
-    """Which of the camera's own mirrors and line CCDs stand in a beam, of what edges leave of it, before it is theirs.
+def obscuration(model: CameraModel, backend: Backend) -> ObscurationData:
+    """Compute the fraction of a beam that each mirror and line CCD of the camera blocks before the light reaches it.
 
-    A mirror through whose middle light goes, and whose middle reflects none, has a hole there, whether its file states
-    one or not: the first mirror of a telescope about its axis, whose second one shadows that place.
+    A mirror whose middle the light crosses and which reflects none there has a hole, whether its file specifies one or
+    not, like the primary mirror of an on-axis telescope, whose middle the secondary mirror shadows.
     """
     nodes = quadrature.even_disk(_RAYS)
     paths = ray_paths(model, backend, _FIELDS, np.stack([nodes.x, nodes.y], axis=-1), EARLIER)
     edges, bare = obstacles(model), model.bare_assembly(apertures=False)
     blocked: dict[str, np.ndarray] = {}
     through: dict[str, list[np.ndarray]] = {}
-    # light goes straight through planes that it passes, wherever they are told to stand, as at a mirror's vertex
+    # light passes such planes undeviated, wherever the file places them, for example at a mirror's vertex
     acting = [k for k, name in enumerate(paths.names) if name == IMAGE or model.spec.mirrors[name].light != "passes"]
     for before, k in pairwise((-1, *acting)):
-        # what light comes from or goes to is no obstacle on the way
+        # the surfaces at the ends of a path do not block it
         ends = {paths.names[end] for end in (before, k) if end >= 0}
         for body, edge in edges.items():
             if body not in ends:
-                taken, places = _met(backend, bare, body, edge, paths.points[before + 1], paths.points[k + 1])
+                taken, places = _intersections(backend, bare, body, edge, paths.points[before + 1], paths.points[k + 1])
                 blocked[body] = blocked.get(body, np.zeros(taken.shape, bool)) | taken
                 through.setdefault(body, []).append(np.where(taken[..., None], places, np.nan))
-    lit = _lit(model, bare, paths)
-    holes = _holes(model, bare, paths, blocked, through, lit)
+    illuminated = _passed_edges(model, bare, paths)
+    holes = _holes(model, bare, paths, blocked, through, illuminated)
     shares = {
-        body: float(np.max((taken & lit) @ nodes.share / (lit @ nodes.share)))
+        body: float(np.max((taken & illuminated) @ nodes.share / (illuminated @ nodes.share)))
         for body, taken in blocked.items()
         if body not in holes
     }
-    return InTheWay(FrozenMap({body: share for body, share in shares.items() if share > 0.0}), FrozenMap(holes))
+    return ObscurationData(FrozenMap({body: share for body, share in shares.items() if share > 0.0}), FrozenMap(holes))
 
 
 LEAST_SHARE = 0.005
-"""Share of a beam from which on a shadow that no edge states is told: bodies are drawn with margins."""
+"""Fraction of a beam from which an obscuration that no edge models is reported: outlines of bodies include margins."""
 
 
-def unstated_shadows(model: CameraModel, in_the_way: InTheWay) -> str:
-    """What of a camera stands in its beam while its file states no shadow at all, and what that means; empty if nothing
-    does. A file that states one is taken at its word: the outlines of bodies are those of their clear apertures.
+def unmodelled_obscuration(model: CameraModel, obscured: ObscurationData) -> str:
+    """Describe the obscuration by the camera's parts if its file models none; empty otherwise.
+
+    A file that models any obscuration is trusted, as the outlines of bodies are those of their clear apertures.
     """
     if any(edge.blocks for edges in model.edges.values() for edge in edges):
         return ""
-    told = ", ".join(f"{body} {100.0 * s:.1f}%" for body, s in in_the_way.shares.items() if s >= LEAST_SHARE)
-    if not told:
+    blocking = ", ".join(f"{body} blocks {100.0 * s:.1f} %" for body, s in obscured.shares.items() if s >= LEAST_SHARE)
+    if not blocking:
         return ""
     return (
-        f"its own parts stand in its beam ({told}) and its file does not say so: wavefront errors, MTF and images are "
-        "those of a pupil without that shadow; a plane before them with `light: passes` and `edges: [{blocks: circle, "
-        "radius: ...}]` states it"
+        f"{blocking} of the beam, but the file does not model this obscuration: wavefront errors, MTF and images are "
+        "those of a pupil without that shadow. Model it with a plane before these parts with `light: passes` and "
+        "`edges: [{blocks: circle, radius: ...}]`"
     )
 
 
 _SLIVER = 0.01
-"""Share of a mirror's light that its hole may take: along the rim of a shadow that turns with the field."""
+"""Largest fraction of a mirror's light within its hole: light along the rim of a shadow that moves with the field."""
 
 
 def _holes(
@@ -197,47 +199,51 @@ def _holes(
     paths: RayPaths,
     blocked: Mapping[str, np.ndarray],
     through: Mapping[str, list[np.ndarray]],
-    lit: np.ndarray,
+    illuminated: np.ndarray,
 ) -> dict[str, float]:
-    """Radii of the holes of mirrors that light needs, metres."""
+    """Return the radii of central holes of mirrors that the light needs, metres."""
     out = {}
     for body in model.mirrors:
         if model.spec.mirrors[body].light is not None or not np.any(blocked.get(body, False)):
             continue
-        # what another one takes reaches neither the hole nor the mirror about it; one that takes nearly all of it
-        # has a hole itself
+        # light that another body blocks reaches neither the hole nor the mirror around it; a body that blocks nearly
+        # all light has a hole itself
         others = [taken for name, taken in blocked.items() if name != body and np.mean(taken) < 0.5]
-        left = lit & ~np.any(others, axis=0) if others else lit
-        met = np.concatenate([places[left & np.isfinite(places[..., 0])] for places in through[body]])
-        used = bare.nominal_pose(body).inverse().apply(paths.points[1 + paths.names.index(body)])[left]
-        if met.size and used.size:
-            radius = float(np.max(np.hypot(met[:, 0], met[:, 1])))
+        remaining = illuminated & ~np.any(others, axis=0) if others else illuminated
+        crossings = np.concatenate([places[remaining & np.isfinite(places[..., 0])] for places in through[body]])
+        used = bare.nominal_pose(body).inverse().apply(paths.points[1 + paths.names.index(body)])[remaining]
+        if crossings.size and used.size:
+            radius = float(np.max(np.hypot(crossings[:, 0], crossings[:, 1])))
             if float(np.mean(np.hypot(used[:, 0], used[:, 1]) < radius)) < _SLIVER:
                 out[body] = radius
     return out
 
 
-def _lit(model: CameraModel, bare: Assembly, paths: RayPaths) -> np.ndarray:
-    """Which rays edges of surfaces let through, (F, N)."""
-    lit = np.ones(paths.points.shape[1:3], dtype=bool)
+def _passed_edges(model: CameraModel, bare: Assembly, paths: RayPaths) -> np.ndarray:
+    """Return which rays pass the edges of all surfaces, (F, N)."""
+    passed = np.ones(paths.points.shape[1:3], dtype=bool)
     if not model.edges:
-        return lit
-    return lit & model.uncut(
+        return passed
+    return passed & model.unvignetted(
         lambda name: bare.nominal_pose(name).inverse().apply(paths.points[1 + paths.names.index(name)])
     )
 
 
-def _met(
+def _intersections(
     backend: Backend, bare: Assembly, body: str, edge: Aperture, start: np.ndarray, end: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Which of the stretches start..end, (F, N, 3), meet the clear area of a body, (F, N), and where its surface, in
-    its own x and y, (F, N, 2).
+    """Return which of the segments start..end, (F, N, 3), meet the clear area of a body, and where.
+
+    Returns
+    -------
+    tuple of ndarray
+        Blocked rays, (F, N), and their positions in the body's x and y, (F, N, 2), metres.
     """
-    way = end - start
-    length = np.linalg.norm(way, axis=-1)
+    path_vector = end - start
+    length = np.linalg.norm(path_vector, axis=-1)
     obstacle = Element(body, body, bare.elements[body].surface, Interaction.PASS, edge)
     system = assemble(bare.with_element(obstacle), [(body,)])
-    rays = make_rays(backend, start.reshape(-1, 3), (way / np.maximum(length, _NEAR)[..., None]).reshape(-1, 3))
+    rays = make_rays(backend, start.reshape(-1, 3), (path_vector / np.maximum(length, _NEAR)[..., None]).reshape(-1, 3))
     position, _, path, inside = trace(backend, system, rays).numpy()
     path, inside = path.reshape(length.shape), inside.reshape(length.shape)
     place = position.reshape(*length.shape, 3)[..., :2]
@@ -245,41 +251,41 @@ def _met(
 
 
 _NEAR = 1e-6
-"""A ray meets a surface where it starts or ends: so close to it does not count, metres."""
+"""Distance from the ends of a ray segment within which an intersection does not count, metres."""
 
 
 _RIM = 48
-"""Rays on the edge of the stop."""
+"""Number of rays on the edge of the stop."""
 
 
 @shows("paraxial.focal_length [m]", "entrance_pupil [m]", "aperture", "obscuration.shares", "obscuration.holes")
 @dataclass(frozen=True, eq=False)
 class FirstOrderData:
-    """First-order data of a camera in one state, traced; lengths in metres, angles in radians.
+    """First-order data of a camera in one state, by ray trace; lengths in metres, angles in radians.
 
     Attributes
     ----------
     spec : CameraSpec
-        The camera.
+        Camera.
     paraxial : Paraxial
-        Data about the axis.
+        Paraxial data about the axis.
     entrance_pupil : float
         Diameter of the entrance pupil.
     principal_distance_line, principal_distance_track : float
-        Change of the image's place per angle in the middle of the field, along the line and along the track, where the
-        image plane stands.
-    aperture : tuple[float, float]
+        Change of image position per angle in the middle of the field, along the line and along the track, on the actual
+        image plane.
+    aperture : tuple of float
         Numerical apertures along the line and along the track.
     round_aperture : float
-        Numerical aperture of the round beam with the same solid angle at the image.
-    image : tuple[float, float]
+        Numerical aperture of the circular beam with the same solid angle at the image.
+    image : tuple of float
         Length and width of the image of the whole field.
-    chief_ray_angle : tuple[float, float]
-        Of chief rays against the image's normal: in the middle, and the largest over the field.
+    chief_ray_angle : tuple of float
+        Angle between chief ray and image normal: in the middle, and the largest over the field.
     length : float
         Distance along the parent axis between the outermost of the mirrors and the image.
-    obscuration : InTheWay
-        What of the camera, as designed, stands in its own beam.
+    obscuration : ObscurationData
+        Obscuration by the parts of the nominal camera.
     """
 
     spec: CameraSpec
@@ -292,7 +298,7 @@ class FirstOrderData:
     image: tuple[float, float]
     chief_ray_angle: tuple[float, float]
     length: float
-    obscuration: InTheWay
+    obscuration: ObscurationData
 
     @property
     def working_f_number_line(self) -> float:
@@ -301,26 +307,34 @@ class FirstOrderData:
 
 
 def _near(value: float) -> float | None:
-    """Return a length that is no rounding of an infinite one, metres."""
+    """Return a length, metres, or None for an infinite one."""
     return value if abs(value) < _INFINITE else None
 
 
 _INFINITE = 1e9
-"""Distance of an exit pupil, or its diameter, from which on image space is telecentric, metres."""
+"""Distance or diameter of an exit pupil beyond which image space counts as telecentric, metres."""
 
 FIRST_ORDER: Record[FirstOrderData] = Record(
-    "First-order data of a camera in the state in which it is judged, at its design wavelength. Focal lengths, F-"
-    "number and pupils are paraxial, about the axis; all else is of the field's middle where nothing else is stated.",
-    Quantity("focal_length_m", lambda d: d.paraxial.focal_length, "effective focal length, wherever the image stands"),
-    Quantity("back_focal_length_m", lambda d: d.paraxial.back_focal_length, "from the last mirror to the focus"),
-    Quantity("principal_distance_along_line_m", lambda d: d.principal_distance_line, "image's place per angle"),
-    Quantity("principal_distance_along_track_m", lambda d: d.principal_distance_track, "image's place per angle"),
+    "First-order data of a camera in the analysed state, at its design wavelength. Focal lengths, F-"
+    "number and pupils are paraxial, about the axis; all else refers to the middle of the field unless specified.",
+    Quantity(
+        "focal_length_m",
+        lambda d: d.paraxial.focal_length,
+        "effective focal length, independent of the image plane's position",
+    ),
+    Quantity(
+        "back_focal_length_m", lambda d: d.paraxial.back_focal_length, "distance from the last mirror to the focus"
+    ),
+    Quantity("principal_distance_along_line_m", lambda d: d.principal_distance_line, "image position per angle"),
+    Quantity("principal_distance_along_track_m", lambda d: d.principal_distance_track, "image position per angle"),
     Quantity("entrance_pupil_m", lambda d: d.entrance_pupil, "diameter of the beam along the axis that fills the stop"),
     Quantity("entrance_pupil_before_first_mirror_m", lambda d: d.paraxial.entrance_pupil, "positive toward the scene"),
     Quantity("exit_pupil_m", lambda d: _near(d.entrance_pupil * d.paraxial.exit_magnification), "diameter"),
-    Quantity("exit_pupil_before_image_m", lambda d: _near(d.paraxial.exit_pupil), "none where it is at infinity"),
+    Quantity("exit_pupil_before_image_m", lambda d: _near(d.paraxial.exit_pupil), "distance; null at infinity"),
     Quantity("f_number", lambda d: d.paraxial.focal_length / d.entrance_pupil, "focal length over entrance pupil"),
-    Quantity("working_f_number", lambda d: 0.5 / d.round_aperture, "of the round beam with the same solid angle"),
+    Quantity(
+        "working_f_number", lambda d: 0.5 / d.round_aperture, "F-number of the circular beam with the same solid angle"
+    ),
     Quantity("working_f_number_along_line", lambda d: d.working_f_number_line, "1 / (2 NA) at the image"),
     Quantity("working_f_number_along_track", lambda d: 0.5 / d.aperture[1], "1 / (2 NA) at the image"),
     Quantity("field_deg", lambda d: 2.0 * np.array([d.spec.field.x, d.spec.field.y]), "full angles of the field"),
@@ -332,12 +346,12 @@ FIRST_ORDER: Record[FirstOrderData] = Record(
         converted=False,
     ),
     Quantity("pitch_um", lambda d: d.spec.line.pitch, "pitch of the line's pixels"),
-    Quantity("pixel_arcsec", lambda d: d.spec.line.pitch / d.principal_distance_line, "angle that a pixel sees"),
-    Quantity("nyquist_per_mm", lambda d: 0.5 / d.spec.line.pitch, "of the line's pixels"),
+    Quantity("pixel_arcsec", lambda d: d.spec.line.pitch / d.principal_distance_line, "angle of a pixel"),
+    Quantity("nyquist_per_mm", lambda d: 0.5 / d.spec.line.pitch, "Nyquist frequency of the line's pixels"),
     Quantity(
         "cutoff_per_mm",
         lambda d: 1.0 / (d.spec.wavelength * d.working_f_number_line),
-        "frequency from which diffraction leaves no contrast along the line",
+        "cut-off frequency of diffraction along the line",
     ),
     Quantity(
         "sampling_lambda_f_per_pixel",
@@ -351,29 +365,29 @@ FIRST_ORDER: Record[FirstOrderData] = Record(
     Quantity(
         "chief_ray_angle_deg",
         lambda d: np.array(d.chief_ray_angle),
-        "of chief rays against the image's normal: in the middle, and the largest over the field",
+        "angle between chief ray and image normal: in the middle, and the largest over the field",
     ),
     Quantity("length_m", lambda d: d.length, "along the parent axis between the outermost of mirrors and image"),
     Quantity(
-        "obscuration", lambda d: d.obscuration.shares, "body of the camera -> largest share of a beam that it takes"
+        "obscuration", lambda d: d.obscuration.shares, "body of the camera -> largest fraction of a beam that it blocks"
     ),
     Quantity(
         "hole_radius_mm",
         lambda d: d.obscuration.holes,
-        "mirror -> least radius of the hole that light needs which goes through it, where its file states none",
+        "mirror -> least radius of the central hole that the light needs, where the file specifies none",
     ),
 )
 
 
 def first_order_data(optics: CameraOptics) -> FirstOrderData:
-    """Trace what the first-order data of a camera follow from, in its state.
+    """Trace the rays of the first-order data of a camera in its state.
 
     Raises
     ------
     AimError, BeamMissedError
-        Light does not come through.
+        Light does not pass.
     AfocalError
-        The state brings it to no focus.
+        The light of this state has no focus.
     """
     path, model, backend = optics.path, optics.model, optics.path.backend
     state = path.coloured(optics.state, optics.wavelength)

@@ -23,7 +23,7 @@ from optics.raytrace.trace import BeamMissedError
 from scenes.models import monitor_layout
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
-from scenes.models.obstruction import LEAST_GAP, convex_bodies, monitor_beams, rays_taken, separation
+from scenes.models.obstruction import LEAST_GAP, blocked_rays, convex_bodies, monitor_beams, separation
 from scenes.specs.instrument import CENTRAL_PRISM, SIDES, prism_of
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
@@ -377,14 +377,14 @@ def touching(one: BeamFacts, other: BeamFacts) -> bool:
     one, other : BeamFacts
         Beams that were evaluated alone.
     """
-    # as scenes.models.monitor_chain.facet_places: of two in one corner the one that leans more stands farther out
+    # as scenes.models.monitor_chain.facet_positions: of two in one corner the one that leans more stands farther out
     offset = one.facets - other.facets
     lean = offset[:, :2]
     distance = np.sum(lean * offset[:, 2:], axis=1) / np.maximum(np.linalg.norm(lean, axis=1), 1e-12)
     if np.any(distance < max(one.beam.width, other.beam.width)):  # the edge of two facets is half way between them
         return True
     for light, planes in ((one.light, other.planes), (other.light, one.planes)):
-        if any(rays_taken(light, faces).any() for faces in planes):
+        if any(blocked_rays(light, faces).any() for faces in planes):
             return True
     for a in one.bodies:
         for b in other.bodies:

@@ -133,35 +133,35 @@ def frames_fits(recorded: RecordedFrames, cards: Iterable[Card]) -> bytes:
 
     first = recorded.pages[0]
     unit = fits.PrimaryHDU(recorded.frames)
-    own: list[Card] = []
+    header: list[Card] = []
     if recorded.heights:
-        own.append(("BUNIT", "m", "values are heights above the ellipsoid"))
+        header.append(("BUNIT", "m", "values are heights above the ellipsoid"))
     elif recorded.place is None:
-        own.append(("BUNIT", "adu", "values are grey values (DN)"))
-    own += [
+        header.append(("BUNIT", "adu", "values are grey values (DN)"))
+    header += [
         ("NFRAMES", len(recorded.frames), "frames in this file, along axis 3"),
         ("AXIS1", "column", "what axis 1 counts"),
         ("AXIS2", "row", "what axis 2 counts"),
         ("AXIS3", "frame", "what axis 3 counts"),
     ]
     if "camera" in first:
-        own.append(("CAMERA", ascii_text(first["camera"]), "camera of the CCD"))
+        header.append(("CAMERA", ascii_text(first["camera"]), "camera of the CCD"))
     if "note" in first:
-        own.append(("NOTE", ascii_text(first["note"]), "remark on the frames"))
+        header.append(("NOTE", ascii_text(first["note"]), "remark on the frames"))
     if "pitch_um" in first:
-        own.append(("XPIXSZ", first["pitch_um"], "[um] pixel pitch along a row"))
-        own.append(("YPIXSZ", first["pitch_um"], "[um] pixel pitch along a column"))
+        header.append(("XPIXSZ", first["pitch_um"], "[um] pixel pitch along a row"))
+        header.append(("YPIXSZ", first["pitch_um"], "[um] pixel pitch along a column"))
     if "exposure_s" in first:
-        own.append(("EXPTIME", first["exposure_s"], "[s] exposure of each frame"))
+        header.append(("EXPTIME", first["exposure_s"], "[s] exposure of each frame"))
     if recorded.place is not None:
         longitude, latitude, across, down = recorded.place
-        own += [
+        header += [
             ("LON0", longitude, "[deg] longitude of the first pixel's centre"),
             ("LAT0", latitude, "[deg] latitude of the first pixel's centre"),
             ("DLON", across, "[deg] step of longitude per column"),
             ("DLAT", down, "[deg] step of latitude per row"),
         ]
-    _put_cards(unit, [*own, *cards])
+    _put_cards(unit, [*header, *cards])
     units = [unit]
     if "time_s" in first:
         units.append(_times("FRAMES", "frame", [page["time_s"] for page in recorded.pages]))
@@ -187,7 +187,7 @@ def expected_fits(data: xr.Dataset, cards: Sequence[Card]) -> bytes:
         first = str(variable.dims[0])
         for k, channel in enumerate(data["channel"].values):
             unit = fits.ImageHDU(variable.values[:, k])
-            own: list[Card] = [
+            header: list[Card] = [
                 ("EXTNAME", f"{channel} {name}", "channel and quantity"),
                 ("BUNIT", "photon", "expected, per pixel and frame"),
                 ("QUANTITY", ascii_text(str(variable.attrs["long_name"])), "what the values are"),
@@ -198,8 +198,8 @@ def expected_fits(data: xr.Dataset, cards: Sequence[Card]) -> bytes:
                 ("YPIXSZ", round(1e6 * float(data.attrs["pitch_m"]), 9), "[um] pixel pitch along a column"),
             ]
             if first == "state":
-                own += [(f"STATE{s}", str(state), f"plane {s}") for s, state in enumerate(data["state"].values, 1)]
-            _put_cards(unit, own)
+                header += [(f"STATE{s}", str(state), f"plane {s}") for s, state in enumerate(data["state"].values, 1)]
+            _put_cards(unit, header)
             units.append(unit)
     if "time" in data.coords:
         units.append(_times("TIMES", "plane", data["time"].values.tolist()))
@@ -363,7 +363,7 @@ def export(source: Path, manifest: Manifest, frames: str, tables: str, folder: R
         files += _frames(source, manifest, folder, advance)
     described: list[DataTable] = []
     if tables != NONE:
-        with _told(source):
+        with _reading_errors(source):
             described = result_tables(source, list(manifest.sha256))
         for k, table in enumerate(described):
             made_of = table.facts.get("file", "*.json")
@@ -379,7 +379,7 @@ def export(source: Path, manifest: Manifest, frames: str, tables: str, folder: R
 
 
 @contextmanager
-def _told(place: Path) -> Iterator[None]:
+def _reading_errors(place: Path) -> Iterator[None]:
     """Raise InputError for any failure to read a file of a run folder."""
     try:
         yield
@@ -400,13 +400,13 @@ def _put(folder: RunFolder, file: str, content: bytes, source: str, what: str, i
 def _frames(source: Path, manifest: Manifest, folder: RunFolder, advance: Advance) -> Iterator[ExportedFile]:
     """Write recorded frames, then expected images; every file of frames is read back and compared."""
     cards = run_cards(manifest.program, manifest.seed)
-    about = _detector(source, manifest)
+    detector = _detector(source, manifest)
     pictures = [name for name in manifest.sha256 if name.startswith(_IMAGES) and name.endswith(".tiff")]
     for k, name in enumerate(pictures):
-        with _told(source / name):
+        with _reading_errors(source / name):
             recorded = read_frames(source / name)
-            known = about if "area CCD" in str(recorded.pages[0].get("camera", "")) else []
-            content = frames_fits(recorded, [*known, *cards])
+            camera_cards = detector if "area CCD" in str(recorded.pages[0].get("camera", "")) else []
+            content = frames_fits(recorded, [*camera_cards, *cards])
         file = f"{name.removesuffix('.tiff')}.fits"
         yield _put(folder, file, content, name, _what(recorded.pages[0]), len(recorded.frames))
         real = recorded.frames.dtype.kind == "f"
@@ -415,9 +415,9 @@ def _frames(source: Path, manifest: Manifest, folder: RunFolder, advance: Advanc
         advance("frames", k + 1, len(pictures))
     for name, stem in EXPECTED.items():
         if name in manifest.sha256:
-            with _told(source / name):
+            with _reading_errors(source / name):
                 data = read_netcdf((source / name).read_bytes())
-                content = expected_fits(data, [*about, *cards])
+                content = expected_fits(data, [*detector, *cards])
                 items = int(np.prod(data["photons"].shape[:-2]))
             yield _put(folder, f"{stem}.fits", content, name, "expected photons per pixel and frame", items)
 
@@ -438,16 +438,16 @@ def _detector(source: Path, manifest: Manifest) -> list[Card]:
 
 def export_report(done: Exported) -> Report:
     """Return the report: the files written, and the descriptions of the tables' columns."""
-    images = [one for one in done.files if not one.file.startswith("tables/")]
-    tables = [one for one in done.files if one.file.startswith("tables/")]
-    said = []
+    images = [item for item in done.files if not item.file.startswith("tables/")]
+    tables = [item for item in done.files if item.file.startswith("tables/")]
+    parts = []
     if images:
-        count = sum(one.items for one in images)
-        said.append(f"{len(images)} files with {count} images as {done.frames.upper()}, identical when read back")
+        count = sum(item.items for item in images)
+        parts.append(f"{len(images)} files with {count} images as {done.frames.upper()}, identical when read back")
     if tables:
         kind = {"parquet": "Parquet"}.get(done.tables, done.tables.upper())
-        said.append(f"{len(tables)} tables with {sum(one.items for one in tables)} rows as {kind}")
-    rows: list[list[Cell]] = [[one.file, one.source, one.what, one.items, 1e-3 * one.bytes] for one in done.files]
+        parts.append(f"{len(tables)} tables with {sum(item.items for item in tables)} rows as {kind}")
+    rows: list[list[Cell]] = [[item.file, item.source, item.what, item.items, 1e-3 * item.bytes] for item in done.files]
     heads = ("file", "source", "content", "images or rows", "size [kB]")
     columns: list[list[Cell]] = [
         [table.name, column.name, column.unit, column.description]
@@ -456,16 +456,16 @@ def export_report(done: Exported) -> Report:
     ]
     sections = []
     if columns:
-        told = Table(
+        column_table = Table(
             "columns", "Columns of the tables", "As in the files.", ("table", "column", "unit", "description"), columns
         )
-        sections.append(Section("Columns", (), (told,), folded=1))
+        sections.append(Section("Columns", (), (column_table,), folded=1))
     warnings = [
         f"{name} has changed since its run: its checksum differs from that in the manifest" for name in done.changed
     ]
     return Report(
         title=f"Export of {done.run}",
-        verdict=f"Exported the run of {done.manifest.kind} in {done.run}: {'; '.join(said)}.",
+        verdict=f"Exported the run of {done.manifest.kind} in {done.run}: {'; '.join(parts)}.",
         lead=(),
         facts=(
             ("run", str(done.run)),

@@ -146,13 +146,13 @@ def result_tables(folder: Path, files: Sequence[str]) -> list[DataTable]:
     data = {name: read_json(folder / name) for name in json_files}
     tables = [numbers] if (numbers := _numbers(data)) is not None else []
     tables += [table for nested in NESTED if (table := _nested(nested, data.get(nested.file, {}))) is not None]
-    taken = {table.name for table in tables}
+    used = {table.name for table in tables}
     for name in files:
         if name.endswith(".csv"):
             stem = Path(name).stem
-            own = stem if stem not in taken else f"{stem}_table"
-            taken.add(own)
-            table = _kept(own, name, (folder / name).read_text("utf-8"), _told_names(folder, name, files))
+            label = stem if stem not in used else f"{stem}_table"
+            used.add(label)
+            table = _kept(label, name, (folder / name).read_text("utf-8"), _described_columns(folder, name, files))
             tables += [table] if table is not None else []
     return tables
 
@@ -171,15 +171,15 @@ def _numbers(data: Mapping[str, Any]) -> DataTable | None:
     rows: list[tuple[str, str, float | None, float | None, str, str | None]] = []
     for file, content in data.items():
         for key, sigma, value in _leaves(content):
-            last = tuple(part for part in re.split(r"[.\[\]]", key) if part and not part.isdigit())
+            key_parts = tuple(part for part in re.split(r"[.\[\]]", key) if part and not part.isdigit())
             number = float(value) if isinstance(value, bool | int | float) else None
             text = None if isinstance(value, int | float) and not isinstance(value, bool) else json.dumps(value)
             text = value if isinstance(value, str) else text
-            rows.append((file, key, number, sigma, unit_of(last[-2:]) if number is not None else "", text))
+            rows.append((file, key, number, sigma, unit_of(key_parts[-2:]) if number is not None else "", text))
     if not rows:
         return None
     names = ("file", "key", "value", "sigma", "unit", "text")
-    told = (
+    descriptions = (
         "file of the run folder",
         "path of keys in the file, outermost first; [k] is item k of a list",
         "number, in the unit of its row; 1 for true, 0 for false",
@@ -187,7 +187,7 @@ def _numbers(data: Mapping[str, Any]) -> DataTable | None:
         "unit of the number, from its key; empty for dimensionless numbers",
         "texts, true, false and null",
     )
-    columns = zip(names, zip(*rows, strict=True), told, strict=True)
+    columns = zip(names, zip(*rows, strict=True), descriptions, strict=True)
     return DataTable(
         NUMBERS,
         "Every number of the run's JSON files",
@@ -235,9 +235,9 @@ def _nested(nested: Nested, content: Mapping[str, Any]) -> DataTable | None:
     rows = list(_rows(content.get(nested.key), len(nested.levels)))
     if not rows:
         return None
-    names = list(dict.fromkeys(name for _, found in rows for name in found))
+    names = list(dict.fromkeys(name for _, values_of_row in rows for name in values_of_row))
     columns = [_column(level, [path[k] for path, _ in rows]) for k, level in enumerate(nested.levels)]
-    columns += [_column(name, [found.get(name) for _, found in rows]) for name in names]
+    columns += [_column(name, [values_of_row.get(name) for _, values_of_row in rows]) for name in names]
     return DataTable(nested.name, nested.title, tuple(columns), {"file": nested.file, **_frames_of(content)})
 
 
@@ -255,18 +255,18 @@ def _rows(data: Any, depth: int, above: tuple[str, ...] = ()) -> Iterator[tuple[
 def _column(name: str, values: Sequence[Any], named: Mapping[str, str] = FrozenMap()) -> DataColumn:
     """Return a column with the unit and the description of its name."""
     head = _HEAD.fullmatch(name)
-    own, unit = (head["name"], head["unit"]) if head is not None else (name, "")
-    if own in named:
-        return DataColumn.of(own, values, unit, named[own])
-    read = (*parameters.CAMERA_PARAMETERS.values(), parameters.ANGLE, *parameters.GROUND)
-    known = {**DESCRIPTIONS, **{one.key: (one.file_unit, one.meaning) for one in read}}
-    if own in known and not unit:
-        return DataColumn.of(own, values, *known[own])
+    stem, unit = (head["name"], head["unit"]) if head is not None else (name, "")
+    if stem in named:
+        return DataColumn.of(stem, values, unit, named[stem])
+    listed = (*parameters.CAMERA_PARAMETERS.values(), parameters.ANGLE, *parameters.GROUND)
+    known = {**DESCRIPTIONS, **{one.key: (one.file_unit, one.meaning) for one in listed}}
+    if stem in known and not unit:
+        return DataColumn.of(stem, values, *known[stem])
     for ending, text in _SIGMAS.items():
-        base = own.removesuffix(ending)
-        if base != own and base in known:
-            return DataColumn.of(own, values, known[base][0], text.format(base))
-    return DataColumn.of(own, values, unit or unit_of((own,)), f"column {own!r} of the run's own table")
+        base = stem.removesuffix(ending)
+        if base != stem and base in known:
+            return DataColumn.of(stem, values, known[base][0], text.format(base))
+    return DataColumn.of(stem, values, unit or unit_of((stem,)), f"column {stem!r} of the run's own table")
 
 
 # --- tables that the run keeps ---------------------------------------------------------------------------
@@ -281,17 +281,17 @@ def _kept(name: str, file: str, text: str, named: Mapping[str, str]) -> DataTabl
         raise ValueError(f"{file} has rows of different lengths")
     columns: list[DataColumn] = []
     for k, head in enumerate(heads):
-        one = _column(head, _cells([row[k] for row in rows]), named)
+        column = _column(head, _cells([row[k] for row in rows]), named)
         if file == POINTS and head == "height_m":
-            one = DataColumn.of(head, one.plain, *_POINT_HEIGHT)
-        columns.append(replace(one, name=_free(one.name, [other.name for other in columns])))
+            column = DataColumn.of(head, column.plain, *_POINT_HEIGHT)
+        columns.append(replace(column, name=_free(column.name, [other.name for other in columns])))
     return DataTable(name, TITLES.get(file, f"{file} of the run"), tuple(columns), {"file": file})
 
 
 def _free(name: str, taken: Sequence[str]) -> str:
     """Return the name, with a number behind it if it is taken."""
     names = (name, *(f"{name} ({k})" for k in range(2, len(taken) + 2)))
-    return next(one for one in names if one not in taken)
+    return next(candidate for candidate in names if candidate not in taken)
 
 
 def _cells(cells: Sequence[str]) -> list[Any]:
@@ -304,7 +304,7 @@ def _cells(cells: Sequence[str]) -> list[Any]:
     return [cell or None for cell in cells]
 
 
-def _told_names(folder: Path, name: str, files: Sequence[str]) -> dict[str, str]:
+def _described_columns(folder: Path, name: str, files: Sequence[str]) -> dict[str, str]:
     """Return the descriptions of columns from a netCDF file with the same table, if there is one."""
     beside = f"{name.removesuffix('.csv')}.nc"
     if beside not in files:

@@ -449,7 +449,7 @@ def heat_section(run: JobRun) -> Section | None:
     faces: list[list[Cell]] = [
         [
             *(face, change.motion.rotate[0] / ARCSEC, change.motion.rotate[1] / ARCSEC, 1e9 * change.motion.shift[2]),
-            *(1e9 * change.figure_rms, 1e9 * change.lost, 1e9 * change.unmeshed),
+            *(1e9 * change.figure_rms, 1e9 * change.lost, 1e9 * change.mesh_error),
         ]
         for body in run.heated.values()
         for face, change in body.faces.items()

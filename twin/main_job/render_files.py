@@ -235,7 +235,7 @@ _WARMED_FACE: Record[HeatedFace] = Record(
     Quantity("growth_ppm", lambda face: face.motion.expansion, "relative change of size"),
     Quantity("figure_nm", lambda face: {f"Z{j}": a for j, a in face.motion.figure.items()}, "Zernike terms of its sag"),
     Quantity("not_carried_rms_nm", lambda face: face.lost, "residual of the Zernike terms"),
-    Quantity("coarser_elements_rms_nm", lambda face: face.unmeshed, "difference that coarser finite elements make"),
+    Quantity("coarser_elements_rms_nm", lambda face: face.mesh_error, "difference that coarser finite elements make"),
 )
 HEATED_BODY: Record[HeatedBody] = Record(
     "Temperature field of a body by a table of nodes.",
@@ -243,8 +243,8 @@ HEATED_BODY: Record[HeatedBody] = Record(
     Quantity("spacing_mm", lambda body: body.spacing, "distance of neighbouring nodes"),
     Quantity("linear_change_k", lambda body: body.linear.change, "change at the body's origin of the linear field"),
     Quantity("linear_gradient_k_per_m", lambda body: body.linear.gradient, "gradient of the linear field"),
-    Quantity("not_linear_rms_k", lambda body: body.left[0], "residual of the linear field, RMS over the volume"),
-    Quantity("not_linear_largest_k", lambda body: body.left[1], "largest residual of the linear field"),
+    Quantity("not_linear_rms_k", lambda body: body.residual[0], "residual of the linear field, RMS over the volume"),
+    Quantity("not_linear_largest_k", lambda body: body.residual[1], "largest residual of the linear field"),
     Quantity("between_nodes_rms_k", lambda body: body.between, "error of nodes interpolated from the others"),
     Quantity(
         "outside_share",

@@ -15,7 +15,7 @@ from optics.geometry.tree import State, compose
 from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import Backend
 from scenes.models.camera_sharpness import blur_warnings
-from scenes.models.instrument_builder import squared_facets
+from scenes.models.instrument_builder import facet_alignment
 from scenes.models.instrument_model import Instrument, MisplacedError
 from scenes.models.obstruction import find_obstructions, moved_into_beams
 from scenes.models.scenery import measured_finishes
@@ -415,7 +415,7 @@ def _mounted_facets(experiment: MonitorExperiment) -> str:
     """Return the facet orientations with which the monitor of an instrument as built would work, as text."""
     instrument, advice = experiment.instrument, "bodies closer to their design positions"
     try:
-        rotations = squared_facets(instrument, experiment.backend)
+        rotations = facet_alignment(instrument, experiment.backend)
     except (MisplacedError, *LOST):
         return advice
     bodies = {body.path: body for body in instrument.assembly.tree.bodies}

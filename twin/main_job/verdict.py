@@ -14,7 +14,7 @@ from analysis.monitor import parameters
 from analysis.monitor.monitor_formulas import PER_SI
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from optics.geometry.tree import Motion
-from scenes.models.job_state import beyond_statement
+from scenes.models.job_state import beyond_prior
 from scenes.specs.course import moment
 from twin.framework.artefact import FAR, SAME, plain, residual_text, significant
 from twin.framework.report import answer
@@ -75,7 +75,7 @@ def judge(run: JobRun) -> Judgement:
         first, *others = _misled(run, rows, wrong)
     else:
         first, *others = _recovered(run, rows)
-    unobserved = (*unobserved_perturbations(run), *run.reading.unseen)
+    unobserved = (*unobserved_perturbations(run), *run.reading.unobserved)
     computed = (*run.warnings, *doubted(run), *contradiction(run), *unobserved)
     warnings = (*computed, *_beyond_prior(run, rows, unobserved), *_misreadings(run))
     doubt = "σ does not hold for this measurement: see the warnings" if not run.sigma_holds else ""
@@ -409,7 +409,7 @@ def _beyond_prior(run: RenderRun, rows: tuple[Reading, ...], warned: tuple[str, 
     wrong = [r for r in rows if abs(r.ratio) > limit]
     if not wrong or run.series is not None:
         return ()
-    excesses = beyond_statement(run.resolved, run.experiment.stated)
+    excesses = beyond_prior(run.resolved, run.experiment.stated)
     unwarned = [excess for excess in excesses if not any(text.startswith(f"{excess.body}:") for text in warned)]
     if not unwarned:
         return ()

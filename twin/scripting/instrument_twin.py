@@ -240,13 +240,14 @@ class InstrumentTwin:
     def _given(self, perturb: Sequence[Mapping[str, Mapping[str, Any]] | str]) -> dict[str, Any]:
         """Return the requested perturbations by the nodes' paths; unknown names stay and are reported later."""
         try:
-            said: dict[str, Any] = perturbation_in_words(one for one in perturb if isinstance(one, str))
+            asked: dict[str, Any] = perturbation_in_words(one for one in perturb if isinstance(one, str))
             for one in perturb:
                 if not isinstance(one, str):
-                    said |= dict(one)
+                    asked |= dict(one)
             nodes = self._nodes
             return {
-                find_node(name, nodes) if matching_nodes(name, nodes) else name: what for name, what in said.items()
+                find_node(name, nodes) if matching_nodes(name, nodes) else name: motion
+                for name, motion in asked.items()
             }
         except Problem as problem:
             raise InputError(problem.at("", key=("perturb",))) from None
@@ -266,11 +267,11 @@ class InstrumentTwin:
         InputError
             No such file, or one that is not valid for this instrument.
         """
-        named = disturbances if isinstance(disturbances, str) else dict(disturbances)
-        plain = {**self._plain, "disturbances": named}
+        reference = disturbances if isinstance(disturbances, str) else dict(disturbances)
+        plain = {**self._plain, "disturbances": reference}
         job = self._with_job(plain).resolved.job
-        stated = find_disturbances(job, self.resolved.instrument)
-        resolved = self.resolved.model_copy(update={"job": job, "disturbances": stated})
+        prior = find_disturbances(job, self.resolved.instrument)
+        resolved = self.resolved.model_copy(update={"job": job, "disturbances": prior})
         twin = InstrumentTwin(resolved, self._bench.stating(resolved))
         twin.experiment.stated  # noqa: B018 - raises now if the instrument lacks a body
         return twin
@@ -293,8 +294,8 @@ class InstrumentTwin:
         InputError
             A key is wrong, or a perturbation is so large that light misses the mirrors or a spot its CCD.
         """
-        given = {"frames": frames, "seed": seed}
-        own = {key: value for key, value in given.items() if value is not None}
+        arguments = {"frames": frames, "seed": seed}
+        own = {key: value for key, value in arguments.items() if value is not None}
         job = self._with_job({**self._plain, "render": {**self._plain.get("render", {}), **own, **render}}).resolved
         started, backend = time.time(), self._bench.backend
         return _shot_of(render_job(job, backend, experiment=self._bench.experiment), backend, started)
@@ -325,25 +326,25 @@ class InstrumentTwin:
         experiment = self._bench.experiment
         path = experiment.path
         keys = [channel.key for channel in path.channels]
-        first = as_frames(before, "before", keys, path.shape)
-        second = as_frames(after, "after", keys, path.shape)
-        stated = experiment.disturbances
-        again = experiment.motion_models
+        frames_before = as_frames(before, "before", keys, path.shape)
+        frames_after = as_frames(after, "after", keys, path.shape)
+        prior = experiment.disturbances
+        motion_models = experiment.motion_models
         recovery = recover_monitor(
-            first, second[None], experiment.calibration, method, disturbances=stated, motions=again
+            frames_before, frames_after[None], experiment.calibration, method, disturbances=prior, motions=motion_models
         )
         reading = MonitorReading(
             channels=tuple((channel.camera, channel.name) for channel in path.channels),
             cameras=experiment.cameras,
             ground=experiment.ground,
-            disturbances=stated,
+            disturbances=prior,
             recovery=recovery,
             crosstalk={},
-            frames=second.shape[1],
+            frames=frames_after.shape[1],
             centroid=method,
         )
-        given = (*blur_warnings(self.resolved, self._bench.backend), *coarse_warnings(self.resolved))
-        return found_table(reading, given)
+        warnings = (*blur_warnings(self.resolved, self._bench.backend), *coarse_warnings(self.resolved))
+        return found_table(reading, warnings)
 
     def jacobian(self, motions: Sequence[str]) -> xr.Dataset:
         """Return exact derivatives with respect to elementary motions, about the unperturbed instrument.
@@ -370,18 +371,18 @@ class InstrumentTwin:
         experiment = self._bench.experiment
         names = list(self.cameras)
         keys = [channel.key for channel in experiment.path.channels]
-        chosen = [_motion_named(text, self._nodes) for text in motions]
-        size = np.array([motion.unit_size for motion in chosen])
-        spots = spot_jacobian(experiment.path, chosen)
-        truth = truth_jacobian(experiment.instrument, self._bench.backend, chosen)
+        elementary = [_motion_named(text, self._nodes) for text in motions]
+        size = np.array([motion.unit_size for motion in elementary])
+        spots = spot_jacobian(experiment.path, elementary)
+        truth = truth_jacobian(experiment.instrument, self._bench.backend, elementary)
         gains = estimator_gains(experiment.cameras, experiment.disturbances)
-        moved = spots.reshape(-1, len(chosen))
-        made_of = {name: parameters.rows_of(experiment.cameras[name]) for name in names}
+        spot_shifts = spots.reshape(-1, len(elementary))
+        parameter_rows = {name: parameters.rows_of(experiment.cameras[name]) for name in names}
         readings = [
-            [rows @ (gain[4 * k : 4 * k + 4] @ moved) * size for gain in gains.values()]
-            for k, rows in enumerate(made_of.values())
+            [rows @ (gain[4 * k : 4 * k + 4] @ spot_shifts) * size for gain in gains.values()]
+            for k, rows in enumerate(parameter_rows.values())
         ]
-        true = np.stack([rows @ truth[name] * size for name, rows in made_of.items()])
+        true = np.stack([rows @ truth[name] * size for name, rows in parameter_rows.items()])
         return xr.Dataset(
             {
                 "spots": (("channel", "axis", "motion"), spots * size, {"units": "px"}),
@@ -390,7 +391,7 @@ class InstrumentTwin:
             },
             coords={
                 "motion": list(motions),
-                "per": ("motion", [motion.unit for motion in chosen]),
+                "per": ("motion", [motion.unit for motion in elementary]),
                 "channel": keys,
                 "axis": ["row", "column"],
                 "camera": names,
@@ -440,8 +441,8 @@ class InstrumentTwin:
         return InstrumentTwin(self.resolved.with_job(job), self._bench)
 
     def __repr__(self) -> str:
-        moved = ", ".join(self.resolved.job.perturb) or "nothing"
-        return f"<{self.name}: cameras {', '.join(self.cameras)}; perturbed: {moved}>"
+        perturbed = ", ".join(self.resolved.job.perturb) or "nothing"
+        return f"<{self.name}: cameras {', '.join(self.cameras)}; perturbed: {perturbed}>"
 
     def _repr_html_(self) -> str:
         return name_html(self.name, self.cameras, self.perturbations)

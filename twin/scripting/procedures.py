@@ -119,16 +119,16 @@ def perform(
         setup = validate(type(setup), YamlFile("", tree, {}))
         if test is not None:
             setup = setup.model_copy(update={"test": setup.test.with_source(Source(test.source.file))})
-    setup, number, stated = seeded(procedure, setup, seed)
+    setup, number, options = seeded(procedure, setup, seed)
     started, clock = time.time(), time.monotonic()
-    run, given = performed(procedure, setup, load_backend(backend), number)
+    run, warnings = performed(procedure, setup, load_backend(backend), number)
     seconds = time.monotonic() - clock
-    shown = with_warnings(procedure.report(run), given)
+    report = with_warnings(procedure.report(run), warnings)
     program, _, command = name.partition(" ")
-    called = (f"twin.{program}", started, seconds, backend)
-    facts = RunFacts(stated.pop("config"), *called, command=command, checks=shown.checks, **stated)
-    numbers = shown.with_verdict(procedure.numbers(run))
-    return TestResult(name, numbers, shown, setup, run, facts, procedure.kind)
+    run_times = (f"twin.{program}", started, seconds, backend)
+    facts = RunFacts(options.pop("config"), *run_times, command=command, checks=report.checks, **options)
+    numbers = report.with_verdict(procedure.numbers(run))
+    return TestResult(name, numbers, report, setup, run, facts, procedure.kind)
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

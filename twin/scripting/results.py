@@ -98,8 +98,8 @@ class Shot:
         cameras = self.run.targets.cameras if self.run.targets is not None else {}
         rows = {
             (camera, name, direction): _edge_row(place, direction)
-            for camera, found in cameras.items()
-            for name, place in found.places.items()
+            for camera, targets in cameras.items()
+            for name, place in targets.places.items()
             for direction in place.before.edges
         }
         table = pd.DataFrame.from_dict(rows, orient="index")
@@ -115,12 +115,12 @@ class Shot:
         light; there is a row for every camera, state and field. The table is empty unless ``quality=True`` was set and
         the instrument has a monitor.
         """
-        found = self.run.quality
+        quality = self.run.quality
         rows = {
             (name, when, field): {one.key: one.value(camera)[s, k] for one in AT_FIELDS}
-            for name, camera in ({} if found is None else found.cameras).items()
+            for name, camera in ({} if quality is None else quality.cameras).items()
             for s, when in enumerate(("before", "after"))
-            for k, field in enumerate(() if found is None else found.fields)
+            for k, field in enumerate(() if quality is None else quality.fields)
         }
         table = pd.DataFrame.from_dict(rows, orient="index")
         if rows:
@@ -129,8 +129,8 @@ class Shot:
 
     def _repr_html_(self) -> str:
         notes = "".join(f"<p>⚠ {escape(text)}</p>" for text in self.warnings)
-        told = f"<p>{escape(self.verdict)}</p>"
-        return f"{told}{_truth_frame(self.truth).to_html()}{notes}{self.after._repr_html_()}"
+        verdict = f"<p>{escape(self.verdict)}</p>"
+        return f"{verdict}{_truth_frame(self.truth).to_html()}{notes}{self.after._repr_html_()}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,11 +218,11 @@ class Found:
                 true = float(truth[key].sel(camera=camera))
                 rows[camera, key] = self._row(true, self.values.sel(at), sigma.sel(at), noise.sel(at))
         pairs = [("both", "angle", parameters.ANGLE, self.angle)]
-        pairs += [("ground", "ground", one, self.ground) for one in parameters.GROUND]
-        for where, start, one, found in pairs:
-            key, name = f"{start}_{one.key}", one.key
-            if key in truth and found:
-                columns = (found[name], found[f"{name}_sigma"], found[f"{name}_sigma_noise"])
+        pairs += [("ground", "ground", parameter, self.ground) for parameter in parameters.GROUND]
+        for where, start, parameter, dataset in pairs:
+            key, name = f"{start}_{parameter.key}", parameter.key
+            if key in truth and dataset:
+                columns = (dataset[name], dataset[f"{name}_sigma"], dataset[f"{name}_sigma_noise"])
                 rows[where, key] = self._row(float(truth[key]), *columns)
         table = pd.DataFrame.from_dict(rows, orient="index")
         table.index = pd.MultiIndex.from_tuples(rows, names=["camera", "parameter"])
@@ -230,11 +230,11 @@ class Found:
 
     def _row(self, true: float, readings: xr.DataArray, sigma: xr.DataArray, noise: xr.DataArray) -> dict[str, float]:
         """Return a row of ``compare``."""
-        own = {str(name): float(readings.sel(estimator=name)) for name in readings.estimator.values}
-        spread, error = float(sigma.sel(estimator=self.judged)), own[self.judged] - true
-        by_noise = float(noise.sel(estimator=self.judged))
-        told = {"sigma": spread, "sigma_noise": by_noise, "error": error, "in_sigma": error / spread}
-        return {"true": true, **own, **told}
+        values = {str(name): float(readings.sel(estimator=name)) for name in readings.estimator.values}
+        spread, error = float(sigma.sel(estimator=self.judged)), values[self.judged] - true
+        noise_sigma = float(noise.sel(estimator=self.judged))
+        errors = {"sigma": spread, "sigma_noise": noise_sigma, "error": error, "in_sigma": error / spread}
+        return {"true": true, **values, **errors}
 
     def _repr_html_(self) -> str:
         notes = "".join(f"<p>⚠ {escape(text)}</p>" for text in self.warnings)
@@ -272,25 +272,25 @@ def _truth_frame(truth: xr.Dataset) -> pd.DataFrame:
 def shot_of(run: JobRun, backend: Backend, started: float) -> Shot:
     """Return the exposure of a run, traced on a backend and started at a time in seconds since the epoch."""
     keys = [channel.key for channel in run.experiment.instrument.channels]
-    about: dict[str, Any] = {"units": "DN", "instrument": run.resolved.instrument.name}
+    attributes: dict[str, Any] = {"units": "DN", "instrument": run.resolved.instrument.name}
     before = after = np.zeros((0, run.frames, 0, 0), np.uint16)
     expected = xr.Dataset()
     if isinstance(run, RenderRun):
         before, after, expected = run.before, run.after, irradiance(run).to_xarray()
-        about |= {"exposure_s": run.experiment.exposure, "pitch_m": run.experiment.path.pitch, "seed": run.seed}
+        attributes |= {"exposure_s": run.experiment.exposure, "pitch_m": run.experiment.path.pitch, "seed": run.seed}
 
     def frames(name: str, values: np.ndarray) -> xr.DataArray:
         dims = ("channel", "frame", "row", "column")
-        return xr.DataArray(values, dims=dims, coords={"channel": keys}, name=name, attrs=about)
+        return xr.DataArray(values, dims=dims, coords={"channel": keys}, name=name, attrs=attributes)
 
-    told = judge(run)
+    judgement = judge(run)
     return Shot(
         before=frames("before", before),
         after=frames("after", after),
         expected=expected,
         truth=_truth(run),
-        verdict=told.verdict,
-        warnings=tuple(told.warnings),
+        verdict=judgement.verdict,
+        warnings=tuple(judgement.warnings),
         run=run,
         _backend=backend,
         _started=started,
@@ -300,14 +300,14 @@ def shot_of(run: JobRun, backend: Backend, started: float) -> Shot:
 
 def _truth(run: JobRun) -> xr.Dataset:
     """Return the true changes of a run."""
-    true = run.truth_dict()
-    cameras = true["cameras"]
+    truth = run.truth_dict()
+    cameras = truth["cameras"]
     keys = list(next(iter(cameras.values())))
     data: dict[str, Any] = {key: ("camera", [cameras[name][key] for name in cameras]) for key in keys}
     for start, group in (("angle", "intersection_angle"), ("ground", "ground")):
-        data |= {f"{start}_{key}": value for key, value in true.get(group, {}).items()}
-    about = {"reference_frames": frames_text("truth")}
-    return xr.Dataset(data, coords={"camera": list(cameras)}, attrs=about)
+        data |= {f"{start}_{key}": value for key, value in truth.get(group, {}).items()}
+    attributes = {"reference_frames": frames_text("truth")}
+    return xr.Dataset(data, coords={"camera": list(cameras)}, attrs=attributes)
 
 
 def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
@@ -323,7 +323,7 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
     recovery, cameras = reading.recovery, list(reading.cameras)
     channels = ["/".join(channel) for channel in reading.channels]
     disturbances = "" if reading.disturbances is None else reading.disturbances.name
-    told = (*warnings, *reading.doubts, *reading.notes, *reading.unseen)
+    texts = (*warnings, *reading.doubts, *reading.notes, *reading.unobserved)
     shares = {(group, key): v for group, own in reading.from_statement.items() for key, v in own.items()}
     from_statement = pd.Series(shares, dtype=float, name="from_statement")
     if shares:
@@ -344,17 +344,19 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
     def spread(of: Callable[[CameraParameters], np.ndarray]) -> xr.DataArray:
         """Return covariances of all cameras and estimators in the units of the readings."""
         rows = {camera: parameters.rows_of(calibrated) for camera, calibrated in reading.cameras.items()}
-        found = [[made @ of(recovery.parameters[c][e])[0] @ made.T for e in estimators] for c, made in rows.items()]
+        blocks = [
+            [matrix @ of(recovery.parameters[c][e])[0] @ matrix.T for e in estimators] for c, matrix in rows.items()
+        ]
         both = {**coords, "parameter_2": keys}
-        return xr.DataArray(np.array(found), dims=(*dims, "parameter_2"), coords=both)
+        return xr.DataArray(np.array(blocks), dims=(*dims, "parameter_2"), coords=both)
 
     def by_estimator(group: str) -> xr.Dataset:
         """Return the rows of a group, with sigmas, by estimator."""
         data: dict[str, list[float]] = {}
         for row in table:
             if row.group == group:
-                told = zip(("", "_sigma", "_sigma_noise"), (row.value, row.sigma, row.noise), strict=True)
-                for ending, number in told:
+                numbers_by_ending = zip(("", "_sigma", "_sigma_noise"), (row.value, row.sigma, row.noise), strict=True)
+                for ending, number in numbers_by_ending:
                     data.setdefault(f"{row.parameter.key}{ending}", []).append(number)
         variables = {name: ("estimator", numbers) for name, numbers in data.items()}
         return xr.Dataset(variables, coords={"estimator": estimators} if data else {}, attrs=about)
@@ -372,7 +374,7 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
         ),
         disturbances=disturbances,
         sigma_holds=reading.sigma_holds,
-        warnings=told,
+        warnings=texts,
         from_statement=from_statement,
     )
 

@@ -378,7 +378,7 @@ def test_fields_are_those_of_the_file(tmp_path: Path, backend) -> None:
     notes = [str(note) for note in made.notes if note.statement == "field"]
     assert len(notes) == 1
     assert "one axis alone, to 2 deg" in notes[0]
-    assert "corners are 2.828 deg out" in notes[0]
+    assert "with corners at 2.828 deg" in notes[0]
     assert "--field '2 deg'" in notes[0]
     # a single direction gets a small field about it
     made = camera_of(replace(lens, fields=((0.0, 0.0),)), "singlet", backend)

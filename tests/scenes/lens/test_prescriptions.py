@@ -350,7 +350,7 @@ def test_an_object_far_away_is_at_infinity(tmp_path: Path, backend) -> None:
     path = file(tmp_path, "far.zmx", paraboloid("FTYP 1 0 3 1 0 0 0\nXFLN 0 2e6 0\nYFLN 0 0 2e6\n", "2e9"))
     made = camera_of(read_zemax(path), "far", backend)
     assert (made.camera.field.x, made.camera.field.y) == pytest.approx((1e-3, 0.5e-3), rel=1e-3)
-    assert "2e+06 m away is taken for infinity, whose image is 0.5 um nearer" in " ".join(map(str, made.notes))
+    assert "2e+06 m away, treated as infinity, whose image is 0.5 um nearer" in " ".join(map(str, made.notes))
     path.write_text(paraboloid(ANGLES, "9e8"), "utf-8")
     with pytest.raises(InputError, match="finite distance"):
         camera_of(read_zemax(path), "near", backend)

@@ -17,7 +17,7 @@ from scenes.lens.statements import own_glasses, read_catalogue
 from scenes.lens.zemax_reader import read_zemax
 from scenes.models.camera_design import CameraDesignSetup
 from scenes.models.camera_model import build_camera_under_test, derive_camera
-from scenes.models.disturbances import motions_of_spec, stated_motions
+from scenes.models.disturbances import disturbance_prior, prior_of_spec
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.monitor_layout import MonitorDesignSetup
 from scenes.models.scenery import measured_finishes
@@ -125,7 +125,7 @@ def focus(folder: Path, fixture: Fixture) -> Read:
 def disturbances(folder: Path, fixture: Fixture) -> Read:
     """Disturbances of the pair gf7; a table of correlations beside them."""
     pair = fixture("gf7_pair")
-    return lambda path: motions_of_spec(load.load_disturbances(path), pair)
+    return lambda path: prior_of_spec(load.load_disturbances(path), pair)
 
 
 def correlations(folder: Path, fixture: Fixture) -> Read:
@@ -144,7 +144,7 @@ def stated_job(folder: Path, fixture: Fixture) -> Read:
     (folder / "own.yaml").write_text("name: own\njoint: {reason: r, components: {forward/M2 shift z: 3 um}}\n", "utf-8")
 
     def read(path: Path) -> object:
-        return stated_motions(resolve(path), pair)
+        return disturbance_prior(resolve(path), pair)
 
     return read
 
