@@ -266,7 +266,7 @@ def test_wavefronts_of_batoids_rays(backend, camera, name: str) -> None:
         assert np.ptp(left) > 0.9 * wave.peak_to_valley
         # and where the chief ray falls
         place = peer.items[-1].coordSys.origin + rays.r[0] - model.focal_plane.translation
-        np.testing.assert_allclose(wave.place, place[:2], atol=1e-12)
+        np.testing.assert_allclose(wave.position, place[:2], atol=1e-12)
 
 
 # --- colour oracle ----------------------------------------------------------------------------------------------------

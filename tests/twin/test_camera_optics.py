@@ -40,8 +40,8 @@ def test_wavefronts_and_spots_of_rays_traced_in_the_prescription_frame(backend, 
         assert wave.rms == pytest.approx(wavefront_error(gf7, rays), rel=1e-6)
         assert spot.rms == pytest.approx(rms_spot(rays[0]), rel=1e-6)
         # prescription x is along the line, y along the track; the focal plane's centre is that of the field
-        assert wave.place[0] == pytest.approx(rays[0][0, 0], abs=1e-12)
-        assert wave.place[1] == pytest.approx(rays[0][0, 1] - gf7.focal_plane.translation[1], abs=1e-12)
+        assert wave.position[0] == pytest.approx(rays[0][0, 0], abs=1e-12)
+        assert wave.position[1] == pytest.approx(rays[0][0, 1] - gf7.focal_plane.translation[1], abs=1e-12)
 
 
 def test_a_defocused_focal_plane_is_the_term_of_defocus(gf7_alone) -> None:
@@ -82,16 +82,16 @@ def test_what_prisms_take_is_missing_in_every_table(backend, gf7_pair) -> None:
 def test_beams_of_which_nothing_can_be_told_are_refused(backend, camera, monkeypatch) -> None:
     optics = CameraOptics.alone(camera("ritchey_chretien"), backend)
     beams = VariedBeams(optics, [(0.0, 0.0)], None, None)
-    with pytest.raises(BeamMissedError, match="a surface's edge stops light of a field"):
+    with pytest.raises(BeamMissedError, match="the edge of a surface blocks light of a field"):
         beams.light([{"camera/M2": Motion(shift=(0.05, 0.0, 0.0))}])
     # more terms than places at which light comes through
     assert np.isfinite(beams.zernike_rows(11)).all()
-    few = [one[:9] for one in beams.lit()[0]]
+    few = [one[:9] for one in beams.illuminated_nodes()[0]]
     monkeypatch.setattr(beams, "lit", lambda: [few])
     with pytest.raises(UnphysicalError, match="11 Zernike terms are not independent"):
         beams.zernike_rows(11)
     monkeypatch.setattr(varied_beams, "RESIDUAL", 0.0)
-    with pytest.raises(varied_beams.RoughError, match=r"polynomials do not follow: they leave \S+ waves"):
+    with pytest.raises(varied_beams.RoughWavefrontError, match=r"polynomials do not represent the wavefronts: they leave \S+ waves"):
         VariedBeams(optics, [(0.0, 0.0)], None, None)
     rays = VariedBeams._rays
 
@@ -100,7 +100,7 @@ def test_beams_of_which_nothing_can_be_told_are_refused(backend, camera, monkeyp
         return (*light, np.zeros_like(alive)), aimed
 
     monkeypatch.setattr(VariedBeams, "_rays", cut)
-    with pytest.raises(varied_beams.CutError, match="cut by what is not the stop"):
+    with pytest.raises(varied_beams.VignettedBeamError, match="vignetted by a surface that is neither the stop"):
         VariedBeams(optics, [(0.0, 0.0)], None, None)
 
 
@@ -136,7 +136,7 @@ def test_a_camera_of_one_colour_is_that_of_its_wavelength(achromat, backend) -> 
         assert ours.wavelength == blue
         # the reference sphere's radius is that of the design's exit pupil: second order in the error
         assert ours.rms == pytest.approx(theirs.rms, rel=1e-5)
-        np.testing.assert_allclose(ours.place, theirs.place, atol=1e-12)
+        np.testing.assert_allclose(ours.position, theirs.position, atol=1e-12)
     assert achromat.at(achromat.wavelength).wavefront().rms == achromat.wavefront().rms
     with pytest.raises(ValueError, match="outside the range"):
         achromat.at(5e-6)
@@ -153,7 +153,7 @@ def test_lateral_colour_is_in_the_pupils(achromat) -> None:
         own = polychromatic_transfer(pupil, frequency[:, None] * [1.0, 0.0], np.array([line]), np.ones(1), np.zeros(1))
         values.append(own[0])
         spot = achromat.at(float(line)).spot(field)
-        assert spot.place[0] - design.place[0] == pytest.approx(moved[k], abs=1e-13)
+        assert spot.position[0] - design.position[0] == pytest.approx(moved[k], abs=1e-13)
         middle = np.angle(own[0, 1]) / (-2.0 * np.pi * frequency[1])
         assert middle == pytest.approx(moved[k] + spot.centroid[0], abs=2e-9)
     assert abs(moved[0] - moved[1]) > 1e-7

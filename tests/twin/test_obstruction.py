@@ -23,7 +23,7 @@ from scenes.specs.load import CAMERAS, LIBRARY, library_names, load_band_detecto
 from scenes.specs.resolved import resolve_job
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile
-from twin.camera.first_order_data import obscuration, unstated_shadows
+from twin.camera.first_order_data import obscuration, unmodelled_obscuration
 from twin.main_job.render_job import render_job
 from twin.monitor.image_quality import image_quality
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
@@ -201,7 +201,7 @@ def without_edges(folder) -> str:
 def test_cameras_of_the_library_state_their_shadows(name: str, backend) -> None:
     model = derive_camera(load_camera(name), backend)
     found = obscuration(model, backend)
-    assert not unstated_shadows(model, found)
+    assert not unmodelled_obscuration(model, found)
     # a mirror about its axis is round, and within the round shadow that its file states but for its margin: of korsch,
     # whose field is beside the axis, (79.9^2 - 75^2) / (250^2 - 75^2) mm^2 = 1.33 %; the corners of a square would take
     # 3 %
@@ -212,14 +212,14 @@ def test_cameras_of_the_library_state_their_shadows(name: str, backend) -> None:
 def test_a_mirror_in_the_beam_that_no_edge_states_is_told(tmp_path, backend) -> None:
     data = {"instrument": without_edges(tmp_path), "perturb": ["M2 shift z 5 um"]}
     run = render_job(resolve_job(validate(JobSpec, YamlFile("", data, {}))), backend)
-    (told,) = (text for text in run.warnings if "its own parts stand in its beam" in text)
+    (told,) = (text for text in run.warnings if "the file does not model this obscuration" in text)
     # the round mirror of 0.3 of the diameter, the field and the margin about it, by 4000 rays
-    share = float(re.search(r"M2 ([\d.]+)%", told)[1])
+    share = float(re.search(r"M2 blocks ([\d.]+) %", told)[1])
     beam, field, margin = 0.3 * 0.5, 2.0 * 1.05 * 0.00264, 0.01
     assert share == pytest.approx(100.0 * (beam + field + margin) ** 2 / 0.5**2, abs=0.2)
     assert "a pupil without that shadow" in told
     run = render_job(resolve_job(validate(JobSpec, YamlFile("", {**data, "instrument": RC}, {}))), backend)
-    assert not any("its own parts" in text for text in run.warnings)
+    assert not any("does not model this obscuration" in text for text in run.warnings)
 
 
 def test_what_has_moved_into_a_monitors_beam_is_told(gf7_pair, backend) -> None:

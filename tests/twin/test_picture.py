@@ -22,7 +22,7 @@ from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve
 from twin.main_job.render_job import render_job
 from twin.pictures.light_paths import trace_light_paths
-from twin.pictures.picture import SHOTS, PictureError, Shot, Studio, colour_variant, staged, write_pictures
+from twin.pictures.picture import SHOTS, PictureError, Shot, Studio, colour_variant, picture_setup, write_pictures
 from twin.pictures.picture_scene import framed, looking, points_in_world
 from twin.pictures.scene_file import build_scene, motions
 
@@ -42,13 +42,13 @@ def seen(backend, gf7_pair, paths):
     out = {}
     for shot in SHOTS:
         half = Shot(shot.name, shot.width // 2, shot.height // 2, 2, 2, shot.shows)
-        out[shot.shows] = (*which_body(gf7_pair, paths, backend, half), staged(gf7_pair, paths, half)[0])
+        out[shot.shows] = (*which_body(gf7_pair, paths, backend, half), picture_setup(gf7_pair, paths, half)[0])
     return out
 
 
 def which_body(instrument, paths, backend, shot: Shot) -> tuple[np.ndarray, list[str]]:
     """What the middle of every pixel shows first: (height, width) number into the list of bodies, -1 for nothing."""
-    view, parts = staged(instrument, paths, shot)
+    view, parts = picture_setup(instrument, paths, shot)
     with colour_variant(backend) as mi:
         index, _ = Studio(mi, parts, view).first_hits(0.0, 0.0)
     return index, [part.body for part in parts]
@@ -99,7 +99,7 @@ def test_every_body_is_where_its_mesh_is_projected_to(gf7_pair, paths, seen):
             checked += 1
     assert checked > 50
     with pytest.raises(ValueError, match="the prisms or the focal plane, not 'moon'"):
-        staged(gf7_pair, paths, Shot("moon.png", 10, 10, 2, 2, "moon"))
+        picture_setup(gf7_pair, paths, Shot("moon.png", 10, 10, 2, 2, "moon"))
 
 
 # --- how they look ----------------------------------------------------------------------------------------------------

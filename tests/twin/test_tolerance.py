@@ -27,7 +27,7 @@ from twin.tolerance.samples import Workforce, draw_samples
 from twin.tolerance.tolerance_bench import Adjustments, ToleranceBench
 from twin.tolerance.tolerance_report import tolerance_report
 from twin.tolerance.tolerance_run import Yield, run_tolerance, worst_jobs
-from twin.tolerance.variations import spectrum_shares, states_of, tolerance_numbers
+from twin.tolerance.variations import spectrum_shares, states_of, tolerance_parameters
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,9 @@ def test_a_compensator_without_a_range_changes_nothing(
 ) -> None:
     idle = {**TEXTS["gf7"]["compensators"], "idle": {"motion": "M3 shift z", "range": "0 um", "step": "1 um"}}
     other = ToleranceBench(budget(tmp_path, compensators=idle), backend)
-    np.testing.assert_array_equal(other.try_out(drawn * other.sizes).parts, bench.try_out(drawn * bench.sizes).parts)
+    np.testing.assert_array_equal(
+        other.adjust_cameras(drawn * other.sizes).parts, bench.adjust_cameras(drawn * bench.sizes).parts
+    )
 
 
 @pytest.mark.second
@@ -78,7 +80,7 @@ def test_adjustments_are_the_best_and_more_of_them_are_better(bench: ToleranceBe
             one._residuals(one.beams.light(states_of((*one.numbers, *one.compensators), amounts)).paths) ** 2, axis=1
         )
 
-    tried = bench.try_out(drawn * bench.sizes)
+    tried = bench.adjust_cameras(drawn * bench.sizes)
     best = squares(bench, tried.moves)
     for c, step in enumerate((2e-6, 2e-5)):
         for sign in (1.0, -1.0):
@@ -87,7 +89,7 @@ def test_adjustments_are_the_best_and_more_of_them_are_better(bench: ToleranceBe
             assert np.all(squares(bench, away) > best - 1e-12)
     one = {"focus": TEXTS["gf7"]["compensators"]["focus"]}
     fewer = ToleranceBench(budget(tmp_path, compensators=one), backend)
-    without = squares(fewer, fewer.try_out(drawn * fewer.sizes).moves)
+    without = squares(fewer, fewer.adjust_cameras(drawn * fewer.sizes).moves)
     assert np.all(best <= without + 1e-10)
     assert np.any(best < 0.999 * without)
 
@@ -103,7 +105,7 @@ def test_rays_go_through_the_stop_where_adjustments_have_brought_it(motion: str,
     }
     bench = ToleranceBench(budget(tmp_path, compensators=one, tolerances=tolerances), backend)
     amounts = np.eye(2) * bench.sizes
-    tried = bench.try_out(amounts, paths=True)
+    tried = bench.adjust_cameras(amounts, paths=True)
     assert np.max(np.abs(tried.moves)) > 1e-4
     states = states_of((*bench.numbers, *bench.compensators), np.concatenate([amounts, tried.moves], axis=1))
     assert tried.paths is not None
@@ -118,11 +120,11 @@ def test_ranges_steps_and_errors_are_kept(backend, tmp_path) -> None:
     bench = ToleranceBench(budget(tmp_path, compensators=moved), backend)
     x = np.random.default_rng(1).uniform(-1.0, 1.0, (6, len(bench.numbers)))
     errors = np.random.default_rng(2).standard_normal((6, 2))
-    ideal, made = bench.try_out(x * bench.sizes), bench.try_out(x * bench.sizes, errors)
+    ideal, made = bench.adjust_cameras(x * bench.sizes), bench.adjust_cameras(x * bench.sizes, errors)
     assert np.all(np.abs(ideal.moves[:, 0]) <= 50e-6 * (1 + 1e-12))
     np.testing.assert_allclose(made.moves[:, 0] / 10e-6, np.round(made.moves[:, 0] / 10e-6), atol=1e-9)
     # the turn follows the rounded focus, then gets its error; without it it would be the best for that focus
-    calm = bench.try_out(x * bench.sizes, np.zeros((6, 2)))
+    calm = bench.adjust_cameras(x * bench.sizes, np.zeros((6, 2)))
     np.testing.assert_allclose(made.moves[:, 1] - calm.moves[:, 1], errors[:, 1] * np.radians(1.0 / 3600.0), rtol=1e-3)
 
 
@@ -147,7 +149,7 @@ def test_each_adjustment_is_the_best_for_those_made_before_it() -> None:
 
 def test_models_and_limits_hold_against_exact_traces(bench: ToleranceBench, drawn: np.ndarray) -> None:
     found = sensitivities(bench)
-    exact = bench.values(bench.try_out(drawn * bench.sizes).parts)
+    exact = bench.values(bench.adjust_cameras(drawn * bench.sizes).parts)
     modelled = bench.values(found.model.quadratic(drawn))
     spread = np.std(exact, axis=0)
     # the third order of motions within these limits; of an MTF it is larger
@@ -163,7 +165,9 @@ def test_models_and_limits_hold_against_exact_traces(bench: ToleranceBench, draw
         if np.isfinite(share):
             ends = np.zeros((2, len(bench.numbers)))
             ends[:, bench.entries["tilt"][0]] = (share, -share)
-            lost = bench.merits[m].worse(bench.values(bench.try_out(ends * bench.sizes).parts)[:, m], found.nominal[m])
+            lost = bench.merits[m].worse(
+                bench.values(bench.adjust_cameras(ends * bench.sizes).parts)[:, m], found.nominal[m]
+            )
             assert np.max(lost) == pytest.approx(inverse.losses[m], rel=1e-3)
 
 
@@ -174,7 +178,7 @@ def test_a_group_moves_as_one_body(backend, tmp_path) -> None:
     # rays are those of the designed directions: a field of a degree does not end at 20 arcsec
     setup = budget(tmp_path, tolerances={"all": every}, compensators={}, merits=merits)
     bench = ToleranceBench(setup, backend)
-    nominal, turned = bench.values(bench.try_out(np.array([[0.0], [1.0]]) * bench.sizes).parts)
+    nominal, turned = bench.values(bench.adjust_cameras(np.array([[0.0], [1.0]]) * bench.sizes).parts)
     assert turned[1] == pytest.approx(bench.sizes[0], rel=1e-6)
     assert turned[2] < 1e-9
     assert turned[3] < 1e-11
@@ -185,7 +189,7 @@ def test_a_group_moves_as_one_body(backend, tmp_path) -> None:
 @pytest.mark.second
 def test_an_obscured_camera_is_that_of_the_camera_program(backend, tmp_path) -> None:
     bench = ToleranceBench(budget(tmp_path, "obscured"), backend)
-    tried = bench.values(bench.try_out(np.array([[0.0], [1.0]]) * bench.sizes).parts)
+    tried = bench.values(bench.adjust_cameras(np.array([[0.0], [1.0]]) * bench.sizes).parts)
     for x, values in zip((0.0, 1.0), tried, strict=True):
         camera = bench.optics.in_state(states_of(bench.numbers, np.array([[x]]) * bench.sizes)[0])
         assert values[0] == pytest.approx(max(wave.rms for wave in camera.wavefronts(bench.fields)), rel=1e-4)
@@ -229,7 +233,7 @@ class Straight:
     def scaled(self, scales: np.ndarray) -> Straight:
         return Straight(self.slope * scales, self.real)
 
-    def try_out(self, x: np.ndarray, errors: Any) -> SimpleNamespace:
+    def adjust_cameras(self, x: np.ndarray, errors: Any) -> SimpleNamespace:
         return SimpleNamespace(parts=self.real * x @ self.slope[:, None])
 
 
@@ -247,7 +251,7 @@ def test_an_allocation_is_the_cheapest_that_keeps_its_margin(target: float, real
     }
     setup = SimpleNamespace(test=SimpleNamespace(tolerances=entries))
     bench = Straight(slope, real)
-    values = np.abs(bench.try_out(x, None).parts)
+    values = np.abs(bench.adjust_cameras(x, None).parts)
     samples = SimpleNamespace(x=x, values=values, seeds=np.zeros(2000, int))
     fine = tuple(np.arange(1.0, 10.0, 0.01).round(2).tolist())
     spec = AllocationSpec(target=target, grades=fine)
@@ -331,7 +335,7 @@ def test_bad_input_is_told_with_its_key(name: str, changes: dict, key: str, word
 def test_a_body_warmed_within_what_is_known_grows_by_its_expansion(bench, tmp_path) -> None:
     setup = budget(tmp_path, tolerances={"a": {"motion": "focal_plane temperature", "limit": "5 K"}})
     thermal = bench.experiment.thermal
-    (number,) = tolerance_numbers(setup, bench.instrument, thermal)
+    (number,) = tolerance_parameters(setup, bench.instrument, thermal)
     grown = {body: move.shape["expansion"] for body, move in number.moves.items()}
     assert grown.keys() == {"base/gf7/focal_plane", "base/gf7/focal_plane/line"}
     assert grown == pytest.approx({body: thermal.materials[body].expansion for body in grown})
@@ -390,7 +394,7 @@ def test_models_of_scaled_tolerances_are_the_model_of_scaled_draws() -> None:
     bench = SimpleNamespace(
         parts=4, merits=(merit_of("wavefront", 0, at_most=1.0), merit_of("roll", 1, at_most="1 rad"))
     )
-    (spread,) = merit_models._spread(bench, model, np.array([0, 2]), np.array([0.5]))
+    (spread,) = merit_models._figure_error_parts(bench, model, np.array([0, 2]), np.array([0.5]))
     assert spread[1] == pytest.approx(model.nominal[1] + 0.5 * np.hypot(model.slope[1, 0], model.slope[1, 2]))
 
 
@@ -413,7 +417,7 @@ def test_cameras_have_errors_of_their_own(backend, tmp_path, monkeypatch) -> Non
         tolerance_run, "ToleranceBench", lambda *_: SimpleNamespace(passing=lambda values: values < 1.0)
     )
     monkeypatch.setattr(tolerance_run, "draw_samples", drawn)
-    found = tolerance_run._judged(budget(tmp_path), backend, SimpleNamespace(limits={}), 3, None, None)
+    found = tolerance_run._validated_yield(budget(tmp_path), backend, SimpleNamespace(limits={}), 3, None, None)
     assert (found.passed, found.of) == (4, 4)
     assert asked != [3]
 
@@ -421,7 +425,7 @@ def test_cameras_have_errors_of_their_own(backend, tmp_path, monkeypatch) -> Non
 def test_warnings_of_instrument_and_engine_reach_the_report(backend, tmp_path, monkeypatch) -> None:
     told: list[str] = []
     monkeypatch.setattr(given_warnings, "blur_warnings", lambda setup, backend: ("the camera is blurred",))
-    monkeypatch.setattr(given_warnings, "unstated_shadows", lambda model, way: "M2 stands in its beam")
+    monkeypatch.setattr(given_warnings, "unmodelled_obscuration", lambda model, way: "M2 stands in its beam")
     monkeypatch.setattr(
         given_warnings, "moved_into_beams", lambda *state: ("left: M2 has moved and would take 3 rays",)
     )
@@ -455,8 +459,8 @@ def test_a_camera_whose_own_parts_stand_in_its_beam_is_told(backend, tmp_path) -
     setup = budget(
         tmp_path, "few", instrument=str(file), tolerances=tolerances, compensators={}, merits={"w": wavefront}
     )
-    found = given_warnings.given_warnings(setup, ToleranceBench(setup, backend))
-    assert any("its own parts stand in its beam" in text for text in found)
+    found = given_warnings.instrument_warnings(setup, ToleranceBench(setup, backend))
+    assert any("the file does not model this obscuration" in text for text in found)
 
 
 def test_what_the_engine_of_studies_warns_of_is_passed_on(backend, tmp_path, monkeypatch) -> None:
@@ -504,7 +508,7 @@ def test_an_allocation_is_reached_by_the_limits_of_its_table(loose: float, backe
     bench = ToleranceBench(setup, backend)
     found = sensitivities(bench)
     drawn = draw_samples(setup, bench, backend, 60, 3, Workforce())
-    graded = allocation._graded
+    graded = allocation._rounded_to_grades
 
     def too_loose(*given: Any) -> Any:
         limits, rounded = graded(*given)

@@ -1,1 +1,1 @@
-"""A camera as optical designers look at it: wavefronts, spots, MTF, first-order data, distortion; refocusing."""
+"""Analysis of one camera: first-order data, wavefronts, spots, MTF, colour, distortion, field curvature, refocusing."""

@@ -1,4 +1,4 @@
-"""``python -m twin.camera``: a camera as an optical designer looks at it, and its best focus."""
+"""Command ``python -m twin.camera``: the optical analysis of a camera, and its best focus."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from twin.framework import cli
 from twin.framework.command import run_test
 
 TILT = "tilt"
+"""Name of the option that also tilts the focal plane."""
 
 app = cli.program()
 
@@ -34,22 +35,35 @@ def main(
     ],
     options: cli.Options,
     what: Annotated[str | None, typer.Argument(hidden=True, metavar="")] = None,
-    camera: Annotated[str | None, typer.Option("--camera", help="Which camera, where there are several.")] = None,
+    camera: Annotated[str | None, typer.Option("--camera", help="Camera to analyse, if the file has several.")] = None,
     refocus: Annotated[
-        bool, typer.Option("--refocus", help="Find the best image plane first; writes the camera's file with it.")
+        bool,
+        typer.Option(
+            "--refocus", help="Find the best image plane first; also writes the camera's file with that plane."
+        ),
     ] = False,
     perturb: Annotated[
         list[str] | None,
-        typer.Option("--perturb", metavar="TEXT", help='Perturb it, "M2 shift z 20 um"; may be said several times.'),
+        typer.Option(
+            "--perturb",
+            metavar="TEXT",
+            help='Perturb the camera, for example "M2 shift z 20 um"; may be given several times.',
+        ),
     ] = None,
     temperature: Annotated[
-        str | None, typer.Option("--temperature", metavar="TEXT", help='Warm all of it, "+2 K".')
+        str | None,
+        typer.Option(
+            "--temperature", metavar="TEXT", help='Change the temperature of the whole camera, for example "+2 K".'
+        ),
     ] = None,
-    tilt: Annotated[bool, typer.Option("--tilt", help="With --refocus: turn the image about the line, too.")] = False,
+    tilt: Annotated[
+        bool, typer.Option("--tilt", help="With --refocus: also tilt the image plane about the line.")
+    ] = False,
 ) -> None:
-    """Look at a camera as an optical designer does: layout with rays, first-order data, wavefronts, spots, MTF,
-    through focus, distortion, field curvature and illumination over the field; first of all how good it is, where it
-    is worst and what limits it.
+    """Analyse a camera over its field: wavefronts, spots, MTF, distortion, illumination and first-order data.
+
+    The report shows the layout with rays as well, and through focus and field curvature. The verdict names the worst
+    field and the dominant aberration.
 
         python -m twin.camera gf7
 
@@ -60,18 +74,18 @@ def main(
         python -m twin.camera my_camera.yaml --perturb "M2 shift z 20 um" --perturb "M2 rotate x 3 arcsec"
 
     With --refocus the image plane is moved to the least mean square wavefront error over the field, with
-    `--refocus --tilt` turned about the line as well. The camera's file with that plane, comments kept, is in artefacts/
-    and can be used as it is.
+    `--refocus --tilt` it is tilted about the line as well. The camera's file with that plane and all comments is in
+    artefacts/, ready for use.
 
-    With --perturb and --temperature, and of a job, the camera is looked at in that state, and the first paragraph says
-    what it did. Bodies are called by their path or its last parts, as in a job's file.
+    With --perturb, --temperature or a job the camera is analysed in that state, and the first paragraph describes the
+    effect. Bodies are named by their path or its last parts, as in a job's file.
 
     The run folder gets report.html, optics.json (numbers), optics.nc (maps, spots, curves), config.yaml, and figures
     and tables in artefacts/.
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    turned = tilt or what is not None  # what stood there in earlier versions
+    turned = tilt or what is not None  # the second argument of earlier versions
 
     def read() -> Any:
         from scenes.specs.instrument import BASE
@@ -86,7 +100,7 @@ def main(
         return procedure.resolve(file, camera).perturbed([*(perturb or ()), *warmed])
 
     procedure = PROCEDURES["camera"]
-    # what a refocused camera's file lacks has then been done; how good it is now its verdict says
+    # a refocused camera is not judged: its verdict states its image quality
     run = partial(procedure.run, refocus=refocus, tilt=turned)
     words = (*(("--refocus",) if refocus else ()), *((f"--{TILT}",) if turned else ()))
     named = file if camera is None else Path(f"{file.stem}-{camera}.yaml")

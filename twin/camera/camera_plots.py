@@ -1,6 +1,4 @@
-"""Figures of a judged camera: maps and spots over the field, MTF, through focus, curves along the
-line, distortion.
-"""
+"""Plots of a camera analysis: wavefront maps and spots over the field, MTF, colour, through focus, distortion."""
 
 from __future__ import annotations
 
@@ -19,22 +17,23 @@ from twin.framework.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, SK
 MICRO = "\N{MICRO SIGN}m"
 _FIELD_COLOURS = (INK, SKY, BLUE, VERMILION, ORANGE)
 _FIRST_TERMS = range(4, 23)
-"""Zernike terms that are drawn as bars, Noll's order."""
+"""Noll indices of the Zernike terms in the bar chart."""
 
 
 def degrees_text(run: CameraRun, field: Field) -> str:
-    """A field in degrees, along the line and along the track, for titles."""
+    """Format a field in degrees along the line and along the track."""
     halves = (run.camera.field.x, run.camera.field.y)
     return ", ".join(plain(float(np.degrees(s * h)), 4) for s, h in zip(field, halves, strict=True)) + "\N{DEGREE SIGN}"
 
 
 def _grid(height: float) -> tuple[Figure, np.ndarray]:
+    """Return a figure with three by three panels."""
     figure = new_figure(height, {"w_pad": 0.05, "h_pad": 0.06})
     return figure, np.ravel(figure.subplots(3, 3))
 
 
 def wavefront_figure(run: CameraRun) -> Figure:
-    """Maps at nine fields, of one scale of colours."""
+    """Draw wavefront maps at nine fields with a common colour scale."""
     figure, axes = _grid(9.6)
     most = max(float(np.nanmax(np.abs(wave.map))) for wave in run.waves)
     for one, wave in zip(axes, run.waves, strict=True):
@@ -49,7 +48,7 @@ def wavefront_figure(run: CameraRun) -> Figure:
 
 
 def spot_figure(run: CameraRun) -> Figure:
-    """Spots at nine fields in boxes of one size, with the Airy disk."""
+    """Draw spots at nine fields in boxes of equal size, with the Airy disk."""
     figure, axes = _grid(10.2)
     half = max(1.2 * run.spots[GRID.index((0.0, 0.0))].airy, 1.08 * max(spot.farthest for spot in run.spots))
     for one, spot in zip(axes, run.spots, strict=True):
@@ -65,7 +64,7 @@ def spot_figure(run: CameraRun) -> Figure:
 
 
 def zernike_figure(run: CameraRun) -> Figure:
-    """Terms in the middle of the field and where it is worst."""
+    """Draw the Zernike terms in the middle of the field and at the worst field."""
     figure = new_figure(3.6)
     axes = figure.subplots()
     middle = run.waves[GRID.index((0.0, 0.0))]
@@ -84,7 +83,7 @@ def zernike_figure(run: CameraRun) -> Figure:
 
 
 def error_figure(run: CameraRun) -> Figure:
-    """Rms wavefront error over the field as a map, and along the line in three places along the track."""
+    """Draw the rms wavefront error over the field as a map, and along the line at three positions along the track."""
     figure = new_figure(3.3)
     left, right = figure.subplots(1, 2, gridspec_kw={"width_ratios": [1.35, 1.0]})
     x, y = (np.degrees(run.field[..., k] * h) for k, h in enumerate((run.camera.field.x, run.camera.field.y)))
@@ -105,7 +104,7 @@ def error_figure(run: CameraRun) -> Figure:
     for limit, name in ((SHARP, "diffraction limited"), (BLURRED, "blurred")):
         if limit < 4.0 * most and most < 4.0 * limit:
             right.axhline(limit, color=GREY, lw=0.8, ls=":")
-            # beside the frame, where no curve comes
+            # beside the frame, clear of the curves
             right.annotate(
                 name.replace(" ", "\n"), (1.0, limit), (4, 0), xycoords=("axes fraction", "data"),
                 textcoords="offset points", va="center", fontsize=7.5, annotation_clip=False,
@@ -122,7 +121,7 @@ def error_figure(run: CameraRun) -> Figure:
 
 
 def mtf_figure(run: CameraRun) -> Figure:
-    """MTF curves of five fields, each with its own limit of diffraction, and MTF at Nyquist along the line."""
+    """Draw MTF curves of five fields, each with its diffraction limit, and the MTF at Nyquist along the line."""
     figure = new_figure(6.4)
     axes = np.ravel(figure.subplots(2, 3, sharey=True))
     for k, (one, mtf) in enumerate(zip(axes, run.mtfs, strict=False)):
@@ -144,7 +143,7 @@ def mtf_figure(run: CameraRun) -> Figure:
 
 
 def lateral_figure(run: CameraRun) -> Figure:
-    """Place of every wavelength's chief ray from the reference's, along the line and along the track."""
+    """Draw the chief-ray position of every wavelength relative to the reference, along the line and the track."""
     colours = run.colours
     assert colours is not None
     assert colours.lateral is not None
@@ -155,14 +154,14 @@ def lateral_figure(run: CameraRun) -> Figure:
         for f, colour in zip(range(len(colours.fields)), _FIELD_COLOURS, strict=True):
             text = degrees_text(run, colours.fields[f])
             one.plot(nm, 1e6 * colours.lateral[f, :, direction], color=colour, lw=1.3, label=text, marker=_mark(nm))
-        _over_light(one, run, f"place {name}")
-    axes[0].set_ylabel(f"from the reference wavelength, {MICRO}")
+        _over_light(one, run, f"position {name}")
+    axes[0].set_ylabel(f"relative to the reference wavelength, {MICRO}")
     axes[0].legend(fontsize=7.0, title="field", title_fontsize=7.5)
     return figure
 
 
 def axial_figure(run: CameraRun) -> Figure:
-    """Best focus by wavelength, field by field."""
+    """Draw best focus by wavelength for each field."""
     colours = run.colours
     assert colours is not None
     assert colours.axial is not None
@@ -179,11 +178,12 @@ def axial_figure(run: CameraRun) -> Figure:
 
 
 def _mark(wavelengths: np.ndarray) -> str:
-    """Dots where so few wavelengths stand that they are lines."""
+    """Return a marker for curves with few wavelengths."""
     return "o" if len(wavelengths) < 12 else ""
 
 
 def _over_light(axes: Axes, run: CameraRun, title: str) -> None:
+    """Label axes that show a quantity by wavelength."""
     assert run.colours is not None
     axes.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
     axes.axvline(1e9 * run.colours.reference, color=GREY, lw=0.8, ls=":")
@@ -193,7 +193,7 @@ def _over_light(axes: Axes, run: CameraRun, title: str) -> None:
 
 
 def light_mtf_figure(run: CameraRun) -> Figure:
-    """MTF curves over the light, and images of points, of five fields."""
+    """Draw polychromatic MTF curves and point images of five fields."""
     assert run.colours is not None
     figure = new_figure(5.2)
     rows = figure.subplots(2, len(run.colours.fields))
@@ -201,11 +201,11 @@ def light_mtf_figure(run: CameraRun) -> Figure:
         upper, lower = rows[:, k]
         draw_mtf(upper, mtf, label=k == 0)
         upper.set_title(degrees_text(run, mtf.field), fontsize=8.5)
-        um = 1e6 * psf.place
+        um = 1e6 * psf.position
         lower.pcolormesh(
             um, um, np.sqrt(np.maximum(psf.values, 0.0)), cmap="YlGnBu", shading="nearest", rasterized=True
         )
-        # as far as there is a thousandth of the peak
+        # up to a thousandth of the peak
         lit = np.abs(um)[np.max(psf.values, axis=0) + np.max(psf.values, axis=1) > 1e-3 * np.max(psf.values)]
         lower.set_xlim(-np.max(lit), np.max(lit))
         lower.set_ylim(-np.max(lit), np.max(lit))
@@ -221,7 +221,7 @@ def light_mtf_figure(run: CameraRun) -> Figure:
 
 
 def focus_figure(run: CameraRun) -> Figure:
-    """Wavefront error and MTF at Nyquist through focus, field by field."""
+    """Draw wavefront error and MTF at Nyquist through focus for each field."""
     focus = run.focus
     count = 3 if np.any(np.isfinite(focus.mtf)) else 1
     figure = new_figure(3.3)
@@ -240,13 +240,13 @@ def focus_figure(run: CameraRun) -> Figure:
         one.set_ylim(0.0, None)
     for one in axes:
         one.axvline(0.0, color=LIGHT, lw=0.8, zorder=0)
-        one.set_xlabel(f"detector downstream, {MICRO}")
+        one.set_xlabel(f"defocus of the detector, downstream, {MICRO}")
         plain_axes(one)
     return figure
 
 
 def curves_figure(run: CameraRun) -> Figure:
-    """Field curvature and astigmatism, illumination along the line."""
+    """Draw field curvature, astigmatism and illumination along the line."""
     curves = run.curves
     figure = new_figure(3.2)
     left, right = figure.subplots(1, 2)
@@ -272,7 +272,7 @@ def curves_figure(run: CameraRun) -> Figure:
 
 
 def distortion_figure(run: CameraRun) -> Figure:
-    """Departure from the perfect camera over the field, drawn larger, and along the line."""
+    """Draw the departure from the distortion-free camera, magnified over the field and to scale along the line."""
     d = run.distortion
     figure = new_figure(3.6)
     left, right = figure.subplots(1, 2, gridspec_kw={"width_ratios": [1.35, 1.0]})
@@ -282,7 +282,7 @@ def distortion_figure(run: CameraRun) -> Figure:
     for places, colour, width in ((d.ideal, GREY, 0.6), (d.ideal + factor * away, BLUE, 1.0)):
         for line in (*places, *np.swapaxes(places, 0, 1)):
             left.plot(1e3 * line[:, 0], 1e3 * line[:, 1], color=colour, lw=width)
-    left.set_title(f"Grid of fields, departures {factor:g} times")
+    left.set_title(f"Grid of fields, distortion × {factor:g}")
     left.set_xlabel("along the line [mm]")
     left.set_ylabel("along the track [mm]")
     _lines(right, run)
@@ -291,28 +291,29 @@ def distortion_figure(run: CameraRun) -> Figure:
 
 
 def _lines(axes: Axes, run: CameraRun) -> None:
+    """Draw the distortion along the line."""
     d = run.distortion
     axes.plot(1e3 * d.position, 1e6 * d.residual, color=INK, lw=1.4, label="L \N{MINUS SIGN} f tan W")
     if np.max(np.abs(d.residual_with_point - d.residual)) > 1e-9:
         axes.plot(
-            1e3 * d.position, 1e6 * d.residual_with_point, color=ORANGE, lw=1.2, label="principal point fitted, too"
+            1e3 * d.position, 1e6 * d.residual_with_point, color=ORANGE, lw=1.2, label="with fitted principal point"
         )
     axes.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
     axes.set_title("Along the line")
-    axes.set_xlabel("L, mm from its middle")
+    axes.set_xlabel("L, mm from the line's middle")
     axes.set_ylabel(f"distortion, {MICRO}")
     axes.legend(fontsize=7.5)
     plain_axes(axes)
 
 
 def _round_factor(value: float) -> float:
-    """The largest 1, 2 or 5 times a power of ten up to a value."""
+    """Return the largest number 1, 2 or 5 times a power of ten that does not exceed a value."""
     size = 10.0 ** np.floor(np.log10(value))
     return float(size * max(step for step in (1.0, 2.0, 5.0) if step * size <= value * (1.0 + 1e-9)))
 
 
 def refocus_figure(run: CameraRun) -> Figure:
-    """Wavefront error of every field before and after refocusing."""
+    """Draw the wavefront error of every field before and after refocusing."""
     assert run.refocus is not None
     figure = new_figure(3.0)
     axes = figure.subplots()

@@ -1,4 +1,4 @@
-"""Report of a judged camera: the verdict, first-order data, then every figure and table that a designer looks for."""
+"""Report of a camera analysis: verdict, first-order data, and all plots and tables."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from scenes.models.camera_sharpness import FIELDS, field_text
 from twin.camera import camera_plots as plots
 from twin.camera.camera_run import CameraRun, built_text, camera_data, perturbed_text, refocus_text, verdict
 from twin.camera.colour import Colours
-from twin.camera.first_order_data import FIRST_ORDER, unstated_shadows
+from twin.camera.first_order_data import FIRST_ORDER, unmodelled_obscuration
 from twin.camera.layout_plot import layout_figure
 from twin.framework.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
 from twin.framework.data_files import netcdf
 from twin.framework.report import Report, Section, answer
 from twin.framework.svg import look, to_svg
 
-_TOLD_TERMS = 15
+_TABLE_TERMS = 15
 """Zernike terms in the table of fields; the others are in optics.json and optics.nc."""
 
 
 def camera_report(run: CameraRun) -> Report:
-    """Report of a judged camera."""
+    """Build the report of a camera analysis."""
     texts = refocus_text(run), built_text(run), perturbed_text(run)
-    told, more = answer(*verdict(run), "see the wavefronts and the layout")
+    verdict_text, more = answer(*verdict(run), "see the wavefronts and the layout")
     sections = [
         _layout(run),
         *([_refocus(run)] if run.refocus is not None else []),
@@ -40,7 +40,7 @@ def camera_report(run: CameraRun) -> Report:
     sections += [_through_focus(run), _field(run), *([_bodies(run)] if run.quality is not None else [])]
     return Report(
         f"Camera {run.setup.title}",
-        told,
+        verdict_text,
         (*more, *(text for text in texts if text), _first_order_text(run)),
         _facts(run),
         first_order_table(run),
@@ -50,29 +50,32 @@ def camera_report(run: CameraRun) -> Report:
 
 
 def _new_name(run: CameraRun) -> str:
-    """Name of the refocused camera and of its file."""
+    """Return the name of the refocused camera, which its file has as well."""
     return f"{run.setup.camera.name}_refocused"
 
 
 def _figure(name: str, title: str, caption: str, draw: Callable[..., Figure], *drawn: Any) -> SvgFigure:
+    """Draw a figure as SVG."""
     with look(name):
         return SvgFigure(name, title, caption, to_svg(draw(*drawn)))
 
 
 def _first_order_text(run: CameraRun) -> str:
+    """Summarise the first-order data and the obscuration."""
     n, d = FIRST_ORDER(run.first_order), run.distortion
     blocked = ", ".join(f"{body} {100 * share:.1f}%" for body, share in n["obscuration"].items())
-    unstated = unstated_shadows(run.optics.model, run.first_order.obscuration)
+    unmodelled = unmodelled_obscuration(run.optics.model, run.first_order.obscuration)
     return (
         f"f {n['focal_length_m']:.4g} m, F/{n['f_number']:.3g}, field {n['field_deg'][0]:.3g} by "
         f"{n['field_deg'][1]:.3g} deg; principal distance along the line {d.line_distance:.6g} m, "
         f"distortion at most {1e6 * d.line_largest:.3g} µm there; "
-        + (f"its own parts stand in the beam: {blocked}." if blocked else "nothing of its own stands in the beam.")
-        + (f" {unstated[0].upper()}{unstated[1:]}." if unstated else "")
+        + (f"obscuration by its own parts: {blocked}." if blocked else "no obscuration by its own parts.")
+        + (f" {unmodelled}." if unmodelled else "")
     )
 
 
 def _facts(run: CameraRun) -> tuple[tuple[str, str], ...]:
+    """Return the facts about the camera, as pairs of label and text."""
     spec = run.camera
     facts = [("Camera", spec.name)]
     if spec.description:
@@ -80,7 +83,7 @@ def _facts(run: CameraRun) -> tuple[tuple[str, str], ...]:
     if run.setup.instrument is not None:
         facts.append(("Mounted", f"as {run.setup.mounted} of {run.setup.where}"))
     facts.append(("Mirrors", ", ".join(f"{m} (stop)" if m == spec.stop else m for m in spec.mirrors)))
-    facts.append(("Waves", f"of {1e9 * spec.wavelength:.0f} nm"))
+    facts.append(("Design wavelength", f"{1e9 * spec.wavelength:.0f} nm, the unit of waves"))
     facts.append(
         ("Fields", "angles along the line and along the track from the middle of the field; the first is positive at "
          "the line's left end (+Y)")
@@ -89,7 +92,7 @@ def _facts(run: CameraRun) -> tuple[tuple[str, str], ...]:
 
 
 def first_order_table(run: CameraRun) -> Table:
-    """First-order data, the report's first table."""
+    """Return the table of first-order data, the first of the report."""
     n = FIRST_ORDER(run.first_order)
     state = "as perturbed" if run.perturbed else "as built" if run.optics.built else "as designed"
 
@@ -109,7 +112,7 @@ def first_order_table(run: CameraRun) -> Table:
         ("entrance pupil", f"{1e3 * n['entrance_pupil_m']:.5g} mm, "
          f"{_before(n['entrance_pupil_before_first_mirror_m'])} the first mirror"),
         ("exit pupil", f"{far(n['exit_pupil_m'])}, {_before(n['exit_pupil_before_image_m'])} the image"),
-        ("chief rays at the image", "{:.3f} deg from its normal in the middle, {:.3f} at most".format(
+        ("chief rays at the image", "{:.3f} deg from its normal in the middle, at most {:.3f} deg".format(
             *n["chief_ray_angle_deg"])),
         ("field of view", "{:.4g} × {:.4g} deg".format(*n["field_deg"])),
         ("image", "{:.2f} × {:.2f} mm".format(*n["image_mm"])),
@@ -123,49 +126,53 @@ def first_order_table(run: CameraRun) -> Table:
          ", ".join(f"{b} {100 * s:.2f}%" for b, s in n["obscuration"].items()) or "none"),
     ]  # fmt: skip
     if n["hole_radius_mm"]:
-        holes = ", ".join(f"{b} a hole of {r:.1f} mm radius or more" for b, r in n["hole_radius_mm"].items())
-        rows.append(("light goes through", f"{holes} (the file states none: edges: [{{blocks: circle, radius: ...}}])"))
-    about = "the axis" if run.optics.model.axis.on_axis else "the field's middle, as no light comes along the axis"
+        holes = ", ".join(f"{b} needs a hole of at least {r:.1f} mm radius" for b, r in n["hole_radius_mm"].items())
+        rows.append(("central holes", f"{holes} (not in the file; specify edges: [{{blocks: circle, radius: ...}}])"))
+    axis_text = (
+        "the axis" if run.optics.model.axis.on_axis else "the middle of the field, as no light arrives along the axis"
+    )
     caption = (
         f"The camera {state}, at {1e9 * run.camera.wavelength:.0f} nm. "
-        f"Focal lengths, F-number and pupils are paraxial, about {about}; all else is of the field's middle where "
-        "nothing else is stated, on the image plane where it stands."
+        f"Focal lengths, F-number and pupils are paraxial, about {axis_text}; all else refers to the middle of the "
+        "field "
+        "unless specified, on the actual image plane."
     )
     return Table("first-order", "First-order data", caption, ("quantity", "value"), rows)
 
 
 def _before(distance: float | None) -> str:
+    """Describe a distance as before or behind."""
     if distance is None or abs(distance) > 1e4:
         return "infinitely far from"
     return f"{abs(distance):.4g} m {'before' if distance > 0.0 else 'behind'}"
 
 
 def _layout(run: CameraRun) -> Section:
+    """Return the section on the layout."""
     model, backend = run.optics.model, run.optics.path.backend
-    caption = (
-        "To one scale, in the prescription's frame; mirrors with their clear apertures, dash-dotted the parent axis."
-    )
+    caption = "To scale, in the prescription's frame; mirrors with their clear apertures; dash-dotted: the parent axis."
     figure = _figure("layout", "Layout with rays", caption, layout_figure, model, backend)
     return Section("Layout", (), (figure,))
 
 
 def _refocus(run: CameraRun) -> Section:
+    """Return the section on the refocused camera."""
     assert run.refocus is not None
-    moved = run.refocus
+    refocused = run.refocus
     rows: list[list[Cell]] = [
         [plots.degrees_text(run, field), float(b), float(a)]
-        for field, b, a in zip(FIELDS, moved.errors_before, moved.errors_after, strict=True)
+        for field, b, a in zip(FIELDS, refocused.errors_before, refocused.errors_after, strict=True)
     ]
     text = (
-        f"The image plane with the least mean square wavefront error over {len(FIELDS)} fields"
-        + (", place and tilt" if moved.tilt else "")
-        + ". All else here is of the refocused camera."
+        f"Image plane with the least mean square wavefront error over {len(FIELDS)} fields"
+        + (", position and tilt" if refocused.tilt else "")
+        + ". All other results refer to the refocused camera."
     )
     name = _new_name(run)
-    file = file_with_plane(run.setup.camera, moved.after, name)
+    file = file_with_plane(run.setup.camera, refocused.after, name)
     artefacts: tuple[Artefact, ...] = (
-        _figure("refocus", "Before and after", "Waves rms, logarithmic.", plots.refocus_figure, run),
-        CameraFile(name.lower(), "The refocused camera", "Its file: other name and image, else as it was.", file),
+        _figure("refocus", "Before and after", "Waves rms, logarithmic scale.", plots.refocus_figure, run),
+        CameraFile(name.lower(), "The refocused camera", "Its file, which differs in name and image plane only.", file),
         Table("refocus-fields", "Wavefront error by field", "Waves rms.", ("field", "before", "after"), rows,
               (None, 4, 4)),
     )  # fmt: skip
@@ -173,27 +180,28 @@ def _refocus(run: CameraRun) -> Section:
 
 
 def _wavefronts(run: CameraRun) -> Section:
+    """Return the section on wavefront errors."""
     heads = ["", *(plots.degrees_text(run, w.field) for w in run.waves)]
     rows: list[list[Cell]] = [
         ["rms", *(w.rms for w in run.waves)],
         ["peak to valley", *(w.peak_to_valley for w in run.waves)],
         ["Strehl ratio", *(w.strehl for w in run.waves)],
     ]
-    for j in range(4, _TOLD_TERMS + 1):
-        told = (w.parts if w.is_cut else w.coefficients for w in run.waves)
-        rows.append([f"Z{j} {zernike.name(j)}", *(float(terms[j - 1]) for terms in told)])
-    caption = "Waves; Zernike terms in Noll's order, waves rms, piston and tilt taken out."
-    cut = [w for w in run.waves if w.is_cut]
+    for j in range(4, _TABLE_TERMS + 1):
+        term_values = (w.parts if w.is_vignetted else w.coefficients for w in run.waves)
+        rows.append([f"Z{j} {zernike.name(j)}", *(float(terms[j - 1]) for terms in term_values)])
+    caption = "Waves; Zernike terms in Noll's order, waves rms, piston and tilt removed."
+    cut = [w for w in run.waves if w.is_vignetted]
     if cut:
         sets = "; ".join(dict.fromkeys(w.polynomials for w in cut))
-        caption += f" The numbers are of these: {sets}. Circle terms fitted to the same light are in optics.json."
-        caption += f" The rms is right to {max(w.accuracy for w in cut):.1g} of itself, by a finer quadrature."
+        caption += f" Polynomials: {sets}. Circle terms fitted to the same light are in optics.json."
+        caption += f" The relative error of the rms is {max(w.accuracy for w in cut):.1g}, by a finer quadrature."
     table = Table("zernike", "Wavefront error by field", caption, heads, rows, (None, *[4] * len(run.waves)))
     kinds = ", ".join(f"{kind} {size:.3g}" for kind, size in run.limits[:3])
     text = f"At the worst field, {field_text(run.camera, run.worst[1])}: {kinds} waves rms."
     over_field = "Rms wavefront error; the ring marks the worst field."
     over_stop = (
-        "Over the stop, x along the line to the right, y along the track upward; one scale of colours. Positive where "
+        "Over the stop, x along the line to the right, y along the track upward; common colour scale. Positive where "
         "the wavefront is ahead."
     )
     figures = (
@@ -205,12 +213,13 @@ def _wavefronts(run: CameraRun) -> Section:
 
 
 def _spots(run: CameraRun) -> Section:
+    """Return the section on spots."""
     rows: list[list[Cell]] = [
         [plots.degrees_text(run, s.field), 1e6 * s.rms, *(1e6 * s.rms_along), 1e6 * s.farthest, s.rms / s.airy]
         for s in run.spots
     ]
     heads = ("field", "rms [µm]", "along line [µm]", "along track [µm]", "largest [µm]", "rms / Airy radius")
-    caption = "Hexapolar rays about the spot's centroid, in boxes of one size; the circle is the Airy disk."
+    caption = "Hexapolar rays about the spot's centroid, in boxes of equal size; circle: Airy disk."
     figure = _figure("spots", "Spot diagrams", caption, plots.spot_figure, run)
     decimals = (None, 3, 3, 3, 3, 3)
     table = Table("spot-sizes", "Spot sizes by field", "Radii about the centroid.", heads, rows, decimals)
@@ -218,8 +227,9 @@ def _spots(run: CameraRun) -> Section:
 
 
 def _mtf(run: CameraRun) -> Section:
+    """Return the section on the MTF."""
     if not run.mtfs:
-        return Section("MTF", (f"No MTF is given {run.without_mtf}.",))
+        return Section("MTF", (f"No MTF: {run.without_mtf}.",))
     rows: list[list[Cell]] = []
     for mtf in run.mtfs:
         values = mtf.at(mtf.nyquist)
@@ -227,13 +237,16 @@ def _mtf(run: CameraRun) -> Section:
         rows.append([plots.degrees_text(run, mtf.field), *map(float, values), *limits])
     heads = ("field", "along line", "along track", "limit along line", "limit along track")
     text = (
-        f"Of the optics alone, at {1e9 * run.camera.wavelength:.0f} nm: pixels, charge and motion come on top of it. "
+        f"Optics alone, at {1e9 * run.camera.wavelength:.0f} nm, without the effects of pixels, charge and motion. "
         f"Nyquist is {1e-3 * run.optics.nyquist:.4g} cycles/mm."
     )
     change = max(mtf.accuracy for mtf in run.mtfs)
     if change:
-        text += f" Edges cut the pupil; a third of the lines through it changes a curve by {change:.1g} at most."
-    caption = "Along the line and along the track; dashed what diffraction allows."
+        text += (
+            " Edges vignette the pupil; with a third of the lines through it the curves change by at most "
+            f"{change:.1g}."
+        )
+    caption = "Along the line and along the track; dashed: diffraction limit."
     figure = _figure("mtf", "MTF by field", caption, plots.mtf_figure, run)
     return Section(
         "MTF", (text,), (figure, Table("mtf-nyquist", "MTF at Nyquist", "", heads, rows, (None, 3, 3, 3, 3)))
@@ -241,7 +254,7 @@ def _mtf(run: CameraRun) -> Section:
 
 
 def _colours(run: CameraRun) -> list[Section]:
-    """Lateral and axial colour of a camera with lenses, then what all wavelengths together make."""
+    """Return the sections on lateral and axial colour of lenses and on polychromatic image quality."""
     colours = run.colours
     if colours is None:
         return []
@@ -250,6 +263,7 @@ def _colours(run: CameraRun) -> list[Section]:
 
 
 def _lenses(run: CameraRun, colours: Colours, ends: str) -> list[Section]:
+    """Return the section on lateral and axial colour; none for a camera without lenses."""
     lateral, second = colours.lateral_primary, colours.lateral_secondary
     axial, other = colours.axial_primary, colours.axial_secondary
     if colours.lateral is None or lateral is None or second is None or axial is None or other is None:
@@ -262,16 +276,16 @@ def _lenses(run: CameraRun, colours: Colours, ends: str) -> list[Section]:
              "axial [µm]", "secondary [µm]")  # fmt: skip
     widest = float(np.max(np.linalg.norm(np.ptp(colours.lateral, axis=1), axis=-1)))
     text = (
-        f"Light of {ends} nm, reference {1e9 * colours.reference:.6g} nm. Chief rays of one field spread over "
-        f"{1e6 * widest:.3g} µm at most, {widest / run.camera.line.pitch:.2g} pixels. In the middle of the field the "
+        f"Light of {ends} nm, reference {1e9 * colours.reference:.6g} nm. Chief rays of one field spread over at most "
+        f"{1e6 * widest:.3g} µm, {widest / run.camera.line.pitch:.2g} pixels. In the middle of the field the "
         f"focus of the shortest wavelength lies {1e6 * axial[0]:+.4g} µm from that of the longest, that of the "
-        f"reference {1e6 * other[0]:+.4g} µm from the middle of both."
+        f"reference {1e6 * other[0]:+.4g} µm from the mean of both."
     )
-    about = (
-        "Where the chief ray of a wavelength meets the focal plane, from that of the reference; dotted the reference."
+    about = "Chief-ray position of each wavelength relative to that of the reference; dotted: the reference."
+    along = (
+        "Position of the least rms wavefront error of each wavelength; positive is downstream, away from the optics."
     )
-    along = "Least rms wavefront error of each wavelength by itself; positive is downstream, away from the optics."
-    caption = "Primary: shortest less longest wavelength. Secondary: reference less the middle of both."
+    caption = "Primary: shortest minus longest wavelength. Secondary: reference minus the mean of both."
     figures = (
         _figure("lateral-colour", "Lateral colour", about, plots.lateral_figure, run),
         _figure("axial-colour", "Axial colour", along, plots.axial_figure, run),
@@ -281,46 +295,51 @@ def _lenses(run: CameraRun, colours: Colours, ends: str) -> list[Section]:
 
 
 def _light(run: CameraRun, colours: Colours, ends: str) -> Section:
-    title = "Over all wavelengths"
+    """Return the section on polychromatic MTF and point images."""
+    title = "Polychromatic image quality"
     if not colours.mtfs:
-        return Section(title, (f"No MTF is told {colours.without_mtf or run.without_mtf}.",))
+        return Section(title, (f"No MTF: {colours.without_mtf or run.without_mtf}.",))
     rows: list[list[Cell]] = []
     for mtf, psf in zip(colours.mtfs, colours.psfs, strict=True):
         limits = [float(np.interp(mtf.nyquist, mtf.frequency, row)) for row in mtf.limit]
         rows.append([plots.degrees_text(run, mtf.field), *map(float, mtf.at(mtf.nyquist)), *limits, float(psf.strehl)])
     heads = ("field", "along line", "along track", "limit along line", "limit along track", "Strehl ratio")
     count = len(colours.mtfs[0].wavelengths)
-    exact = "lines, summed exactly" if colours.spectrum.lines else f"right to {colours.error:.1g}"
+    exact = "spectral lines, summed exactly" if colours.spectrum.lines else f"accurate to {colours.error:.1g}"
     text = (
-        f"Light of {ends} nm, as the spectrum weighs it, at {count} wavelengths: {exact}. All wavelengths are about "
-        "one point of the image, so that colours which stand apart blur it."
+        f"Light of {ends} nm, weighted by the spectrum, at {count} wavelengths: {exact}. All wavelengths are referred "
+        "to "
+        "one point of the image, so that lateral and axial colour blur it."
     )
-    caption = "MTF by field; below, the image of a point, its square root in colours, about the design's chief ray."
+    caption = "MTF by field; below: point images (square root of irradiance) about the design wavelength's chief ray."
     figure = _figure("light-mtf", "MTF and point images", caption, plots.light_mtf_figure, run)
-    table = Table("light-mtf-nyquist", "MTF at Nyquist over the light", "", heads, rows, (None, 3, 3, 3, 3, 3))
+    table = Table("light-mtf-nyquist", "Polychromatic MTF at Nyquist", "", heads, rows, (None, 3, 3, 3, 3, 3))
     return Section(title, (text,), (figure, table))
 
 
 def _through_focus(run: CameraRun) -> Section:
+    """Return the section on image quality through focus."""
     best = 1e6 * run.focus.best
     where = f"{fixed(abs(best), 1)} µm {'downstream' if best > 0.0 else 'upstream'} of the focal plane"
-    text = f"The least error over these fields is {where}." if np.isfinite(best) else "The light has no focus."
+    text = f"Best focus over these fields is {where}." if np.isfinite(best) else "The light has no focus."
     caption = "The detector moves along its normal; positive is downstream, away from the optics."
     return Section("Through focus", (text,), (_figure("focus", "Through focus", caption, plots.focus_figure, run),))
 
 
 def _field(run: CameraRun) -> Section:
+    """Return the section on distortion, field curvature and illumination."""
     d, curves = run.distortion, run.curves
     half = float(np.max(np.abs(d.position)))
     point, both = d.line_point
     text = (
         f"Along the line: principal distance {d.line_distance:.6f} m with the principal point in the line's middle, "
-        f"distortion {1e6 * d.line_rms:.3g} µm rms and {1e6 * d.line_largest:.3g} µm at most, "
+        f"distortion {1e6 * d.line_rms:.3g} µm rms and at most {1e6 * d.line_largest:.3g} µm, "
         f"{100 * d.line_largest / half:.2g}% of half the line. Fitted together: {both:.6f} m and a principal point "
         f"{fixed(1e3 * point, 3)} mm off.",
-        f"Over the whole field: the nearest perfect camera has f {d.distance:.6f} m and its principal point at "
+        f"Over the whole field: the best-fitting distortion-free camera has f {d.distance:.6f} m and its principal "
+        "point at "
         f"({plain(1e3 * d.point[0], 4)}, {plain(1e3 * d.point[1], 6)}) mm from the line's middle, near the parent "
-        f"axis; the field departs from it by {1e6 * d.rms:.3g} µm rms, {1e6 * d.largest:.3g} µm at most.",
+        f"axis; distortion relative to it is {1e6 * d.rms:.3g} µm rms, at most {1e6 * d.largest:.3g} µm.",
     )
     x = np.degrees(curves.share * run.camera.field.x)
     rows: list[list[Cell]] = [
@@ -333,25 +352,29 @@ def _field(run: CameraRun) -> Section:
         [1e3 * float(p), float(np.degrees(w)), 1e6 * float(r)]
         for p, w, r in zip(d.position, d.angle, d.residual, strict=True)
     ]
-    against = "Left against the perfect camera with the best principal distance and point; right along the line."
-    bent = "Along the line. Illumination is the solid angle of the beam as the focal plane sees it."
-    told = ("L [mm]", "W [deg]", "distortion [µm]")
+    against = (
+        "Left: relative to the distortion-free camera with the best principal distance and point. Right: along the "
+        "line."
+    )
+    bent = "Along the line. Illumination: solid angle of the beam seen from the focal plane."
+    line_heads = ("L [mm]", "W [deg]", "distortion [µm]")
     artefacts = (
         _figure("distortion", "Distortion", against, plots.distortion_figure, run),
         _figure("field-curves", "Focus and illumination", bent, plots.curves_figure, run),
         Table("field-curves-table", "Along the line", "", heads, rows, (3, 2, 2, 2, 5, 4)),
-        Table("distortion-line", "Distortion along the line", "", told, line, (3, 5, 3)),
+        Table("distortion-line", "Distortion along the line", "", line_heads, line, (3, 5, 3)),
     )
     return Section("Over the field", text, artefacts)
 
 
 def _bodies(run: CameraRun) -> Section:
+    """Return the section on bodies of the instrument that block the beam."""
     assert run.quality is not None
     rows: list[list[Cell]] = [
         [body, *(100.0 * float(v) for v in share[0])] for body, share in run.quality.bodies.items()
     ]
-    rows.append(["all together, of the light", *(100.0 * float(v) for v in run.quality.light_lost[0])])
-    text = "Bodies of the instrument that stand in the beam; MTF and through focus are without what they take."
+    rows.append(["all bodies, fraction of the light", *(100.0 * float(v) for v in run.quality.light_lost[0])])
+    text = "Bodies of the instrument that obscure the beam. MTF and through focus exclude the light that they block."
     heads = ("body", "right end [%]", "middle [%]", "left end [%]")
-    table = Table("bodies", "Share of the beam", "", heads, rows, (None, 2, 2, 2))
+    table = Table("bodies", "Fraction of the beam blocked", "", heads, rows, (None, 2, 2, 2))
     return Section("In the instrument", (text,), (table,))

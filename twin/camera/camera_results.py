@@ -1,4 +1,4 @@
-"""What is told of a camera's images at one field: wavefront, spot and MTF, and what these numbers must be."""
+"""Results of a camera's images at one field: wavefront, spot and MTF, with checks of their physical limits."""
 
 from __future__ import annotations
 
@@ -16,19 +16,22 @@ if TYPE_CHECKING:  # takes half a second with pandas, and only who asks for a da
     import xarray as xr
 
 Field = tuple[float, float]
-"""Shares of the half angles of view: along the line, along the track."""
+"""Fractions of the half angles of view: along the line, along the track."""
 
 TERMS = 37
-"""Zernike terms (Noll's order) that are told of a wavefront: all to seventh order, and the spherical of eighth."""
+"""Number of Zernike terms (Noll's order) of a wavefront: all to seventh order, and the spherical term of eighth."""
 
 ROUNDING = 1e-6
-"""By which shares and Strehl ratios may leave 0 to 1: what quadratures over pieces of shadows are right to."""
+"""Tolerance by which fractions of light and Strehl ratios may leave 0 to 1: the accuracy of quadratures over pieces of
+shadows.
+"""
 
 MTF_ROUNDING = 1e-3
-"""By which an MTF may leave 0 to 1 or exceed that of the perfect wavefront: what its quadrature is held to."""
+"""Tolerance by which an MTF may leave 0 to 1 or exceed that of the perfect wavefront: the accuracy of its quadrature.
+"""
 
-MOST_ERROR = 1e6
-"""Rms wavefront error beyond which a number is none of an image, waves: 0.6 m of path."""
+MAX_RMS_WAVES = 1e6
+"""Rms wavefront error beyond which a result is rejected as unphysical, waves; it is 0.6 m of path."""
 
 
 @shows("field", "rms [waves]", "peak_to_valley [waves]", "strehl", "vignetted [percent]", "map [waves]")
@@ -39,41 +42,41 @@ class Wavefront:
     Attributes
     ----------
     field : Field
-        where.
+        Field of the beam.
     wavelength : float
-        Metres; waves are of this.
-    x, y : np.ndarray
-        Coordinates of the map's columns and rows on the stop, in units of its radius, (n,); x runs along the line, y
-        along the track.
-    map : np.ndarray
-        Waves, (n, n); NaN where no light is.
-    coefficients : np.ndarray
-        Zernike's circle terms in Noll's order, waves rms over the whole stop, (TERMS,), fitted to the light that comes
-        through; their names are ``optics.geometry.zernike``'s.
-    parts : np.ndarray
-        Of the rms that each term makes, waves, (TERMS,): the coefficients, where all of the stop is lit; else those of
-        the same terms made orthonormal over what is lit, each without what the earlier ones hold. Over a ring these are
-        the annular Zernike terms (Mahajan, J. Opt. Soc. Am. 71, 75, 1981). Their squares and that of ``residual`` sum
-        to that of ``rms``.
+        Wavelength, metres, the unit of waves.
+    x, y : (n,) ndarray
+        Coordinates of the map's columns and rows on the stop, in units of its radius; x runs along the line, y along
+        the track.
+    map : (n, n) ndarray
+        Wavefront error, waves; NaN where there is no light.
+    coefficients : (TERMS,) ndarray
+        Zernike circle terms in Noll's order, waves rms over the whole stop, fitted to the light that passes;
+        ``optics.geometry.zernike`` names them.
+    parts : (TERMS,) ndarray
+        Contribution of each term to the rms, waves: the coefficients if the whole stop is illuminated; else those of
+        the same terms made orthonormal over the illuminated area, each without the contribution of the earlier ones.
+        Over a ring these are the annular Zernike terms (Mahajan, J. Opt. Soc. Am. 71, 75, 1981). Their squares and that
+        of ``residual`` sum to that of ``rms``.
     rms : float
-        Waves, exact for smooth wavefronts; ``accuracy`` says how far.
+        Rms wavefront error, waves, exact for smooth wavefronts up to ``accuracy``.
     peak_to_valley : float
-        Waves, over the map and the edge.
+        Peak-to-valley wavefront error over the map and the edge, waves.
     residual : float
         Rms that the Zernike terms leave, waves.
     strehl : float
         Strehl ratio, from the mean phasor over the stop.
     vignetted : float
-        Share of the stop's area whose light other apertures and bodies stop.
-    place : tuple[float, float]
-        Of the chief ray on the line CCD, (along the line, along the track), metres.
+        Fraction of the stop's area whose light other apertures and bodies block.
+    position : tuple of float
+        Chief ray on the line CCD, (along the line, along the track), metres.
     hole : float
-        Radius of the hole of a pupil that is a ring about the stop's middle, in units of the stop's; 0 for a whole one,
-        NaN for any other.
+        Radius of the central hole of an annular pupil, in units of the stop's radius; 0 for a whole pupil, NaN for any
+        other.
     accuracy : float
-        Of a beam that edges cut: change of rms, as a share of it, or of the Strehl ratio by a finer quadrature,
-        whichever is larger; 2e-3 where the shadows of edges are not known and 10 000 rays stand for the light. 0 for a
-        free beam.
+        For a beam vignetted by edges: change of the rms, as a fraction of it, or of the Strehl ratio by a finer
+        quadrature, whichever is larger; 2e-3 where the shadows of edges are not known and 10 000 rays sample the light.
+        0 for a free beam.
     """
 
     field: Field
@@ -88,23 +91,23 @@ class Wavefront:
     residual: float
     strehl: float
     vignetted: float
-    place: tuple[float, float]
+    position: tuple[float, float]
     hole: float = 0.0
     accuracy: float = 0.0
 
     @property
-    def is_cut(self) -> bool:
-        """Whether edges or bodies take some of the light."""
+    def is_vignetted(self) -> bool:
+        """True if edges or bodies block some of the light."""
         return self.hole != 0.0
 
     @property
     def polynomials(self) -> str:
-        """What ``parts`` are numbers of."""
+        """Name of the polynomials to which ``parts`` refer."""
         if self.hole == 0.0:
             return "Zernike circle terms"
         if np.isfinite(self.hole):
-            return f"annular Zernike terms, hole {self.hole:.4f} of the stop"
-        return "terms orthonormal over the light of this pupil"
+            return f"annular Zernike terms, obscuration ratio {self.hole:.4f}"
+        return "terms orthonormal over the illuminated part of this pupil"
 
     @property
     def orthonormal_terms(self) -> dict[str, float]:
@@ -117,20 +120,20 @@ class Wavefront:
         return {zernike.name(j): float(c) for j, c in enumerate(self.coefficients, start=1)}
 
     def to_xarray(self) -> xr.Dataset:
-        """``wavefront`` over pupil coordinates and ``zernike`` over Noll's index, with units and names."""
+        """Return ``wavefront`` over pupil coordinates and ``zernike`` over Noll's index, with units and names."""
         import xarray as xr
 
         index = np.arange(1, len(self.coefficients) + 1)
         names = [zernike.name(int(j)) for j in index]
-        along = "{} on the stop over its radius"
+        axis_name = "{} on the stop over its radius"
         return xr.Dataset(
             {
                 "wavefront": (("y", "x"), self.map, {"units": "waves", "long_name": "wavefront error"}),
                 "zernike": ("noll", self.coefficients, {"units": "waves rms"}),
             },
             {
-                "x": ("x", self.x, {"long_name": along.format("along the line")}),
-                "y": ("y", self.y, {"long_name": along.format("along the track")}),
+                "x": ("x", self.x, {"long_name": axis_name.format("along the line")}),
+                "y": ("y", self.y, {"long_name": axis_name.format("along the track")}),
                 "noll": ("noll", index, {"long_name": "Noll's index"}),
                 "term": ("noll", names),
             },
@@ -140,7 +143,7 @@ class Wavefront:
                 "wavelength_m": self.wavelength,
                 "wfe_rms_waves": self.rms,
                 "strehl": self.strehl,
-                **({} if not self.is_cut else {"polynomials": self.polynomials, "parts_waves": self.parts}),
+                **({} if not self.is_vignetted else {"polynomials": self.polynomials, "parts_waves": self.parts}),
             },
         )
 
@@ -148,27 +151,27 @@ class Wavefront:
 @shows("field", "rms [um]", "farthest [um]", "airy [um]", "rays [um]")
 @dataclass(frozen=True, eq=False)
 class Spot:
-    """Where the rays of one field meet the line CCD.
+    """Spot diagram of one field on the line CCD.
 
     Attributes
     ----------
     field : Field
-        where.
-    rays : np.ndarray
-        From the chief ray, (along the line, along the track), metres, (N, 2); hexapolar on the stop, the chief ray
-        first; those that an aperture stops are left out.
-    centroid : np.ndarray
-        Of all light from the chief ray, metres, (2,).
+        Field of the beam.
+    rays : (N, 2) ndarray
+        Ray positions relative to the chief ray, (along the line, along the track), metres; hexapolar on the stop, the
+        chief ray first, without vignetted rays.
+    centroid : (2,) ndarray
+        Centroid of all light relative to the chief ray, metres.
     rms : float
         Rms distance from the centroid, metres, exact for smooth wavefronts.
-    rms_along : np.ndarray
-        The same along the line and along the track, metres, (2,).
+    rms_along : (2,) ndarray
+        Rms distance along the line and along the track, metres.
     farthest : float
-        Of the rays from the centroid, metres.
+        Largest distance of a ray from the centroid, metres.
     airy : float
-        Radius of the Airy disk of the same numerical aperture, metres.
-    place : tuple[float, float]
-        Of the chief ray on the line CCD, (along the line, along the track), metres.
+        Radius of the Airy disk of equal numerical aperture, metres.
+    position : tuple of float
+        Chief ray on the line CCD, (along the line, along the track), metres.
     """
 
     field: Field
@@ -178,44 +181,44 @@ class Spot:
     rms_along: np.ndarray
     farthest: float
     airy: float
-    place: tuple[float, float]
+    position: tuple[float, float]
 
     def to_xarray(self) -> xr.Dataset:
-        """The rays, metres from the chief ray."""
+        """Return the rays relative to the chief ray, metres."""
         import xarray as xr
 
         names = {"along_line": self.rays[:, 0], "along_track": self.rays[:, 1]}
         data = {name: ("ray", values, {"units": "m"}) for name, values in names.items()}
-        told = {"reference_frames": frames_text("optics"), "field": self.field}
-        return xr.Dataset(data, attrs={**told, "rms_m": self.rms, "airy_m": self.airy})
+        attributes = {"reference_frames": frames_text("optics"), "field": self.field}
+        return xr.Dataset(data, attrs={**attributes, "rms_m": self.rms, "airy_m": self.airy})
 
 
 @shows("field", "at_nyquist", "nyquist [cycles/mm]", "frequency [cycles/mm]", "wavelengths [nm]")
 @dataclass(frozen=True, eq=False)
 class Mtf:
-    """Modulation transfer at one field, of the optics alone.
+    """Modulation transfer function at one field, of the optics alone.
 
     Attributes
     ----------
     field : Field
-        where.
-    frequency : np.ndarray
-        cycles/m, (M,).
-    values : np.ndarray
-        Along the line and along the track, (2, M).
-    limit : np.ndarray
-        The same pupil without wavefront error, (2, M).
-    wavelengths : np.ndarray
-        Of the light, metres, (K,).
+        Field of the beam.
+    frequency : (M,) ndarray
+        Spatial frequencies, cycles/m.
+    values : (2, M) ndarray
+        MTF along the line and along the track.
+    limit : (2, M) ndarray
+        MTF of the same pupil without wavefront error, the diffraction limit.
+    wavelengths : (K,) ndarray
+        Wavelengths of the light, metres.
     nyquist : float
-        Of the pixels, cycles/m.
-    weights : np.ndarray
-        Signal at each wavelength, sum 1, (K,).
+        Nyquist frequency of the pixels, cycles/m.
+    weights : (K,) ndarray
+        Signal at each wavelength, sum 1.
     error : float
-        By how much the values change at most where more wavelengths are taken; 0 for lines.
+        Largest change of the values if more wavelengths are taken; 0 for spectral lines.
     accuracy : float
-        Of a pupil that edges cut: change of the values by a third of the lines through it, at most; they are right to a
-        tenth of that. 0 for a free pupil.
+        For a pupil vignetted by edges: largest change of the values by a third of the lines through it; their error is
+        a tenth of that. 0 for a free pupil.
     """
 
     field: Field
@@ -230,16 +233,16 @@ class Mtf:
 
     @property
     def at_nyquist(self) -> np.ndarray:
-        """Along the line and along the track at the pixels' Nyquist frequency, (2,); NaN beyond the table."""
+        """MTF along the line and along the track at the pixels' Nyquist frequency, (2,); NaN beyond the table."""
         ends = {"left": np.nan, "right": np.nan}
         return np.array([np.interp(self.nyquist, self.frequency, row, **ends) for row in self.values])
 
     def at(self, frequency: float) -> np.ndarray:
-        """Along the line and along the track at a frequency among the table's, cycles/m, (2,)."""
+        """Return the MTF along the line and along the track at a frequency within the table, cycles/m, (2,)."""
         return np.array([np.interp(frequency, self.frequency, row) for row in self.values])
 
     def to_xarray(self) -> xr.Dataset:
-        """``mtf`` and ``limit`` over direction and frequency."""
+        """Return ``mtf`` and ``limit`` over direction and frequency."""
         import xarray as xr
 
         return xr.Dataset(
@@ -257,34 +260,34 @@ class Mtf:
         )
 
 
-def hold_wavefront(wave: Wavefront) -> None:
-    """Hold a wavefront's numbers to what any has.
+def check_wavefront(wave: Wavefront) -> None:
+    """Check that a wavefront's numbers are physically possible.
 
     Raises
     ------
     UnphysicalError
-        One cannot be; with what it is.
+        A number is impossible; the message names it.
     """
-    check_range("the share of a stop that is vignetted", wave.vignetted, 0.0, 1.0, ROUNDING)
+    check_range("the vignetted fraction of a stop", wave.vignetted, 0.0, 1.0, ROUNDING)
     check_range("a Strehl ratio", wave.strehl, 0.0, 1.0, ROUNDING)
-    check_range("an rms wavefront error in waves", wave.rms, 0.0, MOST_ERROR, 0.0)
+    check_range("an rms wavefront error in waves", wave.rms, 0.0, MAX_RMS_WAVES, 0.0)
     square = float(np.sum(wave.parts**2)) + wave.residual**2
     check_close(
-        "the squares of the parts of a wavefront error and of what they leave",
+        "the sum of squares of a wavefront error's parts and of their residual",
         square,
         wave.rms**2,
-        "the square of the whole",
+        "the square of its rms",
         1e-6 * wave.rms**2 + ROUNDING**2,
     )
 
 
-def hold_mtf(mtf: Mtf) -> None:
-    """Hold an MTF to what any has: by Schwarz' inequality no error raises one of the same light.
+def check_mtf(mtf: Mtf) -> None:
+    """Check that an MTF is physically possible: by Schwarz' inequality aberrations cannot increase it.
 
     Raises
     ------
     UnphysicalError
-        It cannot be; with what it is.
+        A value is impossible; the message names it.
     """
     check_range("an MTF", mtf.values, 0.0, 1.0, MTF_ROUNDING)
     check_range("the MTF of a perfect wavefront", mtf.limit, 0.0, 1.0, MTF_ROUNDING)

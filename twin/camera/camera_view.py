@@ -1,9 +1,9 @@
-"""A camera to be looked at interactively: what ``CameraOptics`` says of it, with maps, spots and MTF curves.
+"""Camera for interactive use: ``CameraOptics`` with plots of maps, spots and MTF curves.
 
 >>> camera = CameraView.alone(load_camera("gf7"), load_backend("llvm"))
 >>> camera.wavefront(field=(1, 0)).plot()
 
-Of a job's perturbed instrument it is made by
+For the perturbed instrument of a job use
 
 >>> experiment = MonitorExperiment(resolved, backend)
 >>> CameraView.within(experiment.instrument, "forward", backend, experiment.state(resolved.job))
@@ -29,17 +29,27 @@ LINE, TRACK = BLUE, VERMILION
 """Colours of the direction along the line, and along the track."""
 
 WAVES = DIVERGING
-"""Colour map of wavefront errors, white where there is none."""
+"""Colour map of wavefront errors; points without light are white."""
 
 
 def field_text(field: tuple[float, float]) -> str:
-    """A field for a title."""
+    """Format a field for a title."""
     along, across = field
     return f"({along:+.2g}, {across:+.2g})".replace("+0)", "0)").replace("(+0,", "(0,").replace("-", "\N{MINUS SIGN}")
 
 
 def draw_wavefront(axes: Axes, wavefront: Wavefront, most: float | None = None) -> QuadMesh:
-    """A map over the stop; ``most``: waves at both ends of the colours, default the map's own largest."""
+    """Draw a wavefront map over the stop.
+
+    Parameters
+    ----------
+    axes : Axes
+        Axes to draw into.
+    wavefront : Wavefront
+        Wavefront error.
+    most : float, optional
+        Waves at both ends of the colour scale; by default the largest absolute value of the map.
+    """
     values = wavefront.map
     end = float(np.nanmax(np.abs(values))) if most is None else most
     mesh = axes.pcolormesh(
@@ -53,7 +63,17 @@ def draw_wavefront(axes: Axes, wavefront: Wavefront, most: float | None = None) 
 
 
 def draw_spot(axes: Axes, spot: Spot, half: float | None = None) -> None:
-    """Rays about their centroid in a box, um, with the Airy disk; ``half``: of the box's width, metres."""
+    """Draw the rays of a spot about their centroid in a box, micrometres, with the Airy disk.
+
+    Parameters
+    ----------
+    axes : Axes
+        Axes to draw into.
+    spot : Spot
+        Spot.
+    half : float, optional
+        Half the width of the box, metres; by default it contains all rays and the Airy disk.
+    """
     rays = 1e6 * (spot.rays - spot.centroid)
     reach = 1e6 * (max(1.15 * spot.airy, 1.1 * spot.farthest) if half is None else half)
     axes.plot(rays[:, 0], rays[:, 1], ".", ms=2.2, color=BLUE, mew=0.0)
@@ -85,11 +105,11 @@ def draw_mtf(axes: Axes, mtf: Mtf, label: bool = True) -> None:
     plain_axes(axes)
 
 
-class Pictured:
-    """What a notebook shows as its words and its figure."""
+class Plottable:
+    """Mixin for results that a notebook shows as their text and their figure."""
 
     def plot(self) -> Figure:
-        """The figure."""
+        """Return the figure."""
         raise NotImplementedError
 
     def _repr_html_(self) -> str:
@@ -100,15 +120,15 @@ class Pictured:
 
 
 SIZE = (4.6, 4.0)
-"""Width and height of a picture, inches."""
+"""Width and height of a figure, inches."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class WavefrontView(Wavefront, Pictured):
-    """A wavefront error that can be drawn."""
+class WavefrontView(Wavefront, Plottable):
+    """Wavefront error with a plot."""
 
     def plot(self) -> Figure:
-        """Map over the stop, waves."""
+        """Plot the map over the stop, waves."""
         with look("wavefront"):
             figure = Figure(figsize=SIZE, layout="constrained")
             axes = figure.subplots()
@@ -121,11 +141,11 @@ class WavefrontView(Wavefront, Pictured):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SpotView(Spot, Pictured):
-    """A spot that can be drawn."""
+class SpotView(Spot, Plottable):
+    """Spot with a plot."""
 
     def plot(self) -> Figure:
-        """Rays and the Airy disk."""
+        """Plot the rays and the Airy disk."""
         with look("spot"):
             figure = Figure(figsize=(SIZE[1], SIZE[1]), layout="constrained")
             axes = figure.subplots()
@@ -137,11 +157,11 @@ class SpotView(Spot, Pictured):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MtfView(Mtf, Pictured):
-    """An MTF that can be drawn."""
+class MtfView(Mtf, Plottable):
+    """MTF with a plot."""
 
     def plot(self) -> Figure:
-        """Both directions, the limit of diffraction, Nyquist's frequency."""
+        """Plot both directions, the diffraction limit and the Nyquist frequency."""
         with look("mtf"):
             figure = Figure(figsize=SIZE, layout="constrained")
             axes = figure.subplots()
@@ -151,11 +171,11 @@ class MtfView(Mtf, Pictured):
         return figure
 
 
-class CameraView(CameraOptics, Pictured):
-    """``CameraOptics`` of which wavefront, spot and MTF have ``plot()``; made by ``alone`` or ``within``, as that."""
+class CameraView(CameraOptics, Plottable):
+    """``CameraOptics`` whose wavefront, spot and MTF have ``plot()``; create it by ``alone`` or ``within``."""
 
     def plot(self) -> Figure:
-        """The layout as designed with rays of three fields, in the plane of symmetry and from above."""
+        """Plot the nominal layout with rays of three fields, in the plane of symmetry and from above."""
         # it draws with what the reports draw with
         from twin.camera.layout_plot import layout_figure
 
@@ -163,17 +183,40 @@ class CameraView(CameraOptics, Pictured):
             return layout_figure(self.model, self.path.backend)
 
     def wavefront(self, field: Field = (0.0, 0.0), points: int = 129) -> WavefrontView:
-        """Wavefront error at a field (shares of the half field along the line, along the track); ``points`` of its map
-        on each axis. Raises as ``CameraOptics.rays``.
+        """Compute the wavefront error at a field.
+
+        Parameters
+        ----------
+        field : Field
+            Fractions of the half field along the line and along the track.
+        points : int
+            Points of the map on each axis.
+
+        Raises
+        ------
+        AimError, BeamMissedError
+            As for ``CameraOptics.rays``.
         """
         return _shown(WavefrontView, super().wavefront(field, points))
 
     def spot(self, field: Field = (0.0, 0.0), defocus: float = 0.0) -> SpotView:
-        """Spot at a field, on the line CCD moved by ``defocus`` metres downstream. Raises as ``CameraOptics.rays``."""
+        """Compute the spot at a field, on the line CCD moved by ``defocus`` metres downstream.
+
+        Raises
+        ------
+        AimError, BeamMissedError
+            As for ``CameraOptics.rays``.
+        """
         return _shown(SpotView, super().spot(field, defocus))
 
     def mtf(self, field: Field = (0.0, 0.0), frequency: np.ndarray | None = None) -> MtfView:
-        """MTF at a field and frequencies (cycles/m). Raises as ``CameraOptics.pupils``."""
+        """Compute the MTF at a field and frequencies (cycles/m).
+
+        Raises
+        ------
+        AimError, BeamMissedError, ValueError
+            As for ``CameraOptics.pupils``.
+        """
         return _shown(MtfView, super().mtf(field, frequency))
 
 
@@ -181,4 +224,5 @@ Shown = TypeVar("Shown")
 
 
 def _shown(kind: type[Shown], value: Any) -> Shown:
+    """Convert a result to its class with a plot."""
     return kind(**{own.name: getattr(value, own.name) for own in fields(value)})

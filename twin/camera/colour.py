@@ -1,13 +1,13 @@
-"""A camera over all wavelengths of its light: where each is imaged, where each is sharp, and what all together make.
+"""Polychromatic analysis of a camera: lateral and axial colour, MTF and point images over its spectrum.
 
-**Lateral colour** is where the chief ray of a wavelength meets the focal plane, **axial colour** where along the light
-that wavelength has its least rms wavefront error; both from those of the reference wavelength. **Primary** is what
-stands between the shortest and the longest wavelength, **secondary** what stands between the reference wavelength and
-the middle of these two.
+**Lateral colour** is the position of a wavelength's chief ray on the focal plane, **axial colour** the position of its
+least rms wavefront error along the light; both relative to the reference wavelength. **Primary** colour is the
+difference between the shortest and the longest wavelength, **secondary** colour that between the reference wavelength
+and the mean of these two.
 
 Transfer functions of all wavelengths are about one point of the image, that of the design wavelength's chief ray, so
-that lateral and axial colour blur what they make together. The mean over the light is by Gauss' rule for this very
-spectrum. Rules of more and more wavelengths are taken until the MTF does not change; by how much it still did is told.
+that lateral and axial colour blur the polychromatic image. The mean over the spectrum is by the Gauss rule for this
+very spectrum. The number of wavelengths is increased until the MTF does not change; the last change is reported.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from twin.framework.record import Quantity, Record
 from twin.targets.target_images import wavelengths_enough
 
 FIRST_RULE = 5
-"""Wavelengths of the first rule."""
+"""Number of wavelengths of the first rule."""
 
 CURVE_POINTS = 21
-"""Wavelengths of curves over the light, odd."""
+"""Number of wavelengths of curves over the spectrum, odd."""
 
 FOCUS_RINGS = 6
 """Rings of the quadrature over the stop by which a focus is found."""
@@ -45,55 +45,54 @@ WINDOW, PSF_POINTS = 24.0, 129
 
 @dataclass(frozen=True, eq=False)
 class Psf:
-    """Image of a point in all of its light, of the optics alone.
+    """Polychromatic point spread function of the optics alone.
 
     Attributes
     ----------
     field : Field
-        where.
-    place : np.ndarray
-        Of columns and rows, from the design wavelength's chief ray, metres, (N,); columns along the line, rows along
-        the track.
-    values : np.ndarray
-        Irradiance for unit light, 1/m^2, (N, N).
+        Field of the point.
+    position : (N,) ndarray
+        Coordinates of columns (along the line) and rows (along the track) from the design wavelength's chief ray,
+        metres.
+    values : (N, N) ndarray
+        Irradiance for unit light, 1/m^2.
     strehl : float
-        Largest value over that of the same pupils without wavefront error, every wavelength in its place.
+        Peak relative to that of the same pupils without wavefront error and without lateral colour.
     """
 
     field: Field
-    place: np.ndarray
+    position: np.ndarray
     values: np.ndarray
     strehl: float
 
 
 @dataclass(frozen=True, eq=False)
 class Colours:
-    """A camera over its light.
+    """Polychromatic results of a camera.
 
     Attributes
     ----------
     spectrum : SpectrumSpec
-        The light.
+        Spectrum of the light.
     reference : float
-        Wavelength from which colours count: that of the design where the light holds it, else the mean.
-    wavelengths : np.ndarray
-        Ascending, first and last those of the light, metres, (K,).
-    fields : tuple[Field, ...]
-        F.
-    lateral : np.ndarray | None
-        Of chief rays from the reference's, along the line and along the track, metres, (F, K, 2); None for a camera
-        without lenses, which has none.
-    axial : np.ndarray | None
-        Best focus from the focal plane, along its normal of the prescription's z, positive downstream, metres, (F, K);
-        None likewise.
-    axial_reference : np.ndarray | None
-        The same of the reference wavelength, (F,); None likewise.
-    mtfs : tuple[Mtf, ...]
-        Over the light, at the fields; empty where there is none.
-    psfs : tuple[Psf, ...]
-        likewise.
+        Reference wavelength of colour: that of the design if the spectrum contains it, else the mean, metres.
+    wavelengths : (K,) ndarray
+        Ascending wavelengths, first and last those of the spectrum, metres.
+    fields : tuple of Field
+        F fields.
+    lateral : (F, K, 2) ndarray, or None
+        Chief rays relative to the reference's, along the line and along the track, metres; None for a camera without
+        lenses, which has no lateral colour.
+    axial : (F, K) ndarray, or None
+        Best focus from the focal plane, along the prescription's z, positive downstream, metres; None without lenses.
+    axial_reference : (F,) ndarray, or None
+        Best focus of the reference wavelength, metres; None without lenses.
+    mtfs : tuple of Mtf
+        Polychromatic MTF at the fields; empty where there is none.
+    psfs : tuple of Psf
+        Polychromatic point images at the fields; empty where there are none.
     without_mtf : str
-        Why there is none, empty where there is.
+        Reason why there is no MTF; empty where there is one.
     """
 
     spectrum: SpectrumSpec
@@ -109,34 +108,34 @@ class Colours:
 
     @property
     def lateral_primary(self) -> np.ndarray | None:
-        """Place of the shortest wavelength less that of the longest, metres, (F, 2)."""
+        """Chief-ray position of the shortest wavelength minus that of the longest, metres, (F, 2)."""
         return None if self.lateral is None else np.asarray(self.lateral[:, 0] - self.lateral[:, -1])
 
     @property
     def lateral_secondary(self) -> np.ndarray | None:
-        """Place of the reference wavelength less the middle between shortest and longest, metres, (F, 2)."""
+        """Chief-ray position of the reference wavelength minus the mean of shortest and longest, metres, (F, 2)."""
         return None if self.lateral is None else np.asarray(-0.5 * (self.lateral[:, 0] + self.lateral[:, -1]))
 
     @property
     def axial_primary(self) -> np.ndarray | None:
-        """Focus of the shortest wavelength less that of the longest, metres, (F,)."""
+        """Focus of the shortest wavelength minus that of the longest, metres, (F,)."""
         return None if self.axial is None else np.asarray(self.axial[:, 0] - self.axial[:, -1])
 
     @property
     def axial_secondary(self) -> np.ndarray | None:
-        """Focus of the reference wavelength less the middle between shortest and longest, metres, (F,)."""
+        """Focus of the reference wavelength minus the mean of shortest and longest, metres, (F,)."""
         if self.axial is None or self.axial_reference is None:
             return None
         return np.asarray(self.axial_reference - 0.5 * (self.axial[:, 0] + self.axial[:, -1]))
 
     @property
     def error(self) -> float:
-        """By how much the MTF still changed with more wavelengths, at most; 0 for lines."""
+        """Largest change of the MTF by the last increase of the number of wavelengths; 0 for spectral lines."""
         return max((mtf.error for mtf in self.mtfs), default=0.0)
 
 
 def reference_wavelength(optics: CameraOptics, spectrum: SpectrumSpec) -> float:
-    """From which colours count, metres: the design wavelength where the light holds it, else the light's mean."""
+    """Return the reference wavelength of colour, metres: the design wavelength if in the spectrum, else the mean."""
     design, (first, last) = optics.model.spec.wavelength, spectrum.ends
     return float(design) if first <= design <= last else spectrum.mean
 
@@ -144,19 +143,19 @@ def reference_wavelength(optics: CameraOptics, spectrum: SpectrumSpec) -> float:
 def lateral_colour(
     optics: CameraOptics, fields: Sequence[Field] | np.ndarray, wavelengths: np.ndarray, reference: float
 ) -> np.ndarray:
-    """Where chief rays of wavelengths (K,) meet the focal plane, from those of a reference wavelength, metres.
+    """Compute chief-ray positions of wavelengths (K,) relative to a reference wavelength, metres.
 
     Returns
     -------
-    np.ndarray
-        (F, K, 2), along the line and along the track.
+    (F, K, 2) ndarray
+        Positions along the line and along the track.
 
     Raises
     ------
     AimError, BeamMissedError
-        a chief ray is lost.
+        A chief ray is lost.
     ValueError
-        a glass is not known at a wavelength.
+        The index of a glass is unknown at a wavelength.
     """
     light = optics.directions(fields)
 
@@ -168,29 +167,30 @@ def lateral_colour(
 
 
 def axial_colour(optics: CameraOptics, fields: Sequence[Field], wavelengths: np.ndarray) -> np.ndarray:
-    """Best focus of each field by itself at each wavelength (K,), from the focal plane, downstream positive, metres.
+    """Compute best focus of each single field at each wavelength (K,), from the focal plane, metres.
 
-    It is along the prescription's z, on a plane with the focal plane's tilt; in a state as the focal plane has moved.
+    It is along the prescription's z, positive downstream, on a plane with the focal plane's tilt; in a perturbed state
+    relative to the moved focal plane.
 
     Returns
     -------
-    np.ndarray
-        (F, K).
+    (F, K) ndarray
+        Best focus.
 
     Raises
     ------
     AimError, BeamMissedError
         Light is lost.
     ValueError
-        a glass is not known at a wavelength.
+        The index of a glass is unknown at a wavelength.
     """
-    own = FocalPlane.of(optics.model.spec)
+    nominal = FocalPlane.of(optics.model.spec)
     out = np.empty((len(fields), len(wavelengths)))
-    for f, place in enumerate(fields):
+    for f, field in enumerate(fields):
         for k, wavelength in enumerate(wavelengths):
-            beams = optics.at(float(wavelength)).beams((place,), FOCUS_RINGS)
+            beams = optics.at(float(wavelength)).beams((field,), FOCUS_RINGS)
             downstream = float(np.sign(np.mean(beams.direction[..., 2])))
-            out[f, k] = downstream * (beams.best_plane().z - own.z)
+            out[f, k] = downstream * (beams.best_plane().z - nominal.z)
     return out
 
 
@@ -200,32 +200,32 @@ def spectral_mtfs(
     spectrum: SpectrumSpec,
     frequency: np.ndarray | None = None,
 ) -> tuple[Mtf, ...]:
-    """MTF over a spectrum at fields (F, 2), with as many wavelengths as it takes.
+    """Compute the polychromatic MTF at fields (F, 2), with as many wavelengths as are needed.
 
     Parameters
     ----------
     optics : CameraOptics
-        The camera.
-    fields : Sequence[Field] | np.ndarray
-        where.
+        Camera.
+    fields : (F, 2) array_like
+        Fields.
     spectrum : SpectrumSpec
-        The light.
-    frequency : np.ndarray | None
-        As for ``CameraOptics.mtfs``.
+        Spectrum of the light.
+    frequency : (M,) ndarray, optional
+        Spatial frequencies, as for ``CameraOptics.mtfs``.
 
     Returns
     -------
-    tuple[Mtf, ...]
-        F, each with the change of its values by the rule before.
+    tuple of Mtf
+        MTF of each field, with the change of its values from the previous rule.
 
     Raises
     ------
     AimError, BeamMissedError, ValueError
-        As ``CameraOptics.pupils``; also for light over which the MTF still changes by more than ``WORST_CHANGE`` at
-        ``LARGEST_RULE`` wavelengths.
+        As for ``CameraOptics.pupils``; also if the MTF still changes by more than ``WORST_CHANGE`` at ``LARGEST_RULE``
+        wavelengths.
     """
     if frequency is None:
-        # to the cut-off of the shortest wavelength, whatever the rule
+        # up to the cut-off of the shortest wavelength, for any rule
         frequency = optics.at(spectrum.ends[0]).mtfs(fields)[0].frequency
     done: list[tuple[Mtf, ...]] = []
 
@@ -243,24 +243,26 @@ def spectral_mtfs(
 def spectral_psfs(
     optics: CameraOptics, fields: Sequence[Field] | np.ndarray, wavelengths: np.ndarray, weights: np.ndarray
 ) -> tuple[Psf, ...]:
-    """Images of points over wavelengths (K,) with weights (K,) at fields (F, 2), on ``PSF_POINTS`` squared.
+    """Compute point images over wavelengths (K,) with weights (K,) at fields (F, 2), ``PSF_POINTS`` square.
 
     Raises
     ------
     AimError, BeamMissedError, ValueError
-        As ``CameraOptics.pupils``.
+        As for ``CameraOptics.pupils``.
     """
     colours, shares = np.asarray(wavelengths, float), np.asarray(weights, float) / np.sum(weights)
     ends = (int(np.argmin(colours)), int(np.argmax(colours)))
     spots = [optics.at(float(colours[k])).spots(fields) for k in ends]
     design = optics.spots(fields)
     out = []
-    for f, own in enumerate(optics.colour_pupils(fields, colours)):
-        pupils = own if len(own) > 1 else own * len(colours)
+    for f, field_pupils in enumerate(optics.colour_pupils(fields, colours)):
+        pupils = field_pupils if len(field_pupils) > 1 else field_pupils * len(colours)
         aperture = 0.5 * float(np.max(pupils[ends[1]].cutoff(np.eye(2), 1.0)))
         # about the design wavelength's chief ray, as the pupils are
-        reach = max(float(np.max(np.abs(np.array(spot[f].place) - design[f].place + spot[f].rays))) for spot in spots)
-        half = max(0.25 * WINDOW * colours[ends[1]] / aperture, 1.5 * reach)
+        extent = max(
+            float(np.max(np.abs(np.array(spot[f].position) - design[f].position + spot[f].rays))) for spot in spots
+        )
+        half = max(0.25 * WINDOW * colours[ends[1]] / aperture, 1.5 * extent)
         sampled = [_sampled(pupil, float(colour), half) for pupil, colour in zip(pupils, colours, strict=True)]
 
         def over_light(x: Grid, y: Grid, sampled: Sequence[PupilField] = sampled) -> np.ndarray:
@@ -270,7 +272,7 @@ def spectral_psfs(
         grid = Grid(-half, step, PSF_POINTS)
         values = over_light(grid, grid)
         row, column = np.unravel_index(int(np.argmax(values)), values.shape)
-        # the peak lies between points
+        # the peak lies between grid points
         x, y = (Grid(float(grid.points()[k]) - step, step / 8.0, 17) for k in (column, row))
         peak = float(np.max(over_light(x, y)))
         limit = sum(
@@ -281,7 +283,7 @@ def spectral_psfs(
 
 
 def _sampled(pupil: PupilFunction, wavelength: float, half: float) -> PupilField:
-    """A pupil at as many nodes as its image up to ``half`` metres from its middle takes; its shadows are taken off."""
+    """Sample a pupil as finely as its image up to ``half`` metres from the middle needs, without its shadows."""
     aperture = 0.5 * float(np.max(pupil.cutoff(np.eye(2), 1.0)))
     nothing = np.zeros(1, complex)
     right, left, _ = pupil.edge.corners(nothing)
@@ -298,8 +300,8 @@ def _sampled(pupil: PupilFunction, wavelength: float, half: float) -> PupilField
     return PupilField(u, v, eikonal, amplitude * weight * scale, wavelength)
 
 
-def judge_colours(optics: CameraOptics, spectrum: SpectrumSpec, fields: tuple[Field, ...], sharp: bool) -> Colours:
-    """Look at a camera over its light; without MTF for a camera that is not ``sharp``.
+def evaluate_colours(optics: CameraOptics, spectrum: SpectrumSpec, fields: tuple[Field, ...], sharp: bool) -> Colours:
+    """Compute the polychromatic results of a camera, without MTF if it is not ``sharp``.
 
     Raises
     ------
@@ -317,25 +319,25 @@ def judge_colours(optics: CameraOptics, spectrum: SpectrumSpec, fields: tuple[Fi
     try:
         mtfs = spectral_mtfs(optics, fields, spectrum)
         psfs = spectral_psfs(optics, fields, mtfs[0].wavelengths, mtfs[0].weights)
-    except ValueError as error:  # colours too far apart, or a wavefront too rough at one of them
+    except ValueError as error:  # too much lateral colour, or a wavefront too irregular at a wavelength
         return replace(out, without_mtf=str(error))
     return replace(out, mtfs=mtfs, psfs=psfs)
 
 
 @dataclass(frozen=True, eq=False)
 class _AtField:
-    """Colours at one of their fields."""
+    """Polychromatic results at one of the fields."""
 
     colours: Colours
     number: int
 
     def of(self, values: np.ndarray | None) -> Any:
-        """What stands for this field in an array (F, ...); None for none."""
+        """Return the entry of this field in an array (F, ...); None for none."""
         return None if values is None else values[self.number]
 
     @property
     def mtf(self) -> np.ndarray | None:
-        """Over the light at Nyquist, along the line and along the track."""
+        """Polychromatic MTF at Nyquist, along the line and along the track."""
         if not self.colours.mtfs:
             return None
         mtf = self.colours.mtfs[self.number]
@@ -343,67 +345,70 @@ class _AtField:
 
     @property
     def strehl(self) -> float | None:
-        """Over the light."""
+        """Polychromatic Strehl ratio."""
         return self.colours.psfs[self.number].strehl if self.colours.psfs else None
 
 
 _FIELD: Record[_AtField] = Record(
-    "Colour at one field; along the line and along the track where there are two numbers.",
+    "Colour at one field; pairs of numbers are along the line and along the track.",
     Quantity("field", lambda a: a.colours.fields[a.number], "shares of the half field, along the line and the track"),
     Quantity(
         "lateral_primary_um",
         lambda a: a.of(a.colours.lateral_primary),
-        "chief ray of the shortest wavelength from that of the longest",
+        "chief-ray position of the shortest wavelength minus that of the longest",
         where_known=True,
     ),
     Quantity(
         "lateral_secondary_um",
         lambda a: a.of(a.colours.lateral_secondary),
-        "chief ray of the reference wavelength from the middle of both",
+        "chief-ray position of the reference wavelength minus the mean of both",
         where_known=True,
     ),
     Quantity(
         "axial_primary_um",
         lambda a: a.of(a.colours.axial_primary),
-        "best focus of the shortest wavelength from that of the longest, downstream positive",
+        "best focus of the shortest wavelength minus that of the longest, downstream positive",
         where_known=True,
     ),
     Quantity(
         "axial_secondary_um",
         lambda a: a.of(a.colours.axial_secondary),
-        "best focus of the reference wavelength from the middle of both",
+        "best focus of the reference wavelength minus the mean of both",
         where_known=True,
     ),
-    Quantity("mtf_at_nyquist", lambda a: a.mtf, "of the optics over the light", where_known=True),
-    Quantity("strehl", lambda a: a.strehl, "Strehl ratio over the light", where_known=True),
+    Quantity("mtf_at_nyquist", lambda a: a.mtf, "polychromatic MTF of the optics", where_known=True),
+    Quantity("strehl", lambda a: a.strehl, "polychromatic Strehl ratio", where_known=True),
 )
 
 COLOURS: Record[Colours] = Record(
-    "A camera over the wavelengths of its light.",
-    Quantity("shortest_nm", lambda c: c.spectrum.ends[0], "wavelength with light"),
-    Quantity("longest_nm", lambda c: c.spectrum.ends[1], "wavelength with light"),
-    Quantity("reference_nm", lambda c: c.reference, "wavelength from which colours count"),
+    "Polychromatic results of a camera.",
+    Quantity("shortest_nm", lambda c: c.spectrum.ends[0], "shortest wavelength of the spectrum"),
+    Quantity("longest_nm", lambda c: c.spectrum.ends[1], "longest wavelength of the spectrum"),
+    Quantity("reference_nm", lambda c: c.reference, "reference wavelength of colour"),
     Quantity("fields", lambda c: [_AtField(c, f) for f in range(len(c.fields))], "field by field", record=_FIELD),
     Quantity(
         "wavelengths_of_mtf",
         lambda c: len(c.mtfs[0].wavelengths) if c.mtfs else None,
-        "of Gauss' rule, or all lines",
+        "number of wavelengths of the Gauss rule, or of spectral lines",
         where_known=True,
     ),
     Quantity(
-        "mtf_error", lambda c: c.error if c.mtfs else None, "its change by more of them, at most", where_known=True
+        "mtf_error",
+        lambda c: c.error if c.mtfs else None,
+        "largest change of the MTF with more wavelengths",
+        where_known=True,
     ),
-    Quantity("without_mtf", lambda c: c.without_mtf or None, "why there is none", where_known=True),
+    Quantity("without_mtf", lambda c: c.without_mtf or None, "reason why there is no MTF", where_known=True),
 )
 
 
 def colour_data(colours: Colours) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What optics.nc has of them: variables and coordinates."""
+    """Return the variables and coordinates of optics.nc for the polychromatic results."""
     metres = {"units": "m"}
     data: dict[str, Any] = {}
     coords: dict[str, Any] = {}
     if colours.lateral is not None and colours.axial is not None:
-        about = {**metres, "long_name": "chief ray's place from that of the reference wavelength"}
+        about = {**metres, "long_name": "chief-ray position relative to the reference wavelength"}
         data["lateral_colour"] = (("mtf_field", "wavelength", "direction"), colours.lateral, about)
         about = {**metres, "long_name": "best focus from the focal plane, downstream positive"}
         data["axial_colour"] = (("mtf_field", "wavelength"), colours.axial, about)
@@ -413,14 +418,14 @@ def colour_data(colours: Colours) -> tuple[dict[str, Any], dict[str, Any]]:
         data["light_mtf"] = (
             dims,
             np.stack([m.values for m in colours.mtfs]),
-            {"long_name": "modulation over the light"},
+            {"long_name": "polychromatic modulation"},
         )
-        about = {"long_name": "the same without wavefront error, every wavelength in its place"}
+        about = {"long_name": "polychromatic modulation without wavefront error and lateral colour"}
         data["light_mtf_limit"] = (dims, np.stack([m.limit for m in colours.mtfs]), about)
         about = {"units": "1/m", "long_name": "spatial frequency in the image, cycles per length"}
         coords["light_frequency"] = ("light_frequency", colours.mtfs[0].frequency, about)
-        about = {"units": "1/m2", "long_name": "irradiance of a point's image for unit light"}
+        about = {"units": "1/m2", "long_name": "irradiance of a point image for unit light"}
         data["psf"] = (("mtf_field", "row", "column"), np.stack([p.values for p in colours.psfs]), about)
-        about = {**metres, "long_name": "place of columns and rows from the design wavelength's chief ray"}
-        data["psf_place"] = (("mtf_field", "column"), np.stack([p.place for p in colours.psfs]), about)
+        about = {**metres, "long_name": "position of columns and rows from the design wavelength's chief ray"}
+        data["psf_position"] = (("mtf_field", "column"), np.stack([p.position for p in colours.psfs]), about)
     return data, coords

@@ -1,4 +1,4 @@
-"""Statistics of the wavefront of one beam over the light that edges and bodies leave of it."""
+"""Statistics of the wavefront of a beam over the light that edges and bodies leave of it."""
 
 from __future__ import annotations
 
@@ -19,39 +19,41 @@ from optics.waves.pupil_terms import products, smooth_terms
 from twin.targets.target_path import LineRays, TargetPath
 
 WORST_LIGHT = 5e-3
-"""Share of the light by which shadows of edges and traced rays may differ: 10 000 rays count a share to 1e-3."""
+"""Largest difference between the fraction of light by shadows of edges and by traced rays; 10 000 rays count it to
+1e-3.
+"""
 
 RAYS_ACCURACY = 2e-3
-"""What numbers of a cut beam are right to where 10 000 rays stand for its light: as a share of an rms wavefront
-error."""
+"""Accuracy of results for a vignetted beam if 10 000 rays sample its light, as a fraction of the rms wavefront error.
+"""
 
 SHARPEST = 1e-4
-"""Rms wavefront error of which shares are told, waves; of less there is rounding of paths in it."""
+"""Rms wavefront error, waves, below which changes are relative to this value, as rounding of paths then dominates."""
 
 _SHADOW_NODES = 6
-"""Along each side of a shadow's box."""
+"""Quadrature nodes along each side of a shadow's box."""
 
 _ASTRAY, _DARK_DEGREE = 2.0, 12
-"""Ranges of the light's wavefront beyond which rays in the dark do not count, and degree of what stands for them."""
+"""Departure of shadowed rays, in ranges of the wavefront, beyond which a polynomial replaces them, and its degree."""
 
 _FINER_RINGS, _FINER_NODES = 4, 2
-"""More of both for the finer quadrature, by which numbers are held."""
+"""Additional rings and nodes of the finer quadrature, which checks the results."""
 
 
 @dataclass(frozen=True, eq=False)
-class ExactFit:
-    """What is known of a cut beam without a raster.
+class VignettedFit:
+    """Wavefront statistics of a vignetted beam by exact quadrature.
 
     Attributes
     ----------
     fit : PartFit
-        Of its wavefront.
+        Statistics of the wavefront.
     light : float
-        Share of the stop that comes through.
+        Fraction of the stop's light that passes.
     hole : float
-        Of a ring, as of ``Wavefront``.
+        Radius of the central hole, as in ``Wavefront``.
     accuracy : float
-        As of ``Wavefront``.
+        Accuracy, as in ``Wavefront``.
     """
 
     fit: PartFit
@@ -60,7 +62,7 @@ class ExactFit:
     accuracy: float
 
 
-def exact_fit(
+def fit_illuminated(
     path: TargetPath,
     state: State,
     direction: np.ndarray,
@@ -68,31 +70,31 @@ def exact_fit(
     light: float,
     to_sphere: Callable[[LineRays], np.ndarray],
     terms: int,
-) -> ExactFit | None:
+) -> VignettedFit | None:
     """Fit a wavefront over the light of a beam by a quadrature that ends at the edges.
 
     Parameters
     ----------
     path : TargetPath
-        Of the camera.
+        Light path of the camera.
     state : State
-        Of its assembly.
-    direction : np.ndarray
-        Of the light, world, (1, 3).
+        State of its assembly.
+    direction : (1, 3) ndarray
+        Direction of the light in the world frame.
     rings : int
-        Of the quadrature over the whole stop.
+        Rings of the quadrature over the whole stop.
     light : float
-        Share of the stop that traced rays come through.
-    to_sphere : Callable[[LineRays], np.ndarray]
-        Optical paths of rays to their reference spheres, (1, N), metres.
+        Fraction of the stop's light that passes by traced rays.
+    to_sphere : callable
+        Function from rays to their optical paths to the reference spheres, (1, N), metres.
     terms : int
-        Of Zernike.
+        Number of Zernike terms.
 
     Returns
     -------
-    ExactFit | None
-        None where the shadows are not known or not those of traced rays, rays in what is dark do not come to the image,
-        or a finer quadrature tells other numbers.
+    VignettedFit or None
+        None if the shadows are not known or disagree with traced rays, if rays in the shadow do not reach the image, or
+        if a finer quadrature gives other values.
 
     Raises
     ------
@@ -103,68 +105,71 @@ def exact_fit(
         pieces, error = path.shadows_on_stop(state, direction)
     except UnphysicalError:
         return None
-    more = (0, 0), (_FINER_RINGS, _FINER_NODES)
-    stops = [IlluminatedStop.of(pieces, rings + r, _SHADOW_NODES + n) for r, n in more]
+    refinement = (0, 0), (_FINER_RINGS, _FINER_NODES)
+    stops = [IlluminatedStop.of(pieces, rings + r, _SHADOW_NODES + n) for r, n in refinement]
     if abs(float(stops[1].light[0]) - light) > WORST_LIGHT:
         return None
     points = [np.stack([stop.x[0], stop.y[0]], axis=-1) for stop in stops]
-    every = np.concatenate([np.zeros((1, 2)), *points])
-    rays = path.rays(state, direction, every, edges=False)
-    # boxes about shadows reach a little beyond the stop, which ends these rays; their paths are as of others
-    if not np.all(rays.valid[0] | (np.hypot(*every.T) > 1.0)):
+    all_points = np.concatenate([np.zeros((1, 2)), *points])
+    rays = path.rays(state, direction, all_points, edges=False)
+    # boxes about shadows extend a little beyond the stop, which vignettes these rays; their paths are valid
+    if not np.all(rays.valid[0] | (np.hypot(*all_points.T) > 1.0)):
         return None
     waves = np.split(-to_sphere(rays)[0, 1:] / path.model.spec.wavelength, [len(points[0])])
     both = list(zip(stops, waves, strict=True))
-    tamed = [(stop, _tamed(stop, pieces, rings + r, wave)) for (stop, wave), (r, _) in zip(both, more, strict=True)]
-    for tried in (both, tamed):
+    continued = [
+        (stop, _tamed(stop, pieces, rings + r, wave)) for (stop, wave), (r, _) in zip(both, refinement, strict=True)
+    ]
+    for attempt in (both, continued):
         try:
-            coarse, fine = (fit_part(stop.x[0], stop.y[0], stop.weight[0], wave, terms) for stop, wave in tried)
+            coarse, fine = (fit_part(stop.x[0], stop.y[0], stop.weight[0], wave, terms) for stop, wave in attempt)
         except UnphysicalError:
             continue
-        # rays in the dark that go astray leave no square above zero
+        # shadowed rays that are far off can make the mean square negative
         if not min(coarse.rms, fine.rms) > 0.0:
             continue
         change = max(abs(fine.rms - coarse.rms) / max(fine.rms, SHARPEST), abs(fine.strehl - coarse.strehl))
         if change < RAYS_ACCURACY:
-            return ExactFit(fine, float(stops[1].light[0]), float(holes(pieces)[0]), max(change, error))
+            return VignettedFit(fine, float(stops[1].light[0]), float(holes(pieces)[0]), max(change, error))
     return None
 
 
 def _tamed(stop: IlluminatedStop, pieces: np.ndarray, rings: int, wave: np.ndarray) -> np.ndarray:
-    """The wavefront (N,) with a smooth continuation of the light's where rays in the dark go far astray, as those do
-    that pass the rims of lenses outside; what it is there is taken off again.
+    """Return the wavefront (N,) with a smooth continuation where rays in the shadow depart far from it.
+
+    Such rays pass outside the rims of lenses; the quadrature subtracts their contribution again.
     """
     points = np.stack([stop.x[0], stop.y[0]], axis=-1)
     free = ~covered(pieces, points, SMALLEST)[0]
     middle, spread = np.mean(wave[free]), np.ptp(wave[free])
     if np.all(np.abs(wave[~free] - middle) <= _ASTRAY * spread):
         return wave
-    own = slice(0, quadrature.disk(rings).count)
-    near = points / np.maximum(np.hypot(*points.T), 1.0)[:, None]
-    table = products(near[:, 0], near[:, 1], _DARK_DEGREE)
-    known = free[None, own], wave[None, own, None]
-    terms = smooth_terms(table[own], stop.weight[0, own], *known)
+    ring_nodes = slice(0, quadrature.disk(rings).count)
+    clamped = points / np.maximum(np.hypot(*points.T), 1.0)[:, None]
+    table = products(clamped[:, 0], clamped[:, 1], _DARK_DEGREE)
+    light_values = free[None, ring_nodes], wave[None, ring_nodes, None]
+    terms = smooth_terms(table[ring_nodes], stop.weight[0, ring_nodes], *light_values)
     return np.where(free, wave, table @ terms[0, :, 0])
 
 
-def counted_fit(nodes: PupilNodes, weight: np.ndarray, flat: np.ndarray, terms: int, free: bool) -> PartFit:
-    """Statistics of a levelled wavefront by the rays that come through.
+def fit_by_rays(nodes: PupilNodes, weight: np.ndarray, flat: np.ndarray, terms: int, free: bool) -> PartFit:
+    """Compute the statistics of a levelled wavefront from the rays that pass.
 
     Parameters
     ----------
     nodes : PupilNodes
-        Of the stop, N.
-    weight : np.ndarray
-        Of the nodes, 0 where no light comes through, (N,).
-    flat : np.ndarray
-        The wavefront without piston and tilt, waves, (N,).
+        Quadrature nodes of the stop, N.
+    weight : (N,) ndarray
+        Weights of the nodes, 0 where no light passes.
+    flat : (N,) ndarray
+        Wavefront error without piston and tilt, waves.
     terms : int
-        Of Zernike.
+        Number of Zernike terms.
     free : bool
-        Whether none of the weights is 0.
+        True if none of the weights is 0.
     """
     fit = fit_wavefront(nodes.x, nodes.y, weight, flat, terms)
-    # over a part of the disk the terms share tilt among them; what is level there was taken out before
+    # over a part of the disk several terms contain tilt, which was removed from the wavefront before
     rms = fit.rms if free else np.sqrt(np.sum(weight * flat**2) / np.sum(weight))
     phasor = np.sum(weight * np.exp(2j * np.pi * flat)) / np.sum(weight)
     return PartFit(

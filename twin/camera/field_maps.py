@@ -1,4 +1,4 @@
-"""What of a camera changes over its field: distortion, focus, illumination, wavefront error, MTF through focus."""
+"""Camera properties that vary over the field: distortion, focus, illumination, wavefront error, MTF through focus."""
 
 from __future__ import annotations
 
@@ -15,50 +15,50 @@ from twin.camera.camera_optics import CameraOptics, rim
 from twin.camera.camera_results import Field
 
 LINE_POINTS = 41
-"""Places along the line at which distortion is told: as many as the truth of the main job has."""
+"""Number of points along the line at which distortion is computed, as many as in the truth of the main job."""
 
 GRID = (11, 5)
-"""Fields along the line and along the track of maps over the field."""
+"""Number of fields along the line and along the track of distortion maps."""
 
 FOCUS_STEPS = 41
-"""Steps through focus, odd."""
+"""Number of positions through focus, odd."""
 
 FOCUS_DEPTHS = 3.0
-"""Reach through focus, in depths of focus lambda F^2 * 2."""
+"""Range through focus to either side, in depths of focus 2 lambda F^2."""
 
 
 @shows("distance [m]", "rms [um]", "largest [um]", "line_distance [m]", "line_largest [um]")
 @dataclass(frozen=True, eq=False)
 class Distortion:
-    """Where the camera images directions, against the nearest perfect camera.
+    """Distortion of a camera relative to the best-fitting distortion-free camera.
 
-    The perfect camera images a direction at c + f t, with t the tangents of its angles from the focal plane's normal,
-    along the line and along the track: a plane parallel to the image, through which it is seen from one point.
+    The distortion-free camera images a direction at c + f t, with t the tangents of its angles from the focal plane's
+    normal, along the line and along the track: a perspective projection onto a plane parallel to the image.
 
     Attributes
     ----------
-    fields : np.ndarray
-        Shares of the half field, (A, B, 2), along the line and then along the track.
-    places : np.ndarray
-        Of chief rays on the focal plane, along the line and along the track, metres, (A, B, 2).
-    ideal : np.ndarray
-        Of the best perfect camera, metres, (A, B, 2).
+    fields : (A, B, 2) ndarray
+        Fractions of the half field, along the line and then along the track.
+    places : (A, B, 2) ndarray
+        Chief rays on the focal plane, along the line and along the track, metres.
+    ideal : (A, B, 2) ndarray
+        Positions by the best distortion-free camera, metres.
     distance : float
-        Its principal distance f, metres.
-    point : np.ndarray
-        Its principal point c, metres from the line's centre, (2,).
-    angle : np.ndarray
-        W of places along the line, from the line of sight, radians, (M,).
-    position : np.ndarray
-        L of these, metres, (M,).
+        Principal distance f of that camera, metres.
+    point : (2,) ndarray
+        Principal point c of that camera, metres from the line's centre.
+    angle : (M,) ndarray
+        Field angles W of points along the line, from the line of sight, radians.
+    position : (M,) ndarray
+        Positions L of these points, metres.
     line_distance : float
         Principal distance of the line, sum(L tan W) / sum(tan^2 W), metres.
-    line_point : tuple[float, float]
-        Principal point of the line when it is fitted, metres, and the distance that goes with it.
-    residual : np.ndarray
-        L - f tan W with ``line_distance``, metres, (M,).
-    residual_with_point : np.ndarray
-        With both, metres, (M,).
+    line_point : tuple of float
+        Principal point of the line when it is fitted, and the principal distance of that fit, metres.
+    residual : (M,) ndarray
+        Distortion L - f tan W with ``line_distance``, metres.
+    residual_with_point : (M,) ndarray
+        Distortion with principal point and distance fitted, metres.
     """
 
     fields: np.ndarray
@@ -75,33 +75,33 @@ class Distortion:
 
     @property
     def rms(self) -> float:
-        """Rms distance of the grid from the perfect camera's, metres."""
+        """Rms distance of the grid from that of the distortion-free camera, metres."""
         return float(np.sqrt(np.mean(np.sum((self.places - self.ideal) ** 2, axis=-1))))
 
     @property
     def largest(self) -> float:
-        """The largest of these distances, metres."""
+        """Largest distance of the grid from that of the distortion-free camera, metres."""
         return float(np.max(np.linalg.norm(self.places - self.ideal, axis=-1)))
 
     @property
     def line_rms(self) -> float:
-        """Rms of the distortion along the line, metres."""
+        """Rms distortion along the line, metres."""
         return float(np.sqrt(np.mean(self.residual**2)))
 
     @property
     def line_largest(self) -> float:
-        """The largest distortion along the line, metres."""
+        """Largest absolute distortion along the line, metres."""
         return float(np.max(np.abs(self.residual)))
 
 
 def field_grid(count: tuple[int, int] = GRID) -> np.ndarray:
-    """Fields (A, B, 2) evenly over the whole field."""
+    """Return fields (A, B, 2) evenly spaced over the whole field."""
     along, across = (np.linspace(-1.0, 1.0, n) for n in count)
     return np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1)
 
 
 def distortion(optics: CameraOptics) -> Distortion:
-    """Trace chief rays over the field and along the line."""
+    """Compute the distortion from chief rays over the field and along the line."""
     fields = field_grid()
     light = optics.directions(fields.reshape(-1, 2))
     places = optics.path.places(optics.state, light)
@@ -114,30 +114,32 @@ def distortion(optics: CameraOptics) -> Distortion:
     design[:, 0] = tangent.T.ravel()
     design[:count, 1] = 1.0
     design[count:, 2] = 1.0
-    found, *_ = np.linalg.lstsq(design, places.T.ravel(), rcond=None)
-    ideal = (design @ found).reshape(2, count).T
+    solution, *_ = np.linalg.lstsq(design, places.T.ravel(), rcond=None)
+    ideal = (design @ solution).reshape(2, count).T
     spec = optics.model.spec
     half = 0.5 * spec.line.pixels * spec.line.pitch
     position = np.linspace(-half, half, LINE_POINTS)
     sight = optics.path.directions(np.stack([position, np.zeros(LINE_POINTS)], axis=-1), optics.state)
     axes = optics.assembly.nominal_pose(optics.path.root).rotation
-    own = sight @ axes
+    camera_sight = sight @ axes
     # from the line of sight, which is the middle one; the image of light that goes toward +Y lies at +Y'
-    angle = np.arctan2(own[:, 1], -own[:, 2]) - np.arctan2(own[LINE_POINTS // 2, 1], -own[LINE_POINTS // 2, 2])
-    alone = float(principal_distance(position, angle))
+    angle = np.arctan2(camera_sight[:, 1], -camera_sight[:, 2]) - np.arctan2(
+        camera_sight[LINE_POINTS // 2, 1], -camera_sight[LINE_POINTS // 2, 2]
+    )
+    balanced = float(principal_distance(position, angle))
     both, point = (float(value) for value in principal_distance_and_point(position, angle))
     t = np.tan(angle)
     return Distortion(
         fields=fields,
         places=places.reshape(fields.shape),
         ideal=ideal.reshape(fields.shape),
-        distance=float(found[0]),
-        point=found[1:],
+        distance=float(solution[0]),
+        point=solution[1:],
         angle=angle,
         position=position,
-        line_distance=alone,
+        line_distance=balanced,
         line_point=(point, both),
-        residual=position - alone * t,
+        residual=position - balanced * t,
         residual_with_point=position - both * t + point * t**2,
     )
 
@@ -145,25 +147,25 @@ def distortion(optics: CameraOptics) -> Distortion:
 @shows("share", "focus [um]", "illumination", "vignetted", "mtf")
 @dataclass(frozen=True, eq=False)
 class FieldCurves:
-    """Along the line, at the middle of the field along the track.
+    """Curves along the line, in the middle of the field along the track.
 
     Attributes
     ----------
-    share : np.ndarray
-        Of half the field along the line, (M,).
-    focus_line, focus_track : np.ndarray
-        Best focus of the fans of rays along the line and along the track, from the focal plane, positive downstream,
-        metres, (M,).
-    focus : np.ndarray
-        Of the whole beam: least rms wavefront error, metres, (M,).
-    error : np.ndarray
-        Rms wavefront error there, waves, (M,).
-    illumination : np.ndarray
-        Solid angle of the beam as the focal plane sees it, over that of the middle, (M,).
-    vignetted : np.ndarray
-        Share of the beam that other apertures than the stop take, (M,).
-    mtf : np.ndarray
-        At Nyquist, of the optics, along the line and along the track, (M, 2); NaN where there is none.
+    share : (M,) ndarray
+        Fraction of half the field along the line.
+    focus_line, focus_track : (M,) ndarray
+        Best focus of the ray fans along the line and along the track, from the focal plane, positive downstream,
+        metres.
+    focus : (M,) ndarray
+        Focus of the whole beam with the least rms wavefront error, metres.
+    error : (M,) ndarray
+        Rms wavefront error on the focal plane, waves.
+    illumination : (M,) ndarray
+        Solid angle of the beam seen from the focal plane, relative to the middle of the field.
+    vignetted : (M,) ndarray
+        Fraction of the beam that apertures other than the stop block.
+    mtf : (M, 2) ndarray
+        MTF of the optics at Nyquist, along the line and along the track; NaN where there is none.
     """
 
     share: np.ndarray
@@ -177,7 +179,7 @@ class FieldCurves:
 
 
 def field_curves(optics: CameraOptics, sharp: bool, count: int = 21) -> FieldCurves:
-    """Trace ``count`` fields along the line; without MTF for a camera that is not ``sharp``."""
+    """Compute the curves for ``count`` fields along the line, without MTF if the camera is not ``sharp``."""
     share = np.linspace(-1.0, 1.0, count)
     fields = np.stack([share, np.zeros(count)], axis=-1)
     waves = optics.wavefronts(fields, points=3, terms=28)
@@ -192,8 +194,8 @@ def field_curves(optics: CameraOptics, sharp: bool, count: int = 21) -> FieldCur
     focus = -both * 2.0 / aperture**2
     # of the whole beam the shift makes both terms of an elliptic pupil; what is best takes most of both away
     a, b = (aperture**2).T
-    made = np.stack([(a + b) / (8.0 * np.sqrt(3.0)), (a - b) / (4.0 * np.sqrt(6.0))], axis=-1)
-    whole = -np.sum(terms[:, [3, 5]] * made, axis=-1) / np.sum(made**2, axis=-1)
+    defocus_terms = np.stack([(a + b) / (8.0 * np.sqrt(3.0)), (a - b) / (4.0 * np.sqrt(6.0))], axis=-1)
+    beam_focus = -np.sum(terms[:, [3, 5]] * defocus_terms, axis=-1) / np.sum(defocus_terms**2, axis=-1)
     mtf = np.full((count, 2), np.nan)
     if sharp:
         mtf = np.array([one.values[:, 1] for one in optics.mtfs(fields, np.array([0.0, optics.nyquist]))])
@@ -201,7 +203,7 @@ def field_curves(optics: CameraOptics, sharp: bool, count: int = 21) -> FieldCur
         share=share,
         focus_line=focus[:, 0],
         focus_track=focus[:, 1],
-        focus=whole,
+        focus=beam_focus,
         error=np.array([wave.rms for wave in waves]),
         illumination=area / area[count // 2],
         vignetted=np.array([wave.vignetted for wave in waves]),
@@ -212,20 +214,20 @@ def field_curves(optics: CameraOptics, sharp: bool, count: int = 21) -> FieldCur
 @shows("fields", "defocus [um]", "best [um]", "error [waves]")
 @dataclass(frozen=True, eq=False)
 class ThroughFocus:
-    """At fields, along the light.
+    """Image quality through focus at F fields.
 
     Attributes
     ----------
-    fields : tuple[Field, ...]
-        F.
-    defocus : np.ndarray
-        Of the detector, positive downstream, metres, (Z,).
-    error : np.ndarray
-        Rms wavefront error, waves, (F, Z).
-    mtf : np.ndarray
-        At Nyquist, along the line and along the track, (F, 2, Z); NaN where there is none.
+    fields : tuple of Field
+        Fields.
+    defocus : (Z,) ndarray
+        Defocus of the detector, positive downstream, metres.
+    error : (F, Z) ndarray
+        Rms wavefront error, waves.
+    mtf : (F, 2, Z) ndarray
+        MTF at Nyquist, along the line and along the track; NaN where there is none.
     best : float
-        With the least mean square error over the fields, metres; NaN where the light has no focus.
+        Defocus with the least mean square error over the fields, metres; NaN where the light has no focus.
     """
 
     fields: tuple[Field, ...]
@@ -236,24 +238,24 @@ class ThroughFocus:
 
 
 def through_focus(optics: CameraOptics, fields: tuple[Field, ...], sharp: bool) -> ThroughFocus:
-    """Move the detector through focus."""
+    """Compute the image quality while the detector moves through focus."""
     spec = optics.model.spec
     f_number = optics.spot().airy / (1.22 * spec.wavelength)
     beams = optics.beams(fields, 6)
-    own, best = FocalPlane.of(spec), beams.best_plane()
+    nominal, best = FocalPlane.of(spec), beams.best_plane()
     downstream = float(np.sign(np.mean(beams.direction[..., 2])))
-    away = downstream * (best.z - own.z)
+    shift = downstream * (best.z - nominal.z)
     # the focal plane and the best focus are both in it, for a camera near its focus evenly about the focal plane
     depth = 2.0 * spec.wavelength * f_number**2
-    reach = max(FOCUS_DEPTHS * depth, 1.3 * abs(away)) if beams.reaches(best) else FOCUS_DEPTHS * depth
-    defocus = np.linspace(-reach, reach, FOCUS_STEPS)
-    error = np.stack([beams.errors(FocalPlane(own.z + downstream * dz, own.tilt)) for dz in defocus], axis=-1)
+    half_range = max(FOCUS_DEPTHS * depth, 1.3 * abs(shift)) if beams.reaches(best) else FOCUS_DEPTHS * depth
+    defocus = np.linspace(-half_range, half_range, FOCUS_STEPS)
+    error = np.stack([beams.errors(FocalPlane(nominal.z + downstream * dz, nominal.tilt)) for dz in defocus], axis=-1)
     mtf = _mtf_through_focus(optics, fields, defocus, sharp)
-    return ThroughFocus(fields, defocus, error, mtf, away if beams.reaches(best) else np.nan)
+    return ThroughFocus(fields, defocus, error, mtf, shift if beams.reaches(best) else np.nan)
 
 
 def _mtf_through_focus(optics: CameraOptics, fields: tuple[Field, ...], defocus: np.ndarray, sharp: bool) -> np.ndarray:
-    """MTF at Nyquist, (F, 2, Z); NaN for a camera that is not sharp."""
+    """Return the MTF at Nyquist, (F, 2, Z); NaN for a camera that is not sharp."""
     mtf = np.full((len(fields), 2, len(defocus)), np.nan)
     if sharp:
         wavelength = np.array([optics.model.spec.wavelength])

@@ -1,4 +1,4 @@
-"""A camera's layout with rays: side view in the plane of symmetry, and from above."""
+"""Layout of a camera with rays: side view in the plane of symmetry, and top view."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from twin.framework.artefact import plain
 from twin.framework.svg import BLUE, GREEN, GREY, INK, LIGHT, VERMILION, new_figure, plain_axes
 
 _END_COLOURS = (BLUE, GREEN, VERMILION)
-"""Colours of the negative end of the field, its middle, its positive end."""
+"""Colours of the negative end of the field, its middle and its positive end."""
 
 _BEFORE = 0.16
-"""Share of the layout's length that is drawn of the light before it."""
+"""Length of the incoming rays in the drawing, as a fraction of the layout's length."""
 
 _VIEWS = ((1, "y", "Side view, in the plane of symmetry"), (0, "x", "Top view, along the line"))
 
 
 def layout_figure(model: CameraModel, backend: Backend) -> Figure:
-    """Chief and marginal rays of three fields in both views, mirrors, stop and focal plane, to one scale."""
+    """Draw chief and marginal rays of three fields, mirrors, stop and focal plane in both views, to the same scale."""
     boxes = [_extent(model, backend, axis) for axis, _, _ in _VIEWS]
     low, high = min(b[0] for b in boxes), max(b[1] for b in boxes)
     heights = [b[3] - b[2] for b in boxes]
@@ -44,19 +44,19 @@ def layout_figure(model: CameraModel, backend: Backend) -> Figure:
 
 
 def _fields(axis: int) -> list[tuple[float, float]]:
-    """Three fields in the plane of a view."""
+    """Return three fields in the plane of a view."""
     return [(s, 0.0) if axis == 0 else (0.0, s) for s in (-1.0, 0.0, 1.0)]
 
 
 def _rays(model: CameraModel, backend: Backend, axis: int) -> np.ndarray:
-    """Chief, lower and upper marginal ray of three fields, (1 + K, 3, 3, 3)."""
+    """Trace chief, lower and upper marginal ray of three fields, (1 + K, 3, 3, 3)."""
     stop = np.zeros((3, 2))
     stop[1:, axis] = -INSIDE, INSIDE
     return ray_paths(model, backend, _fields(axis), stop).points
 
 
 def _extent(model: CameraModel, backend: Backend, axis: int) -> tuple[float, float, float, float]:
-    """Least and largest z and transverse coordinate of a view, with room about them."""
+    """Return the least and largest z and transverse coordinate of a view, with a margin."""
     rays = _rays(model, backend, axis)
     points = rays[1:]
     z = points[..., 2]
@@ -68,13 +68,14 @@ def _extent(model: CameraModel, backend: Backend, axis: int) -> tuple[float, flo
 
 
 def _begun(points: np.ndarray, first: float) -> np.ndarray:
-    """Rays (1 + K, ..., 3) that begin at z = first."""
+    """Return rays (1 + K, ..., 3) extended to begin at z = first."""
     start, then = points[0], points[1]
     share = (first - start[..., 2:]) / (then - start)[..., 2:]
     return np.concatenate([(start + share * (then - start))[None], points[1:]])
 
 
 def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: float) -> None:
+    """Draw one view."""
     points = _begun(_rays(model, backend, axis), first)
     half = np.degrees((model.spec.field.x, model.spec.field.y)[axis])
     for share, colour in zip((-1.0, 0.0, 1.0), _END_COLOURS, strict=True):
@@ -100,7 +101,7 @@ def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: fl
             drawn = pose.apply(np.stack([x, y, z], axis=-1))
         else:
             drawn = model.mirror_pose(name).apply(np.stack([x, y, model.surfaces[name].sag(x, y)], axis=-1))
-        if name not in edges and name != IMAGE and model.spec.mirrors[name].light == "passes":  # nothing stands there
+        if name not in edges and name != IMAGE and model.spec.mirrors[name].light == "passes":  # no body is there
             axes.plot(drawn[:, 2], drawn[:, axis], color=GREY, lw=0.8, ls=(0, (1, 2)), zorder=3)
         else:
             axes.plot(drawn[:, 2], drawn[:, axis], color=INK, lw=2.6, solid_capstyle="butt", zorder=3)
@@ -109,8 +110,9 @@ def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: fl
 
 
 def _label(axes: Axes, model: CameraModel, name: str, drawn: np.ndarray, axis: int) -> None:
+    """Write the name of a surface beside it."""
     text = "focal plane" if name == IMAGE else f"{name}, stop" if name == model.spec.stop else name
-    # beyond the end that is farther from the axis; from above all ends are alike, and neighbours take turns
+    # beyond the end that is farther from the axis; in the top view all ends are alike, and neighbours alternate
     turn = name == IMAGE or model.mirrors.index(name) == 0
     end = drawn[int(np.argmax(np.abs(drawn[:, 1])))] if axis == 1 else drawn[-1 if turn else 0]
     up = 1 if end[1] >= np.mean(drawn[:, 1]) else -1

@@ -1,8 +1,7 @@
-"""Beams of a camera at fixed fields in many states: wavefronts by exact traces, in batches.
+"""Wavefronts of a camera's beams at fixed fields in many states, by exact traces in batches.
 
-All beams are those that the designed camera images at its fields, traced through the same points of the stop. What
-bodies and edges take of a beam is that of the designed camera at its design wavelength: small motions change it in
-second order.
+All beams are those that the nominal camera images at its fields, traced through the same points of the stop. Vignetting
+of a beam is that of the nominal camera at its design wavelength: small motions change it in second order.
 """
 
 from __future__ import annotations
@@ -30,40 +29,44 @@ from scenes.models.camera_model import LAUNCH_DISTANCE, glass_steps, in_glass
 from twin.camera.camera_optics import CameraOptics
 
 AT_ONCE = 200
-"""States traced in one launch, to bound memory."""
+"""Number of states traced in one launch, to limit memory."""
 AIM_TOLERANCE = 1e-8
-"""Distance of a ray from its point of the stop, metres: a wavefront error of ten waves changes by 1e-6 of one there."""
+"""Largest distance of a ray from its point of the stop, metres; it changes a wavefront error of ten waves by 1e-6
+waves.
+"""
 GRIDS = ((5, 8), (7, 10), (10, 14))
 """Rings of the stop's quadrature and degree of the polynomials for the wavefront, the coarsest first."""
 RESIDUAL = 1e-3
-"""Rms of a wavefront that its polynomials may leave, waves."""
+"""Largest rms of a wavefront that its polynomials may leave, waves."""
 
 
-class CutError(UnphysicalError):
-    """Beams are cut by what is not the stop and has no edges of its own."""
+class VignettedBeamError(UnphysicalError):
+    """Beams are vignetted by a surface that is neither the stop nor has edges."""
 
-    allowed = "fields whose light comes through whole"
+    allowed = "fields whose light is not vignetted"
 
 
-class RoughError(UnphysicalError):
-    """Polynomials do not follow the wavefronts."""
+class RoughWavefrontError(UnphysicalError):
+    """Polynomials cannot represent the wavefronts."""
 
-    allowed = "a sharper camera, or fields where it is"
+    allowed = "a sharper camera, or fields where it is sharp"
 
 
 class BeamLight(NamedTuple):
-    """Light of states at the line CCD.
+    """Light of S states at the line CCD.
 
     Attributes
     ----------
-    paths : np.ndarray
-        Optical paths of the beams' rays less those of the chief rays, of all K traced wavelengths, (S, F, K N), metres.
-    eikonals : np.ndarray
-        Likewise to planes, as transfer functions take them, (S, F, K N); the paths where they are not asked.
-    chiefs : np.ndarray
-        Directions of chief rays, (S, F, 3).
-    aimed : np.ndarray
-        Where rays start, (S, K, F, 1 + N, 3), world, metres.
+    paths : (S, F, K N) ndarray
+        Optical paths of the beams' rays to the reference spheres minus those of the chief rays, of all K traced
+        wavelengths, metres.
+    eikonals : (S, F, K N) ndarray
+        Optical paths to planes minus those of the chief rays, for transfer functions; equal to ``paths`` where they are
+        not requested.
+    chiefs : (S, F, 3) ndarray
+        Directions of the chief rays.
+    aimed : (S, K, F, 1 + N, 3) ndarray
+        Starting points of the rays in the world frame, metres.
     """
 
     paths: np.ndarray
@@ -78,43 +81,45 @@ class VariedBeams:
     Parameters
     ----------
     optics
-        The camera as designed.
+        Camera in its nominal state.
     fields
-        Shares of the half field, (F, 2).
+        Fractions of the half field, (F, 2).
     colours
-        Wavelengths that are traced, metres, (K,); that of the design by default.
+        Wavelengths that are traced, metres, (K,); by default that of the design.
     shares
-        Of them, which sum to 1, (K,); all alike by default.
+        Weights of the wavelengths, which sum to 1, (K,); by default equal.
     planes
-        Whether eikonals are wanted.
+        Compute eikonals as well.
 
     Attributes
     ----------
     directions
-        Of the light, world, (F, 3).
+        Directions of the light in the world frame, (F, 3).
     start
-        Where the designed camera's chief rays start, world, metres, (F, 3).
+        Starting points of the nominal camera's chief rays in the world frame, metres, (F, 3).
     nodes
-        Of the stop.
+        Quadrature nodes of the stop.
     degree
-        Of the polynomials in the pupil by which wavefronts are told.
+        Degree of the polynomials in the pupil that represent wavefronts.
     solve
-        From values at the nodes to their coefficients, (T, N).
+        Matrix from values at the nodes to polynomial coefficients, (T, N).
     designed
-        Light of the designed camera, of one state.
+        Light of the nominal camera, of one state.
     cosines
         Direction cosines (row, column) of its rays at the line CCD, (K, F, N, 2).
     residual
         Rms that the polynomials leave of its wavefronts, waves.
     pieces
-        Polygons on the stop's unit disk that its beams lack, (F, P, V, 2).
+        Polygons on the stop's unit disk where its beams are shadowed, (F, P, V, 2).
 
     Raises
     ------
-    CutError, RoughError
-        Beams of which nothing can be told so.
+    VignettedBeamError
+        A surface that is neither the stop nor has edges vignettes a beam.
+    RoughWavefrontError
+        Polynomials cannot represent the wavefronts.
     AimError, BeamMissedError
-        The light of a field does not come through.
+        The light of a field does not pass.
     """
 
     def __init__(
@@ -137,6 +142,7 @@ class VariedBeams:
 
     @one_blas_thread()
     def _prepare(self) -> None:
+        """Trace the nominal camera with the coarsest grid whose polynomials represent its wavefronts."""
         self.directions = self.optics.directions(self.fields)
         for rings, degree in GRIDS:
             self.nodes, self.degree = quadrature.disk(rings), degree
@@ -144,21 +150,25 @@ class VariedBeams:
             self._aim_nominal()
             traced, aimed = self._rays([{}])
             if not traced[3].all():
-                raise CutError("the beams of the fields are cut by what is not the stop and has no edges of its own")
+                raise VignettedBeamError(
+                    "the beams of the fields are vignetted by a surface that is neither the stop nor has edges"
+                )
             self.designed = self._light(traced, aimed)
             self.cosines = traced[1][0, :, :, 1:, 1::-1]
             self.solve = to_terms(self.nodes, degree)
-            own = self.designed.paths[0].reshape(len(self.fields), len(self.shares), -1)
-            rest = own - own @ self.solve.T @ products(self.nodes.x, self.nodes.y, degree).T
+            nominal_paths = self.designed.paths[0].reshape(len(self.fields), len(self.shares), -1)
+            rest = nominal_paths - nominal_paths @ self.solve.T @ products(self.nodes.x, self.nodes.y, degree).T
             self.residual = float(np.sqrt(np.max(rest**2 @ self.nodes.share))) / self.wavelength
             if self.residual <= RESIDUAL:
                 break
         else:
-            raise RoughError(f"wavefronts that polynomials do not follow: they leave {self.residual:.2g} waves")
+            raise RoughWavefrontError(
+                f"polynomials do not represent the wavefronts: they leave {self.residual:.2g} waves"
+            )
         self.pieces = self.optics.path.shadows_on_stop({}, self.directions)[0]
 
     def _aim_nominal(self) -> None:
-        """Launch points and aiming of the designed camera's rays, from which all others are aimed."""
+        """Aim the rays of the nominal camera, from which all others are aimed."""
         path = self.optics.path
         self.start = np.asarray(
             path.assembly.nominal_pose(f"{path.root}/{path.model.mirrors[0]}").translation
@@ -175,12 +185,12 @@ class VariedBeams:
         self._aimed = aim(self.backend, systems, self._fan_for(1), self._target, near, slopes, AIM_TOLERANCE)
 
     def _aimed_at_stop(self, states: Sequence[State], placed: PlacedBodies) -> np.ndarray:
-        """Where rays start that meet their points of the stop in coloured states, (S * K * F, 1 + N, 3).
+        """Return starting points of rays to their points of the stop, per state and wavelength, (S * K * F, 1 + N, 3).
 
         Raises
         ------
         AimError
-            The light of some state does not reach the stop.
+            The light of a state does not reach the stop.
         """
         path, count = self.optics.path, len(states) // len(self._glass)
         to_stop = assemble(path.assembly, [f"{path.name}/to_stop"], states, placed=placed)
@@ -191,13 +201,18 @@ class VariedBeams:
     def _rays(
         self, states: Sequence[State], aimed: np.ndarray | None = None
     ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
-        """Position and direction (S, K, F, 1 + N, 3), path and validity (S, K, F, 1 + N) of the beams at the line CCD,
-        chief rays first, and where their rays start, (S, K, F, 1 + N, 3), which is found where it is not given.
+        """Trace the beams to the line CCD.
+
+        Returns
+        -------
+        tuple of tuple and ndarray
+            Position and direction (S, K, F, 1 + N, 3), path and validity (S, K, F, 1 + N), chief rays first; and the
+            starting points, (S, K, F, 1 + N, 3), which are aimed if they are not given.
 
         Raises
         ------
         AimError
-            The light of some state does not reach the stop.
+            The light of a state does not reach the stop.
         """
         path, count = self.optics.path, len(states)
         coloured = self._coloured(states)
@@ -208,19 +223,19 @@ class VariedBeams:
         rays = make_rays(self.backend, aimed.reshape(len(along), -1, 3), along)
         traced = trace(self.backend, imaging, rays).numpy()
         shape = (count, len(self._glass), len(self.fields), len(self.points))
-        told = tuple(one.reshape(*shape, *one.shape[2:]) for one in traced)
-        return told, aimed.reshape(*shape, 3)  # type: ignore[return-value]
+        reshaped = tuple(one.reshape(*shape, *one.shape[2:]) for one in traced)
+        return reshaped, aimed.reshape(*shape, 3)  # type: ignore[return-value]
 
     def _coloured(self, states: Sequence[State]) -> list[State]:
-        """The states as each traced wavelength meets them, state by state, S * K."""
+        """Return the states with the glasses' indices at each traced wavelength, state by state, S * K."""
         return [in_glass(state, steps) for state in states for steps in self._glass]
 
     def _owners(self, count: int) -> np.ndarray:
-        """Number of the coloured state of each beam of so many states, (S * K * F,)."""
+        """Return the number of the state and wavelength of each beam for ``count`` states, (S * K * F,)."""
         return np.repeat(np.arange(count * len(self._glass)), len(self.fields))
 
     def _fan_for(self, count: int) -> RayFan:
-        """The fan of all beams of so many states."""
+        """Return the ray fan of all beams of ``count`` states."""
         times = count * len(self._glass)
 
         def every(array: np.ndarray) -> np.ndarray:
@@ -229,8 +244,9 @@ class VariedBeams:
         return RayFan(every(self._fan.position), every(self._fan.direction), every(self._fan.axes), True)
 
     def _to_sphere(self, position: np.ndarray, direction: np.ndarray, paths: np.ndarray, radius: float) -> np.ndarray:
-        """Optical paths to the spheres of a radius about the images of the chief rays, of all wavelengths about the
-        mean of these, less those of the chief rays, (S, F, K N).
+        """Return optical paths to spheres about the chief rays' images, minus those of the chief rays, (S, F, K N).
+
+        The spheres of all wavelengths are about the weighted mean of their images.
         """
         middle = np.einsum("k,skfx->sfx", self.shares, position[:, :, :, 0])
         to_sphere = path_to_sphere(position, direction, paths, middle[:, None, :, None], radius)
@@ -238,6 +254,7 @@ class VariedBeams:
         return np.asarray(np.moveaxis(longer, 1, 2).reshape(len(paths), len(self.fields), -1))
 
     def _light(self, traced: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], aimed: np.ndarray) -> BeamLight:
+        """Return the light at the line CCD from traced rays."""
         position, direction, path, _ = traced
         paths = self._to_sphere(position, direction, path, self.radius)
         eikonals = self._to_sphere(position, direction, path, np.inf) if self._planes else paths
@@ -246,51 +263,51 @@ class VariedBeams:
 
     @one_blas_thread()
     def light(self, states: Sequence[State], aimed: np.ndarray | None = None) -> BeamLight:
-        """What the light of states comes to at the line CCD.
+        """Trace the light of states to the line CCD.
 
         Parameters
         ----------
-        states : Sequence[State]
-            S of them.
-        aimed : np.ndarray | None
-            Where their rays start, as of ``BeamLight``; None to aim them.
+        states : sequence of State
+            S states.
+        aimed : ndarray, optional
+            Starting points of the rays, as in ``BeamLight``; by default they are aimed.
 
         Raises
         ------
         PhysicalError
-            The light of some state is lost.
+            The light of a state is lost.
         """
-        found, step = [], max(1, AT_ONCE // len(self._glass))
+        parts, step = [], max(1, AT_ONCE // len(self._glass))
         for start in range(0, len(states), step):
-            some = slice(start, start + step)
-            traced, own = self._rays(states[some], None if aimed is None else aimed[some])
+            batch = slice(start, start + step)
+            traced, own = self._rays(states[batch], None if aimed is None else aimed[batch])
             if not traced[3].all():
-                raise BeamMissedError("a surface's edge stops light of a field")
-            found.append(self._light(traced, own))
-        return BeamLight(*(np.concatenate(own) for own in zip(*found, strict=True)))
+                raise BeamMissedError("the edge of a surface blocks light of a field")
+            parts.append(self._light(traced, own))
+        return BeamLight(*(np.concatenate(own) for own in zip(*parts, strict=True)))
 
     @property
     def free(self) -> bool:
-        """Whether nothing but the stop limits the beams."""
+        """True if nothing but the stop limits the beams."""
         return not self.pieces.shape[1] or not bool(np.any(area(self.pieces) > SMALLEST))
 
-    def lit(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Of every field nodes x, y and shares of a quadrature over the light, (N',) each; shares sum to one."""
+    def illuminated_nodes(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Return nodes x, y and weights of a quadrature over the light of every field, (N',) each; weights sum to 1."""
         if self.free:
             nodes = quadrature.disk(self.degree)
             return [(nodes.x, nodes.y, nodes.share)] * len(self.fields)
         out = []
         for own in self.pieces:
-            lit = IlluminatedStop.of(own[None], self.degree, max(6, self.degree // 2 + 2))
-            out.append((lit.x[0], lit.y[0], lit.weight[0] / np.sum(lit.weight)))
+            stop = IlluminatedStop.of(own[None], self.degree, max(6, self.degree // 2 + 2))
+            out.append((stop.x[0], stop.y[0], stop.weight[0] / np.sum(stop.weight)))
         return out
 
     @one_blas_thread()
     def zernike_rows(self, last: int) -> np.ndarray:
-        """From optical paths at the nodes (N,) to Zernike terms Z1 to Z``last`` of the wavefront error, (F, last, N).
+        """Return the matrix from optical paths at the nodes (N,) to Zernike terms Z1 to Z``last``, (F, last, N).
 
-        Metres rms, Noll's order, positive where the wavefront is ahead; axes of the stop. Of a cut pupil the terms are
-        made orthonormal over its light one after the other: annular ones of a ring.
+        The terms are in metres rms, Noll's order, positive where the wavefront is ahead, with the axes of the stop. For
+        a vignetted pupil they are made orthonormal over its light one after the other: annular terms for a ring.
 
         Parameters
         ----------
@@ -298,7 +315,7 @@ class VariedBeams:
             Highest Noll index.
         """
         out = []
-        for x, y, share in self.lit():
+        for x, y, share in self.illuminated_nodes():
             table = products(x, y, self.degree) @ self.solve
             basis = zernike.basis(last, x, y)
             gram = basis.T @ (share[:, None] * basis)
@@ -313,26 +330,27 @@ class VariedBeams:
 
     @cached_property
     def defocus(self) -> np.ndarray:
-        """What the optical paths grow by as the image point moves downstream along the chief ray, (F, N), per metre."""
+        """Change of the optical paths as the image point moves downstream along the chief ray, (F, N), per metre."""
         direction = self._rays([{}])[0][1][0, 0]
         return np.asarray(np.einsum("fni,fi->fn", direction[:, 1:], direction[:, 0]) - 1.0)
 
     @one_blas_thread()
     def focus_rows(self) -> np.ndarray:
-        """From optical paths at the nodes (N,) to where the rms error is least, along the chief ray of the designed
-        camera, metres downstream of the line CCD, (F, N).
+        """Return the matrix from optical paths at the nodes (N,) to the focus of least rms error, (F, N).
+
+        The focus is along the chief ray of the nominal camera, metres downstream of the line CCD.
         """
         out = []
-        for (x, y, share), longer in zip(self.lit(), self.defocus, strict=True):
+        for (x, y, share), longer in zip(self.illuminated_nodes(), self.defocus, strict=True):
             table = products(x, y, self.degree)
             phase = _without_tilt(x, y, share, table @ self.solve @ longer)
-            own = _without_tilt(x, y, share, table @ self.solve)
-            out.append(-((share * phase) @ own) / float(share @ phase**2))
+            wavefront_rows = _without_tilt(x, y, share, table @ self.solve)
+            out.append(-((share * phase) @ wavefront_rows) / float(share @ phase**2))
         return np.stack(out)
 
 
 def _without_tilt(x: np.ndarray, y: np.ndarray, share: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values (N, ...) at nodes without piston and tilt over the light."""
+    """Return values (N, ...) at nodes without piston and tilt over the light."""
     level = np.stack([np.ones_like(x), x, y], axis=-1)
     weighted = level * share[:, None]
     return np.asarray(values - level @ np.linalg.solve(level.T @ weighted, weighted.T @ values))

@@ -1,1 +1,1 @@
-"""Pictures and the 3-D scene of an instrument."""
+"""Rendered pictures and the 3-D scene of an instrument."""

@@ -1,4 +1,4 @@
-"""Rays to be drawn: imaging beams and monitor beams of a perturbed instrument, for figures and the 3-D view."""
+"""Rays for drawing: imaging beams and monitor beams of a perturbed instrument, for plots and the 3-D view."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from scenes.models.instrument_model import Instrument
 from scenes.specs.instrument import BASE
 
 RIM = 48
-"""Rays around the edge of a beam; the first is at +x of the stop or face, then counterclockwise."""
+"""Number of rays around the edge of a beam; the first is at +x of the stop or face, then counterclockwise."""
 
 FIELDS = ("left edge", "centre", "right edge")
 """Imaging beams that are drawn: the +Y end of the line CCD, its middle, its -Y end."""
 
 _AIM = 1e-6
-"""How well an edge ray meets the edge, metres: drawings need no better."""
+"""Aiming tolerance of edge rays, metres, sufficient for drawings."""
 
 
 @dataclass(frozen=True, eq=False)
 class Beam:
-    """One beam: its middle ray and ``RIM`` rays along its edge.
+    """Beam with its middle ray and ``RIM`` rays along its edge.
 
     Attributes
     ----------
     camera : str
-        whose.
+        Name of the camera.
     name : str
         ``imaging/left edge`` ... or ``monitor/`` and the channel's name.
-    vertices : np.ndarray
-        (1 + RIM, K, 3) world points, middle ray first, metres; imaging beams run from the scene to the line CCD,
-        monitor beams from the pinhole to the area CCD.
-    footprints : Mapping[tuple[str, int], np.ndarray]
+    vertices : (1 + RIM, K, 3) ndarray
+        Points in the base frame, middle ray first, metres; imaging beams run from the scene to the line CCD, monitor
+        beams from the pinhole to the area CCD.
+    footprints : mapping
         (mirror, pass) -> (1 + RIM, 2) points in the mirror's x, y, metres; pass 0 first, then 1.
     """
 
@@ -52,40 +52,48 @@ class Beam:
 
     @property
     def is_monitor(self) -> bool:
-        """Whether it belongs to the monitor."""
+        """True for a beam of the monitor."""
         return self.name.startswith("monitor/")
 
 
 @dataclass(frozen=True, eq=False)
 class LightPaths:
-    """All beams of an instrument in one state, and where its bodies stand."""
+    """All beams of an instrument in one state, and the poses of its bodies.
+
+    Attributes
+    ----------
+    beams : tuple of Beam
+        Beams of all cameras.
+    placed : PlacedBodies
+        Poses of the bodies.
+    """
 
     beams: tuple[Beam, ...]
     placed: PlacedBodies
 
     def of(self, camera: str, monitor: bool) -> tuple[Beam, ...]:
-        """The beams of one camera and kind."""
+        """Return the imaging or monitor beams of one camera."""
         return tuple(b for b in self.beams if b.camera == camera and b.is_monitor == monitor)
 
 
 def trace_light_paths(instrument: Instrument, backend: Backend, state: State, reach: float = 0.0) -> LightPaths:
-    """Trace the beams.
+    """Trace the beams of an instrument.
 
     Parameters
     ----------
     instrument : Instrument
-        The instrument.
+        Instrument.
     backend : Backend
-        Where to trace.
+        Array backend of the trace.
     state : State
-        What is perturbed.
+        Perturbed state.
     reach : float
-        How far the imaging beams are drawn beyond the first mirror toward the scene, metres; 0 takes the distance of
-        the farthest 180-deg prism, without a monitor the longest camera's length.
+        Length of the imaging beams beyond the first mirror toward the scene, metres; 0 takes the distance of the
+        farthest 180-deg prism, without a monitor the longest camera's length.
     """
     placed = instrument.assembly.place([state])
     spec = instrument.spec
-    distances = [one.prism_180.distance for name in spec.cameras for one in spec.channels_of(name).values()]
+    distances = [c.prism_180.distance for name in spec.cameras for c in spec.channels_of(name).values()]
     reach = reach or max(distances, default=0.0) or _length(instrument, placed)
     beams = _imaging(instrument, backend, state, placed, reach)
     if instrument.channels:
@@ -94,7 +102,7 @@ def trace_light_paths(instrument: Instrument, backend: Backend, state: State, re
 
 
 def _length(instrument: Instrument, placed: PlacedBodies) -> float:
-    """How far the surfaces of the longest camera lie apart, metres."""
+    """Return the largest distance between two surfaces of a camera, metres."""
     lengths = []
     for name, model in instrument.cameras.items():
         places = np.array([placed.pose(f"{BASE}/{name}/{surface}").translation for surface in model.mirrors])
@@ -103,19 +111,20 @@ def _length(instrument: Instrument, placed: PlacedBodies) -> float:
 
 
 def _circle(radius: float) -> np.ndarray:
-    """(1 + RIM, 2): the centre, then the edge."""
+    """Return the centre and points along the edge of a circle, (1 + RIM, 2)."""
     angle = 2.0 * np.pi * np.arange(RIM) / RIM
     edge = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return np.concatenate([np.zeros((1, 2)), radius * edge])
 
 
 def _radius(aperture: Aperture | None) -> float:
+    """Return the inscribed radius of an aperture."""
     assert aperture is not None
     return aperture.inscribed
 
 
 def _imaging(instrument: Instrument, backend: Backend, state: State, placed: PlacedBodies, reach: float) -> list[Beam]:
-    """Traced backward, from points of the line CCDs through the edge of the stops; all cameras at once."""
+    """Trace the imaging beams of all cameras backward, from points of the line CCDs through the edge of the stops."""
     assembly, names = instrument.assembly, list(instrument.cameras)
     rays = 1 + RIM
     points, guesses, targets = [], [], []
@@ -139,19 +148,19 @@ def _imaging(instrument: Instrument, backend: Backend, state: State, placed: Pla
     for i, (camera, chain) in enumerate(zip(names, chains, strict=True)):
         hits = [traced.hit(k)[i] for k in range(len(chain))]
         path = [placed.pose(assembly.elements[n].body).apply(h) for n, h in zip(chain, hits, strict=True)]
-        # end on a plane square to the middle ray
-        square = leaving[i, rays]
-        along = (path[-1][rays] + reach * square - path[-1]) @ square / (leaving[i] @ square)
+        # end on a plane perpendicular to the middle ray
+        normal = leaving[i, rays]
+        along = (path[-1][rays] + reach * normal - path[-1]) @ normal / (leaving[i] @ normal)
         vertices = np.stack([path[-1] + along[:, None] * leaving[i], *path[::-1], position[i]], axis=1)
         for j, field in enumerate(FIELDS):
-            own = slice(j * rays, (j + 1) * rays)
-            prints = {(name.rpartition("/")[2], 0): hit[own, :2] for name, hit in zip(chain, hits, strict=True)}
-            out.append(Beam(camera, f"imaging/{field}", vertices[own], prints))
+            field_rows = slice(j * rays, (j + 1) * rays)
+            prints = {(name.rpartition("/")[2], 0): hit[field_rows, :2] for name, hit in zip(chain, hits, strict=True)}
+            out.append(Beam(camera, f"imaging/{field}", vertices[field_rows], prints))
     return out
 
 
 def _monitor(instrument: Instrument, backend: Backend, state: State, placed: PlacedBodies) -> list[Beam]:
-    """From every pinhole through the edge of its return face and back to the area CCD; all channels at once."""
+    """Trace the monitor beams of all channels from the pinholes via the return faces to the area CCDs."""
     assembly, channels = instrument.assembly, instrument.channels
     guess = np.array([instrument.toward_optics(placed, c.camera)[0] for c in channels])[:, None]
     start = np.array([placed.pose(c.reticle_body).translation for c in channels])[:, None]
@@ -178,7 +187,13 @@ def _monitor(instrument: Instrument, backend: Backend, state: State, placed: Pla
 def _aimed(
     backend: Backend, systems: SystemBatch, points: np.ndarray, guess: np.ndarray, target: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rays from points (B, N or 1, 3) through targets (B, N, 2) of the last element; position, direction (B, N, 3)."""
+    """Aim rays from points (B, N or 1, 3) at targets (B, N, 2) of the last element.
+
+    Returns
+    -------
+    tuple of ndarray
+        Position and direction, (B, N, 3) each.
+    """
     points = np.broadcast_to(points, (*target.shape[:2], 3))
     guesses = np.broadcast_to(guess, points.shape)
     fan = RayFan(points, guesses, transverse_axes(guesses, np.broadcast_to([0.0, 1.0, 0.0], guesses.shape)))

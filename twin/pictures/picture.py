@@ -1,11 +1,11 @@
-"""Pictures of an instrument, rendered by Mitsuba and cleaned of noise.
+"""Pictures of an instrument, rendered by Mitsuba and denoised.
 
-Pixels are sampled one list at a time, not picture by picture: those on matt surfaces need few samples, glass many.
-Every pixel's samples are averaged in a fixed order, so that a seed gives the same picture again.
+Pixels are sampled in lists of equal sample count rather than picture by picture: those on matt surfaces need few
+samples, glass many. The samples of a pixel are averaged in a fixed order, so that a seed reproduces the same picture.
 
-``picture.png`` shows both cameras, ``picture_prisms.png`` the central prism and what is next to it, and
-``picture_focal_plane.png`` the detectors of the first camera. They are for looking at, not for measuring: lines of
-light are drawn a few pixels thick, and the room is a photographer's studio.
+``picture.png`` shows both cameras, ``picture_prisms.png`` the central prism and its neighbours, and
+``picture_focal_plane.png`` the detectors of the first camera. They are illustrations and not for measuring: light beams
+are drawn a few pixels thick, and the room is a photographer's studio.
 """
 
 from __future__ import annotations
@@ -29,29 +29,29 @@ from twin.pictures.picture_scene import Part, View, framed, load_studio, points_
 from twin.pictures.scene_file import build_scene
 
 VARIANTS = {"llvm": "llvm_ad_rgb", "cuda": "cuda_ad_rgb"}
-"""Mitsuba's variant with colour that a backend's machine can run."""
+"""Backend -> the colour variant of Mitsuba that its machine can run."""
 AT_ONCE = 4_000_000
-"""Paths between two looks at the keyboard."""
+"""Number of paths per launch, between which the program can be interrupted."""
 BRIGHTEST = 4.0
-"""Samples are cut here: one path that finds a lamp through glass must not leave a white dot."""
+"""Radiance at which samples are clipped, so that single paths to a lamp through glass leave no white dots."""
 DEPTH = 14
-"""Longest path, in segments: light crosses two prisms and more."""
+"""Largest number of path segments: light crosses two prisms and more."""
 SOFT = 0.75
-"""Half width of the tent that a pixel averages over, pixels."""
+"""Half width of the tent filter of a pixel, pixels."""
 
 
 class PictureError(RuntimeError):
-    """The pictures cannot be made; the message says why."""
+    """Error in rendering the pictures; the message says why."""
 
 
 @contextmanager
 def colour_variant(backend: Backend) -> Iterator[Any]:
-    """Mitsuba with its colour variant; the one that was set before is set again afterwards.
+    """Provide Mitsuba with its colour variant; the previous variant is restored afterwards.
 
     Raises
     ------
     PictureError
-        The variant cannot be set (another one is never taken), or Mitsuba fails.
+        The variant cannot be set (no other one is used instead), or Mitsuba fails.
     """
     import mitsuba as mi  # after optics, which has named the LLVM library
 
@@ -69,6 +69,7 @@ def colour_variant(backend: Backend) -> Iterator[Any]:
 
 
 def _set_variant(mi: Any, variant: str) -> None:
+    """Set Mitsuba's variant, or raise PictureError."""
     try:
         mi.set_variant(variant)
     except (ImportError, AttributeError) as error:
@@ -78,16 +79,16 @@ def _set_variant(mi: Any, variant: str) -> None:
 
 
 class Studio:
-    """A scene and a camera in Mitsuba.
+    """Scene and camera in Mitsuba.
 
     Parameters
     ----------
     mi
         Mitsuba with its colour variant set.
     parts
-        What stands in the studio.
+        Parts of the scene.
     view
-        The camera.
+        Camera.
     """
 
     def __init__(self, mi: Any, parts: list[Part], view: View) -> None:
@@ -101,54 +102,52 @@ class Studio:
         self._part_of[numbers] = np.arange(len(parts))
 
     def chunks(self, pixels: np.ndarray, samples: int) -> Iterator[np.ndarray]:
-        """Pixels in groups that are quickly done."""
+        """Yield pixels in groups that are rendered quickly."""
         size = max(1, AT_ONCE // samples)
         for start in range(0, len(pixels), size):
             yield pixels[start : start + size]
 
     def light(self, pixels: np.ndarray, samples: int, seed: int) -> np.ndarray:
-        """Mean light in pixels, (N, 3).
+        """Return the mean radiance of pixels, (N, 3).
 
         Parameters
         ----------
-        pixels : np.ndarray
-            Row times width plus column, (N,).
+        pixels : (N,) ndarray of int
+            Row times width plus column.
         samples : int
-            Per pixel.
+            Samples per pixel.
         seed : int
-            Of the samples.
+            Seed of the samples.
         """
         mi = self._mi
-        every = np.repeat(pixels, samples)
+        samples_of_pixels = np.repeat(pixels, samples)
         sampler = mi.load_dict({"type": "independent"})
-        mixed = np.random.SeedSequence([seed, samples, int(pixels[0])]).generate_state(1)
-        sampler.seed(int(mixed[0]), len(every))
+        sampler_seed = np.random.SeedSequence([seed, samples, int(pixels[0])]).generate_state(1)
+        sampler.seed(int(sampler_seed[0]), len(samples_of_pixels))
         offset = SOFT * mi.warp.square_to_tent(sampler.next_2d())
-        ray = self._rays(every, offset.x, offset.y)
+        ray = self._rays(samples_of_pixels, offset.x, offset.y)
         light, _, _ = self._integrator.sample(self._scene, sampler, ray)
         values = np.minimum(np.asarray(light.numpy()), BRIGHTEST)
         return np.asarray(values.reshape(3, len(pixels), samples).mean(axis=2, dtype=float).T)
 
     def first_hits(self, x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
-        """Number of the part that every pixel shows first, -1 for none (H, W), and the normal there, (H, W, 3).
+        """Return the number of the part that each pixel shows first, -1 for none (H, W), and its normal, (H, W, 3).
 
         Parameters
         ----------
-        x : float
-            Where in the pixel, pixels from its middle.
-        y : float
-            likewise.
+        x, y : float
+            Position within the pixel, pixels from its middle.
         """
         import drjit as dr
 
         mi, size = self._mi, (self._view.height, self._view.width)
         ray = self._rays(np.arange(size[0] * size[1]), mi.Float(x), mi.Float(y))
         hit = self._scene.ray_intersect(ray)
-        found = dr.select(hit.is_valid(), dr.reinterpret_array(mi.UInt32, hit.shape), 0)
-        return self._part_of[found.numpy()].reshape(size), hit.sh_frame.n.numpy().T.reshape(*size, 3)
+        shape = dr.select(hit.is_valid(), dr.reinterpret_array(mi.UInt32, hit.shape), 0)
+        return self._part_of[shape.numpy()].reshape(size), hit.sh_frame.n.numpy().T.reshape(*size, 3)
 
     def _rays(self, pixels: np.ndarray, x: Any, y: Any) -> Any:
-        """Rays through pixels, from their middle off by x, y."""
+        """Return rays through pixels, displaced from their middle by x, y."""
         mi, view = self._mi, self._view
         row, column = np.divmod(pixels, view.width)
         place = mi.Point2f(
@@ -160,6 +159,7 @@ class Studio:
 
 
 def _sensor(mi: Any, view: View) -> Any:
+    """Return Mitsuba's description of the camera."""
     look = mi.ScalarTransform4f().look_at(
         origin=view.eye.tolist(), target=(view.eye + view.forward).tolist(), up=view.up.tolist()
     )
@@ -179,37 +179,38 @@ def _sensor(mi: Any, view: View) -> Any:
 BLUR, BLUR_SHARE = (6.0, 16.0), 0.025
 """Over how many pixels the light on a flat patch is averaged: limits, and share of the root of its area."""
 EXPOSURE = 0.88
+"""Factor from radiance to exposed radiance."""
 SHOULDER = 0.75
-"""Exposed light above this is compressed, so that nothing is burnt out."""
+"""Exposed radiance above which the tone curve compresses, so that highlights keep detail."""
 
 
-def still_patches(seen: Sequence[tuple[np.ndarray, np.ndarray]], matt: Sequence[bool]) -> np.ndarray:
-    """Numbers of the flat patches of matt surfaces, (H, W); -1 on their borders and everywhere else.
+def uniform_patches(seen: Sequence[tuple[np.ndarray, np.ndarray]], matt: Sequence[bool]) -> np.ndarray:
+    """Return the numbers of flat patches of matt surfaces, (H, W); -1 on their borders and elsewhere.
 
     Parameters
     ----------
-    seen : Sequence[tuple[np.ndarray, np.ndarray]]
-        Some looks at the scene: number of the part (H, W), -1 for none, and normal (H, W, 3).
-    matt : Sequence[bool]
-        Of every part, whether the light on it changes slowly.
+    seen : sequence of tuple
+        First hits at several positions in the pixels: number of the part (H, W), -1 for none, and normal (H, W, 3).
+    matt : sequence of bool
+        True for each part on which the light varies slowly.
     """
     first, square = _patches(*seen[0]), np.ones((3, 3), np.uint8)
     still = np.array([*matt, False])[seen[0][0]]
-    for part, normal in seen:  # a border is a pixel that shows two things in any look, and its neighbours
+    for part, normal in seen:  # a border pixel shows two patches in any of these hits, or is adjacent to such a pixel
         patches = _patches(part, normal)
         still &= (patches == first) & (cv2.dilate(patches, square) == cv2.erode(patches, square))
     return np.where(still, first, -1.0).astype(np.int64)
 
 
-def without_grain(image: np.ndarray, patches: np.ndarray) -> np.ndarray:
-    """Average the light over each patch; what belongs to none stays as it is.
+def denoised(image: np.ndarray, patches: np.ndarray) -> np.ndarray:
+    """Average the light over each patch; pixels of no patch remain unchanged.
 
     Parameters
     ----------
-    image : np.ndarray
-        (H, W, 3) rendered light.
-    patches : np.ndarray
-        (H, W) numbers, -1 for none.
+    image : (H, W, 3) ndarray
+        Rendered light.
+    patches : (H, W) ndarray of int
+        Numbers of the patches, -1 for none.
     """
     out = image.astype(np.float32)
     for value in np.unique(patches[patches >= 0]):
@@ -226,7 +227,7 @@ def without_grain(image: np.ndarray, patches: np.ndarray) -> np.ndarray:
 
 
 def displayed(light: np.ndarray) -> np.ndarray:
-    """Light -> sRGB grey values, uint8."""
+    """Convert radiance to sRGB grey values, uint8."""
     x = np.clip(EXPOSURE * light, 0.0, None)
     room = 1.0 - SHOULDER
     x = np.where(x > SHOULDER, SHOULDER + room * -np.expm1(-(x - SHOULDER) / room), x)
@@ -235,7 +236,7 @@ def displayed(light: np.ndarray) -> np.ndarray:
 
 
 def _patches(part: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """A number for every part and direction of its surface, float32 (H, W); exact for up to 16000 parts."""
+    """Return a number for every part and direction of its surface, float32 (H, W); exact for up to 16000 parts."""
     steps = np.rint(4.0 * normal).astype(int) + 5
     return (part * 1000 + steps @ np.array([1, 10, 100])).astype(np.float32)
 
@@ -244,23 +245,23 @@ PICTURE = "render the pictures"
 """Name of the work in the progress display."""
 
 LOOKS = ((0.0, 0.0), (-0.35, -0.25), (0.35, 0.25))
-"""Where in a pixel it is looked at to find out whether it shows one thing only, pixels from its middle."""
+"""Positions in a pixel at which it is tested for showing a single part, pixels from its middle."""
 
 Advance = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One picture.
+    """Settings of one picture.
 
     Attributes
     ----------
     name : str
-        Of the file.
+        Name of the file.
     width, height : int
-        pixels.
+        Size, pixels.
     coarse, fine : int
-        Samples per pixel, of matt surfaces (which are smoothed) and of all else.
+        Samples per pixel of matt surfaces, which are denoised, and of all other pixels.
     shows : str
         ``instrument``, ``prisms`` or ``focal_plane``.
     """
@@ -289,24 +290,24 @@ def write_pictures(
     advance: Advance = lambda part, done, total: None,
     shots: tuple[Shot, ...] = SHOTS,
 ) -> None:
-    """Render the pictures of an instrument in a perturbed state and hand them over as PNG files.
+    """Render the pictures of an instrument in a perturbed state and write them as PNG files.
 
     Parameters
     ----------
     instrument : Instrument
-        The instrument.
+        Instrument.
     backend : Backend
-        Where to trace.
+        Array backend of the trace.
     state : State
-        What is perturbed; motions are far too small to be seen.
-    write : Callable[[str, Callable[[Path], None]], None]
-        Takes the name of a file and what writes it, e.g. ``RunFolder.write_with``.
+        Perturbed state; its motions are far too small to be visible.
+    write : callable
+        Function of a file name and of the function that writes the file, e.g. ``RunFolder.write_with``.
     seed : int
-        Of the samples.
+        Seed of the samples.
     advance : Advance
-        Told how many percent of all pictures are done.
-    shots : tuple[Shot, ...]
-        Which pictures.
+        Called with the percentage of all pictures done.
+    shots : tuple of Shot
+        Pictures to render.
 
     Raises
     ------
@@ -316,17 +317,18 @@ def write_pictures(
     paths = trace_light_paths(instrument, backend, state)
     pixels = [shot.width * shot.height for shot in shots]
     for k, shot in enumerate(shots):
-        before, own = sum(pixels[:k]) / sum(pixels), pixels[k] / sum(pixels)
+        before, weight = sum(pixels[:k]) / sum(pixels), pixels[k] / sum(pixels)
 
-        def say(share: float, before: float = before, own: float = own) -> None:
-            advance(PICTURE, round(100.0 * (before + own * share)), 100)
+        def say(share: float, before: float = before, weight: float = weight) -> None:
+            advance(PICTURE, round(100.0 * (before + weight * share)), 100)
 
         image = render_shot(instrument, paths, backend, shot, seed, say)
         write(shot.name, partial(_save, image))
 
 
-def _save(image: np.ndarray, place: Path) -> None:
-    place.write_bytes(cv2.imencode(".png", image[..., ::-1])[1].tobytes())
+def _save(image: np.ndarray, path: Path) -> None:
+    """Write an image as a PNG file."""
+    path.write_bytes(cv2.imencode(".png", image[..., ::-1])[1].tobytes())
 
 
 def render_shot(
@@ -337,49 +339,49 @@ def render_shot(
     seed: int = 0,
     advance: Callable[[float], None] = lambda share: None,
 ) -> np.ndarray:
-    """One picture, (height, width, 3) uint8, red first.
+    """Render one picture, (height, width, 3) uint8, red first.
 
     Raises
     ------
     PictureError
         Mitsuba cannot run the variant that the pictures need, or fails.
     """
-    view, parts = staged(instrument, paths, shot)
+    view, parts = picture_setup(instrument, paths, shot)
     with colour_variant(backend) as mi:
         studio = Studio(mi, parts, view)
-        seen = [studio.first_hits(x, y) for x, y in LOOKS]
-        patches = still_patches(seen, [part.matt for part in parts])
-        plain = np.flatnonzero(patches >= 0)
-        busy = np.flatnonzero(patches < 0)
-        work = len(plain) * shot.coarse + len(busy) * shot.fine
+        hits = [studio.first_hits(x, y) for x, y in LOOKS]
+        patches = uniform_patches(hits, [part.matt for part in parts])
+        uniform_pixels = np.flatnonzero(patches >= 0)
+        detailed_pixels = np.flatnonzero(patches < 0)
+        work = len(uniform_pixels) * shot.coarse + len(detailed_pixels) * shot.fine
         image = np.zeros((shot.height * shot.width, 3))
         done = 0
-        for pixels, samples in ((plain, shot.coarse), (busy, shot.fine)):
-            for chosen in studio.chunks(pixels, samples):
-                image[chosen] = studio.light(chosen, samples, seed)
-                done += len(chosen) * samples
+        for pixels, samples in ((uniform_pixels, shot.coarse), (detailed_pixels, shot.fine)):
+            for chunk in studio.chunks(pixels, samples):
+                image[chunk] = studio.light(chunk, samples, seed)
+                done += len(chunk) * samples
                 advance(done / work)
-    return displayed(without_grain(image.reshape(shot.height, shot.width, 3), patches))
+    return displayed(denoised(image.reshape(shot.height, shot.width, 3), patches))
 
 
-def staged(instrument: Instrument, paths: LightPaths, shot: Shot) -> tuple[View, list[Part]]:
-    """Where the camera of a picture stands, and all that it may see."""
+def picture_setup(instrument: Instrument, paths: LightPaths, shot: Shot) -> tuple[View, list[Part]]:
+    """Return the camera of a picture and all parts that it may show."""
     points = points_in_world(build_scene(instrument, paths))
     if shot.shows == "instrument":
-        wanted, (azimuth, elevation, field) = list(points), (-66.0, 24.0, 28.0)
+        names, (azimuth, elevation, field) = list(points), (-66.0, 24.0, 28.0)
     elif shot.shows == "prisms":
-        wanted = [name for name in points if name.startswith(CENTRAL_PRISM) or prism_of(name) == PRISM_0]
+        names = [name for name in points if name.startswith(CENTRAL_PRISM) or prism_of(name) == PRISM_0]
         azimuth, elevation, field = -66.0, 24.0, 24.0
     elif shot.shows == "focal_plane":
         plane = f"{BASE}/{next(iter(instrument.cameras))}/focal_plane"
-        wanted = [name for name in points if name.startswith(plane)]
-        # into the housing, against the light, a little from the side
+        names = [name for name in points if name.startswith(plane)]
+        # view into the housing, against the light, slightly from the side
         x, y, z = -paths.placed.pose(plane).rotation[:, 2]
         azimuth = float(np.degrees(np.arctan2(y, x))) + 12.0
         elevation = float(np.degrees(np.arctan2(z, np.hypot(x, y)))) + 5.0
         field = 24.0
     else:
         raise ValueError(f"a picture shows the instrument, the prisms or the focal plane, not {shot.shows!r}")
-    shown = np.concatenate([points[name] for name in wanted])
+    shown = np.concatenate([points[name] for name in names])
     view = framed(shown, azimuth, elevation, field, (shot.width, shot.height))
     return view, studio_parts(instrument, paths, view.pixel_at(shown))

@@ -1,4 +1,4 @@
-"""The scene of a picture: from where it is seen, and what stands in it.
+"""Scene of a picture: its camera, materials and lighting.
 
 Bodies come from ``twin.pictures.scene_file``, so that a picture and ``scene.glb`` show the same ones.
 """
@@ -21,18 +21,18 @@ from twin.pictures.scene_file import BLOCK, BRASS, DARK, GLASS, MIRROR, SILICON,
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A pinhole camera; +Z of the base frame is up in the picture.
+    """Pinhole camera of a picture; +Z of the base frame is up in the picture.
 
     Attributes
     ----------
-    eye : np.ndarray
-        Where it stands, metres.
-    forward, right, up : np.ndarray
+    eye : (3,) ndarray
+        Position in the base frame, metres.
+    forward, right, up : (3,) ndarray
         Unit vectors in the base frame.
     half_width : float
         Tangent of half the horizontal field.
     width, height : int
-        Of the picture, pixels.
+        Size of the picture, pixels.
     """
 
     eye: np.ndarray
@@ -44,7 +44,13 @@ class View:
     height: int
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """World points (N, 3) -> column and row, (N, 2) pixels from the picture's top left corner."""
+        """Project points (N, 3) in the base frame to columns and rows.
+
+        Returns
+        -------
+        (N, 2) ndarray
+            Pixels from the picture's top left corner.
+        """
         away = np.asarray(points, dtype=float) - self.eye
         scale = 0.5 * self.width / self.half_width / (away @ self.forward)
         return np.stack(
@@ -52,7 +58,7 @@ class View:
         )
 
     def pixel_at(self, points: np.ndarray) -> float:
-        """Size of a pixel in the middle of points, metres."""
+        """Return the size of a pixel at the mean depth of points, metres."""
         depth = float((np.asarray(points) - self.eye).mean(axis=0) @ self.forward)
         return 2.0 * self.half_width * depth / self.width
 
@@ -63,7 +69,7 @@ class View:
 
 
 def looking(azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Forward, right and up of a camera that stands at an azimuth (from +X toward +Y) and elevation, degrees."""
+    """Return forward, right and up of a camera at an azimuth (from +X toward +Y) and elevation, degrees."""
     a, e = np.radians([azimuth, elevation])
     forward = -np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -74,22 +80,22 @@ def looking(azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray, n
 def framed(
     points: np.ndarray, azimuth: float, elevation: float, field: float, size: tuple[int, int], margin: float = 0.04
 ) -> View:
-    """The nearest camera of a direction that has all points in its picture.
+    """Return the nearest camera in a direction whose picture contains all points.
 
     Parameters
     ----------
-    points : np.ndarray
-        (N, 3), metres.
+    points : (N, 3) ndarray
+        Points in the base frame, metres.
     azimuth : float
-        Of the camera as seen from the points, from +X toward +Y, degrees.
+        Azimuth of the camera seen from the points, from +X toward +Y, degrees.
     elevation : float
-        Likewise, toward +Z, degrees.
+        Elevation of the camera seen from the points, toward +Z, degrees.
     field : float
         Horizontal field of view, degrees.
-    size : tuple[int, int]
+    size : tuple of int
         Width and height, pixels.
     margin : float
-        Share of the width that stays free on every side.
+        Free margin on every side, as a fraction of the width.
     """
     width, height = size
     forward, right, up = looking(azimuth, elevation)
@@ -107,22 +113,22 @@ def framed(
 
 
 SMOOTH = 0.35
-"""Edges flatter than this are not edges but facets of a curved surface, radians."""
+"""Angle below which an edge is a facet boundary of a curved surface, radians."""
 BEAM_PIXELS, EDGE_PIXELS = 1.0, 0.55
 """Radius of beams and of the drawn edges of glass, in pixels at the middle of the picture."""
 GLOW = 1.3
-"""Radiance of beams; the floor's is about 0.9."""
+"""Radiance of drawn beams; that of the floor is about 0.9."""
 FLOOR = "floor"
 GAP = 0.05
-"""From the lowest point of the instrument to the floor, metres."""
+"""Distance from the lowest point of the instrument to the floor, metres."""
 
 _GLASS_EDGE = (0.03, 0.12, 0.15)
 
 
 def _coloured(colour: Sequence[float], **more: float) -> dict[str, Any]:
-    """Mitsuba's description of a surface of one colour, linear red, green and blue, that is alike on both sides."""
-    own = {"type": "principled", "base_color": {"type": "rgb", "value": list(colour)}, **more}
-    return {"type": "twosided", "bsdf": own}
+    """Return Mitsuba's description of a two-sided surface of one colour, linear red, green and blue."""
+    bsdf = {"type": "principled", "base_color": {"type": "rgb", "value": list(colour)}, **more}
+    return {"type": "twosided", "bsdf": bsdf}
 
 
 _BSDF: dict[str, dict[str, Any]] = {
@@ -157,25 +163,25 @@ _MATERIALS = (
     (GLASS, "glass"),
     (BLOCK, "block"),
 )
-"""What a body is painted with in ``scene.glb``, and what it is made of here."""
+"""Material of a body in ``scene.glb``, and the corresponding material of the picture."""
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A mesh of one material.
+    """Mesh of one material.
 
     Attributes
     ----------
     body : str
-        Path of the body that it belongs to; ``light/...`` for beams, ``floor``.
-    mesh : trimesh.Trimesh
-        In the base frame, metres.
-    bsdf : Mapping[str, Any]
+        Path of the body to which it belongs; ``light/...`` for beams, ``floor``.
+    mesh : Trimesh
+        Mesh in the base frame, metres.
+    bsdf : mapping
         Mitsuba's description of the material.
-    radiance : tuple[float, float, float] | None
-        Red, green, blue that it emits.
+    radiance : tuple of float, or None
+        Emitted red, green and blue.
     matt : bool
-        Whether light on it changes slowly: neither mirror nor glass, and no thin line.
+        True if light on it varies slowly: neither mirror nor glass, and no thin line.
     """
 
     body: str
@@ -186,16 +192,16 @@ class Part:
 
 
 def studio_parts(instrument: Instrument, paths: LightPaths, pixel: float) -> list[Part]:
-    """All that stands in the studio.
+    """Return all parts of the studio.
 
     Parameters
     ----------
     instrument : Instrument
-        The instrument.
+        Instrument.
     paths : LightPaths
-        Its beams and where its bodies stand.
+        Beams of the instrument and poses of its bodies.
     pixel : float
-        Size of a picture's pixel at the instrument, metres; it decides how thick lines are drawn.
+        Size of a picture's pixel at the instrument, metres, from which the thickness of lines follows.
     """
     scene = build_scene(instrument, paths, tube=BEAM_PIXELS * pixel)
     backs = {
@@ -207,18 +213,18 @@ def studio_parts(instrument: Instrument, paths: LightPaths, pixel: float) -> lis
     lowest = np.inf
     for name in scene.graph.nodes_geometry:
         matrix, geometry = scene.graph.get(name)
-        own = scene.geometry[geometry]
-        world = trimesh.Trimesh(own.vertices, own.faces, process=False)
+        local_mesh = scene.geometry[geometry]
+        world = trimesh.Trimesh(local_mesh.vertices, local_mesh.faces, process=False)
         world.apply_transform(matrix)
         lowest = min(lowest, float(world.bounds[0, 2]))
-        material = own.visual.material
+        material = local_mesh.visual.material
         if name.startswith("light/"):
             colour = _linear(material.baseColorFactor[:3])
             parts.append(Part(name, world, _BSDF["lamp"], tuple(GLOW * colour), False))
             continue
         kind = next((kind for known, kind in _MATERIALS if known is material), "")
         if name in backs:
-            polished = own.face_normals[:, 2] * backs[name] < -0.5
+            polished = local_mesh.face_normals[:, 2] * backs[name] < -0.5
             parts.append(Part(name, _part_of(world, polished), _BSDF["mirror"], matt=False))
             parts.append(Part(name, _part_of(world, ~polished), _BSDF["substrate"]))
         else:
@@ -231,7 +237,7 @@ def studio_parts(instrument: Instrument, paths: LightPaths, pixel: float) -> lis
 
 
 def points_in_world(scene: trimesh.Scene) -> dict[str, np.ndarray]:
-    """Name of a node with a mesh -> its vertices in the base frame, (N, 3) metres."""
+    """Return the vertices of every mesh in the base frame, name of its node -> (N, 3), metres."""
     out = {}
     for name in scene.graph.nodes_geometry:
         matrix, geometry = scene.graph.get(name)
@@ -240,17 +246,18 @@ def points_in_world(scene: trimesh.Scene) -> dict[str, np.ndarray]:
 
 
 def _paint(material: Any) -> dict[str, Any]:
-    """What ``scene.glb`` has a body painted with, as Mitsuba describes it."""
+    """Return Mitsuba's description of a material of ``scene.glb``."""
     metallic, roughness = float(material.metallicFactor), float(material.roughnessFactor)
     return _coloured(_linear(material.baseColorFactor[:3]).tolist(), metallic=metallic, roughness=roughness)
 
 
 def _part_of(mesh: trimesh.Trimesh, faces: np.ndarray) -> trimesh.Trimesh:
+    """Return some faces of a mesh."""
     return trimesh.Trimesh(mesh.vertices, mesh.faces[faces], process=False)
 
 
 def _edges(mesh: trimesh.Trimesh, radius: float) -> trimesh.Trimesh:
-    """The sharp edges of a body as thin rods."""
+    """Return the sharp edges of a body as thin rods."""
     sharp = mesh.face_adjacency_edges[mesh.face_adjacency_angles > SMOOTH]
     rods = [
         trimesh.creation.cylinder(radius=radius, segment=mesh.vertices[ends], sections=6)
@@ -262,20 +269,21 @@ def _edges(mesh: trimesh.Trimesh, radius: float) -> trimesh.Trimesh:
     return joined
 
 
-def _floor(height: float, reach: float = 500.0) -> trimesh.Trimesh:
-    corners = reach * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+def _floor(height: float, half_size: float = 500.0) -> trimesh.Trimesh:
+    """Return the floor as a large square."""
+    corners = half_size * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     corners[:, 2] = height
     return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
 
 
 def _linear(colour: Any) -> np.ndarray:
-    """Grey values of sRGB, 0..255, -> linear 0..1."""
+    """Convert sRGB grey values, 0..255, to linear values, 0..1."""
     value = np.asarray(colour, dtype=float) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
 def _studio_light(mi: Any, view: View, rows: int = 128) -> dict[str, Any]:
-    """Soft neutral light from all sides, two large soft boxes beside and above the camera, a dark horizon opposite."""
+    """Return soft light from all sides, two large soft boxes near the camera and a dark horizon opposite."""
     theta = np.pi * (np.arange(rows) + 0.5) / rows
     phi = 2.0 * np.pi * (np.arange(2 * rows) + 0.5) / (2 * rows)
     polar, azimuth = np.meshgrid(theta, phi, indexing="ij")
@@ -285,17 +293,17 @@ def _studio_light(mi: Any, view: View, rows: int = 128) -> dict[str, Any]:
     flat = -np.array([view.forward[0], view.forward[1], 0.0])
     flat /= np.linalg.norm(flat)  # horizontally toward the camera
     side = np.array([view.right[0], view.right[1], 0.0])
-    # mirrors show what is behind the instrument: it is dark near the floor, so that they stand out from the floor
-    behind_it = np.clip(toward @ -flat, 0.0, 1.0)
+    # mirrors reflect the horizon behind the camera's target, which is dark near the floor for contrast with the floor
+    opposite = np.clip(toward @ -flat, 0.0, 1.0)
     rise = np.clip(height / 0.75, 0.0, 1.0)
     level = 0.55 + 0.45 * np.clip(height, 0.0, 1.0)
-    level = level + np.sqrt(behind_it) * (0.10 + 1.0 * rise**1.5 - level)
-    for place, reach, strength in (
+    level = level + np.sqrt(opposite) * (0.10 + 1.0 * rise**1.5 - level)
+    for direction, half_angle, strength in (
         (0.60 * flat - 0.75 * side + 0.85 * np.array([0, 0, 1]), 0.55, 1.5),
         (0.45 * flat + 0.90 * side + 0.80 * np.array([0, 0, 1]), 0.40, 0.9),
     ):
-        off = np.arccos(np.clip(toward @ (place / np.linalg.norm(place)), -1.0, 1.0))
-        level = level + strength / (1.0 + np.exp((off - reach) / 0.05))
+        angle = np.arccos(np.clip(toward @ (direction / np.linalg.norm(direction)), -1.0, 1.0))
+        level = level + strength / (1.0 + np.exp((angle - half_angle) / 0.05))
     colour = np.repeat(level[..., None], 3, axis=-1).astype(np.float32)
     return {
         "type": "envmap",
@@ -305,7 +313,7 @@ def _studio_light(mi: Any, view: View, rows: int = 128) -> dict[str, Any]:
 
 
 def load_studio(mi: Any, parts: list[Part], view: View) -> Any:
-    """A ``mi.Scene`` of the parts under the studio's light; Mitsuba's index of a shape is the number of the part."""
+    """Return a ``mi.Scene`` of the parts under the studio's light; shapes have the order of the parts."""
     names = [f"part{i:04d}" for i in range(len(parts))]
     description: dict[str, Any] = {"type": "scene", "light": _studio_light(mi, view)}
     for name, part in zip(names, parts, strict=True):
@@ -317,6 +325,7 @@ def load_studio(mi: Any, parts: list[Part], view: View) -> Any:
 
 
 def _mesh(mi: Any, name: str, part: Part) -> Any:
+    """Return a part as a mesh of Mitsuba."""
     smooth = trimesh.graph.smooth_shade(part.mesh, angle=SMOOTH)
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(dict(part.bsdf))

@@ -1,15 +1,15 @@
-"""``scene.glb``: the perturbed instrument and its light paths in three dimensions, for any glTF viewer.
+"""3-D scene ``scene.glb`` of the perturbed instrument and its light paths, for any glTF viewer, and its own viewer.
 
 The scene is in the base frame, in metres (X = flight direction, Y = along the line CCDs, Z toward the scene). Every
-body of the tree is a node whose name is the body's path; a viewer shows the tree as the twin has it. Mirrors have their
-true shape and clear aperture; figure errors, far too small to be seen, are left out. What has no size of its own
-(board, reticle) is given one that is easy to see; the light-sensitive faces are to scale.
+body of the tree is a node whose name is the body's path, so that a viewer shows the instrument's tree. Mirrors have
+their true shape and clear aperture; figure errors, far too small to be visible, are omitted. Bodies without a size in
+the model (board, reticle) are drawn large enough to see; the light-sensitive faces are to scale.
 
-The scene's ``extras`` hold ``motions``: body -> how it moved in its parent, so that a viewer can exaggerate it. k times
-the motion is the matrix ``nominal`` (column by column) times the turn by k ``rotate`` (rotation vector, radians) about
-``pivot`` and the shift by k ``shift``, metres, in the body's own nominal frame.
+The scene's ``extras`` contain ``motions``: body -> its motion relative to its parent, so that a viewer can exaggerate
+it. k times the motion is the matrix ``nominal`` (column by column) times the rotation by k ``rotate`` (rotation vector,
+radians) about ``pivot`` and the shift by k ``shift``, metres, in the body's nominal frame.
 
-The interactive view of scene.glb as a part of a page that needs nothing else: no file beside it, no network.
+The interactive viewer is part of the report's page and needs neither other files nor a network.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ TUBE = 0.0015
 TUBE_SIDES = 5
 """Radius of drawn rays, metres, and their number of sides."""
 
-LEAST_MOTION = 1e-12
-"""Radians and metres below which a body did not move but for rounding."""
+MIN_MOTION = 1e-12
+"""Rotation (radians) or shift (metres) below which a motion is rounding."""
 
 _WORLD = "world"
 
@@ -53,6 +53,7 @@ _WORLD = "world"
 def _metal(
     red: int, green: int, blue: int, metallic: float = 0.55, roughness: float = 0.25, alpha: int = 255
 ) -> PBRMaterial:
+    """Return a glTF material of 8-bit colour."""
     return PBRMaterial(
         baseColorFactor=[red, green, blue, alpha],
         metallicFactor=metallic,
@@ -74,16 +75,16 @@ MONITOR = (_metal(213, 94, 0, 0.0, 0.8), _metal(230, 159, 0, 0.0, 0.8))
 
 
 def scene_bytes(instrument: Instrument, state: State, paths: LightPaths) -> bytes:
-    """The content of ``scene.glb``: the instrument in a perturbed state as binary glTF.
+    """Return the contents of ``scene.glb``: the instrument in a perturbed state as binary glTF.
 
     Parameters
     ----------
     instrument : Instrument
-        The instrument.
+        Instrument.
     state : State
-        What is perturbed.
+        Perturbed state.
     paths : LightPaths
-        Its light in that state.
+        Light paths in that state.
     """
     scene = build_scene(instrument, paths)
     scene.metadata["motions"] = motions(instrument, state, paths.placed)
@@ -91,20 +92,20 @@ def scene_bytes(instrument: Instrument, state: State, paths: LightPaths) -> byte
 
 
 def motions(instrument: Instrument, state: State, placed: PlacedBodies) -> dict[str, dict[str, Any]]:
-    """Body -> its motion against its parent, as the scene's ``extras`` hold it; bodies at rest are left out.
+    """Return body -> its motion relative to its parent, as in the scene's ``extras``, without bodies at rest.
 
     Parameters
     ----------
     instrument : Instrument
-        The instrument.
+        Instrument.
     state : State
-        What is perturbed, for the pivots.
+        Perturbed state, for the pivots.
     placed : PlacedBodies
-        Its bodies in that state.
+        Poses of the bodies in that state.
     """
     nominal = instrument.assembly.place()
     bodies = instrument.assembly.tree.bodies
-    rest, moved = (_all_in_parents(bodies, where) for where in (nominal, placed))
+    rest, moved = (_all_in_parents(bodies, poses) for poses in (nominal, placed))
     back = np.swapaxes(rest[:, :3, :3], -1, -2)
     turn = back @ moved[:, :3, :3]
     offset = np.einsum("bij,bj->bi", back, moved[:, :3, 3] - rest[:, :3, 3])
@@ -112,17 +113,17 @@ def motions(instrument: Instrument, state: State, placed: PlacedBodies) -> dict[
     rotate = Rotation.from_matrix(turn).as_rotvec()
     shift = np.einsum("bij,bj->bi", turn, pivots) + offset - pivots
     out = {}
-    for k in np.flatnonzero(np.maximum(np.abs(rotate), np.abs(shift)).max(axis=1) > LEAST_MOTION):
+    for k in np.flatnonzero(np.maximum(np.abs(rotate), np.abs(shift)).max(axis=1) > MIN_MOTION):
         vectors = {"rotate": rotate[k].tolist(), "shift": shift[k].tolist(), "pivot": pivots[k].tolist()}
         out[bodies[k].path] = {"nominal": rest[k].T.ravel().tolist(), **vectors}
     return out
 
 
 def _all_in_parents(bodies: Sequence[Body], placed: PlacedBodies) -> np.ndarray:
-    """Matrices of all bodies relative to their parents, or to the world, (B, 4, 4)."""
-    own = np.array([placed.index[body.path] for body in bodies])
-    matrix = np.zeros((len(own), 4, 4))
-    matrix[:, :3, :3], matrix[:, :3, 3] = placed.rotation[0, own].real, placed.translation[0, own].real
+    """Return the matrices of all bodies relative to their parents, or to the world, (B, 4, 4)."""
+    body_rows = np.array([placed.index[body.path] for body in bodies])
+    matrix = np.zeros((len(body_rows), 4, 4))
+    matrix[:, :3, :3], matrix[:, :3, 3] = placed.rotation[0, body_rows].real, placed.translation[0, body_rows].real
     matrix[:, 3, 3] = 1.0
     number = {body.path: k for k, body in enumerate(bodies)}
     parents = np.array([number.get(body.parent, -1) if body.parent else -1 for body in bodies])
@@ -135,7 +136,7 @@ def _all_in_parents(bodies: Sequence[Body], placed: PlacedBodies) -> np.ndarray:
 
 
 def build_scene(instrument: Instrument, paths: LightPaths, tube: float = TUBE) -> trimesh.Scene:
-    """The scene as a tree of nodes with the bodies' names; rays are tubes of radius ``tube``, metres."""
+    """Build the scene as a tree of nodes named after the bodies; rays are tubes of radius ``tube``, metres."""
     meshes = _body_meshes(instrument, paths)
     scene = trimesh.Scene(base_frame=_WORLD)
     placed = paths.placed
@@ -160,7 +161,7 @@ def build_scene(instrument: Instrument, paths: LightPaths, tube: float = TUBE) -
 
 
 def _body_meshes(instrument: Instrument, paths: LightPaths) -> dict[str, trimesh.Trimesh]:
-    """Body path -> mesh in the body's own frame, metres, unscaled."""
+    """Return body path -> mesh in the body's frame, metres, unscaled."""
     out: dict[str, trimesh.Trimesh] = {}
     for camera, model in instrument.cameras.items():
         for mirror in model.mirrors:
@@ -170,13 +171,15 @@ def _body_meshes(instrument: Instrument, paths: LightPaths) -> dict[str, trimesh
         line = model.spec.line.pixels * model.spec.line.pitch
         channels = [c for c in instrument.channels if c.camera == camera]
         reach_x, reach_y = board_size(model, [p for c in channels for p in (c.pinhole, c.ccd)])
-        # light arrives along +Z of the focal plane, so what carries the detectors stands on the +Z side
+        # light arrives along +Z of the focal plane, so the board that carries the detectors is on the +Z side
         out[plane] = _painted(_box((reach_x, reach_y, BOARD), 2.0 * CHIP + 0.5 * BOARD), DARK)
         out[f"{plane}/line"] = _painted(_box((LINE_WIDTH, line, CHIP), 0.5 * CHIP), SILICON)
         for channel in channels:
             out.update(_channel_meshes(instrument, channel))
     placed = paths.placed
-    for solid in instrument.solids:  # as they have grown: brought back to nominal size like all others
+    for solid in (
+        instrument.solids
+    ):  # meshes of solids include thermal expansion: restore their nominal size like that of all others
         mesh = solid_mesh(solid, placed).mesh
         mesh.vertices = mesh.vertices / placed.scale[0, placed.index[solid.path]].real
         out[solid.path] = _painted(mesh, _material(solid))
@@ -184,16 +187,17 @@ def _body_meshes(instrument: Instrument, paths: LightPaths) -> dict[str, trimesh
 
 
 def is_mirror(solid: Solid) -> bool:
-    """Whether a body is the plate of a mirror, whose polished side looks along its own +Z."""
+    """Return True for the plate of a mirror, whose polished side faces its +Z."""
     return any(face.coating is Coating.MIRROR and face.body == solid.path for face in solid.faces)
 
 
 def _material(solid: Solid) -> PBRMaterial:
+    """Return the drawing material of a solid."""
     return GLASS if solid.transparent else MIRROR if is_mirror(solid) else BLOCK
 
 
 def _baffle_meshes(plates: tuple[Plate, ...]) -> dict[str, tuple[str, trimesh.Trimesh]]:
-    """Name of a baffle -> the body that carries it, and its plates in that body's frame, metres."""
+    """Return name of a baffle -> the body that carries it, and its plates in that body's frame, metres."""
     parts: dict[str, tuple[str, list[trimesh.Trimesh]]] = {}
     for plate in plates:
         outline = plate.outline
@@ -213,10 +217,13 @@ def _baffle_meshes(plates: tuple[Plate, ...]) -> dict[str, tuple[str, trimesh.Tr
 
 
 def _channel_meshes(instrument: Instrument, channel: Channel) -> dict[str, trimesh.Trimesh]:
+    """Return the meshes of a monitor channel's area CCD, reticle and return face."""
     ccd = instrument.spec.autocollimator.area_ccd
     face = instrument.assembly.elements[f"{channel.key}/return_face"].aperture
     assert isinstance(face, Circle)
-    disc = trimesh.creation.cylinder(radius=face.radius, height=CHIP, sections=48)  # a coating, as thick as can be seen
+    disc = trimesh.creation.cylinder(
+        radius=face.radius, height=CHIP, sections=48
+    )  # a coating, drawn thick enough to see
     disc.apply_translation([0.0, 0.0, 0.5 * CHIP])
     reticle = trimesh.creation.cylinder(radius=RETICLE, height=CHIP, sections=24)
     reticle.apply_translation([0.0, 0.0, 0.5 * CHIP])
@@ -229,19 +236,20 @@ def _channel_meshes(instrument: Instrument, channel: Channel) -> dict[str, trime
 
 
 def _box(size: tuple[float, float, float], z: float) -> trimesh.Trimesh:
-    """A box centred on (0, 0, z)."""
+    """Return a box centred on (0, 0, z)."""
     box = trimesh.creation.box(extents=size)
     box.apply_translation([0.0, 0.0, z])
     return box
 
 
 def _painted(mesh: trimesh.Trimesh, material: PBRMaterial) -> trimesh.Trimesh:
+    """Return the mesh with a material."""
     mesh.visual = trimesh.visual.TextureVisuals(material=material)
     return mesh
 
 
 def _tubes(beam: Beam, camera: int, radius: float) -> trimesh.Trimesh:
-    """The middle ray and some edge rays of a beam as thin tubes."""
+    """Return the middle ray and some edge rays of a beam as thin tubes."""
     rays = beam.vertices[[0, *(1 + k * RIM // 4 for k in range(4))]]
     start, end = rays[:, :-1].reshape(-1, 3), rays[:, 1:].reshape(-1, 3)
     along = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)
@@ -263,37 +271,39 @@ def _tubes(beam: Beam, camera: int, radius: float) -> trimesh.Trimesh:
 
 
 LIBRARY = "three.min.js"
-"""What of three.js (MIT, see LICENSE.three.txt beside it) the viewer uses, made as viewer/three_parts.js says."""
+"""Parts of three.js (MIT, see LICENSE.three.txt beside it) that the viewer uses, built as viewer/three_parts.js
+describes.
+"""
 _HERE = files(__package__) / "viewer"
 
 
 def viewer_markup(moved: str) -> Markup:
-    """The element in which the view appears, hidden until it does.
+    """Return the element of the viewer, hidden until the viewer starts.
 
     Parameters
     ----------
     moved : str
-        What was moved, for readers; empty for nothing.
+        Description of the moved bodies for readers; empty for none.
     """
     text = (_HERE / "viewer.html").read_text("utf-8")
     return Markup(text).format(moved=moved or "nothing")
 
 
 def viewer_programs() -> tuple[str, str]:
-    """All that runs in the view: the program as it stands between its tags, and the library, which it puts in."""
+    """Return the programs of the viewer: its own script and the library that the script loads."""
     return f"\n{(_HERE / 'viewer.js').read_text('utf-8')}", (_HERE / LIBRARY).read_text("utf-8")
 
 
 def viewer_scripts(scene: bytes) -> Markup:
-    """What makes the view: the library and the scene, both packed, and the program. They stand at the end of a page.
+    """Return the scripts at the end of a page that start the viewer: compressed library and scene, and the program.
 
     Parameters
     ----------
     scene : bytes
-        Binary glTF, as `scene_bytes` gives it.
+        Binary glTF, from `scene_bytes`.
     """
     program, library = viewer_programs()
-    # names of tags cannot stand in base64, and the program is ours
+    # base64 cannot contain HTML tags, and the program contains none
     return Markup(
         f'<script type="application/gzip" id="viewer-library">{_packed(library.encode())}</script>\n'
         f'<script type="application/gzip" id="viewer-scene">{_packed(scene)}</script>\n'
@@ -302,5 +312,5 @@ def viewer_scripts(scene: bytes) -> Markup:
 
 
 def _packed(data: bytes) -> str:
-    """Compressed, the same bytes at any time, as base64."""
+    """Return data compressed reproducibly, as base64."""
     return base64.b64encode(gzip.compress(data, 9, mtime=0)).decode("ascii")

@@ -20,7 +20,7 @@ FAR = 1e-3
 """Relative error of a monitor's sigma by interpolation above which a warning is given."""
 
 
-def given_warnings(setup: ToleranceSetup, bench: ToleranceBench) -> tuple[str, ...]:
+def instrument_warnings(setup: ToleranceSetup, bench: ToleranceBench) -> tuple[str, ...]:
     """Return the warnings about the nominal instrument."""
     model = bench.optics.model
     shadow = unmodelled_obscuration(model, obscuration(model, bench.backend))
@@ -50,19 +50,19 @@ def beam_warnings(bench: ToleranceBench, states: Sequence[State]) -> tuple[str, 
     )
 
 
-def missed_warnings(missed: Mapping[str, float], cameras: int) -> tuple[str, ...]:
+def interpolation_warnings(errors: Mapping[str, float], cameras: int) -> tuple[str, ...]:
     """Return warnings about monitor merits whose interpolated derivatives are too coarse.
 
     Parameters
     ----------
-    missed : dict
+    errors : dict
         Name of a merit -> relative difference of its sigma from that with traced derivatives.
     cameras : int
         Number of cameras in which the derivatives were traced.
     """
     return tuple(
-        f"{name}: with derivatives traced in {cameras} cameras the sigma differs by up to {100.0 * off:.2g} % from "
+        f"{name}: with derivatives traced in {cameras} cameras the sigma differs by up to {100.0 * error:.2g} % from "
         "that with interpolated ones; use smaller limits, or twin.uncertainty on a job of one camera"
-        for name, off in missed.items()
-        if off > FAR
+        for name, error in errors.items()
+        if error > FAR
     )

@@ -30,12 +30,12 @@ from twin.camera.varied_beams import AT_ONCE, BeamLight, RoughWavefrontError, Va
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import LINE_POINTS, line_points
 from twin.targets.target_images import wavelengths_enough
-from twin.tolerance.designed_light import LitRoots, fixed_transfers, light_of
+from twin.tolerance.designed_light import WavefrontNorm, budget_spectrum, fixed_transfers
 from twin.tolerance.monitor_merit import Merit, MonitorMerit, merits_of, obstructed_shares, require_bodies
-from twin.tolerance.variations import VariedNumber, compensator_numbers, states_of, tolerance_numbers
+from twin.tolerance.variations import VariedParameter, compensator_parameters, states_of, tolerance_parameters
 
 
-def told(slopes: np.ndarray, change: np.ndarray) -> np.ndarray:
+def residual_change(slopes: np.ndarray, change: np.ndarray) -> np.ndarray:
     """Return the linear change (S, R) of the residuals by slopes (S, R, C) for a change of the moves (S, C)."""
     return np.asarray((slopes @ change[..., None])[..., 0])
 
@@ -152,9 +152,9 @@ class Adjustments:
             executed = wanted.copy()
             executed[:, c] = move + accuracy * errors[:, c]
             free[c] = False
-            residuals = residuals + told(slopes, executed - wanted)
+            residuals = residuals + residual_change(slopes, executed - wanted)
             wanted = self.best(slopes, residuals, executed, free)
-            residuals = residuals + told(slopes, wanted - executed)
+            residuals = residuals + residual_change(slopes, wanted - executed)
         return wanted
 
 
@@ -174,7 +174,7 @@ _MOVE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Tried:
+class AdjustedCameras:
     """Perturbed cameras after their adjustments.
 
     Attributes
@@ -199,7 +199,7 @@ class Tried:
     paths: np.ndarray | None = None
 
     @classmethod
-    def joined(cls, results: Sequence[Tried]) -> Tried:
+    def joined(cls, results: Sequence[AdjustedCameras]) -> AdjustedCameras:
         """Return several results concatenated in order."""
         paths = [result.paths for result in results if result.paths is not None]
         return cls(
@@ -252,8 +252,8 @@ class ToleranceBench:
         self.camera = self._camera_name()
         self.line = line_points(instrument, self.camera)
         thermal = self.experiment.thermal
-        self.numbers: tuple[VariedNumber, ...] = tolerance_numbers(setup, instrument, thermal)
-        self.compensators: tuple[VariedNumber, ...] = compensator_numbers(setup, instrument, thermal)
+        self.numbers: tuple[VariedParameter, ...] = tolerance_parameters(setup, instrument, thermal)
+        self.compensators: tuple[VariedParameter, ...] = compensator_parameters(setup, instrument, thermal)
         self.merits, self.fields = merits_of(dict(test.merits), len(self._along), tuple(instrument.cameras))
         if not len(self.fields) and self.compensators:
             allowed = "a merit of kind wavefront, mtf or chief_ray, at whose fields the wavefront is made least"
@@ -301,7 +301,7 @@ class ToleranceBench:
     @one_blas_thread()
     def _prepare(self) -> None:
         """Trace the nominal camera in the spectrum of the budget, with as many wavelengths as its merits need."""
-        test, spectrum = self.setup.test, light_of(self.setup.test, self.optics.model.spec)
+        test, spectrum = self.setup.test, budget_spectrum(self.setup.test, self.optics.model.spec)
         if spectrum is None:
             self._prepare_in(np.array([self.wavelength]), np.ones(1))
             return
@@ -341,7 +341,7 @@ class ToleranceBench:
             self.beams = VariedBeams(self.optics, self.fields, traced, self.traced_shares, "mtf" in self._wanted)
         except (VignettedBeamError, RoughWavefrontError) as error:
             raise self.setup.test.error(str(error), ("merits",), allowed=error.allowed) from error
-        self._roots = LitRoots.of(self.beams.illuminated_nodes(), self.beams.degree)
+        self._roots = WavefrontNorm.of(self.beams.illuminated_nodes(), self.beams.degree)
         self._transfers = fixed_transfers(
             self.optics,
             self.setup.test,
@@ -381,7 +381,9 @@ class ToleranceBench:
 
     # adjustments
 
-    def try_out(self, amounts: np.ndarray, errors: np.ndarray | None = None, paths: bool = False) -> Tried:
+    def adjust_cameras(
+        self, amounts: np.ndarray, errors: np.ndarray | None = None, paths: bool = False
+    ) -> AdjustedCameras:
         """Trace perturbed cameras, adjust them, and compute their merits.
 
         Parameters
@@ -403,9 +405,9 @@ class ToleranceBench:
         results = [
             self._try(amounts[s : s + AT_ONCE], None if errors is None else errors[s : s + AT_ONCE]) for s in starts
         ]
-        return Tried.joined(results if paths else [replace(result, paths=None) for result in results])
+        return AdjustedCameras.joined(results if paths else [replace(result, paths=None) for result in results])
 
-    def _try(self, amounts: np.ndarray, errors: np.ndarray | None) -> Tried:
+    def _try(self, amounts: np.ndarray, errors: np.ndarray | None) -> AdjustedCameras:
         try:
             return self._adjusted(amounts, errors)
         except PhysicalError as error:
@@ -413,13 +415,15 @@ class ToleranceBench:
                 nan_parts = np.full((1, self.parts), np.nan)
                 paths = np.full((1, *self.beams.designed.paths.shape[1:]), np.nan) if len(self.fields) else None
                 moves = np.full((1, len(self.ranges)), np.nan)
-                return Tried(moves, nan_parts, (str(error) or "lost",), np.full(1, np.nan), paths)
+                return AdjustedCameras(moves, nan_parts, (str(error) or "lost",), np.full(1, np.nan), paths)
         half = len(amounts) // 2
         halves = slice(0, half), slice(half, None)
-        return Tried.joined([self._try(amounts[rows], None if errors is None else errors[rows]) for rows in halves])
+        return AdjustedCameras.joined(
+            [self._try(amounts[rows], None if errors is None else errors[rows]) for rows in halves]
+        )
 
     @one_blas_thread()
-    def _adjusted(self, amounts: np.ndarray, errors: np.ndarray | None) -> Tried:
+    def _adjusted(self, amounts: np.ndarray, errors: np.ndarray | None) -> AdjustedCameras:
         """Adjust cameras and compute their merits; raise PhysicalError if the light of any is lost."""
         count = len(amounts)
         moves, settled = np.zeros((count, len(self.ranges))), np.zeros(count)
@@ -429,7 +433,7 @@ class ToleranceBench:
             return states_of((*self.numbers, *self.compensators), moved)
 
         if not len(self.fields):
-            return Tried(moves, self._parts(state(moves), amounts, moves, None), ("",) * count, settled)
+            return AdjustedCameras(moves, self._parts(state(moves), amounts, moves, None), ("",) * count, settled)
         states = state(moves)
         light = self.beams.light(states)
 
@@ -443,7 +447,7 @@ class ToleranceBench:
             slopes = np.tile(self._adjust.slope, (count, 1, 1))
             for _ in range(MOST_STEPS):
                 target = self._adjust.best(slopes, residuals, moves, all_free)
-                expected = told(slopes, target - moves)
+                expected = residual_change(slopes, target - moves)
                 settled = np.sqrt(np.sum(expected**2, axis=1) / len(self.fields))
                 # what has settled stays, so that a camera's numbers do not depend on the others
                 going = settled > SETTLED * 1e-2
@@ -464,7 +468,7 @@ class ToleranceBench:
                 moves = self._adjust.made(slopes, residuals, moves, errors)
                 states = state(moves)
                 light = again(states, np.arange(count))
-        return Tried(moves, self._parts(states, amounts, moves, light), ("",) * count, settled, light.paths)
+        return AdjustedCameras(moves, self._parts(states, amounts, moves, light), ("",) * count, settled, light.paths)
 
     # merits
 
@@ -473,7 +477,7 @@ class ToleranceBench:
         amounts, moves = np.zeros((len(states), len(self.numbers))), np.zeros((len(states), len(self.ranges)))
         return self._parts(states, amounts, moves, self.beams.light(states) if len(self.fields) else None)
 
-    def numbers_of(self, states: Sequence[State]) -> np.ndarray:
+    def residuals_of(self, states: Sequence[State]) -> np.ndarray:
         """Return residuals (S, R) whose squares sum to the mean squares of the merits, in units of the requirements.
 
         They change linearly with small motions. An MTF is represented by the wavefront at its fields, in units of a
