@@ -101,7 +101,7 @@ def test_each_tolerance_changes_the_wavefront_as_in_batoid(bench, alone, peer) -
     assert np.abs(theirs).min() > 100.0 * NOTHING
     np.testing.assert_array_less(np.abs(ours - theirs), CLOSE * np.abs(theirs) + NOTHING)
     # field by field, where the worst of all hides nothing
-    fields = np.sqrt(bench.try_out(ends).parts)
+    fields = np.sqrt(bench.adjust_cameras(ends).parts)
     change = np.sqrt([one.squares for one in found]) - np.sqrt(nominal.squares)
     np.testing.assert_array_less(np.abs(fields - np.sqrt(nominal.squares) - change), CLOSE * np.abs(change) + NOTHING)
     moves = np.array([one.focus for one in found]).reshape(2, -1).T

@@ -30,8 +30,8 @@ from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.study_bench import TEXTS, refusals
 from twin.asbuilt import asbuilt_run
 from twin.asbuilt.asbuilt_bench import AsBuiltBench
-from twin.asbuilt.asbuilt_run import ASBUILT, _standing, _warnings, motions, require_agreement, run_asbuilt
-from twin.asbuilt.next_step import advice, expected, wanted_move
+from twin.asbuilt.asbuilt_run import ASBUILT, _prediction, _warnings, motions, require_agreement, run_asbuilt
+from twin.asbuilt.next_step import advice, expected, optimal_move
 from twin.asbuilt.orientation_check import run_check
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.varied_beams import VariedBeams
@@ -199,7 +199,7 @@ def test_moves_are_part_of_the_state(backend, tmp_path) -> None:
     still = bench_of(
         backend, tmp_path, {"wavefronts": {"one": two["before"]}}, actuators={"z": {**actuators["z"], "range": "0 um"}}
     )
-    assert not np.any(wanted_move(still, np.zeros(len(still.parameters.labels)), None).amounts)
+    assert not np.any(optimal_move(still, np.zeros(len(still.parameters.labels)), None).amounts)
 
 
 def written_maps(folder: Path, coefficients: np.ndarray, orientation: Orientation) -> list[str]:
@@ -294,14 +294,14 @@ def test_one_state_without_light_leaves_the_others(backend, tmp_path, monkeypatc
     found = bench.estimate(bench.measured(bench.draw(rng, "normal"), rng))
     draws = found.draw(rng, 5)
     whole = expected(bench, draws, None)
-    numbers = bench.merit_numbers
+    numbers = bench.merit_residuals
 
     def without(values, after, further=None):
         if np.any(np.all(values == draws[3], axis=1)):
             raise UnphysicalError("lost")
         return numbers(values, after, further)
 
-    monkeypatch.setattr(bench, "merit_numbers", without)
+    monkeypatch.setattr(bench, "merit_residuals", without)
     told = expected(bench, draws, None)
     assert np.isnan(told[3])
     np.testing.assert_allclose(np.delete(told, 3), np.delete(whole, 3), rtol=1e-9)
@@ -328,16 +328,16 @@ def test_a_run_from_file_to_numbers(backend, tmp_path) -> None:
     assert sigmas == sorted(sigmas)
     assert sigmas[-1] == pytest.approx(1.0, abs=1e-6)
     # a chi-square that contradicts the prior makes every sigma larger by its root per degree of freedom
-    whole = replace(run.found.whole, chi_square=4.0 * run.found.whole.degrees)
-    wide = replace(run, found=replace(run.found, whole=whole))
+    whole = replace(run.estimate.whole, chi_square=4.0 * run.estimate.whole.degrees)
+    wide = replace(run, estimate=replace(run.estimate, whole=whole))
     sizes = {"um": 1e-6, "arcsec": ARCSEC, "nm": 1e-9}
     for factor, rows in ((1.0, motions(run)), (2.0, motions(wide))):
         for k, row in enumerate(rows):
             size = sizes[row["unit"]]
-            assert row["value"] == pytest.approx(run.found.mean[k] / size)
+            assert row["value"] == pytest.approx(run.estimate.mean[k] / size)
             assert row["true"] == pytest.approx(run.true[k] / size)
-            assert row["prior_sigma"] == pytest.approx(np.sqrt(run.found.prior.covariance[k, k]) / size)
-            assert row["sigma"] == pytest.approx(factor * np.sqrt(run.found.covariance[k, k]) / size)
+            assert row["prior_sigma"] == pytest.approx(np.sqrt(run.estimate.prior.covariance[k, k]) / size)
+            assert row["sigma"] == pytest.approx(factor * np.sqrt(run.estimate.covariance[k, k]) / size)
     assert [one["sigma"] for one in ASBUILT(wide)["combinations"]] == pytest.approx(
         np.minimum(1.0, 2.0 * np.array(sigmas))
     )
@@ -349,7 +349,7 @@ def test_quantiles_and_chances_of_a_merit_are_those_of_its_draws() -> None:
     rng = np.random.default_rng(2)
     before, now = (rng.uniform(0.0, 1.0, (60, 1)) ** 2 for _ in range(2))
     now[:4], now[4] = np.nan, 0.25
-    found = _standing(merit, np.array([0.01]), (before, now, None), np.array([0.09]))
+    found = _prediction(merit, np.array([0.01]), (before, now, None), np.array([0.09]))
     shares = (2.5, 16.0, 50.0, 84.0, 97.5)
     assert found.before == pytest.approx(np.percentile(np.sqrt(before), shares))
     assert found.now == pytest.approx(np.percentile(np.sqrt(now[4:]), shares))
@@ -357,7 +357,7 @@ def test_quantiles_and_chances_of_a_merit_are_those_of_its_draws() -> None:
     assert (found.designed, found.true) == pytest.approx((0.1, 0.3))
     assert found.moved == ()
     assert np.isnan(found.meets_moved)
-    moved = _standing(merit, np.array([0.01]), (before, now, before), None)
+    moved = _prediction(merit, np.array([0.01]), (before, now, before), None)
     assert (moved.moved, moved.meets_moved) == (moved.before, np.mean(np.sqrt(before) <= 0.5))
     assert np.isnan(moved.true)
 
@@ -394,7 +394,11 @@ def test_each_warning_is_there_where_it_holds_and_no_other() -> None:
             "the measurements do not agree with the prior and their specified errors (chi-square 80 for 20 degrees of "
             "freedom); all sigmas are multiplied by 2",
         ),
-        (state(measurements=[bad, bad.of("sight", 1.0, 10)]), lit, "focus does not agree with the prediction from all others"),
+        (
+            state(measurements=[bad, bad.of("sight", 1.0, 10)]),
+            lit,
+            "focus does not agree with the prediction from all others",
+        ),
         (state(), dark, "1 of 5 states of the posterior have no light; they count as failed"),
     ):
         (said,) = _warnings(found, parts)

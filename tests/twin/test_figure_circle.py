@@ -87,7 +87,7 @@ def test_terms_on_both_mirrors_of_a_telescope(backend, tmp_path) -> None:
     """
     file_with(tmp_path)
     bench = bench_of(tmp_path, "round.yaml", backend, first="M1 figure Z5", second="M2 figure Z6")
-    told = bench.merits[0].values(bench.try_out(np.diag([30e-9, 30e-9])).parts)
+    told = bench.merits[0].values(bench.adjust_cameras(np.diag([30e-9, 30e-9])).parts)
     whole = 2.0 * 30e-9 / 600e-9
     assert told[0] == pytest.approx(whole, rel=0.01)
     assert told[1] == pytest.approx(whole * (0.3 * SHARE / BY_HAND) ** 2, rel=0.02)

@@ -285,7 +285,7 @@ def test_layouts_beyond_their_limits_say_which() -> None:
     LayoutBench._check_limits(own, 0.2, 3.0)
     spots(room, FULLEST)
     for act, told in (
-        (lambda: LayoutBench._check_limits(own, 0.21, 3.0), "its prisms take 21 percent of the imaging pupil"),
+        (lambda: LayoutBench._check_limits(own, 0.21, 3.0), "its prisms block 21 percent of the imaging pupil"),
         (lambda: LayoutBench._check_limits(own, 0.2, 3.1), r"its prisms have a mass of 3\.1 kg"),
         (lambda: spots(room + 0.1, FULLEST), "its spots leave their area CCDs"),
         (lambda: spots(room, FULLEST + 0.01), "its spots are too bright"),

@@ -226,7 +226,7 @@ def whole(setup: MonitorDesignSetup, backend: Backend) -> MonitorDesignRun:
 @pytest.mark.second
 def test_a_short_search_finds_a_better_layout(whole: MonitorDesignRun, tmp_path: Path) -> None:
     best = whole.points[0]
-    assert whole.merit(best.facts) < whole.merit(whole.found.start)
+    assert whole.merit(best.facts) < whole.merit(whole.results.start)
     assert best.facts.pupil_share <= 0.2
 
 

@@ -22,7 +22,7 @@ from twin.main_job.monitor_reading import stated
 from twin.monitor.truth import trace_truth
 from twin.study import scripted
 from twin.study.runs.setup import study_from_text
-from twin.study.scripted import config_text, tell_through
+from twin.study.scripted import config_text, pipe_progress
 
 DESPACE = {"base/forward/M2": {"shift": "0 0 3 um"}}
 JOBS = Path(__file__).resolve().parents[1] / "golden/jobs"
@@ -274,7 +274,7 @@ def test_a_function_that_is_told_may_break_off_the_study() -> None:
 
 def test_the_command_tells_a_pipe() -> None:
     reading, writing = os.pipe()
-    told = tell_through(writing)
+    told = pipe_progress(writing)
     assert not os.get_inheritable(writing)
     told(1, 2)
     told(2, 2)

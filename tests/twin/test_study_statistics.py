@@ -395,13 +395,13 @@ def test_a_share_of_noise_above_one_is_an_error_and_not_cut_off() -> None:
     share = estimates.noise_share(runs.responses[0], runs.study)
     # variance of 200 runs: 10% by chance
     assert share.share == pytest.approx(76.0**2, rel=0.5)
-    fault = estimates.impossible(runs)
+    fault = estimates.impossible_noise(runs)
     assert fault.key == ("responses", "y", "noise")
     assert re.search(r"responses\.y\.noise: the reported noise variance is \d+ times.*_sigma_noise", str(fault))
     # noise that all runs share is no part of what they differ by
     shared = noisy_runs(200, 1, 76.0, noise="shared")
     assert estimates.noise_share(shared.responses[0], shared.study) is None
-    assert estimates.impossible(shared) is None
+    assert estimates.impossible_noise(shared) is None
 
 
 @pytest.mark.parametrize("limits", [(-0.5, 2.0), (6.0, 7.0), (12.0, 15.0), (-60.0, -45.0), (1e3, 1e3 + 1.0)])

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from optics.numerics.number_tree import FrozenMap
-from twin.asbuilt.asbuilt_run import ALONG, AsBuiltRun, Standing, motions, moves_plain, responses
+from twin.asbuilt.asbuilt_run import ALONG, AsBuiltRun, MeritPrediction, motions, moves_plain, responses
 from twin.asbuilt.built_instrument import CORRELATION, POSTERIOR, instrument_text, posterior_files
 from twin.framework.artefact import CameraFile, Cell, CsvFile, DecimalNumber, SvgFigure, Table, plain, significant
 from twin.framework.report import Report, Section, answer
@@ -105,13 +105,13 @@ def _percent(share: float) -> str:
 
 
 def _verdict(run: AsBuiltRun) -> str:
-    parts = [f"{prediction.merit.name} {_percent(prediction.meets)}" for prediction in run.standings]
+    parts = [f"{prediction.merit.name} {_percent(prediction.meets)}" for prediction in run.predictions]
     return f"Probability that {run.bench.camera}, as built, meets its requirements: {', '.join(parts)}"
 
 
 def _known_words(run: AsBuiltRun) -> str:
     known = sum(combination.known for combination in run.known)
-    agreement = run.found.whole
+    agreement = run.estimate.whole
     fits = "agree" if agreement.passes() else "do not agree"
     return (
         f"The measurements determine {known} of {len(run.known)} combinations of motions and {fits} with the prior and "
@@ -129,7 +129,7 @@ def _move_words(run: AsBuiltRun) -> list[str]:
     text = ", ".join(f"{name} by {_short(amount)}" for name, amount in moves.items())
     out = [
         f"Next move: {text}; the expected merit falls from {step.before:.3g} to {step.after:.3g}, of which "
-        f"{step.ignorance:.3g} could be removed if the state were known"
+        f"{step.uncertainty:.3g} could be removed if the state were known"
     ]
     worth = sorted(step.worth.items(), key=lambda item: -item[1])[:_FEW]
     if worth:
@@ -151,7 +151,7 @@ def _short(amount: str | float) -> str:
     return plain(amount, 4)
 
 
-def _cell(value: float, prediction: Standing) -> Cell:
+def _cell(value: float, prediction: MeritPrediction) -> Cell:
     shown = shown_merit(value, prediction.merit)
     if shown is None:
         return None
@@ -160,7 +160,7 @@ def _cell(value: float, prediction: Standing) -> Cell:
     return DecimalNumber(shown, decimals)
 
 
-def _between(values: Sequence[float], prediction: Standing) -> str:
+def _between(values: Sequence[float], prediction: MeritPrediction) -> str:
     if not len(values):
         return ""
     low, middle, high = (shown_merit(values[k], prediction.merit) for k in (1, 2, 3))
@@ -172,7 +172,7 @@ def _between(values: Sequence[float], prediction: Standing) -> str:
 def _summary(run: AsBuiltRun) -> Table:
     rows: list[list[Cell]] = []
     moved, drawn = run.advice is not None, run.true is not None
-    for prediction in run.standings:
+    for prediction in run.predictions:
         spec = prediction.merit.spec
         sign = "at least" if spec.more_is_better else "at most"
         row: list[Cell] = [
@@ -210,7 +210,7 @@ def _range_table(run: AsBuiltRun) -> Table:
 
 
 def _known_table(run: AsBuiltRun) -> Table:
-    factor = np.sqrt(run.found.variance_factor)
+    factor = np.sqrt(run.estimate.variance_factor)
     rows: list[list[Cell]] = [
         [
             combination.name,
@@ -226,10 +226,10 @@ def _known_table(run: AsBuiltRun) -> Table:
 
 
 def _measured_table(run: AsBuiltRun) -> Table:
-    count = len(run.found.measurements)
+    count = len(run.estimate.measurements)
     rows: list[list[Cell]] = []
-    for kind, test in zip(run.bench.kinds, run.found.measurements, strict=True):
-        excluded = [block for name, block, _ in run.found.excluded if name == test.name]
+    for kind, test in zip(run.bench.kinds, run.estimate.measurements, strict=True):
+        excluded = [block for name, block, _ in run.estimate.excluded if name == test.name]
         rows.append(
             [
                 test.name,
@@ -254,7 +254,7 @@ def _move_sections(run: AsBuiltRun) -> tuple[Section, ...]:
         return ()
     bench = run.bench
     moves = moves_plain(run, step.move.amounts)
-    travel = bench.parameters.moved(run.found.mean[None], bench.last)[0]
+    travel = bench.parameters.moved(run.estimate.mean[None], bench.last)[0]
     done = moves_plain(run, travel)
     rows: list[list[Cell]] = [
         [name, entry.motion, _short(done[name]), _short(moves[name]), str(entry.range), str(entry.step or "")]
@@ -280,7 +280,7 @@ def _move_sections(run: AsBuiltRun) -> tuple[Section, ...]:
     text: tuple[str, ...] = (
         f"The move minimises the expected sum of squares of all merits, each in units of its requirement: "
         f"{step.before:.3g} before and {step.after:.3g} after it, averaged over the posterior and the errors of the "
-        f"move by exact traces. {step.ignorance:.3g} of it could be removed if the state were known.",
+        f"move by exact traces. {step.uncertainty:.3g} of it could be removed if the state were known.",
     )
     if not step.move.searched:
         text = (*text, "Not all combinations of whole steps were tried: a better move may exist.")
@@ -321,7 +321,7 @@ def _along_figure(run: AsBuiltRun) -> Figure:
         ax.plot(x, band[2], color=colour, lw=1.6, label=label)
     ax.plot(x, designed, color=INK, lw=1.0, ls="--", label="designed")
     limits = [
-        prediction.merit.spec.requirement for prediction in run.standings if prediction.merit.spec.kind == "wavefront"
+        prediction.merit.spec.requirement for prediction in run.predictions if prediction.merit.spec.kind == "wavefront"
     ]
     if limits:
         ax.axhline(limits[0], color=VERMILION, lw=1.0, label="requirement")

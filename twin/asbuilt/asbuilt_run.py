@@ -19,7 +19,7 @@ from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import Backend
 from scenes.specs.asbuilt import AsBuiltSetup
 from scenes.specs.tolerance import MeritSpec, amount_text
-from twin.asbuilt.asbuilt_bench import AsBuiltBench, of_some, where_lit
+from twin.asbuilt.asbuilt_bench import AsBuiltBench, nan_where_lost, selected_moves
 from twin.asbuilt.next_step import Advice, advice
 from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, silent
@@ -42,7 +42,7 @@ _DRAW = 7e4
 
 
 @dataclass(frozen=True, eq=False)
-class Standing:
+class MeritPrediction:
     """Predicted distribution of a merit of the instrument.
 
     Attributes
@@ -87,7 +87,7 @@ class AsBuiltRun:
         The instrument.
     data : tuple of ndarray
         Data of each measurement.
-    found : StateEstimate
+    estimate : StateEstimate
         Estimated state.
     known : tuple of Combination
         Combinations of motions, the best determined first.
@@ -107,9 +107,9 @@ class AsBuiltRun:
     setup: AsBuiltSetup
     bench: AsBuiltBench
     data: tuple[np.ndarray, ...]
-    found: StateEstimate
+    estimate: StateEstimate
     known: tuple[Combination, ...]
-    standings: tuple[Standing, ...]
+    predictions: tuple[MeritPrediction, ...]
     along: tuple[np.ndarray, np.ndarray]
     advice: Advice | None
     true: np.ndarray | None
@@ -153,14 +153,14 @@ def run_asbuilt(
         except PhysicalError as error:
             allowed = "another seed, or smaller standard deviations"
             raise test.error(f"the drawn instrument has no light: {error}", ("simulate",), allowed=allowed) from error
-    estimate = bench.estimate(data)
-    require_agreement(bench, estimate)
+    state = bench.estimate(data)
+    require_agreement(bench, state)
     advance("state", 1, 4)
-    draws = estimate.draw(_random(seed, _POSTERIOR), test.draws)
+    draws = state.draw(_random(seed, _POSTERIOR), test.draws)
     prior = bench.parameters.prior
     blind = prior.mean + _random(seed, _PRIOR).standard_normal((test.draws, prior.root.shape[1])) @ prior.root.T
     last = bench.last
-    step = advice(bench, estimate, draws, _random(seed, _MOVE)) if bench.parameters.names else None
+    step = advice(bench, state, draws, _random(seed, _MOVE)) if bench.parameters.names else None
     advance("state", 2, 4)
     moved, executed = None, None
     if step is not None:
@@ -170,7 +170,7 @@ def run_asbuilt(
     parts = (bench.merit_parts(blind, last), bench.merit_parts(draws, last), moved)
     truth = None if true is None else bench.merit_parts(true[None], last)[0]
     nominal = bench.merit_parts(np.zeros((1, len(prior.mean))), None)[0]
-    standings = tuple(_standing(merit, nominal, parts, truth) for merit in bench.merits.merits)
+    predictions = tuple(_prediction(merit, nominal, parts, truth) for merit in bench.merits.merits)
     advance("state", 3, 4)
     along = _along(bench, ((blind, None), (draws, None), *(() if executed is None else ((draws, executed),))))
     advance("state", 4, 4)
@@ -178,13 +178,13 @@ def run_asbuilt(
         setup,
         bench,
         data,
-        estimate,
-        combinations(estimate),
-        standings,
+        state,
+        combinations(state),
+        predictions,
         along,
         step,
         true,
-        tuple(_warnings(estimate, parts[1])),
+        tuple(_warnings(state, parts[1])),
     )
 
 
@@ -192,26 +192,23 @@ def _random(seed: int, number: int) -> np.random.Generator:
     return np.random.default_rng(stream(seed, number))
 
 
-def require_agreement(bench: AsBuiltBench, estimate: StateEstimate) -> None:
+def require_agreement(bench: AsBuiltBench, state: StateEstimate) -> None:
     """Raise InputError for an estimate that has not converged, or for measurements that contradict each other.
 
     The error is placed at the measurement that agrees least with all others.
     """
     test = bench.test
-    if not estimate.converged:
+    if not state.converged:
         problem = (
-            f"the estimate has not converged after {estimate.steps} steps: one more changes the predicted readings by "
+            f"the estimate has not converged after {state.steps} steps: one more changes the predicted readings by "
         )
         allowed = "a prior with smaller standard deviations, or a measurement of positions"
-        raise test.error(f"{problem}{estimate.settled:.2g} of their errors", ("measurements",), allowed=allowed)
-    if estimate.whole.chi_square <= WORST_FACTOR * max(1, estimate.whole.degrees):
+        raise test.error(f"{problem}{state.settled:.2g} of their errors", ("measurements",), allowed=allowed)
+    if state.whole.chi_square <= WORST_FACTOR * max(1, state.whole.degrees):
         return
-    worst = min(
-        estimate.measurements,
-        key=lambda consistency: (consistency.p_value, -consistency.chi_square / max(1, consistency.degrees)),
-    )
+    worst = min(state.measurements, key=lambda c: (c.p_value, -c.chi_square / max(1, c.degrees)))
     key = next(kind.key for kind in bench.kinds if kind.name == worst.name)
-    ratio = np.sqrt(estimate.whole.chi_square / estimate.whole.degrees)
+    ratio = np.sqrt(state.whole.chi_square / state.whole.degrees)
     raise test.error(
         f"the measurements contradict each other: their residuals are {ratio:.0f} standard deviations on average, and "
         "this one fits worst",
@@ -225,13 +222,13 @@ def _quantiles(values: np.ndarray) -> tuple[float, ...]:
     return tuple(np.quantile(known, LEVELS).tolist()) if len(known) else (np.nan,) * len(LEVELS)
 
 
-def _standing(
+def _prediction(
     merit: Merit, nominal: np.ndarray, parts: Sequence[np.ndarray | None], truth: np.ndarray | None
-) -> Standing:
+) -> MeritPrediction:
     before, now, moved = (None if part is None else merit.values(part) for part in parts)
     assert before is not None
     assert now is not None
-    return Standing(
+    return MeritPrediction(
         merit,
         float(merit.values(nominal)),
         _quantiles(before),
@@ -249,31 +246,31 @@ def _along(bench: AsBuiltBench, cases: Sequence[tuple[np.ndarray, np.ndarray | N
 
     def rms(values: np.ndarray, further: np.ndarray | None) -> np.ndarray:
         def work(rows: slice) -> np.ndarray:
-            states = bench.parameters.states(values[rows], bench.last, of_some(further, rows))
+            states = bench.parameters.states(values[rows], bench.last, selected_moves(further, rows))
             return np.asarray(np.sqrt(np.maximum(field.parts_of(states), 0.0)))
 
-        return where_lit(work, len(values), (len(ALONG),))
+        return nan_where_lost(work, len(values), (len(ALONG),))
 
     designed = np.sqrt(np.maximum(field.parts_of([{}])[0], 0.0))
     return designed, np.stack([np.nanquantile(rms(*case), LEVELS, axis=0) for case in cases])
 
 
-def _warnings(estimate: StateEstimate, now: np.ndarray) -> list[str]:
+def _warnings(state: StateEstimate, now: np.ndarray) -> list[str]:
     out = []
-    for name, block, agreement in estimate.excluded:
+    for name, block, agreement in state.excluded:
         out.append(
             f"{name}: {block} contradicts all other measurements (chi-square {agreement.chi_square:.0f} for "
             f"{agreement.degrees} degrees of freedom) and is excluded"
         )
-    if not estimate.whole.passes():
-        factor = np.sqrt(estimate.variance_factor)
+    if not state.whole.passes():
+        factor = np.sqrt(state.variance_factor)
         out.append(
             "the measurements do not agree with the prior and their specified errors (chi-square "
-            f"{estimate.whole.chi_square:.0f} for {estimate.whole.degrees} degrees of freedom); all sigmas are "
+            f"{state.whole.chi_square:.0f} for {state.whole.degrees} degrees of freedom); all sigmas are "
             f"multiplied by {factor:.2g}"
         )
-    for test in estimate.measurements:
-        if not test.passes(len(estimate.measurements)):
+    for test in state.measurements:
+        if not test.passes(len(state.measurements)):
             out.append(
                 f"{test.name} does not agree with the prediction from all others: chi-square {test.chi_square:.0f} for "
                 f"{test.degrees} degrees of freedom"
@@ -293,7 +290,7 @@ def _row(values: Sequence[float], merit: Merit) -> dict[str, float | None] | Non
     return {f"p{100 * level:g}": shown_merit(value, merit) for level, value in zip(LEVELS, values, strict=True)}
 
 
-def _standing_plain(prediction: Standing) -> dict[str, Any]:
+def _prediction_plain(prediction: MeritPrediction) -> dict[str, Any]:
     merit = prediction.merit
     out = {
         "kind": merit.spec.kind,
@@ -315,14 +312,14 @@ def _agreement_plain(test: ConsistencyTest) -> dict[str, Any]:
 
 def _measured_plain(run: AsBuiltRun) -> dict[str, Any]:
     out = {}
-    count = len(run.found.measurements)
-    for kind, test in zip(run.bench.kinds, run.found.measurements, strict=True):
+    count = len(run.estimate.measurements)
+    for kind, test in zip(run.bench.kinds, run.estimate.measurements, strict=True):
         out[test.name] = {
             "kind": kind.kind,
             "numbers": len(kind.labels),
             **_agreement_plain(test),
             "agrees": test.passes(count),
-            "excluded": [block for name, block, _ in run.found.excluded if name == test.name],
+            "excluded": [block for name, block, _ in run.estimate.excluded if name == test.name],
         }
     return out
 
@@ -330,30 +327,25 @@ def _measured_plain(run: AsBuiltRun) -> dict[str, Any]:
 def motions(run: AsBuiltRun) -> list[dict[str, Any]]:
     """Return each motion of the prior with its estimate, in reporting units."""
     out = []
-    factor = np.sqrt(run.found.variance_factor)
+    factor = np.sqrt(run.estimate.variance_factor)
     for k, component in enumerate(run.bench.parameters.components):
         size = component.unit_size
         row = {
             "motion": run.bench.parameters.words[k],
             "unit": component.unit,
             "prior_sigma": component.sigma / size,
-            "value": float(run.found.mean[k]) / size,
-            "sigma": float(run.found.sigma[k]) * factor / size,
+            "value": float(run.estimate.mean[k]) / size,
+            "sigma": float(run.estimate.sigma[k]) * factor / size,
         }
         out.append(row if run.true is None else {**row, "true": float(run.true[k]) / size})
     return out
 
 
 def _known_plain(run: AsBuiltRun) -> list[dict[str, Any]]:
-    factor = np.sqrt(run.found.variance_factor)
+    factor = np.sqrt(run.estimate.variance_factor)
     return [
-        {
-            "combination": combination.name,
-            "value": combination.value,
-            "sigma": min(1.0, combination.sigma * factor),
-            "known": combination.known,
-        }
-        for combination in run.known
+        {"combination": c.name, "value": c.value, "sigma": min(1.0, c.sigma * factor), "known": c.known}
+        for c in run.known
     ]
 
 
@@ -373,7 +365,7 @@ def _advice_plain(run: AsBuiltRun) -> dict[str, Any] | None:
         "searched": step.move.searched,
         "merit_before": step.before,
         "merit_after": step.after,
-        "merit_of_uncertainty": step.ignorance,
+        "merit_of_uncertainty": step.uncertainty,
         "merit_reductions": dict(step.worth),
     }
 
@@ -385,7 +377,7 @@ def responses(run: AsBuiltRun) -> dict[str, Any] | None:
     if not names:
         return None
     rows = slice(start, start + len(names))
-    mean, sigma = run.found.mean[rows], run.found.sigma[rows] * np.sqrt(run.found.variance_factor)
+    mean, sigma = run.estimate.mean[rows], run.estimate.sigma[rows] * np.sqrt(run.estimate.variance_factor)
     return {
         name: {"response": 1.0 + float(m), "sigma": float(s)} for name, m, s in zip(names, mean, sigma, strict=True)
     }
@@ -397,28 +389,20 @@ ASBUILT: Record[AsBuiltRun] = Record(
     Quantity("camera", lambda run: run.bench.camera, "camera that is evaluated"),
     Quantity(
         "whole",
-        lambda run: {**_agreement_plain(run.found.whole), "agrees": run.found.whole.passes()},
+        lambda run: {**_agreement_plain(run.estimate.whole), "agrees": run.estimate.whole.passes()},
         "chi-square of all measurements together",
     ),
-    Quantity(
-        "false_alarm", lambda run: FALSE_ALARM, "probability that consistent measurements are called contradictory"
-    ),
+    Quantity("false_alarm", lambda run: FALSE_ALARM, "probability of a false contradiction"),
     Quantity("measurements", _measured_plain, "each compared with the prediction from all others"),
     Quantity("motions", motions, "each motion of the prior: its estimate and standard deviations"),
     Quantity("combinations", _known_plain, "in standard deviations of the prior, the best known first"),
     Quantity(
         "merits",
-        lambda run: {one.merit.name: _standing_plain(one) for one in run.standings},
+        lambda run: {one.merit.name: _prediction_plain(one) for one in run.predictions},
         "each in its unit, with quantiles in percent",
     ),
     Quantity("next_move", _advice_plain, "recommended move of the actuators", where_known=True),
-    Quantity(
-        "responses", responses, "estimated responses of the actuators relative to the traced ones", where_known=True
-    ),
-    Quantity("steps", lambda run: run.found.steps, "Gauss-Newton steps"),
-    Quantity(
-        "settled",
-        lambda run: run.found.settled,
-        "change of the predicted readings by the last step, in standard deviations",
-    ),
+    Quantity("responses", responses, "of the actuators, relative to the traced ones", where_known=True),
+    Quantity("steps", lambda run: run.estimate.steps, "Gauss-Newton steps"),
+    Quantity("settled", lambda run: run.estimate.settled, "change of the readings by the last step, in sigmas"),
 )

@@ -22,7 +22,7 @@ CORRELATION = f"{POSTERIOR}_correlation"
 
 def built_motions(run: AsBuiltRun) -> Mapping[str, Motion]:
     """Return the estimated motion of each body against the drawing, with all moves but without thermal effects."""
-    values = run.found.mean.copy()
+    values = run.estimate.mean.copy()
     for k, component in enumerate(run.bench.parameters.components):
         if component.kind in HEAT:
             values[k] = 0.0
@@ -52,7 +52,7 @@ def unknown(run: AsBuiltRun) -> tuple[list[Component], np.ndarray]:
 
     Errors of moves are added to the components of the bodies that were moved.
     """
-    parameters, estimate = run.bench.parameters, run.found
+    parameters, estimate = run.bench.parameters, run.estimate
     components = [component for component in parameters.components if component.kind not in HEAT]
     indices = {(component.body, component.kind, component.axis): k for k, component in enumerate(components)}
     rows: dict[int, np.ndarray] = {}
@@ -97,7 +97,7 @@ def unknown(run: AsBuiltRun) -> tuple[list[Component], np.ndarray]:
 def _pull(run: AsBuiltRun, actuator: int) -> np.ndarray:
     """Return the derivatives of an actuator's total travel with respect to all parameters, (K,)."""
     parameters, last = run.bench.parameters, run.bench.last
-    count = len(run.found.mean)
+    count = len(run.estimate.mean)
     if last is None:
         return np.zeros(count)
     steps = np.concatenate([np.zeros((1, count)), np.eye(count)])

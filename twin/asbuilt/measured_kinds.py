@@ -57,7 +57,7 @@ class View:
 
     values: np.ndarray
     states: Sequence[State]
-    warmth: Any
+    temperatures_of: Any
 
 
 class Site(ABC):
@@ -481,7 +481,7 @@ class TemperatureReadings(MeasuredKind):
 
     def predict(self, view: View) -> np.ndarray:
         """Return the temperatures of the state."""
-        return np.asarray(view.warmth(self.bodies))
+        return np.asarray(view.temperatures_of(self.bodies))
 
     def covariance(self) -> np.ndarray:
         """Return the covariance with the error that all readings have in common."""

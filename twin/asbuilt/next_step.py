@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.instrument_state.state_estimate import NextMove, StateEstimate, best_move, merit_reduction
-from twin.asbuilt.asbuilt_bench import AsBuiltBench, of_some, where_lit
+from twin.asbuilt.asbuilt_bench import AsBuiltBench, nan_where_lost, selected_moves
 
 MOST_ROUNDS = 3
 """Largest number of times that the optimum move is computed about the state to which the previous one leads."""
@@ -33,11 +33,11 @@ class Advice:
     move: NextMove
     before: float
     after: float
-    ignorance: float
+    uncertainty: float
     worth: dict[str, float]
 
 
-def wanted_move(bench: AsBuiltBench, mean: np.ndarray, after: str | None) -> NextMove:
+def optimal_move(bench: AsBuiltBench, mean: np.ndarray, after: str | None) -> NextMove:
     """Return the move that minimises the expected merit, linearised about the state to which it leads.
 
     Parameters
@@ -75,7 +75,7 @@ def _about(
     count = len(amounts)
     steps = np.diag(bench.actuator_steps)
     moves = np.concatenate([amounts[None], amounts + steps, amounts - steps])
-    residuals = bench.merit_numbers(np.repeat(mean[None], len(moves), axis=0), after, moves)
+    residuals = bench.merit_residuals(np.repeat(mean[None], len(moves), axis=0), after, moves)
     return residuals[0], ((residuals[1 : 1 + count] - residuals[1 + count :]) / (2.0 * bench.actuator_steps[:, None])).T
 
 
@@ -99,7 +99,7 @@ def advice(bench: AsBuiltBench, estimate: StateEstimate, draws: np.ndarray, rng:
         The light of the estimated state is lost.
     """
     after = bench.last
-    move = wanted_move(bench, estimate.mean, after)
+    move = optimal_move(bench, estimate.mean, after)
     executed = bench.actuators.made(move.amounts, rng.standard_normal((len(draws), 2, len(move.amounts))))
     # states without light are told by themselves, and have no merit
     merits = [float(np.nanmean(expected(bench, draws, after, further))) for further in (None, executed)]
@@ -112,16 +112,16 @@ def advice(bench: AsBuiltBench, estimate: StateEstimate, draws: np.ndarray, rng:
         candidates[kind.name] = white @ rows @ estimate.prior.root
     everything: dict[str, np.ndarray] = {"": np.asarray(np.linalg.pinv(estimate.root) * 1e6)}
     worth = merit_reduction(estimate.root, unit_slope, bench.actuators, by_actuators, {**candidates, **everything})
-    ignorance = worth.pop("")
-    return Advice(move, merits[0], merits[1], ignorance, worth)
+    uncertainty = worth.pop("")
+    return Advice(move, merits[0], merits[1], uncertainty, worth)
 
 
 def expected(
     bench: AsBuiltBench, values: np.ndarray, after: str | None, further: np.ndarray | None = None
 ) -> np.ndarray:
     """Return the merits of states (S,), sums of squares in units of the requirements; NaN where the light is lost."""
-    return where_lit(
-        lambda rows: np.sum(bench.merit_numbers(values[rows], after, of_some(further, rows)) ** 2, axis=1),
+    return nan_where_lost(
+        lambda rows: np.sum(bench.merit_residuals(values[rows], after, selected_moves(further, rows)) ** 2, axis=1),
         len(values),
         (),
     )

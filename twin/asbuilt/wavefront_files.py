@@ -19,7 +19,7 @@ TABLES = (".csv", ".tsv")
 """Suffixes of tables of coefficients; all other files are maps."""
 
 
-class NamesWavefronts(Protocol):
+class WavefrontMeasurement(Protocol):
     """Measurement that refers to files of wavefronts.
 
     Attributes
@@ -40,7 +40,7 @@ class NamesWavefronts(Protocol):
         """Return an error at a key of the measurement."""
 
 
-def stated_orientation(measurement: NamesWavefronts) -> Orientation:
+def stated_orientation(measurement: WavefrontMeasurement) -> Orientation:
     """Return the specified orientation of maps and coefficients; raise InputError if its name is unknown."""
     try:
         return Orientation.named(measurement.spec.orientation, measurement.spec.sign)
@@ -48,7 +48,7 @@ def stated_orientation(measurement: NamesWavefronts) -> Orientation:
         raise measurement.wrong(str(error), "orientation", found=measurement.spec.orientation) from error
 
 
-def read_coefficients(measurement: NamesWavefronts, orientation: Orientation | None = None) -> np.ndarray:
+def read_coefficients(measurement: WavefrontMeasurement, orientation: Orientation | None = None) -> np.ndarray:
     """Return the Zernike terms of every field, (F, T), metres rms of the wavefront in single pass.
 
     Parameters
@@ -81,7 +81,7 @@ def read_coefficients(measurement: NamesWavefronts, orientation: Orientation | N
     return np.asarray(table * (0.5 if spec.double_pass else 1.0))
 
 
-def _of_table(measurement: NamesWavefronts, key: str, name: str, fields: int) -> np.ndarray:
+def _of_table(measurement: WavefrontMeasurement, key: str, name: str, fields: int) -> np.ndarray:
     path = measurement.file(key, name, "a CSV file of coefficients")
     try:
         coefficients = read_zernikes(path, wavelength=measurement.beams.wavelength)
@@ -98,7 +98,7 @@ def _of_table(measurement: NamesWavefronts, key: str, name: str, fields: int) ->
     return np.asarray(coefficients.coefficients[:, [coefficients.terms.index(j) for j in wanted]])
 
 
-def _of_map(measurement: NamesWavefronts, number: int, name: str, orientation: Orientation) -> np.ndarray:
+def _of_map(measurement: WavefrontMeasurement, number: int, name: str, orientation: Orientation) -> np.ndarray:
     spec = measurement.spec
     path = measurement.file("maps", name, "a file of a wavefront")
     try:
@@ -112,7 +112,7 @@ def _of_map(measurement: NamesWavefronts, number: int, name: str, orientation: O
     return np.asarray(fitted.parts[spec.numbers[0] - 1 :])
 
 
-def _less(measured: WavefrontMap, reference: WavefrontMap, measurement: NamesWavefronts) -> WavefrontMap:
+def _less(measured: WavefrontMap, reference: WavefrontMap, measurement: WavefrontMeasurement) -> WavefrontMap:
     """Return a map minus the error of the reference surface."""
     if measured.values.shape != reference.values.shape:
         shapes = f"{reference.values.shape} points, the maps {measured.values.shape}"

@@ -20,7 +20,7 @@ from twin.framework.svg import BLUE, GREY, INK, ORANGE, look, new_figure, plain_
 
 def design_report(run: DesignRun) -> Report:
     """Return the report of an optimised camera."""
-    setup, design = run.setup, run.found
+    setup, design = run.setup, run.best
     before, after = design.before, design.after
     worst = float(after.errors.max())
     head, more = answer(

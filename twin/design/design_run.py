@@ -68,7 +68,7 @@ class DesignRun:
     warnings: tuple[str, ...] = ()
 
     @property
-    def found(self) -> Design:
+    def best(self) -> Design:
         """Best design: prescription before and after."""
         return self.searched.best
 
@@ -141,12 +141,12 @@ def _known(of: Callable[[Design], Any]) -> Callable[[Attempt], Any]:
 
 def _pair(of: Callable[[Evaluation], Any]) -> Callable[[DesignRun], Any]:
     """Return a function that gives a number of the camera before and after."""
-    return lambda run: {"before": of(run.found.before), "after": of(run.found.after)}
+    return lambda run: {"before": of(run.best.before), "after": of(run.best.after)}
 
 
 def _chief_rays(run: DesignRun) -> dict[str, np.ndarray]:
     """Return the angles of all chief rays from the normal of the focal plane, radians, before and after."""
-    design, merit = run.found, run.found.merit
+    design, merit = run.best, run.best.merit
 
     def angles(prescription: Prescription) -> np.ndarray:
         direction = trace_beams(merit.backend, prescription, merit.beams).direction[:, 0]
@@ -193,16 +193,16 @@ DESIGN: Record[DesignRun] = Record(
     Quantity("camera", lambda run: run.setup.test.name, "name of the new camera"),
     Quantity("start", lambda run: run.setup.camera.name, "name of the camera that it was made from"),
     Quantity("wfe_rms_waves", _pair(lambda one: one.errors), "of every field, rms, without piston and tilt"),
-    Quantity("fields_deg", lambda run: run.found.merit.beams.fields, "the fields, x and y"),
+    Quantity("fields_deg", lambda run: run.best.merit.beams.fields, "the fields, x and y"),
     Quantity("principal_distance_m", _pair(lambda one: one.principal_distance), "principal distance"),
     Quantity("envelope_m", _pair(lambda one: one.envelope), "extent along the axis"),
     Quantity("anamorphism", _pair(lambda one: one.anamorphism), "focal length along the line over that across it"),
     Quantity("chief_ray_deg", _chief_rays, "angle of the chief ray from the normal of the focal plane, by field"),
     Quantity("clearance_m", _pair(lambda one: one.clearances), "room between beams and edges, by passage"),
-    Quantity("improved", lambda run: run.found.improved, "whether the new camera is better"),
-    Quantity("held_by", lambda run: run.found.active, "active constraints, the most costly first", record=HELD_BY),
-    Quantity("jacobians", lambda run: run.found.evaluations, "Jacobians that were traced for the best"),
-    Quantity("converged", lambda run: run.found.converged, "true if the best search converged", warning=_unsettled),
+    Quantity("improved", lambda run: run.best.improved, "whether the new camera is better"),
+    Quantity("held_by", lambda run: run.best.active, "active constraints, the most costly first", record=HELD_BY),
+    Quantity("jacobians", lambda run: run.best.evaluations, "Jacobians that were traced for the best"),
+    Quantity("converged", lambda run: run.best.converged, "true if the best search converged", warning=_unsettled),
     Quantity("starts", lambda run: run.searched.attempts, "results of all starts", record=START),
     Quantity("starts_at_best", lambda run: run.searched.agreeing, "starts that end within a share of the best"),
     Quantity("local_optimum", lambda run: run.searched.local, "whether starts end at different cameras"),
@@ -228,7 +228,7 @@ def agreement(run: DesignRun) -> str:
 
 def verdict(run: DesignRun) -> str:
     """Return one or two sentences on whether the camera has improved, and which constraints limit it."""
-    design, start, name = run.found, run.setup.camera.name, run.setup.test.name
+    design, start, name = run.best, run.setup.camera.name, run.setup.test.name
     across = design.before.distance_across
     errors = f"{rms_error(design.after):.4f} waves rms over the field ({rms_error(design.before):.4f} in {start})"
     held = tuple(

@@ -64,7 +64,7 @@ class MonitorDesignRun:
         The design.
     bench : LayoutBench
         Bench that evaluated the layouts.
-    found : Found
+    results : Found
         Results of the search.
     points : tuple of Point
         Layouts on the front of merit, pupil share and mass, the best first.
@@ -72,7 +72,7 @@ class MonitorDesignRun:
 
     setup: monitor_layout.MonitorDesignSetup
     bench: LayoutBench
-    found: Found
+    results: Found
     points: tuple[Point, ...]
 
     def worst(self, facts: LayoutFacts, goal: str) -> float:
@@ -214,7 +214,7 @@ def _front(layouts: tuple[LayoutFacts, ...], bench: LayoutBench) -> list[LayoutF
 
 def verdict(run: MonitorDesignRun) -> tuple[str, ...]:
     """Return the sentences of the verdict: goal reached or not, cost of the best layout, and what limits it."""
-    best, start, test = run.points[0].facts, run.found.start, run.setup.test
+    best, start, test = run.points[0].facts, run.results.start, run.setup.test
     parts = []
     for goal, wanted in test.goal.wanted.items():
         unit, size = UNITS[goal]
@@ -344,15 +344,15 @@ LAYOUTS: Record[MonitorDesignRun] = Record(
     "layouts.json: a search for the layout of a monitor.",
     Quantity("instrument", lambda run: run.setup.instrument.name, "instrument from which the search starts"),
     Quantity("goal", _goals, "goals, standard deviations"),
-    Quantity("start", lambda run: _Part(run, run.found.start), "the layout of that instrument", record=LAYOUT),
+    Quantity("start", lambda run: _Part(run, run.results.start), "the layout of that instrument", record=LAYOUT),
     Quantity("layouts", lambda run: {p.name: _Part(run, p.facts) for p in run.points}, "on the front", record=LAYOUT),
-    Quantity("search", lambda run: run.found, "extent of the search", record=SEARCH),
+    Quantity("search", lambda run: run.results, "extent of the search", record=SEARCH),
     Quantity(
-        "ends", lambda run: {e.name: _Part(run, e) for e in run.found.ends}, "results of all searches", record=END
+        "ends", lambda run: {e.name: _Part(run, e) for e in run.results.ends}, "results of all searches", record=END
     ),
     Quantity(
         "optima",
-        lambda run: [[end.name for end in group] for group in optima(run.found, run.bench)],
+        lambda run: [[end.name for end in group] for group in optima(run.results, run.bench)],
         "searches that end with the same merit, within 2 %, the best group first",
     ),
 )

@@ -27,7 +27,7 @@ _MOST_CAUSES = 6
 
 def monitor_design_report(run: MonitorDesignRun) -> Report:
     """Return the report of a search for a monitor's layout."""
-    setup, results = run.setup, run.found
+    setup, results = run.setup, run.results
     start, test = setup.instrument.name, setup.test
     rows = [_row(run, start, results.start), *(_row(run, point.name, point.facts) for point in run.points)]
     heads = (
@@ -92,10 +92,10 @@ def _row(run: MonitorDesignRun, name: str, facts: LayoutFacts) -> list[str | int
 
 
 def _search_text(run: MonitorDesignRun) -> str:
-    results = run.found
+    results = run.results
     text = (
         f"{results.beams} beams were evaluated alone, of which {results.standing} are feasible; {results.compared} "
-        f"combinations were compared and {results.built} built as a whole, of which {len(results.layouts)} are feasible."
+        f"combinations were compared and {results.built} built as a whole, {len(results.layouts)} of them feasible."
     )
     refused = sorted(results.refused.items(), key=lambda item: -item[1])[:3]
     if refused:
@@ -114,7 +114,7 @@ def _search_text(run: MonitorDesignRun) -> str:
 
 def starts_text(run: MonitorDesignRun) -> str:
     """Return a sentence on whether all starts reach the same optimum."""
-    groups, count = optima(run.found, run.bench), len(run.found.ends)
+    groups, count = optima(run.results, run.bench), len(run.results.ends)
     infeasible = count - sum(len(group) for group in groups)
     best = [run.merit(group[0].layouts[0]) for group in groups]
     worst = max(run.merit(end.layouts[0]) for group in groups for end in group)
@@ -133,7 +133,7 @@ def starts_text(run: MonitorDesignRun) -> str:
 
 def _starts_table(run: MonitorDesignRun) -> Table:
     rows: list[list[Cell]] = []
-    for end in run.found.ends:
+    for end in run.results.ends:
         if not end.layouts:
             rows.append([end.name, 0, *[float("nan")] * 3, ""])
             continue
@@ -162,7 +162,7 @@ def _beams_table(run: MonitorDesignRun) -> Table:
 
 
 def _named(run: MonitorDesignRun) -> list[tuple[str, LayoutFacts]]:
-    return [(run.setup.instrument.name, run.found.start), *((p.name, p.facts) for p in run.points)]
+    return [(run.setup.instrument.name, run.results.start), *((p.name, p.facts) for p in run.points)]
 
 
 def _causes_of(run: MonitorDesignRun, facts: LayoutFacts, name: str, goal: str, measured: bool) -> dict[str, float]:
@@ -176,7 +176,7 @@ def _cause_table(run: MonitorDesignRun, name: str) -> Table:
     heads, columns = ["cause"], []
     for goal in run.setup.test.goal.wanted:
         unit = unit_for_reports(UNITS[goal][0])
-        columns.append(_causes_of(run, run.found.start, name, goal, False))
+        columns.append(_causes_of(run, run.results.start, name, goal, False))
         heads.append(f"{GOAL_NAMES[goal]}, unmeasured [{unit}]")
         for label, facts in _named(run)[:2]:
             columns.append(_causes_of(run, facts, name, goal, True))
@@ -198,7 +198,7 @@ def _front_figure(run: MonitorDesignRun) -> Figure:
     left, right = figure.subplots(1, 2, sharey=True)
     costs = (("share of the imaging pupil [%]", lambda f: 100.0 * f.pupil_share), ("prisms [kg]", lambda f: f.mass))
     for axes, (label, cost) in zip((left, right), costs, strict=True):
-        layouts = run.found.layouts
+        layouts = run.results.layouts
         axes.plot(
             [cost(f) for f in layouts], [run.merit(f) for f in layouts], "o", ms=3.5, color=LIGHT, mec=GREY, mew=0.5
         )
@@ -208,7 +208,7 @@ def _front_figure(run: MonitorDesignRun) -> Figure:
             text = point.name.removeprefix(f"{run.points[0].name}_") if k else "best"
             above = k % 2 == 0  # neighbours on the front may stand close
             axes.annotate(text, (x, y), (5, 5) if above else (-9, -11), textcoords="offset points", fontsize=8)
-        start = run.found.start
+        start = run.results.start
         axes.plot([cost(start)], [run.merit(start)], "s", ms=6, color=INK)
         axes.annotate(run.setup.instrument.name, (cost(start), run.merit(start)), (6, -10), textcoords="offset points")
         axes.axhline(1.0, color=ORANGE, lw=1.0)
@@ -242,8 +242,8 @@ def _cause_bars(axes: Axes, run: MonitorDesignRun, goal: str) -> None:
         best.sigmas, key=lambda disturbances: max(best.sigmas[disturbances][key] for key in run.bench.goals_of(goal))
     )
     columns = [
-        ("unmeasured", LIGHT, _causes_of(run, run.found.start, name, goal, False)),
-        (run.setup.instrument.name, SKY, _causes_of(run, run.found.start, name, goal, True)),
+        ("unmeasured", LIGHT, _causes_of(run, run.results.start, name, goal, False)),
+        (run.setup.instrument.name, SKY, _causes_of(run, run.results.start, name, goal, True)),
         (run.points[0].name, VERMILION, _causes_of(run, best, name, goal, True)),
     ]
     size = {c: max(col.get(c, 0.0) for _, _, col in columns[1:]) for _, _, col in columns for c in col}

@@ -108,9 +108,9 @@ def main(
         say = partial(console.print, markup=False, highlight=False, soft_wrap=True)
         if progress_fd is None:
             return study_command.run_study(setup, session, folder, chosen, say)
-        from twin.study.scripted import tell_through  # what a script needs
+        from twin.study.scripted import pipe_progress  # what a script needs
 
-        return study_command.run_study(setup, session, folder, chosen, say, tell_through(progress_fd))
+        return study_command.run_study(setup, session, folder, chosen, say, pipe_progress(progress_fd))
 
     # --resume of a finished study makes its report anew
     finished = resume and out is not None and isfile(out / BLOCKS) and read_manifest(out) is not None

@@ -28,7 +28,7 @@ from scenes.yaml.yaml_file import YamlFile, dump_yaml
 from twin.framework.owned_files import scratch
 from twin.study.runs.base_job import Tree
 
-Told = Callable[[int, int], None]
+ProgressCallback = Callable[[int, int], None]
 """Callback that receives the numbers of finished and of all runs."""
 
 _NUMBER = r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
@@ -83,7 +83,7 @@ def study(
     workers: int | None = None,
     out: str | Path | None = None,
     quiet: bool = False,
-    progress: bool | Told = True,
+    progress: bool | ProgressCallback = True,
 ) -> xr.Dataset:
     """Perturb, render and recover an instrument many times, on all cores.
 
@@ -142,9 +142,9 @@ def study(
             return data.load()
 
 
-def _run(command: list[str], quiet: bool, progress: bool | Told) -> tuple[int, str]:
+def _run(command: list[str], quiet: bool, progress: bool | ProgressCallback) -> tuple[int, str]:
     """Run a study's command to its end and return its exit code and, if quiet, its messages."""
-    callback = progress if callable(progress) else _shown_bar() if progress and not quiet else _silent
+    callback = progress if callable(progress) else _progress_bar() if progress and not quiet else _silent
     reading, writing = os.pipe()
     with os.fdopen(reading) as lines, tempfile.TemporaryFile("w+") as messages:
         words = [*command, "--progress-fd", str(writing)]
@@ -172,7 +172,7 @@ def _silent(done: int, runs: int) -> None:
     """Ignore the progress."""
 
 
-def _shown_bar() -> Told:
+def _progress_bar() -> ProgressCallback:
     """Return a callback that draws a progress bar on stderr, on a terminal or in a notebook; elsewhere a silent one.
 
     The command has its own progress display; this one needs only what is available in a script.
@@ -198,7 +198,7 @@ _WIDTH = 30
 """Length of the progress bar, characters."""
 
 
-def tell_through(descriptor: int) -> Told:
+def pipe_progress(descriptor: int) -> ProgressCallback:
     """Return a callback that writes the progress into a pipe, one line each time; a closed reader is ignored.
 
     Parameters
@@ -227,7 +227,7 @@ def config_text(
     spreads: list[Spread] = []
     middle: dict[str, Any] = {}
     for node, keys in _by_node(vary).items():
-        middle[node] = {key: _taken(value, (node, key), spreads) for key, value in keys.items()}
+        middle[node] = {key: _with_middle_values(value, (node, key), spreads) for key, value in keys.items()}
     if not spreads:
         raise InputError(Issue("nothing varies", key=("vary",), allowed=_FORMS))
     resolved = instrument.perturbed(middle).resolved
@@ -315,12 +315,12 @@ def _with_sigmas(read: Sequence[str]) -> Tree:
     return {"key": [*read], **{name: [*path, f"{key}{end}"] for name, end in (("sigma", TOTAL), ("noise", NOISE))}}
 
 
-def _taken(value: Any, key: KeyPath, spreads: list[Spread]) -> Any:
+def _with_middle_values(value: Any, key: KeyPath, spreads: list[Spread]) -> Any:
     """Return the value with each range replaced by its middle; the ranges are appended to ``spreads``."""
     if isinstance(value, Mapping):
-        return {name: _taken(part, (*key, name), spreads) for name, part in value.items()}
+        return {name: _with_middle_values(part, (*key, name), spreads) for name, part in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_taken(part, (*key, k), spreads) for k, part in enumerate(value)]
+        return [_with_middle_values(part, (*key, k), spreads) for k, part in enumerate(value)]
     if not isinstance(value, str) or "(" not in value:
         return value
     place = (*key, "change") if key[-1] == "temperature" else key

@@ -110,7 +110,7 @@ def run_study(
     session.advance(WRITE, 0, 1)
     # nor are drawing libraries and the like
     from twin.study.report.study_report import write_report
-    from twin.study.report.study_statistics import StudyRuns, impossible
+    from twin.study.report.study_statistics import StudyRuns, impossible_noise
     from twin.study.study_files import write_data
 
     numbers = write_data(plan, result, engine.seconds, engine.computed, folder)
@@ -125,7 +125,7 @@ def run_study(
     missing = [*numbers.unwritten, *report.undrawn]
     if failed == plan.runs:
         missing.insert(0, f"all {failed} runs failed, see report.html")
-    fault = impossible(StudyRuns.of(numbers.data, setup.study))
+    fault = impossible_noise(StudyRuns.of(numbers.data, setup.study))
     if fault is not None:  # everything is written: only what the file says of a response is wrong
         print_error(errors, str(fault))
     results = {**numbers.summary, "verdict": report.verdict, "warnings": warnings}

@@ -116,16 +116,16 @@ def allocate(
     checked = min(CHECKED, len(samples.x))
     share = spec.target + _SAFE * float(np.sqrt(spec.target * (1.0 - spec.target) / checked))
     share = min(share, 1.0 - 1.0 / checked)
-    total = np.zeros(len(costs.kept))
+    total = np.zeros(len(costs.fixed))
     low, high = -np.log(spec.tightest), np.log(spec.loosest)
-    trade = _Trade(bench, model, samples, costs, share, samples.values)
+    trade = _MarginModel(bench, model, samples, costs, share, samples.values)
     first, nothing = trade.passing(total), np.zeros(len(total))
     cheapest = (costs.of_level(total), total, trade) if trade.quantile(nothing)[0] <= 0.0 else None
     for iteration in range(ROUNDS):
         advance("allocation", iteration, ROUNDS)
         bounds = np.clip([low - total, high - total], -np.log(BOUND), np.log(BOUND))
-        step = trade.cheapest(np.where(costs.kept, 0.0, bounds[0]), np.where(costs.kept, 0.0, bounds[1]), total)
-        total, trade = total + step, _Trade.at(bench, total + step, samples, costs, share)
+        step = trade.cheapest(np.where(costs.fixed, 0.0, bounds[0]), np.where(costs.fixed, 0.0, bounds[1]), total)
+        total, trade = total + step, _MarginModel.at(bench, total + step, samples, costs, share)
         price = costs.of_level(total)
         if (cheapest is None or price < cheapest[0]) and trade.quantile(nothing)[0] <= 0.0:
             cheapest = price, total, trade
@@ -137,12 +137,12 @@ def allocate(
     for _ in range(_LAST):
         if trade.quantile(nothing)[0] <= 0.0:
             break
-        total = total + trade.tightened(np.where(costs.kept, 0.0, np.clip(low - total, -np.log(BOUND), 0.0)))
-        trade = _Trade.at(bench, total, samples, costs, share)
+        total = total + trade.tightened(np.where(costs.fixed, 0.0, np.clip(low - total, -np.log(BOUND), 0.0)))
+        trade = _MarginModel.at(bench, total, samples, costs, share)
     passes = trade.quantile(nothing)[0] <= 0.0
     for looser in (passes, False):
-        limits, rounded = _graded(setup, trade, total, spec, looser)
-        final = _Trade.at(bench, np.log(rounded), samples, costs, share)
+        limits, rounded = _rounded_to_grades(setup, trade, total, spec, looser)
+        final = _MarginModel.at(bench, np.log(rounded), samples, costs, share)
         if final.quantile(nothing)[0] <= 0.0:
             break
     predicted = final.passing(nothing)
@@ -191,13 +191,13 @@ class _Costs:
     ----------
     curves : tuple of CostCurve
         Curve of every tolerance (E): logarithm of the cost against the logarithm of the ratio to the specified limit.
-    kept : (E,) ndarray of bool
+    fixed : (E,) ndarray of bool
         True for a limit that the allocation must not change: so specified, or of a distribution that is not centred on
         zero.
     """
 
     curves: tuple[CostCurve, ...]
-    kept: np.ndarray
+    fixed: np.ndarray
 
     @classmethod
     def of(cls, setup: ToleranceSetup) -> _Costs:
@@ -222,7 +222,7 @@ class _Costs:
         return np.asarray(np.exp(values[:, 0]) * values[:, 1])
 
 
-class _Trade:
+class _MarginModel:
     """Worst margins of cameras as functions of the limits, about the limits of a bench.
 
     Parameters
@@ -255,13 +255,15 @@ class _Trade:
         count = min(CHECKED, len(self.model.first))
         if values is None:
             errors = adjustment_errors(bench, samples.seeds[:count].tolist())
-            values = bench.values(bench.try_out(samples.x[:count] * bench.sizes, errors).parts)
+            values = bench.values(bench.adjust_cameras(samples.x[:count] * bench.sizes, errors).parts)
         exact = self._margins(values[:count])
-        modelled = self._worst(self.model.parts(np.ones(len(costs.kept))))[:count]
+        modelled = self._worst(self.model.parts(np.ones(len(costs.fixed))))[:count]
         self.offset = float(np.quantile(exact, share) - np.quantile(modelled, share))
 
     @classmethod
-    def at(cls, bench: ToleranceBench, total: np.ndarray, samples: Samples, costs: _Costs, share: float) -> _Trade:
+    def at(
+        cls, bench: ToleranceBench, total: np.ndarray, samples: Samples, costs: _Costs, share: float
+    ) -> _MarginModel:
         """Return the margins about limits at exp(total) (E,) times those of a bench."""
         now = bench.scaled(np.exp(total))
         return cls(now, sensitivities(now).model, samples, costs, share)
@@ -288,7 +290,7 @@ class _Trade:
         near = order[max(0, at - half) : at + half + 1]
         change = self.model.slope(np.exp(level), near)
         slope = np.zeros(len(level))
-        for e in np.flatnonzero(~self.costs.kept):
+        for e in np.flatnonzero(~self.costs.fixed):
             ahead = self._worst(parts[near] + _STEP * change[:, :, e])
             slope[e] = float(np.mean(ahead - margin[near])) / _STEP
         return float(margin[order[at]]) + self.offset, slope
@@ -309,7 +311,7 @@ class _Trade:
             Step in the logarithms of the limits.
         """
         start = self.tightened(low)
-        if self.costs.kept.all() or self.quantile(start)[0] > 0.0:
+        if self.costs.fixed.all() or self.quantile(start)[0] > 0.0:
             return start
         size = self.costs.of_level(total)
         solution = minimize(
@@ -345,8 +347,8 @@ class _Trade:
         return best
 
 
-def _graded(
-    setup: ToleranceSetup, trade: _Trade, total: np.ndarray, spec: AllocationSpec, looser: bool
+def _rounded_to_grades(
+    setup: ToleranceSetup, trade: _MarginModel, total: np.ndarray, spec: AllocationSpec, looser: bool
 ) -> tuple[dict[str, str | float], np.ndarray]:
     """Round limits down to grades and, if ``looser``, raise one after the other by grades where the yield allows.
 
@@ -362,8 +364,10 @@ def _graded(
     ladders: list[list[tuple[str | float, float]]] = []
     for e, (_, tolerance) in enumerate(entries):
         stays = [(tolerance.limit, tolerance.limit_si)]
-        steps = _ladder(tolerance.limit, tolerance.parts[1], tolerance.limit_si * float(np.exp(total[e])), spec.grades)
-        ladders.append(stays if trade.costs.kept[e] else steps)
+        steps = _grades_near(
+            tolerance.limit, tolerance.parts[1], tolerance.limit_si * float(np.exp(total[e])), spec.grades
+        )
+        ladders.append(stays if trade.costs.fixed[e] else steps)
     chosen = np.zeros(len(entries), dtype=int)
 
     def scales(indices: np.ndarray) -> np.ndarray:
@@ -382,7 +386,9 @@ def _graded(
     return limits, scales(chosen)
 
 
-def _ladder(limit: str | float, kind: str, value: float, grades: Sequence[float]) -> list[tuple[str | float, float]]:
+def _grades_near(
+    limit: str | float, kind: str, value: float, grades: Sequence[float]
+) -> list[tuple[str | float, float]]:
     """Return the grade at or below a value and the next ones above it, in the form of the files and in SI.
 
     Grades are numbers in the unit of the old limit.

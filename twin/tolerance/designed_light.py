@@ -21,7 +21,7 @@ TRANSFER = 1e-3
 """Largest allowed difference between an MTF at fixed pupil nodes and that of the nominal pupil."""
 
 
-def light_of(test: ToleranceBudgetSpec, camera: CameraSpec) -> SpectrumSpec | None:
+def budget_spectrum(test: ToleranceBudgetSpec, camera: CameraSpec) -> SpectrumSpec | None:
     """Return the spectrum in which a budget evaluates a camera; None for its design wavelength.
 
     Raises
@@ -39,7 +39,7 @@ def light_of(test: ToleranceBudgetSpec, camera: CameraSpec) -> SpectrumSpec | No
 
 
 @dataclass(frozen=True, eq=False)
-class LitRoots:
+class WavefrontNorm:
     """Square roots of the quadratic forms from wavefront coefficients (T,) to mean squares over the illuminated pupil.
 
     Attributes
@@ -54,7 +54,7 @@ class LitRoots:
     tilt: np.ndarray
 
     @classmethod
-    def of(cls, lit: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], degree: int) -> LitRoots:
+    def of(cls, lit: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], degree: int) -> WavefrontNorm:
         """Compute the matrices for the illuminated pupils of several fields.
 
         Parameters

@@ -15,7 +15,7 @@ import numpy as np
 from scenes.specs.tolerance import OF_MONITOR
 from twin.camera.varied_beams import AT_ONCE
 from twin.framework.procedure import Advance, silent
-from twin.tolerance.tolerance_bench import ToleranceBench, Tried
+from twin.tolerance.tolerance_bench import AdjustedCameras, ToleranceBench
 
 MOST_PAIRED = 600
 """Largest number of varied parameters for which the second order has mixed terms; of more they would fill the memory.
@@ -65,11 +65,12 @@ class MeritModel:
         """Return the parts (S, P) to the second order at x (S, K)."""
         step = max(1, _AT_ONCE // max(1, self.curvature.shape[0] * x.shape[1]))
         parts = [
-            self.linear(block) + 0.5 * self._bent(block) for block in (x[s : s + step] for s in range(0, len(x), step))
+            self.linear(block) + 0.5 * self._second_order(block)
+            for block in (x[s : s + step] for s in range(0, len(x), step))
         ]
         return np.concatenate(parts)
 
-    def _bent(self, x: np.ndarray) -> np.ndarray:
+    def _second_order(self, x: np.ndarray) -> np.ndarray:
         return np.asarray(np.sum((x @ self.curvature).transpose(1, 0, 2) * x[:, None], axis=-1))
 
 
@@ -160,9 +161,9 @@ def sensitivities(bench: ToleranceBench, advance: Advance = silent) -> Sensitivi
     done = []
     for start in range(0, len(x), AT_ONCE):
         advance("sensitivities", start, len(x))
-        done.append(bench.try_out(x[start : start + AT_ONCE] * bench.sizes, paths=True))
+        done.append(bench.adjust_cameras(x[start : start + AT_ONCE] * bench.sizes, paths=True))
     advance("sensitivities", len(x), len(x))
-    tried = Tried.joined(done)
+    tried = AdjustedCameras.joined(done)
     nominal, plus, minus = tried.parts[0], tried.parts[1 : 1 + count], tried.parts[1 + count :]
     paired = count <= MOST_PAIRED
     curvature = np.zeros((bench.parts, count, count))
@@ -180,13 +181,13 @@ def sensitivities(bench: ToleranceBench, advance: Advance = silent) -> Sensitivi
             ends = np.array([1 + count + rows[0], 1 + rows[0]])
             values[e], moves[e] = bench.values(tried.parts[ends]), tried.moves[ends]
         else:
-            values[e] = bench.values(_spread(bench, model, rows, np.ones(1))[0])
+            values[e] = bench.values(_figure_error_parts(bench, model, rows, np.ones(1))[0])
         reasons = [tried.problems[r] for r in (*(1 + rows), *(1 + count + rows))]
         problems.append(next((text for text in reasons if text), ""))
     return Sensitivities(bench.values(nominal), values, moves, tuple(problems), model)
 
 
-def _spread(bench: ToleranceBench, model: MeritModel, rows: np.ndarray, share: np.ndarray) -> np.ndarray:
+def _figure_error_parts(bench: ToleranceBench, model: MeritModel, rows: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Return the parts (L, P) that represent a figure error at shares (L,) of its limit.
 
     Parts that depend quadratically on the wavefront get their mean over the random terms, the others their rms.
@@ -236,7 +237,7 @@ def inverse_limits(bench: ToleranceBench, sensitivity: Sensitivities, advance: A
     losses = default_losses(bench, sensitivity.nominal)
     entries = list(bench.entries.values())
     guess = np.array(
-        [[_modelled_share(bench, sensitivity, indices, m, losses) for m in range(len(losses))] for indices in entries]
+        [[_model_ratio(bench, sensitivity, indices, m, losses) for m in range(len(losses))] for indices in entries]
     )
     open_ = [
         (e, m) for e, indices in enumerate(entries) for m in range(len(losses)) if len(indices) == 1 and losses[m] > 0.0
@@ -250,7 +251,7 @@ def inverse_limits(bench: ToleranceBench, sensitivity: Sensitivities, advance: A
             indices, m = np.array([entries[e][0] for e in pairs[rows, 0]]), pairs[rows, 1]
             x = np.zeros((2, len(rows), len(bench.numbers)))
             x[0, np.arange(len(rows)), indices], x[1, np.arange(len(rows)), indices] = np.exp(level), -np.exp(level)
-            values = bench.values(bench.try_out(x.reshape(-1, x.shape[-1]) * bench.sizes).parts).reshape(
+            values = bench.values(bench.adjust_cameras(x.reshape(-1, x.shape[-1]) * bench.sizes).parts).reshape(
                 2, len(rows), -1
             )
             worst = np.max([_loss(bench, sensitivity, values[:, k, j], j) for k, j in enumerate(m)], axis=1)
@@ -267,7 +268,7 @@ def _loss(bench: ToleranceBench, sensitivity: Sensitivities, values: np.ndarray,
     return np.asarray(np.where(np.isnan(loss), np.inf, loss))
 
 
-def _modelled_share(
+def _model_ratio(
     bench: ToleranceBench, sensitivity: Sensitivities, indices: Sequence[int], m: int, losses: np.ndarray
 ) -> float:
     """Return the ratio to its limit at which a tolerance causes a merit's loss in the model, at most ``FARTHEST``.
@@ -279,7 +280,7 @@ def _modelled_share(
     share = np.geomspace(FARTHEST**-2, FARTHEST, _GRID)
     model, rows = sensitivity.model, np.array(indices)
     if len(rows) > 1:
-        parts = [_spread(bench, model, rows, share)]
+        parts = [_figure_error_parts(bench, model, rows, share)]
     else:
         bent = model.nominal + 0.5 * np.outer(share**2, model.curvature[:, rows[0], rows[0]])
         parts = [bent + np.outer(sign * share, model.slope[:, rows[0]]) for sign in (1.0, -1.0)]

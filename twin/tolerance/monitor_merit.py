@@ -8,8 +8,8 @@ was built.
 
 The derivatives change by about 1e-4 within tolerances. The change due to each tolerance and each adjustment is traced
 once, and changes of several are added. The terms of a whole figure error are omitted: 10 nm of a term change the
-derivatives by less than 1e-5. The noise of every camera is that of its own images. ``MonitorMerit.missed`` gives the
-resulting error of the sigmas.
+derivatives by less than 1e-5. The noise of every camera is that of its own images.
+``MonitorMerit.interpolation_errors`` gives the resulting error of the sigmas.
 
 **Obstruction.** Prisms, housings, baffles and parts of other cameras block part of the beams of a camera, each where
 the state puts it. The camera's own mirrors belong to its prescription.
@@ -41,7 +41,7 @@ from twin.monitor.monitor_derivative import derivative_changes
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import SpotPath
 from twin.targets.target_path import TargetPath
-from twin.tolerance.variations import VariedNumber, states_of
+from twin.tolerance.variations import VariedParameter, states_of
 
 ROTATIONS = ("d_alpha", "d_beta", "d_gamma")
 """Keys of the three rotations of a camera."""
@@ -87,7 +87,7 @@ class MonitorMerit:
         setup: ToleranceSetup,
         experiment: MonitorExperiment,
         camera: str,
-        numbers: Sequence[VariedNumber],
+        numbers: Sequence[VariedParameter],
         ranges: np.ndarray,
     ) -> MonitorMerit | None:
         """Return the monitor of a budget; None if no merit is about a monitor.
@@ -182,7 +182,7 @@ class MonitorMerit:
         root = known.disturbances.root
         return self._read(changes[0] @ root, changes[1] @ root, self._noise(states))
 
-    def missed(self, amounts: np.ndarray, states: Sequence[State]) -> dict[str, float]:
+    def interpolation_errors(self, amounts: np.ndarray, states: Sequence[State]) -> dict[str, float]:
         """Return the largest relative error of each merit's sigma against ``exact``; arguments as in ``variances``."""
         near, right = self.variances(amounts, states), self.exact(states)
         return {

@@ -99,7 +99,7 @@ def outcomes(bench: ToleranceBench, x: np.ndarray, seeds: Sequence[int]) -> list
         Seeds of the adjustment errors of the S cameras.
     """
     errors = adjustment_errors(bench, seeds)
-    tried = bench.try_out(x * bench.sizes, errors)
+    tried = bench.adjust_cameras(x * bench.sizes, errors)
     values = bench.values(tried.parts)
     out: list[Outcome] = []
     for s, problem in enumerate(tried.problems):
@@ -124,7 +124,7 @@ def adjustment_errors(bench: ToleranceBench, seeds: Sequence[int]) -> np.ndarray
     return np.stack([np.random.default_rng([seed, 1]).standard_normal(len(bench.ranges)) for seed in seeds])
 
 
-def law_of(tolerance: ToleranceSpec) -> dict[str, Any]:
+def distribution_of(tolerance: ToleranceSpec) -> dict[str, Any]:
     """Return the distribution of a tolerance in units of its limit, in the form of a study's file."""
     if tolerance.measured is not None:
         return {"values": list(tolerance.measured_shares)}
@@ -137,7 +137,7 @@ def law_of(tolerance: ToleranceSpec) -> dict[str, Any]:
     return {"truncated": {"mean": middle, "sigma": 1.0 / tolerance.sigmas, "limits": ends}}
 
 
-def study_of(setup: ToleranceSetup, bench: ToleranceBench, samples: int, seed: int) -> StudySetup:
+def sampling_study(setup: ToleranceSetup, bench: ToleranceBench, samples: int, seed: int) -> StudySetup:
     """Return the study that draws cameras of a budget.
 
     Parameters
@@ -155,7 +155,7 @@ def study_of(setup: ToleranceSetup, bench: ToleranceBench, samples: int, seed: i
     factors: dict[str, Any] = {}
     for number in bench.numbers:
         entry = test.tolerances[number.entry]
-        law = {"normal": {"mean": 0.0, "sigma": 1.0}} if entry.spectrum else law_of(entry)
+        law = {"normal": {"mean": 0.0, "sigma": 1.0}} if entry.spectrum else distribution_of(entry)
         factors[number.name.replace(" ", "_")] = {"key": [DRAWS, number.name], **law}
     responses = {
         **{f"merit_{merit.name}": {"key": [KIND, "merits", merit.name]} for merit in bench.merits},
@@ -268,7 +268,7 @@ def draw_samples(
     Incomplete
         The engine of studies could not finish all runs.
     """
-    study = study_of(setup, bench, samples, seed)
+    study = sampling_study(setup, bench, samples, seed)
     plan = Plan.of(study)
     x = np.stack([column.values for column in plan.columns], axis=-1).astype(np.float64)
     seeds = plan.seeds if plan.seeds is not None else np.zeros(samples, np.int64)

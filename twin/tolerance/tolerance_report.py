@@ -236,9 +236,9 @@ def _sensitivity_table(run: ToleranceRun) -> Table:
     for e, (name, item) in enumerate(run.setup.test.tolerances.items()):
         cells: list[Cell] = [name, item.words, str(item.limit)]
         for m, result in enumerate(run.merits):
-            cells += [_scaled(float(run.found.values[e, end, m]), result) for end in (0, 1)]
+            cells += [_scaled(float(run.sensitivity.values[e, end, m]), result) for end in (0, 1)]
         shares = [
-            _unless_rounding(float(run.found.moves[e, end, c]) / (compensator.range_si or 1.0))
+            _unless_rounding(float(run.sensitivity.moves[e, end, c]) / (compensator.range_si or 1.0))
             for c, compensator in enumerate(adjusted.values())
             for end in (0, 1)
         ]
@@ -385,12 +385,12 @@ def _compensator_sections(run: ToleranceRun) -> tuple[Section, ...]:
 
 
 def _monitor_sections(run: ToleranceRun) -> tuple[Section, ...]:
-    if not run.missed or run.bench.monitor is None:
+    if not run.interpolation_errors or run.bench.monitor is None:
         return ()
     stated = run.bench.monitor.stated.name
     rows: list[list[Cell]] = []
     for result in run.merits:
-        if result.merit.name in run.missed:
+        if result.merit.name in run.interpolation_errors:
             spec = result.merit.spec
             readings = ", ".join(readings_of(spec, tuple(run.bench.instrument.cameras)))
             rows.append(
@@ -399,7 +399,7 @@ def _monitor_sections(run: ToleranceRun) -> tuple[Section, ...]:
                     readings,
                     spec.estimator,
                     _scaled(result.nominal, result),
-                    run.missed[result.merit.name],
+                    run.interpolation_errors[result.merit.name],
                 ]
             )
     text = (
@@ -430,7 +430,7 @@ def _yield_figure(run: ToleranceRun) -> Figure:
 
 def _curve(ax: Axes, run: ToleranceRun, result: MeritResult) -> None:
     size, m = merit_unit(result.merit)[1], run.bench.merits.index(result.merit)
-    models = (run.found.model.quadratic, run.found.model.linear)
+    models = (run.sensitivity.model.quadratic, run.sensitivity.model.linear)
     curves = [run.samples.values[:, m], *(result.merit.values(part(run.samples.x)) for part in models)]
     looks = ((BLUE, "-", 1.8, "exact"), (ORANGE, "--", 1.4, "quadratic"), (GREY, ":", 1.2, "linear"))
     for values, (colour, style, width, label) in zip(curves, looks, strict=True):

@@ -22,7 +22,7 @@ from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, silent
 from twin.framework.record import Quantity, Record
 from twin.tolerance.allocation import Allocation, allocate
-from twin.tolerance.given_warnings import beam_warnings, given_warnings, missed_warnings
+from twin.tolerance.given_warnings import beam_warnings, instrument_warnings, interpolation_warnings
 from twin.tolerance.merit_models import InverseLimits, ScaledModel, Sensitivities, inverse_limits, sensitivities
 from twin.tolerance.monitor_merit import Merit, merit_unit, shown_merit
 from twin.tolerance.samples import Samples, Workforce, draw_samples
@@ -130,7 +130,7 @@ class ToleranceRun:
         Tolerance budget.
     bench : ToleranceBench
         Bench of the budget.
-    found : Sensitivities
+    sensitivity : Sensitivities
         Sensitivities and the model of the merits.
     inverse : InverseLimits
         Inverse limits for a loss.
@@ -148,14 +148,14 @@ class ToleranceRun:
         Worst cameras as files of jobs, by name.
     warnings : tuple of str
         Warnings for the user.
-    missed : dict
+    interpolation_errors : dict
         Merit of the monitor -> largest relative difference of its sigma from that with derivatives traced in the camera
         itself, in the first ``EXACT`` cameras.
     """
 
     setup: ToleranceSetup
     bench: ToleranceBench
-    found: Sensitivities
+    sensitivity: Sensitivities
     inverse: InverseLimits
     samples: Samples
     merits: tuple[MeritResult, ...]
@@ -164,7 +164,7 @@ class ToleranceRun:
     judged: Yield | None
     jobs: Mapping[str, str]
     warnings: tuple[str, ...]
-    missed: Mapping[str, float] = field(default_factory=FrozenMap)
+    interpolation_errors: Mapping[str, float] = field(default_factory=FrozenMap)
 
 
 def run_tolerance(
@@ -209,27 +209,27 @@ def run_tolerance(
     seed = test.seed if seed is None else seed
     _require_memory(test)
     bench = ToleranceBench(setup, backend)
-    input_warnings = given_warnings(setup, bench)
+    input_warnings = instrument_warnings(setup, bench)
     sensitivity = sensitivities(bench, advance)
     _require_light(setup, sensitivity)
     inverse = inverse_limits(bench, sensitivity, advance)
     samples = draw_samples(setup, bench, backend, test.samples, seed, force, "cameras", advance)
     passing = bench.passing(samples.values)
-    models = Modelled.of(bench, sensitivity, samples)
+    models = ModelPredictions.of(bench, sensitivity, samples)
     merits = tuple(
         _merit_result(bench, sensitivity, samples, models, m, passing[:, m]) for m in range(len(bench.merits))
     )
     allocation, judged = None, None
     if test.allocation is not None:
         allocation = allocate(setup, bench, sensitivity.model, samples, test.allocation, advance)
-        judged = _judged(setup, backend, allocation, seed, force, advance)
-    missed = _missed(bench, samples)
+        judged = _validated_yield(setup, backend, allocation, seed, force, advance)
+    missed = _interpolation_errors(bench, samples)
     warnings = (
         *input_warnings,
         *engine_warnings,
-        *beam_warnings(bench, _states(bench, samples, worst_of(bench, samples))),
+        *beam_warnings(bench, _states(bench, samples, worst_cameras(bench, samples))),
         *_warnings(bench, sensitivity, samples, merits, allocation, judged, test.allocation),
-        *missed_warnings(missed, EXACT),
+        *interpolation_warnings(missed, EXACT),
     )
     return ToleranceRun(
         setup,
@@ -257,17 +257,17 @@ def _states(bench: ToleranceBench, samples: Samples, rows: np.ndarray) -> list[S
     return states_of((*bench.numbers, *bench.compensators), _amounts(bench, samples, rows))
 
 
-def worst_of(bench: ToleranceBench, samples: Samples) -> np.ndarray:
+def worst_cameras(bench: ToleranceBench, samples: Samples) -> np.ndarray:
     """Return the indices of the worst cameras, the worst first."""
     return np.argsort(-bench.worst_margins(samples.values), kind="stable")[:WORST]
 
 
-def _missed(bench: ToleranceBench, samples: Samples) -> dict[str, float]:
+def _interpolation_errors(bench: ToleranceBench, samples: Samples) -> dict[str, float]:
     """Return the relative interpolation error of each monitor merit's sigma in the first cameras."""
     known = np.flatnonzero(np.all(np.isfinite(samples.values), axis=1))[:EXACT]
     if bench.monitor is None or not known.size:
         return {}
-    return bench.monitor.missed(_amounts(bench, samples, known), _states(bench, samples, known))
+    return bench.monitor.interpolation_errors(_amounts(bench, samples, known), _states(bench, samples, known))
 
 
 def _require_memory(test: ToleranceBudgetSpec) -> None:
@@ -292,7 +292,7 @@ def with_limits(setup: ToleranceSetup, limits: Mapping[str, str | float]) -> Tol
     return setup.model_copy(update={"test": setup.test.model_copy(update={"tolerances": FrozenMap(entries)})})
 
 
-def _judged(
+def _validated_yield(
     setup: ToleranceSetup, backend: Backend, allocation: Allocation, seed: int, force: Workforce, advance: Advance
 ) -> Yield:
     """Return the yield of the allocated limits over independent cameras."""
@@ -303,7 +303,7 @@ def _judged(
 
 
 @dataclass(frozen=True, eq=False)
-class Modelled:
+class ModelPredictions:
     """Merits of the Monte Carlo cameras predicted by the models.
 
     Attributes
@@ -319,7 +319,7 @@ class Modelled:
     without: np.ndarray
 
     @classmethod
-    def of(cls, bench: ToleranceBench, sensitivity: Sensitivities, samples: Samples) -> Modelled:
+    def of(cls, bench: ToleranceBench, sensitivity: Sensitivities, samples: Samples) -> ModelPredictions:
         """Evaluate the models at the draws of the cameras."""
         scaled = ScaledModel.of(sensitivity.model, samples.x, list(bench.entries.values()))
         identity = np.eye(len(bench.entries))
@@ -331,7 +331,12 @@ class Modelled:
 
 
 def _merit_result(
-    bench: ToleranceBench, sensitivity: Sensitivities, samples: Samples, models: Modelled, m: int, passing: np.ndarray
+    bench: ToleranceBench,
+    sensitivity: Sensitivities,
+    samples: Samples,
+    models: ModelPredictions,
+    m: int,
+    passing: np.ndarray,
 ) -> MeritResult:
     merit = bench.merits[m]
     values = samples.values[:, m]
@@ -429,7 +434,7 @@ def _allocation_warnings(allocation: Allocation, judged: Yield, spec: Allocation
 
 def worst_jobs(setup: ToleranceSetup, bench: ToleranceBench, samples: Samples) -> dict[str, str]:
     """Return the worst cameras as jobs for ``python -m twin.render`` and ``twin.camera``, the worst first."""
-    worst = worst_of(bench, samples)
+    worst = worst_cameras(bench, samples)
     out = {}
     for rank, (s, state) in enumerate(zip(worst, _states(bench, samples, worst), strict=True)):
         perturb = {path: _perturb(motion) for path, motion in state.items()}
@@ -516,7 +521,7 @@ def _tolerance_plain(run: ToleranceRun) -> dict[str, Any]:
     bench = run.bench
     for e, (name, tolerance) in enumerate(run.setup.test.tolerances.items()):
         below, above = (
-            {m.name: shown_merit(float(run.found.values[e, end, k]), m) for k, m in enumerate(bench.merits)}
+            {m.name: shown_merit(float(run.sensitivity.values[e, end, k]), m) for k, m in enumerate(bench.merits)}
             for end in (0, 1)
         )
         share = run.inverse.shares[e]
@@ -538,7 +543,7 @@ def _tolerance_plain(run: ToleranceRun) -> dict[str, Any]:
 
 def _moves_at(run: ToleranceRun, entry: int, end: int) -> dict[str, str | float | None]:
     """Return each compensator's move with a tolerance at an end of its limit; None for a figure error."""
-    moves = run.found.moves[entry, end].tolist()
+    moves = run.sensitivity.moves[entry, end].tolist()
     return {
         compensator.name: amount_text(move, compensator.kind) if np.isfinite(move) else None
         for compensator, move in zip(run.bench.compensators, moves, strict=True)
@@ -587,7 +592,9 @@ TOLERANCE: Record[ToleranceRun] = Record(
     Quantity("yield", lambda run: _yield_plain(run.passing), "share of cameras that meet all requirements"),
     Quantity(
         "merits",
-        lambda run: {one.merit.name: _merit_plain(one, run.missed.get(one.merit.name)) for one in run.merits},
+        lambda run: {
+            one.merit.name: _merit_plain(one, run.interpolation_errors.get(one.merit.name)) for one in run.merits
+        },
         "each in its unit; p90 is the value that 90 % of the cameras keep",
     ),
     Quantity(

@@ -60,7 +60,7 @@ class BodyMove:
 
 
 @dataclass(frozen=True, eq=False)
-class VariedNumber:
+class VariedParameter:
     """Varied parameter of a tolerance budget.
 
     Attributes
@@ -85,7 +85,9 @@ class VariedNumber:
     moves: FrozenMap[str, BodyMove]
 
 
-def tolerance_numbers(setup: ToleranceSetup, instrument: Instrument, thermal: ThermalModel) -> tuple[VariedNumber, ...]:
+def tolerance_parameters(
+    setup: ToleranceSetup, instrument: Instrument, thermal: ThermalModel
+) -> tuple[VariedParameter, ...]:
     """Return the parameters of all tolerances in the order of the file; a figure error has one for each of its terms.
 
     Raises
@@ -94,26 +96,26 @@ def tolerance_numbers(setup: ToleranceSetup, instrument: Instrument, thermal: Th
         A body does not exist, or does not allow the motion of a tolerance.
     """
     maker = _Maker(setup.test, instrument, thermal)
-    out: list[VariedNumber] = []
+    out: list[VariedParameter] = []
     for name, tolerance in setup.test.tolerances.items():
         out += maker.tolerance(name, tolerance)
     return tuple(out)
 
 
-def compensator_numbers(
+def compensator_parameters(
     setup: ToleranceSetup, instrument: Instrument, thermal: ThermalModel
-) -> tuple[VariedNumber, ...]:
-    """Return one parameter for each compensator; see ``tolerance_numbers``."""
+) -> tuple[VariedParameter, ...]:
+    """Return one parameter for each compensator; see ``tolerance_parameters``."""
     maker = _Maker(setup.test, instrument, thermal)
     return tuple(maker.compensator(name, compensator) for name, compensator in setup.test.compensators.items())
 
 
-def actuator_number(
+def actuator_parameter(
     test: Spec, instrument: Instrument, thermal: ThermalModel, name: str, actuator: CompensatorSpec
-) -> VariedNumber:
-    """Return the parameter of an actuator under ``actuators`` of a test; see ``tolerance_numbers``."""
+) -> VariedParameter:
+    """Return the parameter of an actuator under ``actuators`` of a test; see ``tolerance_parameters``."""
     moves = _Maker(test, instrument, thermal)._moves(actuator, ("actuators", name), actuator.range_si or 1.0)
-    return VariedNumber(name, name, actuator.parts[1], 1.0, moves)
+    return VariedParameter(name, name, actuator.parts[1], 1.0, moves)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,23 +126,23 @@ class _Maker:
     instrument: Instrument
     thermal: ThermalModel
 
-    def tolerance(self, name: str, spec: ToleranceSpec) -> list[VariedNumber]:
+    def tolerance(self, name: str, spec: ToleranceSpec) -> list[VariedParameter]:
         key: KeyPath = ("tolerances", name)
         kind = spec.parts[1]
         if not spec.spectrum:
-            return [VariedNumber(name, name, kind, spec.limit_si, self._moves(spec, key, spec.limit_si))]
+            return [VariedParameter(name, name, kind, spec.limit_si, self._moves(spec, key, spec.limit_si))]
         body = self._node(spec, spec.parts[0], key)
         sizes = spec.limit_si * spectrum_over(self.instrument.assembly.face(body), spec.spectrum, spec.power)
         return [
-            VariedNumber(
+            VariedParameter(
                 f"{name} Z{j}", name, kind, float(size), FrozenMap({body: BodyMove(figure=FrozenMap({j: 1.0}))})
             )
             for j, size in zip(spec.spectrum, sizes, strict=True)
         ]
 
-    def compensator(self, name: str, spec: CompensatorSpec) -> VariedNumber:
+    def compensator(self, name: str, spec: CompensatorSpec) -> VariedParameter:
         moves = self._moves(spec, ("compensators", name), spec.range_si or 1.0)
-        return VariedNumber(name, name, spec.parts[1], 1.0, moves)
+        return VariedParameter(name, name, spec.parts[1], 1.0, moves)
 
     def _node(self, spec: Varied, name: str, key: KeyPath) -> str:
         """Return the path of a body that allows the motion; raise InputError if there is none."""
@@ -314,7 +316,7 @@ _CELLS = 200
 """Number of cells along each side of the box round a clear aperture for the rms of terms; accurate to 1e-3."""
 
 
-def states_of(numbers: Sequence[VariedNumber], amounts: np.ndarray) -> list[State]:
+def states_of(numbers: Sequence[VariedParameter], amounts: np.ndarray) -> list[State]:
     """Return the states that amounts of varied parameters add up to.
 
     Parameters

@@ -428,7 +428,7 @@ class Gradient:
     method: np.ndarray
 
     @classmethod
-    def unknown(cls, factors: tuple[GradientFactor, ...], asked: Sequence[_Asked]) -> Gradient:
+    def unknown(cls, factors: tuple[GradientFactor, ...], asked: Sequence[_GradientResponse]) -> Gradient:
         """Return a Jacobian whose entries are not filled in yet."""
         shape = (len(asked), len(factors))
         names, units = tuple(response.name for response in asked), tuple(response.spec.units for response in asked)
@@ -468,7 +468,7 @@ class Gradient:
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _GradientResponse:
     """Response with the keys of its number and of the number that is subtracted.
 
     Attributes
@@ -536,7 +536,7 @@ def study_gradient(setup: StudySetup, backend: Backend, advance: Advance = silen
         The base itself cannot be run.
     """
     factors = tuple(GradientFactor.of(setup, name) for name in setup.study.factors)
-    asked = [_Asked(name, spec) for name, spec in setup.study.responses.items()]
+    asked = [_GradientResponse(name, spec) for name, spec in setup.study.responses.items()]
     maker = JobMaker(setup.tree) if setup.study.base.command == "render" else None
     if maker is not None and maker.base.job.course is not None:
         maker = None
@@ -553,13 +553,13 @@ def study_gradient(setup: StudySetup, backend: Backend, advance: Advance = silen
     return replace(table, method=table.method.astype(str))
 
 
-def _spot_responses(resolved: ResolvedJob) -> list[_Asked]:
+def _spot_responses(resolved: ResolvedJob) -> list[_GradientResponse]:
     out = []
     for camera in resolved.instrument.cameras:
         for channel in resolved.instrument.channels_of(camera):
             for axis in ("row", "column"):
                 key = ("recovered", "spots", camera, channel, "after", axis)
-                out.append(_Asked(f"spots.{camera}.{channel}.{axis}", ResponseSpec(key=key, unit="px")))
+                out.append(_GradientResponse(f"spots.{camera}.{channel}.{axis}", ResponseSpec(key=key, unit="px")))
     return out
 
 
@@ -571,7 +571,7 @@ class _Traced:
     maker: JobMaker
     backend: Backend
     factors: Sequence[GradientFactor]
-    asked: Sequence[_Asked]
+    asked: Sequence[_GradientResponse]
     rows: Sequence[int]
     advance: Advance
     slopes: dict[int, Slopes] = field(default_factory=dict)
@@ -710,7 +710,7 @@ def _whole(
     setup: StudySetup,
     backend: Backend,
     factors: Sequence[GradientFactor],
-    asked: Sequence[_Asked],
+    asked: Sequence[_GradientResponse],
     rows: Sequence[int],
     table: Gradient,
     advance: Advance,

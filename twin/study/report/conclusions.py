@@ -10,7 +10,15 @@ from twin.framework.artefact import decimals_for, fixed, significant
 from twin.framework.report import answer
 from twin.study.report.sensitivity_indices import MANY_FAILED, RESAMPLES, Indices, NoIndices
 from twin.study.report.study_analysis import GOALS, Convergence, Requirement, StudyAnalysis
-from twin.study.report.study_statistics import LEAST, Description, Estimate, Interval, Response, impossible, typeset
+from twin.study.report.study_statistics import (
+    LEAST,
+    Description,
+    Estimate,
+    Interval,
+    Response,
+    impossible_noise,
+    typeset,
+)
 
 BAD_MODEL = 0.8
 """Cross-validated R² below which a polynomial chaos model is called poor."""
@@ -35,7 +43,7 @@ def warnings(analysis: StudyAnalysis) -> list[str]:
                 "So many runs failed that the others no longer represent the design; the statistics hold only for "
                 "feasible runs."
             )
-    wrong = impossible(runs)
+    wrong = impossible_noise(runs)
     out += [str(issue) for issue in wrong.issues] if wrong is not None else []
     for name, part in analysis.indices.items():
         disagreeing = [index for index in part.axes if index.agrees is False] if isinstance(part, Indices) else []
@@ -178,7 +186,7 @@ def verdict(analysis: StudyAnalysis) -> tuple[str, tuple[str, ...]]:
         name = f"the requirement {worst.name} ({worst.text})" if worst.name else "all requirements together"
         least = ", the lowest share," if len(known) > 1 else ""
         are = "is" if worst.name else "are"
-        whatever = _whatever(worst)
+        whatever = _open_range(worst)
         first.append(
             f"{name} {are} met by {worst.met} of {plural(worst.count, 'run')} with a finite value{least}{whatever}"
         )
@@ -205,11 +213,11 @@ def _requirement_text(analysis: StudyAnalysis) -> str:
             continue
         of = f" (95% interval {span(r.interval)})" if r.interval is not None else " of the grid"
         are = "is" if r.name else "are"
-        texts.append(f"{name} {are} met by {percent(r.share)} of the runs, {r.met} of {r.count}{of}{_whatever(r)}.")
+        texts.append(f"{name} {are} met by {percent(r.share)} of the runs, {r.met} of {r.count}{of}{_open_range(r)}.")
     return " ".join(texts)
 
 
-def _whatever(r: Requirement) -> str:
+def _open_range(r: Requirement) -> str:
     """Return the range of shares that failed runs leave open, for the end of a sentence."""
     if r.bounds is None:
         return ""

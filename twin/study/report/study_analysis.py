@@ -416,7 +416,7 @@ LINEAR: Record[statistics.LinearModel] = Record(
     Quantity("r2", lambda model: model.r2, "share of the variance that it explains"),
     Quantity("adjusted_r2", lambda model: model.adjusted, "corrected for the number of terms"),
     Quantity("effects", lambda model: {e.factor: e for e in model.effects}, "by factor", record=EFFECT),
-    Quantity("not_separable", lambda model: model.cannot, "factors whose effects the runs do not separate"),
+    Quantity("not_separable", lambda model: model.not_separable, "factors whose effects the runs do not separate"),
 )
 MAIN_EFFECT: Record[statistics.MainEffect] = Record(
     "Means of a response over the runs of a grid, for each value of a factor.",
@@ -451,7 +451,7 @@ CONVERGENCE: Record[Convergence] = Record(
 
 
 @dataclass(frozen=True, eq=False)
-class _About:
+class _ResponseAnalysis:
     """Response, or reported sigma of one, with its analysis."""
 
     found: StudyAnalysis
@@ -472,7 +472,7 @@ class _About:
         return None if indices is None else INDICES(indices)
 
 
-RESPONSE: Record[_About] = Record(
+RESPONSE: Record[_ResponseAnalysis] = Record(
     "Statistics of a response over the runs that have a number, in its unit.",
     Quantity("unit", lambda a: a.of.unit, "of its numbers, empty for pure ones"),
     Quantity("sigma_of", lambda a: a.of.of or None, "response whose reported sigma this is", where_known=True),
@@ -505,7 +505,7 @@ RESPONSE: Record[_About] = Record(
     ),
     Quantity("linear_model", lambda a: a.found.linear[a.of.name], "null where none can be fitted", record=LINEAR),
     Quantity("main_effects", lambda a: a.found.effects[a.of.name], "of a grid", record=MAIN_EFFECT),
-    Quantity("sobol", _About.sobol, "sensitivity indices, where the study asks for them", where_known=True),
+    Quantity("sobol", _ResponseAnalysis.sobol, "sensitivity indices, where the study asks for them", where_known=True),
     Quantity(
         "convergence",
         lambda a: {one.name: one for one in a.found.convergences.get(a.of.name, ())},
@@ -542,7 +542,7 @@ STATISTICS: Record[StudyAnalysis] = Record(
     Quantity("confidence", lambda found: statistics.CONFIDENCE, "of all intervals"),
     Quantity(
         "responses",
-        lambda found: {one.name: _About(found, one) for one in found.runs.everything},
+        lambda found: {one.name: _ResponseAnalysis(found, one) for one in found.runs.everything},
         "responses, and the sigmas that the runs report for them",
         record=RESPONSE,
     ),

@@ -72,7 +72,7 @@ def name_texts(axes: Axes, series: Series, axis: str) -> None:
         axes.set_ylim(-0.6, len(names) - 0.4)
 
 
-def some(good: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
+def thinned(good: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
     """Return the indices of up to ``most`` runs of (n,) ``good``, evenly spaced through the study."""
     indices = np.flatnonzero(good)
     return indices if len(indices) <= most else indices[np.linspace(0, len(indices) - 1, most).astype(int)]
@@ -207,7 +207,7 @@ def _partner(factor: Factor, factors: Sequence[Factor]) -> Factor | None:
 
 def _binned(axes: Axes, factor: Factor, response: Response) -> None:
     """Plot runs, means of neighbouring runs with their intervals, and the middle 68 % of the runs."""
-    shown = some(response.good)
+    shown = thinned(response.good)
     axes.plot(factor.values[shown], response.values[shown], ".", color=GREY, ms=2.0, alpha=0.5, zorder=1)
     groups = list(bins(factor, response.good))
     if len(groups) < 2 or min(len(group) for group in groups) < 3:
@@ -283,7 +283,7 @@ def scatter_figure(analysis: StudyAnalysis, pairs: Sequence[tuple[str, str]]) ->
 
 def _points(axes: Axes, x: Series, y: Series, seed: int, size: float = 3.0) -> None:
     x_positions, y_positions = positions(x) + jitter(x, seed), positions(y) + jitter(y, seed + 1)
-    shown = some(np.isfinite(x_positions) & np.isfinite(y_positions))
+    shown = thinned(np.isfinite(x_positions) & np.isfinite(y_positions))
     axes.plot(x_positions[shown], y_positions[shown], ".", color=BLUE, ms=size, alpha=0.6)
 
 
@@ -295,7 +295,7 @@ def pareto_figure(analysis: StudyAnalysis) -> Figure:
     figure, grid = svg.panels([3.9] * len(analysis.fronts), min(len(analysis.fronts), 2))
     for axes, front in zip(grid, analysis.fronts, strict=True):
         x, y = analysis.runs.find(front.spec.x), analysis.runs.find(front.spec.y)
-        shown = some(front.ranks > 0, 1000)
+        shown = thinned(front.ranks > 0, 1000)
         axes.plot(x.values[shown], y.values[shown], ".", color=GREY, ms=3.5, alpha=0.6, label="dominated runs")
         if len(front.runs):
             # between two runs of the front nothing is known: only steps are sure
@@ -452,7 +452,7 @@ def matrix_figure(analysis: StudyAnalysis) -> Figure:
                 axes.xaxis.set_major_locator(MaxNLocator(3))
             else:
                 x, y = positions(column) + jitter(column, seed), positions(row) + jitter(row, seed + 1)
-                shown = some(np.isfinite(x) & np.isfinite(y), 300)
+                shown = thinned(np.isfinite(x) & np.isfinite(y), 300)
                 axes.plot(x[shown], y[shown], ".", color=BLUE, ms=2.0, alpha=0.6)
                 finish(axes, 3, 3)
                 name_texts(axes, row, "y")

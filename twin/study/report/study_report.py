@@ -319,10 +319,11 @@ def _influences(analysis: StudyAnalysis) -> Section | None:
         rows,
         within=STATISTICS,
     )
-    cannot = sorted({name for r in responses for m in [analysis.linear[r.name]] if m is not None for name in m.cannot})
+    models = [model for r in responses if (model := analysis.linear[r.name]) is not None]
+    not_separable = sorted({name for model in models for name in model.not_separable})
     remarks = [f"R² of the linear model: {', '.join(texts)}."] if texts else []
-    if cannot:
-        remarks.append(f"Not separable from the other factors and excluded from the model: {', '.join(cannot)}.")
+    if not_separable:
+        remarks.append(f"Not separable from the other factors and excluded from the model: {', '.join(not_separable)}.")
     return Section("Effects of the factors", tuple(remarks), (figure, table) if rows else (figure,))
 
 

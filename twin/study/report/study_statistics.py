@@ -439,7 +439,7 @@ def noise_share(response: Response, study: StudySpec) -> NoiseShare | None:
     return NoiseShare(response.name, share, float(stats.chi2.cdf(freedom / share, freedom)))
 
 
-def impossible(runs: StudyRuns) -> InputError | None:
+def impossible_noise(runs: StudyRuns) -> InputError | None:
     """Return an error about all responses whose reported noise exceeds their variance; None if there is none."""
     study = runs.study
     issues: list[Issue] = []
@@ -508,7 +508,7 @@ class LinearModel:
     adjusted: float
     terms: int
     effects: tuple[Effect, ...]
-    cannot: tuple[str, ...] = ()
+    not_separable: tuple[str, ...] = ()
 
 
 def linear_model(factors: Sequence[Factor], response: Response) -> LinearModel | None:
@@ -531,7 +531,7 @@ def linear_model(factors: Sequence[Factor], response: Response) -> LinearModel |
     if response.constant:
         return None
     blocks: list[tuple[Factor, np.ndarray]] = []
-    cannot = []
+    not_separable = []
     design = np.ones((n, 1))
     for factor in factors:
         columns = _columns(factor, good)
@@ -539,7 +539,7 @@ def linear_model(factors: Sequence[Factor], response: Response) -> LinearModel |
             continue
         joined = np.concatenate([design, columns], axis=1)
         if np.linalg.matrix_rank(joined / np.linalg.norm(joined, axis=0)) < joined.shape[1]:
-            cannot.append(factor.name)
+            not_separable.append(factor.name)
             continue
         design = joined
         blocks.append((factor, columns))
@@ -566,7 +566,7 @@ def linear_model(factors: Sequence[Factor], response: Response) -> LinearModel |
         effects.append(_effect(factor, good, y, coefficients[rows], bread[rows], t))
     effects.sort(key=lambda effect: -abs(effect.swing.value))
     adjusted = 1.0 - (1.0 - r2) * (n - 1) / (n - terms)
-    return LinearModel(r2, adjusted, terms, tuple(effects), tuple(cannot))
+    return LinearModel(r2, adjusted, terms, tuple(effects), tuple(not_separable))
 
 
 def _columns(factor: Factor, good: np.ndarray) -> np.ndarray:

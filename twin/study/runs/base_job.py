@@ -189,7 +189,7 @@ def with_place(tree: Tree, model: type[Spec], key: KeyPath, neutral: bool = Fals
     return out
 
 
-def says_nothing(tree: Tree, model: type[Spec], key: KeyPath) -> bool:
+def is_neutral(tree: Tree, model: type[Spec], key: KeyPath) -> bool:
     """Return True if everything that ``with_place`` adds for ``key`` has the same effect as its absence.
 
     Parameters

@@ -25,7 +25,7 @@ from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, key_text, na
 from scenes.yaml.input_file import is_file, unusable
 from scenes.yaml.spec import Source, Spec, validate
 from twin.framework.provenance import source_digest, versions
-from twin.study.runs.base_job import BaseJob, ProcedureBase, Tree, says_nothing, with_place, with_values
+from twin.study.runs.base_job import BaseJob, ProcedureBase, Tree, is_neutral, with_place, with_values
 
 PROGRAM = "twin.study"
 BY_NAME = ("instrument", "disturbances")
@@ -208,7 +208,7 @@ def _placed(study: StudySpec, tree: Tree) -> StudySetup:
         try:
             _refuse_names(study, place)
             tree = with_place(tree, model, place, neutral=is_set)
-            if says_nothing(base, model, place) and not _inherited(base, place):
+            if is_neutral(base, model, place) and not _inherited(base, place):
                 base = with_place(base, model, place, neutral=is_set)
         except Problem as problem:
             raise setup.error(problem, at) from None
