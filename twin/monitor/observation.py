@@ -140,7 +140,7 @@ def observe(
         Experiment with the instrument.
     states : sequence of State
         States to observe.
-    how : Observing
+    how : ObservationOptions
         Options.
     numbers : (S,) array_like of int | None
         Numbers of the states, which select random streams; None to count from 0.
@@ -233,7 +233,7 @@ def read(experiment: MonitorExperiment, light: Light, how: ObservationOptions) -
         Experiment with the instrument.
     light : Light
         Light of the states.
-    how : Observing
+    how : ObservationOptions
         Options.
 
     Raises
