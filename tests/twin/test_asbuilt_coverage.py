@@ -132,7 +132,7 @@ def test_the_bias_of_the_drawings_model_goes_away(backend, tmp_path, record_prop
     places = [own[one.name] for one in stated.components]
     scale = np.outer(stated.sigma, stated.sigma)
     np.testing.assert_allclose(
-        stated.covariance / scale, run.found.covariance[np.ix_(places, places)] / scale, atol=1e-9
+        stated.covariance / scale, run.estimate.covariance[np.ix_(places, places)] / scale, atol=1e-9
     )
 
     tree = {body.path: body for body in design.instrument.assembly.tree.bodies}

@@ -300,7 +300,7 @@ def test_a_search_without_a_layout_that_stands_is_refused(setup: MonitorDesignSe
     monkeypatch.setattr(monitor_design, "_check_start", lambda *_: None)
     monkeypatch.setattr(monitor_design, "Search", lambda *_: SimpleNamespace(run=lambda: found))
     with pytest.raises(
-        BenchError, match="none of 5 beams and 4 layouts is feasible; most frequent reason .7 times.: in the"
+        BenchError, match=r"none of 5 beams and 4 layouts is feasible; most frequent reason \(7 times\): in the"
     ):
         monitor_design.run_monitor_design(setup, None)
     found.layouts = ("a layout",)

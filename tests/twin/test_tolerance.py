@@ -514,7 +514,7 @@ def test_an_allocation_is_reached_by_the_limits_of_its_table(loose: float, backe
         limits, rounded = graded(*given)
         return limits, rounded * loose
 
-    monkeypatch.setattr(allocation, "_graded", too_loose)
+    monkeypatch.setattr(allocation, "_rounded_to_grades", too_loose)
     monkeypatch.setattr(allocation, "ROUNDS", 2)
     spec = setup.test.allocation
     assert spec is not None

@@ -248,7 +248,7 @@ class FocusReadings(MeasuredKind):
         path = self.file("file", self.spec.file, "a focus.json")
         data = read_json(self, path)
         try:
-            # how far the chips of the first band stand downstream of best focus, after the last round of shims
+            # defocus of the chips of the first band, positive downstream of best focus, after the last round of shims
             sites = (data["rounds"][-1] if data.get("rounds") else data["initial"])["sites"]
             first_band = [site for site in sites if site["band"] == sites[0]["band"]]
             fields = tuple((float(site["field"]), 0.0) for site in first_band)

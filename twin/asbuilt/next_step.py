@@ -101,7 +101,7 @@ def advice(bench: AsBuiltBench, estimate: StateEstimate, draws: np.ndarray, rng:
     after = bench.last
     move = optimal_move(bench, estimate.mean, after)
     executed = bench.actuators.made(move.amounts, rng.standard_normal((len(draws), 2, len(move.amounts))))
-    # states without light are told by themselves, and have no merit
+    # states without light are reported in a warning and have no merit
     merits = [float(np.nanmean(expected(bench, draws, after, further))) for further in (None, executed)]
     _, by_actuators = _about(bench, estimate.mean, after, np.zeros(len(move.amounts)))
     unit_slope = bench.merit_slope(estimate.mean, after) @ estimate.prior.root

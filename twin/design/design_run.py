@@ -110,7 +110,7 @@ def run_design(
         remedies = [_REMEDIES[kind] for kind in _REMEDIES if kind in error.violated]
         least = float(MeritFunction.of(backend, start, beams, operands).evaluate(start).clearances.min(initial=np.inf))
         if "clearance" in error.violated and least < 0.0:
-            # a telescope about its axis, whose secondary stands in the beam
+            # an on-axis telescope, whose secondary obstructs the beam
             remedies.insert(0, f"clearance: {np.floor(1e3 * least):g} mm, as {camera.name} obscures its own beams")
         raise BenchError(str(error), key, ", ".join([*remedies, "more to vary, or more starts"])) from error
     design = searched.best

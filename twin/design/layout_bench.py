@@ -377,7 +377,7 @@ def touching(one: BeamFacts, other: BeamFacts) -> bool:
     one, other : BeamFacts
         Beams that were evaluated alone.
     """
-    # as scenes.models.monitor_chain.facet_positions: of two in one corner the one that leans more stands farther out
+    # as scenes.models.monitor_chain.facet_positions: of two facets in one corner the more tilted one is farther out
     offset = one.facets - other.facets
     lean = offset[:, :2]
     distance = np.sum(lean * offset[:, 2:], axis=1) / np.maximum(np.linalg.norm(lean, axis=1), 1e-12)

@@ -105,7 +105,7 @@ def refined(
         slopes = [slope for slope in slopes if not slope.refused and _worth(bench, current, slope) > WORTH]
         if not slopes:
             break
-        # what no goal depends on here it will not depend on a step away
+        # parameters without effect on any goal here have none a step away either
         numbers = tuple(slope.number for slope in slopes)
         better = None
         while better is None and box >= LEAST_BOX:

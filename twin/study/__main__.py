@@ -112,7 +112,7 @@ def main(
 
         return study_command.run_study(setup, session, folder, chosen, say, pipe_progress(progress_fd))
 
-    # --resume of a finished study makes its report anew
+    # --resume of a finished study writes its report again
     finished = resume and out is not None and isfile(out / BLOCKS) and read_manifest(out) is not None
     command = (
         f"python -m twin.study {file}{'' if out is None else f' --out {out}'}{' --force' if options.force else ''}"

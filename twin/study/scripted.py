@@ -160,7 +160,7 @@ def _run(command: list[str], quiet: bool, progress: bool | ProgressCallback) -> 
                 callback(int(there), int(runs))
             code = done.wait()
         except BaseException:
-            # what is told may break off the study, and so does Ctrl-C
+            # the callback may raise an exception to stop the study, as Ctrl-C does
             done.send_signal(signal.SIGINT)
             done.wait()
             raise

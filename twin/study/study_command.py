@@ -90,7 +90,7 @@ def run_study(
         session.advance("runs", done, total)
         progress(done, total)
 
-    # what judges cameras is not imported before the study's file is known to be good
+    # imported late, so that errors in a study's file are reported quickly
     from scenes.models.camera_sharpness import blur_warnings, cameras_of
     from twin.sensors.area_detector import coarse_warnings
 

@@ -132,7 +132,7 @@ def allocate(
         if np.max(np.abs(step)) < _SETTLED:
             break
     if cheapest is not None:
-        # what exact traces pass; the model knows nothing of adjustments at the end of their range, and may lead astray
+        # limits that pass exact traces: the model ignores the ends of the compensators' ranges and may mislead
         _, total, trade = cheapest
     for _ in range(_LAST):
         if trade.quantile(nothing)[0] <= 0.0:

@@ -90,7 +90,7 @@ class Adjustments:
         held = np.broadcast_to(~free | (self.ranges == 0.0), start.shape).copy()
         target = start.copy()
         for _ in range(len(size) + 1):
-            # of those that are held the change is known, and the others follow it
+            # the change of the fixed compensators is known, and the others compensate it
             known = np.where(held, target - start, 0.0)
             rest = np.where(held, 0.0, pull - (normal @ known[..., None])[..., 0])
             mask = ~held
@@ -296,7 +296,7 @@ class ToleranceBench:
         moved = {body for number in self.compensators for body in number.moves}
         return any(body == moved_body or body.startswith(f"{moved_body}/") for body in bodies for moved_body in moved)
 
-    # what does not change from camera to camera
+    # quantities common to all cameras
 
     @one_blas_thread()
     def _prepare(self) -> None:
@@ -449,7 +449,7 @@ class ToleranceBench:
                 target = self._adjust.best(slopes, residuals, moves, all_free)
                 expected = residual_change(slopes, target - moves)
                 settled = np.sqrt(np.sum(expected**2, axis=1) / len(self.fields))
-                # what has settled stays, so that a camera's numbers do not depend on the others
+                # converged cameras stay, so that a camera's numbers do not depend on the others
                 going = settled > SETTLED * 1e-2
                 if not going.any():
                     break
@@ -594,7 +594,7 @@ class ToleranceBench:
         directions = np.concatenate([sight.nominal[index], sight.trace(states)[index]])
         change = line_change(directions, self.line, axes)
         _, _, tangent = line_tangents(directions, self.line, axes)
-        # what a shift and another principal distance explain is not distortion
+        # a shift and a change of the principal distance are not distortion
         moved = (tangent[1:] - tangent[0]) * change.nominal_distance
         level = np.stack([np.ones_like(self.line), self.line], axis=-1)
         rest = (moved - moved @ np.linalg.pinv(level).T @ level.T)[:, self._along]

@@ -49,7 +49,7 @@ def axis_functions(axis: tuple[Factor, ...], good: np.ndarray, degree: int) -> t
     rows = np.stack([np.unique(factor.values, return_inverse=True)[1] for factor in axis], axis=1)
     levels, inverse, counts = np.unique(rows, axis=0, return_inverse=True, return_counts=True)
     if all(factor.numeric for factor in axis):
-        # a table of numbers: all its rows are equally likely, also those that no run took
+        # all rows of a table of numbers are equally likely, also those that no run has drawn
         table = np.stack([np.array(factor.spec.numbers().values, np.float64) for factor in axis], axis=1)
         return _of_table(table, np.stack([factor.values[good] for factor in axis], axis=1), degree)
     if len(levels) > MOST_LEVELS:
@@ -503,21 +503,21 @@ class _Chaos:
         """
         n, m = len(self.y), len(self.terms)
         out, rest = self._fit_rest
-        # of runs that the terms were not fitted to: what they are wrong by elsewhere is in it
+        # leave-one-out residuals also contain the prediction error between the runs
         held_out = float(np.mean(out**2)) if rest > 0.0 else 0.0
         # few runs know their own scatter badly: as Student's distribution is wider than the normal one
         wide = float(stats.t.ppf(0.975, n - m - 1) / stats.norm.ppf(0.975))
         influence = wide * (np.linalg.solve(self.r, self.q.T)[1:] * out).T
         spread = np.sum(influence**2, axis=0)
         generator = np.random.default_rng(np.random.SeedSequence(seed))
-        # where few runs carry what is left (a narrow peak), chance decides how many do, as in Poisson's distribution;
-        # the number that carry it equally, and the upper limit of what may be expected where so many were met
+        # if few runs carry the residual variance (a narrow peak), their number has a Poisson distribution:
+        # the effective number of such runs, and a gamma distribution for the expected number given it
         events = float(np.sum(out**2) ** 2 / np.sum(out**4)) if rest > 0.0 else 1.0
         lows, highs = [], []
         for _ in range(RESAMPLES // 100):
             more = generator.poisson(1.0, (100, n)) - 1.0
             moved = self.coefficients + more @ influence
-            # about the estimate: the squares of what is added are taken off
+            # centred on the estimate: the expected squares of the perturbations are subtracted
             squares = moved**2 - self.coefficients**2 - spread + self._squares
             unexplained = held_out * generator.gamma(events + 1.0, 1.0 / events, 100)
             whole = np.maximum(np.sum(squares, axis=-1), 0.0) + unexplained

@@ -108,7 +108,7 @@ class Response(Series):
         """True if all numbers are equal within rounding."""
         if len(self.known) == 0:
             return True
-        # 64 units in the last place: what sums over a few hundred terms lose
+        # 64 units in the last place, the rounding error of sums over a few hundred terms
         return bool(np.ptp(self.known) <= 64.0 * np.finfo(float).eps * np.max(np.abs(self.known)))
 
 
@@ -427,7 +427,7 @@ def noise_share(response: Response, study: StudySpec) -> NoiseShare | None:
     study : StudySpec
         Study, which specifies whether runs share their noise.
     """
-    # noise that all runs have in common is a part of what they do not differ by
+    # noise common to all runs does not contribute to their variance
     if response.noise is None or study.noise == "shared" or response.constant:
         return None
     stated = response.noise[response.good] ** 2

@@ -222,7 +222,7 @@ def _entry(node: Tree, model: type[Spec], key: KeyPath, k: int, last: bool) -> A
         return node[part]
     annotation = annotation_at(model, key[:k])
     fields = _fields(annotation)
-    # a mapping with free keys may get another entry, one with fields only those that it may have
+    # a mapping with free keys may get any entry, a model only its fields
     known = tuple(dict.fromkeys((*node, *fields)))
     free = typing.get_origin(annotation) is not None and not fields
     default = (

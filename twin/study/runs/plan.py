@@ -75,7 +75,7 @@ def _level(factor: FactorSpec, place: np.ndarray) -> np.ndarray:
 
 def _quantile(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
     """Return the quantiles of a factor at probabilities ``u``."""
-    # a bad file of a study is told before scipy is imported
+    # scipy is imported late, so that errors in a study's file are reported quickly
     from scipy.special import ndtr, ndtri
 
     if factor.kind in _LISTS:

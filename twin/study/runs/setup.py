@@ -68,7 +68,7 @@ class StudySetup:
         """Checksum of everything in the study that affects a number; the base's tree contains all library files."""
         study = {key: value for key, value in self.study.plain().items() if key not in WORDS}
         study["base"] = {"command": self.study.base.command}
-        # in their order: what is drawn for a factor, and the column of a response, go by their numbers
+        # in order, because random draws and columns are assigned by position
         study["factors"] = list(study["factors"].items())
         study["responses"] = [
             {k: v for k, v in response.items() if k != "unit"} for response in study["responses"].values()
