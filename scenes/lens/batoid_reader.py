@@ -102,14 +102,14 @@ class _Reader:
         for name in given:
             names = known.get(str(given.get("type")), ("R", "items"))
             if name != "type" and name not in names:
-                raise self.error((*key, name), "a key that is not known here", given[name], ", ".join(names))
+                raise self.error((*key, name), "this key is not supported", given[name], ", ".join(names))
 
     # ----------------------------------------------------------------------------------------------------- parts
 
     def optic(self, given: Mapping[str, Any], key: KeyPath, pose: Pose, before: float, after: float) -> None:
         """Read an optic and all optics inside it, in its parent's frame and media."""
         if len(key) > 2 * DEEPEST:
-            raise self.error(key, "optics within optics without end", allowed=f"at most {DEEPEST} levels")
+            raise self.error(key, "optics are nested too deeply", allowed=f"at most {DEEPEST} levels")
         kind = given.get("type")
         for name in given:
             if name not in _OF_OPTICS:
@@ -140,11 +140,11 @@ class _Reader:
             case "Baffle" if "obscuration" in given:
                 self._add(given, key, pose, Interaction.PASS, before)
             case "Baffle" | "Interface":
-                text = f"{given.get('name', kind)}: does nothing to rays: not carried"
+                text = f"{given.get('name', kind)}: no effect on rays: omitted"
                 self.notes.append(Note(self.line(key), kind, text))
             case _:
                 known = "CompoundOptic, Lens, Mirror, RefractiveInterface, Detector, Baffle, Interface"
-                raise self.error((*key, "type"), "an optic that is not known here", kind, known)
+                raise self.error((*key, "type"), "this type of optic is not supported", kind, known)
 
     def _add(self, given: Mapping[str, Any], key: KeyPath, pose: Pose, how: Interaction, index: float) -> None:
         """Append a surface of an optic."""
@@ -163,7 +163,7 @@ class _Reader:
         if edges and not edges[0].blocks and not edges[0].rotation and isinstance(edges[0].shape, Aperture):
             clear, rest = edges[0].shape, edges[1:]
         if given.get("type") == "Baffle" and not (shape.is_plane and edges):
-            self.notes.append(Note(self.line(key), name, "a baffle that is no plane, or without an edge: not carried"))
+            self.notes.append(Note(self.line(key), name, "a baffle that is not plane, or without an edge: omitted"))
             return
         surface = LensSurface(
             name,
@@ -176,7 +176,7 @@ class _Reader:
             self.named[index].name if index in self.named else "",
             rest,
         )
-        # the world turns over, and each surface's own frame with it
+        # Rotate the world, and the frame of each surface with it.
         self.surfaces.append(turned_over(LensSurface(**{**vars(surface), "pose": OVER @ pose})))
 
     def _placed(self, given: Mapping[str, Any], key: KeyPath, pose: Pose) -> Pose:
@@ -196,7 +196,7 @@ class _Reader:
                 step = np.array([self.number({"shift": v}, "shift", key) for v in value])
             else:
                 known = "x, y, z, shift, rotX, rotY, rotZ"
-                raise self.error((*key, name), "a place that is not known here", value, known)
+                raise self.error((*key, name), "this coordinate is not supported", value, known)
             pose = pose @ Pose(np.eye(3), step)
         return pose
 
@@ -219,7 +219,7 @@ class _Reader:
                     listed = self.listed(given.get("coefs"), below)
                     first = self.number(given, "imin", key, 2.0)
                     if first != int(first) or not 1 <= first <= 10 or len(listed) > 12:
-                        raise self.error(below, "even powers that are not known here", shown(first), "r^2 to r^40")
+                        raise self.error(below, "these even powers are not supported", shown(first), "r^2 to r^40")
                     powers = {
                         2 * (int(first) + n): self.number({"coefs": a}, "coefs", key) for n, a in enumerate(listed)
                     }
@@ -228,7 +228,7 @@ class _Reader:
                 return self._sum(given, key)
             case _:
                 known = "Plane, Sphere, Paraboloid, Quadric, Asphere, Sum of one of them and a Zernike"
-                raise self.error((*key, "type"), "a surface that is not known here", kind, known)
+                raise self.error((*key, "type"), "this type of surface is not supported", kind, known)
 
     def _sum(self, given: Mapping[str, Any], key: KeyPath) -> Surface:
         """Return the shape of a sum of a conic and a Zernike surface."""
@@ -242,7 +242,7 @@ class _Reader:
                 shape = self.shape(part, below, 1)
                 continue
             if part.get("type") != "Zernike" or terms or self.number(part, "R_inner", below, 0.0) != 0.0:
-                problem = "a part of a sum that is not known here"
+                problem = "this part of a sum is not supported"
                 raise self.error(below, problem, part.get("type"), "one Zernike, R_inner 0")
             self._only(part, below, {"Zernike": ("coef", "R_outer", "R_inner", "x_origin", "y_origin")})
             radius = self.number(part, "R_outer", below, 1.0)
@@ -251,7 +251,7 @@ class _Reader:
             numbers = [self.number({"coef": v}, "coef", below) for v in coefficients]
             terms = {j: a for j, a in enumerate(numbers) if j and a}
             if max(terms, default=0) > MAX_NOLL or not radius > 0.0:
-                problem = "Zernike terms that are not known here"
+                problem = "these Zernike terms are not supported"
                 raise self.error(below, problem, max(terms, default=0), f"Z1 to Z{MAX_NOLL}")
         if shape is None:
             raise self.error(key, "a sum without a conic", allowed="a conic and a Zernike")
@@ -268,7 +268,9 @@ class _Reader:
         except (ValueError, ZeroDivisionError, OverflowError):
             index = math.nan
         if not 0.1 < index < 10.0:
-            raise self.error(key, "no index at this wavelength", kind, f"a medium known at {w * 1e9:.6g} nm")
+            raise self.error(
+                key, "the index is not known at this wavelength", kind, f"a medium known at {w * 1e9:.6g} nm"
+            )
         return index
 
     def _index(self, medium: Mapping[str, Any], key: KeyPath, kind: object, w: float) -> float:
@@ -310,7 +312,7 @@ class _Reader:
                 )
             case _:
                 known = "ConstMedium, TableMedium, SellmeierMedium, SumitaMedium, Air"
-                raise self.error((*key, "type"), "a medium that is not known here", kind, known)
+                raise self.error((*key, "type"), "this type of medium is not supported", kind, known)
 
     def _keep_sellmeier(self, index: float, b_and_c: list[float]) -> None:
         """Store a Sellmeier glass by its index. The file states no range, so one well between the poles is assumed."""
@@ -336,7 +338,7 @@ class _Reader:
             return tuple(sorted(found, key=lambda edge: edge.blocks))
         known = {f"{way}{shape}": keys for shape, keys in _OBSCURATIONS.items() for way in ("Clear", "Obsc")}
         if kind not in known:
-            self.notes.append(Note(self.line(key), kind, f"the obscuration of {name} is not carried"))
+            self.notes.append(Note(self.line(key), kind, f"the obscuration of {name} is omitted"))
             return ()
         self._only(given, key, known)
         x, y = self.number(given, "x", key, 0.0), self.number(given, "y", key, 0.0)
@@ -355,7 +357,7 @@ class _Reader:
                 case _:
                     xs, ys = ([self.number({n: v}, n, key) for v in self.listed(given.get(n), (*key, n))] for n in _XY)
                     if len(xs) != len(ys):
-                        raise self.error(key, "a polygon with other numbers of xs and ys", f"{len(xs)} and {len(ys)}")
+                        raise self.error(key, "a polygon needs as many xs as ys", f"{len(xs)} and {len(ys)}")
                     shape = Polygon(tuple(zip(xs, ys, strict=True)))
         except ValueError as error:
             raise self.error(key, str(error)) from None
@@ -397,14 +399,14 @@ def read_batoid(path: str | Path, wavelength: float) -> Prescription:
     reader.optic(system, ("opticalSystem",), Pose(), reader.ambient, reader.ambient)
     if len(reader.surfaces) < 2:
         raise reader.error(("opticalSystem",), "too few surfaces", len(reader.surfaces), "optics and a detector")
-    # batoid aims at a surface before the telescope; here the stop is the first surface that does something
+    # Batoid aims at a surface before the telescope; here the stop is the first surface with an effect on light.
     active = [k for k, surface in enumerate(reader.surfaces) if surface.interaction is not Interaction.PASS]
     stop = active[0] if active else 0
-    notes = [*reader.notes, Note(0, "", "no stop in the light's way: taken to be the first surface")]
+    notes = [*reader.notes, Note(0, "", "no stop among the surfaces: the first surface is used")]
     if reader.ambient != 1.0:
         notes.append(Note(0, "inMedium", f"indices are relative to it, {reader.ambient:.9f}, and so are paths"))
     name, surfaces = str(system.get("name", "")) or Path(path).stem, tuple(reader.surfaces)
-    # against another medium than that of the file's start the dispersion is another
+    # The dispersion relative to another medium than the first one of the file differs.
     glasses = {glass.name: glass for glass in reader.named.values()} if reader.ambient == 1.0 else {}
     return Prescription(
         name,
@@ -425,11 +427,11 @@ def _loaded(path: str | Path) -> object:
     text = "\n".join(read_lines(source, "a telescope in YAML", LARGEST_FILE))
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of anchors that are given twice
+            warnings.simplefilter("ignore")  # about anchors that are defined twice
             return YAML(typ="rt", pure=True).load(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark
         problem = f"not YAML: {error.problem}"
         raise source.error(problem, None if mark is None else mark.line + 1) from None
     except (YAMLError, ValueError, TypeError, AttributeError, LookupError, RecursionError) as error:
-        raise source.error(f"not YAML that can be read: {type(error).__name__}", 1) from None
+        raise source.error(f"unreadable YAML: {type(error).__name__}", 1) from None

@@ -155,16 +155,16 @@ def take(system: CodevSystem, s: Statement) -> None:
     elif command in _SYSTEM or command in _FIELDS:
         _take_system(system, s)
     elif command in _REFUSED:
-        raise source.error(f"{_REFUSED[command]} is not known here", s.line, s.text)
+        raise source.error(f"{_REFUSED[command]} is not supported", s.line, s.text)
     elif command in OF_NO_EFFECT or (command in ("CUF", "HOR") and not any(source.numbers(s))):
         pass
     elif command in ("RDY", "THI", "CUY", "GLA", "INS", "DEL", "REFL", "RMD", "SCA", "FLY"):
-        problem = "a change of surfaces that have been given before"
+        problem = "a change of earlier surfaces is not supported"
         raise source.error(problem, s.line, s.text, "the sequence of surfaces")
     elif _qualified(s):
-        # a statement for a surface that it names, not for the last one
+        # The statement is for a surface that it names, not for the last one.
         if command in (*_GEOMETRY, "K", "CON", "ASP", *_POWERS, "STO", "DAR", "BEN", "REV", "SPS", "SCO"):
-            problem = "a change of a surface that was given before"
+            problem = "a change of an earlier surface is not supported"
             raise source.error(problem, s.line, s.text, "statements below the surface")
         source.note(s, "not understood")
     elif system.surfaces and _take_surface(system, system.surfaces[-1], s):
@@ -200,7 +200,7 @@ def _take_system(system: CodevSystem, s: Statement) -> None:
             if word[:1] not in "YN":
                 raise source.error("radii or curvatures?", s.line, s.text, "RDM Y, RDM N")
             if system.surfaces:
-                raise source.error("radii or curvatures is said after the first surface", s.line, s.text)
+                raise source.error("RDM follows the first surface", s.line, s.text)
             system.radii = word[0] == "Y"
         case "DIM":
             unit = s.words[0].upper() if s.words else ""
@@ -212,7 +212,7 @@ def _take_system(system: CodevSystem, s: Statement) -> None:
             if not value > 0.0:
                 raise source.error(f"{s.command} is not greater than zero", s.line, s.text)
             if s.command == "NA":
-                source.note(s, "a numerical aperture in image space: the pupil's diameter is not carried")
+                source.note(s, "a numerical aperture in image space: omitted, so that the pupil's diameter is unknown")
             else:
                 kind = {"EPD": "diameter", "FNO": "f_number", "NAO": "object_na"}[s.command]
                 system.pupil = Pupil(kind, value, s.line)
@@ -228,12 +228,12 @@ def _take_system(system: CodevSystem, s: Statement) -> None:
             system.name = joined(s.words)
         case "PRV":
             system.private = True
-            source.note(s, "private glasses are not carried")
+            source.note(s, "private glasses are omitted")
         case "ZOO" | "FLD":
             source.note(s, "not understood")
         case "VUX" | "VLX" | "VUY" | "VLY":
             if any(source.numbers(s)):
-                source.note(s, "vignetting factors are not carried; beams are as wide as the stop lets them")
+                source.note(s, "vignetting factors are omitted; beams are limited by the stop")
         case _:
             values = source.numbers(s)
             system.field_kind = _FIELDS[s.command]
@@ -253,14 +253,14 @@ def _surface(system: CodevSystem, s: Statement) -> None:
     if system.surfaces and system.surfaces[-1].name == "SI":
         raise source.error("a surface behind the image", s.line, s.text)
     if (s.command == "SO") != (not system.surfaces):
-        raise source.error("the object stands first, and once", s.line, s.text, "SO, then S, last SI")
+        raise source.error("there must be one object, before all surfaces", s.line, s.text, "SO, then S, last SI")
     if len(system.surfaces) > MOST_SURFACES:
         raise source.error("too many surfaces", s.line, allowed=f"at most {MOST_SURFACES}")
     number = len(system.surfaces)
     if s.command[1:].isdigit() and int(s.command[1:]) != number:
-        raise source.error("surfaces are not in their order", s.line, s.command, f"S{number}")
+        raise source.error("surfaces are not in order", s.line, s.command, f"S{number}")
     if system.radii is None:
-        problem = "does this file give radii or curvatures? It does not say"
+        problem = "the file does not state if it has radii or curvatures"
         raise source.error(problem, s.line, s.text, "RDM Y or RDM N before the first surface")
     name = s.command if s.command in ("SO", "SI") else f"S{number}"
     first = source.finite(s, 0, "radius" if system.radii else "curvature", 0.0)
@@ -287,7 +287,7 @@ def _take_surface(system: CodevSystem, surface: CodevSurface, s: Statement) -> b
         case "SPS":
             surface.special = s.words[0].upper() if s.words else ""
             if surface.special != "XYP":
-                raise source.error("a special surface that is not known here", s.line, s.text, "SPS XYP")
+                raise source.error("this special surface is not supported", s.line, s.text, "SPS XYP")
         case "SCO":
             word = s.words[0].upper() if s.words else ""
             if word == "K" and len(s.words) == 2:
@@ -295,10 +295,10 @@ def _take_surface(system: CodevSystem, surface: CodevSurface, s: Statement) -> b
             elif word[:1] == "C" and word[1:].isdigit() and 1 <= int(word[1:]) <= 66:
                 surface.polynomial[int(word[1:])] = source.finite(s, 1, "the coefficient")
             else:
-                raise source.error("a coefficient that is not known here", s.line, s.text, "SCO C1 to SCO C66")
+                raise source.error("this coefficient is not supported", s.line, s.text, "SCO C1 to SCO C66")
         case "CUF":
             if any(source.numbers(s)):
-                raise source.error("a curvature of a Fresnel base is not known here", s.line, s.text)
+                raise source.error("a curvature of a Fresnel base is not supported", s.line, s.text)
         case "DAR" | "BEN" | "REV":
             surface.kind = s.command
         case "CIR" | "REX" | "REY" | "ELX" | "ELY" | "ADX" | "ADY" | "ARO":
@@ -325,9 +325,9 @@ def _edge(system: CodevSystem, surface: CodevSurface, s: Statement) -> bool:
     if kinds in (["OBS"], ["HOL"]) and s.command == "CIR":
         surface.hole = max(surface.hole, value)
     elif kinds == ["EDG"]:
-        pass  # of the glass, not of the light
+        pass  # The edge of the glass does not limit the light.
     elif kinds or s.command == "ARO":
-        source.note(s, "this aperture is not carried")
+        source.note(s, "this aperture is omitted")
     elif s.command in ("ADX", "ADY"):
         surface.centre[s.command] = value
     else:
@@ -361,7 +361,7 @@ def read_codev(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
     if not system.surfaces:
         raise source.error("no surface in this file", len(lines), allowed="SO, S, ... SI of a CODE V sequence")
     if system.surfaces[-1].name != "SI":
-        problem = "the sequence has no image: it is cut off"
+        problem = "the sequence has no image: the file is truncated"
         raise source.error(problem, system.surfaces[-1].line, allowed="SI at its end")
     if len(system.surfaces) < 3:
         raise source.error("too few surfaces", system.surfaces[-1].line, allowed="object, optics and image")
@@ -375,7 +375,7 @@ def _prescription(system: CodevSystem, glasses: Glasses) -> Prescription:
         raise source.error("no wavelength in this file", read[0].line, allowed="WL")
     reference = system.reference or (len(system.waves) + 1) // 2
     if reference > len(system.waves):
-        raise source.error("the reference wavelength is none of those given", read[0].line, reference)
+        raise source.error("the reference wavelength is not in the list", read[0].line, reference)
     wavelength = system.waves[reference - 1]
     chain = Chain(source)
     if read[0].medium:
@@ -386,13 +386,13 @@ def _prescription(system: CodevSystem, glasses: Glasses) -> Prescription:
         if not math.isfinite(surface.thickness):
             raise source.error("an infinite distance behind an optical surface", surface.line)
         shift = [given.get(name, 0.0) * scale for name in ("XDE", "YDE", "ZDE")]
-        # left-handed about x and y
+        # Rotations about x and y are left-handed.
         angles = [math.radians(sign * given.get(name, 0.0)) for name, sign in (("ADE", -1), ("BDE", -1), ("CDE", 1))]
         turns = [about_axis(axis, angle) for axis, angle in enumerate(angles)]
         rotation = turns[0] @ turns[1] @ turns[2]
         before = chain.pose
         if last:
-            # the image's "thickness" is a defocus: it stands so much farther along the axis that light came along
+            # The image's "thickness" is a defocus along the axis of the arriving light.
             chain.move((0.0, 0.0, surface.thickness * scale))
         if surface.kind != "REV":
             chain.move(shift, rotation)
@@ -450,7 +450,7 @@ def _behind(source: Source, surface: CodevSurface, wavelength: float, glasses: G
         case "REFL":
             return None
         case "REFR_TIR" | "TIRO":
-            raise source.error("total reflection is not known here", surface.line, medium)
+            raise source.error("total reflection is not supported", surface.line, medium)
     whole, point, rest = medium.partition(".")
     stated, colon, _ = medium.partition(":")
     if (point and whole.isdigit() and rest.isdigit()) or colon:

@@ -42,7 +42,7 @@ def even_asphere(curvature: float, conic: float, powers: Mapping[int, float]) ->
     last = max((n for n, a in powers.items() if a != 0.0 and n > 2), default=2)
     even = tuple(float(powers.get(n, 0.0)) for n in range(4, last + 1, 2))
     second = powers.get(2, 0.0)
-    # the trace knows no r^2 beside the conic; x^2 + y^2 is the same
+    # The tracer has no r^2 term beside the conic; x^2 + y^2 is the same.
     terms = (XYPolynomial(x2=second, y2=second),) if second else ()
     return Surface(curvature, conic, even, terms=terms)
 
@@ -67,7 +67,7 @@ def polynomial(surface: Surface, coefficients: Mapping[tuple[int, int], float], 
     given = {k: c for k, c in coefficients.items() if c != 0.0}
     order = max((a + b for a, b in given), default=0)
     if order > LARGEST_ORDER:
-        raise ValueError(f"a polynomial of order {order}; at most {LARGEST_ORDER} is known")
+        raise ValueError(f"a polynomial of order {order}; at most {LARGEST_ORDER} is supported")
     if not given:
         return surface
     if set(given) <= set(_POLYNOMIAL) and not surface.terms:
@@ -127,7 +127,7 @@ def joined(surface: Surface) -> Surface:
     if figure is None or not amplitudes:
         return replace(shape, figure=figure) if figure is not None else shape
     if not isinstance(figure, ZernikeFigure):
-        raise ValueError("Zernike terms of a sag beside a figure on a grid")
+        raise ValueError("Zernike sag terms with a figure on a grid cannot be merged")
     total: dict[tuple[int, int], float] = {}
     assert isinstance(shape.figure, ZernikeFigure)
     for part in (shape.figure, figure):
@@ -189,12 +189,12 @@ def turned_over(surface: LensSurface) -> LensSurface:
     terms = []
     for term in shape.terms:
         if not isinstance(term, XYPolynomial):
-            raise TypeError(f"{type(term).__name__} is no polynomial")
+            raise TypeError(f"{type(term).__name__} is not a polynomial")
         terms.append(XYPolynomial(**{n: -getattr(term, n) * (-1) ** b for (_, b), n in _POLYNOMIAL.items()}))
     figure = shape.figure
     if isinstance(figure, ZernikeFigure):
         (cx, cy), given = figure.centre, figure.terms
-        # sag(x, y) -> -sag(x, -y): terms that are odd in y keep their sign
+        # sag(x, y) -> -sag(x, -y): terms that are odd in y keep their sign.
         signs = {j: 1.0 if noll_to_nm(j)[1] < 0 else -1.0 for j in given}
         figure = ZernikeFigure(figure.radius, (cx, -cy), {j: signs[j] * a for j, a in given.items()})
     elif figure is not None:

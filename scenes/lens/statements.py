@@ -175,9 +175,9 @@ def read_lines(source: Source, what: str = "a prescription", most: int = LARGEST
     except UnicodeDecodeError as error:
         if not encoding:
             text = content.decode("iso-8859-1")
-            source.notes.append(Note(0, "", "not UTF-8: read as ISO 8859-1, one byte a character"))
+            source.notes.append(Note(0, "", "not UTF-8: read as ISO 8859-1"))
         else:
-            # by places of two bytes: one byte alone may be a newline's half
+            # Decode before counting: a single byte may be half of a newline.
             before = content[: error.start].decode(encoding, "replace")
             problem = f"not {encoding.upper()} text: {error.reason}"
             raise source.error(problem, before.count("\n") + 1) from None
@@ -185,9 +185,9 @@ def read_lines(source: Source, what: str = "a prescription", most: int = LARGEST
     for k, line in enumerate(lines, start=1):
         odd_one = next((c for c in line if (c < " " and c not in "\t\f\x1a") or c in "\x7f\ufffe\ufffd"), None)
         if odd_one is not None:
-            raise source.error("a character that text does not have", k, odd_one, "text in UTF-16, UTF-8 or ISO 8859-1")
+            raise source.error("an invalid character", k, odd_one, "text in UTF-16, UTF-8 or ISO 8859-1")
         if len(line) > LONGEST_LINE:
-            raise source.error("a line too long for a prescription", k, allowed=f"at most {LONGEST_LINE} characters")
+            raise source.error("the line is too long", k, allowed=f"at most {LONGEST_LINE} characters")
     return lines
 
 
@@ -276,7 +276,7 @@ def named_glasses(glasses: Glasses, surfaces: Iterable[LensSurface]) -> Glasses:
 def require_d_line(source: Source, what: str, name: str, wavelength: float, line: int) -> None:
     """Raise InputError for a glass without a catalogue at a wavelength (metres) other than that of its index."""
     if abs(wavelength - D_LINE) > _D_WIDTH:
-        problem = f"a {what} glass, whose index is stated at 587.56 nm alone"
+        problem = f"a {what} glass has an index at 587.56 nm only"
         raise source.error(problem, line, f"{name} at {wavelength * 1e9:.6g} nm", "a catalogue's glass")
 
 
@@ -351,7 +351,7 @@ class Chain:
             self.index, self.glass = behind
         if stop:
             if self.stop >= 0:
-                raise self.source.error("a second stop", line)
+                raise self.source.error("a second stop is not supported", line)
             self.stop = len(self.surfaces)
         surface = LensSurface(name, self.pose, shape, interaction, self.index, edges[0], line, self.glass, edges[1])
         if interaction is Interaction.PASS and not surface.every_edge and shape.is_plane and not (stop or last):
@@ -383,7 +383,7 @@ class Chain:
         source = self.source
         if self.stop < 0:
             self.stop = 0
-            source.notes.append(Note(0, "", f"no {keyword}: taken to be {self.surfaces[0].name}"))
+            source.notes.append(Note(0, "", f"no {keyword}: {self.surfaces[0].name} is used"))
         if self.stop == len(self.surfaces) - 1:
             raise source.error("the image is the stop", self.surfaces[self.stop].line)
         return Prescription(
@@ -457,12 +457,12 @@ def read_catalogue(path: str | Path) -> tuple[CatalogueGlass, ...]:
                 formula = source.whole(s, 1, "the dispersion formula", 0, 1000)
                 if formula not in FORMULAS:
                     known = ", ".join(f"{k} {title}" for k, (title, _) in FORMULAS.items())
-                    raise source.error("an unknown dispersion formula", number, formula, known)
+                    raise source.error("unknown dispersion formula", number, formula, known)
             case "CD" if name:
                 given = source.numbers(s, "a coefficient")
                 coefficients = tuple([*given, *[0.0] * 12][: max(12, len(given))])
             case "ED" if name and s.words and is_number(s.words[0]):
-                # a zero stands for what the maker does not say
+                # A zero stands for missing data.
                 expansion = 1e-6 * source.finite(s, 0, "the expansion") or None
             case "TD" if name and len(s.words) >= _CONSTANTS and all(is_number(word) for word in s.words):
                 constants = source.numbers(s, "a constant of dn/dT")[:_CONSTANTS]
@@ -472,13 +472,13 @@ def read_catalogue(path: str | Path) -> tuple[CatalogueGlass, ...]:
                     raise source.error(f"{name} has no coefficients (CD)", begun)
                 first, last = (source.finite(s, k, "the range") * 1e-6 for k in (0, 1))
                 if first > last:
-                    raise source.error("a range of wavelengths that is reversed", number, s.text, "the shortest first")
+                    raise source.error("the range of wavelengths is reversed", number, s.text, "the shortest first")
                 glasses.append(CatalogueGlass(name, formula, coefficients, first, last, expansion, thermal))
                 name = ""
             case _:
                 pass
     if name:
-        raise source.error(f"{name} has no wavelengths (LD): the file is cut off", begun)
+        raise source.error(f"{name} has no wavelengths (LD): the file is truncated", begun)
     if not glasses:
         raise source.error("no glass in this file", 1, allowed="an AGF catalogue: NM, CD and LD lines")
     return tuple(glasses)

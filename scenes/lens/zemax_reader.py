@@ -131,7 +131,10 @@ def read_zemax(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
     if not system.surfaces:
         raise source.error("no surface in this file", len(lines), allowed="SURF 0, SURF 1, ... of a Zemax file")
     if len(system.surfaces) < 3:
-        problem, found = "too few surfaces: the file is cut off or no system", f"{len(system.surfaces)} surfaces"
+        problem, found = (
+            "too few surfaces: the file is truncated or not an optical system",
+            f"{len(system.surfaces)} surfaces",
+        )
         raise source.error(problem, system.surfaces[-1].line, found, "object, optics and image")
     return _prescription(system, glasses)
 
@@ -142,20 +145,20 @@ def _take(system: _System, s: Statement) -> None:
     if s.command == "SURF":
         number = source.whole(s, 0, "the surface's number", 0, MOST_SURFACES)
         if number != len(system.surfaces):
-            raise source.error("surfaces are not in their order", s.line, number, f"SURF {len(system.surfaces)}")
+            raise source.error("surfaces are not in order", s.line, number, f"SURF {len(system.surfaces)}")
         system.surfaces.append(_Surface(number, s.line))
     elif s.command in _SYSTEM:
         _take_system(system, s)
     elif s.command in _ON_SURFACES or (s.command == "COMM" and system.surfaces):
         if not system.surfaces:
-            raise source.error(f"{s.command} stands before any surface", s.line, s.text, "SURF 0 first")
+            raise source.error(f"{s.command} precedes all surfaces", s.line, s.text, "SURF 0 first")
         _take_surface(system, system.surfaces[-1], s)
     elif s.command == "MNUM":
         if source.whole(s, 0, "the number of configurations", 0, 10_000, 1) > 1:
-            source.note(s, "of several configurations that one comes along whose values stand in the surfaces")
+            source.note(s, "of several configurations only the present one, whose values are in the surfaces, is read")
     elif s.command == "IGNR":
         if s.words[:1] not in ((), ("0",)):
-            raise source.error("a surface that is to be ignored", s.line, s.text, "a file without it")
+            raise source.error("a surface with IGNR is not supported", s.line, s.text, "a file without it")
     elif s.command not in OF_NO_EFFECT:
         source.note(s, "not understood")
 
@@ -181,7 +184,7 @@ def _take_system(system: _System, s: Statement) -> None:
         case "FNUM":
             system.pupil = Pupil("f_number", _positive(source, s, "the F-number"), s.line)
             if len(s.words) > 1 and source.finite(s, 1, "the kind of F-number") != 0.0:
-                source.note(s, "a paraxial working F-number: the pupil's diameter is not carried")
+                source.note(s, "a paraxial working F-number: omitted, so that the pupil's diameter is unknown")
                 system.pupil = None
         case "OBNA":
             system.pupil = Pupil("object_na", _positive(source, s, "the aperture"), s.line)
@@ -206,7 +209,7 @@ def _take_system(system: _System, s: Statement) -> None:
             system.primary = source.whole(s, 0, "the primary wavelength's number", 1, 10_000)
         case _:  # vignetting factors: shares by which a field's pupil is compressed
             if any(v != 0.0 for v in source.numbers(s, "a vignetting factor")):
-                source.note(s, "vignetting factors are not carried; beams are as wide as the stop lets them")
+                source.note(s, "vignetting factors are omitted; beams are limited by the stop")
 
 
 def _positive(source: Source, s: Statement, what: str) -> float:
@@ -252,15 +255,15 @@ def _take_surface(system: _System, surface: _Surface, s: Statement) -> None:
         case "OBDC":
             surface.centre = (source.finite(s, 0, "the decentre"), source.finite(s, 1, "the decentre"))
         case "USAP":
-            source.note(s, "an aperture of any outline is not carried")
+            source.note(s, "an aperture of arbitrary outline is omitted")
         case "SCBD":
             if any(v not in ("0",) and float(source.value(s, v, "a tilt")) != 0.0 for v in s.words[2:]):
-                problem = "a surface with a tilt or decentre of its own"
+                problem = "tilts and decentres of a surface are not supported"
                 raise source.error(problem, s.line, s.text, "coordinate breaks (COORDBRK) in its place")
         case _:
             what = _EDGES.get(s.command)
             if what is None:
-                source.note(s, "this obscuration is not carried")
+                source.note(s, "this obscuration is omitted")
                 return
             surface.edges[what] = (s, source.finite(s, 0, "its size"), source.finite(s, 1, "its size"))
 
@@ -274,12 +277,12 @@ def _prescription(system: _System, glasses: Glasses) -> Prescription:
     primary = system.waves.get(system.primary, waves[0])
     chain, read, glasses = Chain(source), system.surfaces, of_makers(glasses, system.catalogues)
     if read[0].kind == "COORDBRK" or read[0].glass:
-        raise source.error("the object is a coordinate break or stands in glass", read[0].line)
+        raise source.error("the object is a coordinate break or in glass", read[0].line)
     for k, surface in enumerate(read[1:], start=1):
         last = k == len(read) - 1
         if surface.kind == "COORDBRK":
             if surface.glass:
-                raise source.error("a coordinate break with a glass of its own", surface.glass_line)
+                raise source.error("a coordinate break with a glass", surface.glass_line)
             _break(source, chain, surface, scale)
         else:
             name = surface.name if surface.name.isidentifier() else f"S{k}"
@@ -360,7 +363,7 @@ def _shape(source: Source, surface: _Surface, scale: float) -> Surface:
     """Return the shape of a surface, in metres."""
     line = surface.kind_line or surface.line
     if surface.kind not in SHAPES:
-        raise source.error("a kind of surface that is not known here", line, surface.kind, ", ".join(SHAPES))
+        raise source.error("this type of surface is not supported", line, surface.kind, ", ".join(SHAPES))
     c, k, p, x = surface.curvature / scale, surface.conic, surface.parameters, surface.extra
     powers: dict[int, float] = {}
     if surface.kind in ("EVENASPH", "SZERNSAG"):
@@ -369,7 +372,7 @@ def _shape(source: Source, surface: _Surface, scale: float) -> Surface:
         powers = {n: p.get(n, 0.0) * scale ** (1 - n) for n in range(1, 9)}
         odd = [n for n, a in powers.items() if n % 2 and a != 0.0]
         if odd:
-            raise source.error("odd powers of the radius", line, f"r^{odd[0]}", "even powers")
+            raise source.error("odd powers of the radius are not supported", line, f"r^{odd[0]}", "even powers")
     shape = even_asphere(c, k, powers)
     if surface.kind == "XPOLYNOM":
         count, radius = int(x.get(1, 0.0)), x.get(2, 0.0) * scale
@@ -387,7 +390,7 @@ def _shape(source: Source, surface: _Surface, scale: float) -> Surface:
         if terms and not radius > 0.0:
             raise source.error("Zernike terms without a normalisation radius", line)
         if max(terms, default=0) > MAX_NOLL:
-            raise source.error("more Zernike terms than are known", line, max(terms), f"Z1 to Z{MAX_NOLL}")
+            raise source.error("too many Zernike terms", line, max(terms), f"Z1 to Z{MAX_NOLL}")
         if terms:
             centre = (p.get(9, 0.0) * scale, p.get(10, 0.0) * scale)
             shape = shape.with_figure(ZernikeFigure(radius, centre, terms))

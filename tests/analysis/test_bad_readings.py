@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from scipy.stats import binom, multivariate_normal
-from tests.analysis.disturbance_prior import SpotNoise, disturbances
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.filter_state import Observed, _with_errors
 from analysis.monitor.kalman_filter import SeriesFilter, detection_power
 from analysis.statistics import limit_of
 from tests.analysis.followed_series import follow, of_shifts
+from tests.analysis.stated_motions import SpotNoise, disturbances
 from tests.analysis.test_series_smoother import conditioned
 
 pytestmark = pytest.mark.second

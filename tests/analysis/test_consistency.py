@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from tests.analysis.disturbance_prior import disturbances
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw, consistency
 from analysis.monitor.estimators import ESTIMATORS, applicable, preferred_estimator
 from tests.analysis.refusals import refuses
+from tests.analysis.stated_motions import disturbances
 
 COUNT, MOTIONS = 8, 12
 

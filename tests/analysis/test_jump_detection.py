@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2
-from tests.analysis.disturbance_prior import SpotNoise, disturbances
 
 from analysis.monitor import series_smoother
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.jump_detection import candidates
 from analysis.monitor.series_smoother import smooth_series
+from tests.analysis.stated_motions import SpotNoise, disturbances
 
 NOISE = 0.2
 """Of the shifts below, px."""

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2, ncx2
-from tests.analysis.disturbance_prior import correlation_of, disturbances
 
 from analysis.monitor import limits
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, TimeLaw, consistency
 from analysis.monitor.estimators import Shifts, applicable
 from analysis.monitor.monitor_formulas import MonitorGeometry
 from analysis.monitor.parameters import CameraCalibration
+from tests.analysis.stated_motions import correlation_of, disturbances
 from tests.tiers import quick
 
 LOOKS = (0.45, -0.09)

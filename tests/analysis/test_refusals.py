@@ -11,7 +11,6 @@ import pytest
 import tifffile
 from astropy.io import fits
 from scipy import sparse
-from tests.analysis.disturbance_prior import TimeLaw, disturbances
 
 from analysis.arrays import UndeterminedError
 from analysis.block import block_adjustment, reweighting
@@ -58,6 +57,7 @@ from analysis.turntable.dividing_error import CalibrationSeries, cross_validate,
 from tests.analysis import test_adjustment
 from tests.analysis.drawn_blocks import Plan, draw
 from tests.analysis.refusals import refuses
+from tests.analysis.stated_motions import TimeLaw, disturbances
 from tests.analysis.test_jitter_lines import of_disparities
 from tests.analysis.test_monitor_limits import some_cameras
 from tests.analysis.test_spot_centroids import NOISE, SHAPE, airy

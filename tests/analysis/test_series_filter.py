@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.analysis.disturbance_prior import SpotNoise, correlation_of, disturbances
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.filter_state import Observed
@@ -12,6 +11,7 @@ from analysis.monitor.kalman_filter import SeriesFilter, smooth_jointly
 from analysis.monitor.series_smoother import smooth_series
 from analysis.monitor.state_space import HeatInputs, StateSpace
 from tests.analysis.followed_series import follow, of_shifts, whole_steps
+from tests.analysis.stated_motions import SpotNoise, correlation_of, disturbances
 from tests.analysis.test_series_smoother import joint_normal
 
 LAWS = (

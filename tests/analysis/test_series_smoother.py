@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from tests.analysis.disturbance_prior import correlation_of, disturbances
 
 from analysis.monitor import series_smoother
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.series_smoother import smooth_series
 from analysis.spots.spot_positions import NoiseParts, SeriesNoise
 from tests.analysis.refusals import refuses
+from tests.analysis.stated_motions import correlation_of, disturbances
 
 WHITE, CONSTANT = TimeLaw(white=True), TimeLaw()
 DRIFT, SWING, BOTH = TimeLaw(drift_s=50.0), TimeLaw(period_s=90.0), TimeLaw(drift_s=200.0, period_s=70.0)

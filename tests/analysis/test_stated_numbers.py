@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.analysis.disturbance_prior import disturbances
 
 from analysis.monitor.disturbances import TimeLaw
 from analysis.monitor.limits import elasticities, heavy_tails, posterior_sigma, prior_numbers, unobserved_bodies
 from tests.analysis.refusals import refuses
+from tests.analysis.stated_motions import disturbances
 
 RNG = np.random.default_rng(11)
 WHAT = ("rotate x", "rotate y", "shift x", "shift y", "figure Z4", "figure Z5")

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from tests.analysis.disturbance_prior import SpotNoise, disturbances
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.limits import calibrated_sigma
 from analysis.monitor.series_smoother import smooth_series
+from tests.analysis.stated_motions import SpotNoise, disturbances
 
 STATIONARY = (
     TimeLaw(white=True),

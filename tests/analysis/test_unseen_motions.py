@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from scipy.linalg import null_space
-from tests.analysis.disturbance_prior import correlation_of, disturbances
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.model_fit import error_floor, unobservable_modes
+from tests.analysis.stated_motions import correlation_of, disturbances
 
 MOTIONS, SPOTS, PARAMETERS = 14, 4, 3
 SWING, DRIFT = TimeLaw(period_s=5000.0, drift_s=50_000.0), TimeLaw(drift_s=900.0)

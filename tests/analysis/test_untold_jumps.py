@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.analysis.disturbance_prior import disturbances
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.kalman_filter import SeriesFilter, smoothed, with_indicated_jumps
 from tests.analysis.followed_series import follow, of_shifts, whole_steps
+from tests.analysis.stated_motions import disturbances
 from tests.tiers import quick
 
 NOISE, EVERY = 0.3, 400.0

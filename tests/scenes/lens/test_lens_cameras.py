@@ -183,7 +183,7 @@ CURVE = XYPolynomial(x2=1e-3)
         ),
         (Surface(-0.1, terms=(CURVE,), figure=ERROR), "with other sag terms", "", ""),
         (Surface(-0.1, even=(0.0,) * 7 + (1e-9,)), "even powers beyond r^16", "", ""),
-        (Surface(-0.1, terms=(SAG,)), "sag terms that the format does not have", "is no polynomial", ""),
+        (Surface(-0.1, terms=(SAG,)), "sag terms that the format does not have", "is not a polynomial", ""),
         (Surface(-0.1, even=(0.0,) * 9 + (1e-9,), terms=(CURVE,)), "a polynomial beyond order 20", "", ""),
         (Surface(even=(0.0,) * 9 + (1e-9,)), "even powers beyond", "a polynomial of so high an order", ""),
     ],
@@ -209,7 +209,7 @@ def test_a_hole_in_an_obscuration_is_no_edge_of_a_zemax_file(camera) -> None:
 
 
 def test_zernike_terms_that_cannot_be_joined() -> None:
-    for figure, problem in ((GRID, "beside a figure on a grid"), (replace(ERROR, terms={70: 1e-9}), "outside 1..66")):
+    for figure, problem in ((GRID, "with a figure on a grid"), (replace(ERROR, terms={70: 1e-9}), "outside 1..66")):
         with pytest.raises(ValueError, match=problem):
             joined(Surface(-0.1, terms=(SAG,), figure=figure))
 
@@ -354,7 +354,7 @@ def test_the_command_writes_a_perturbed_camera(tmp_path: Path, instrument) -> No
         (tmp_path / f"{name}.yaml").write_text(changed(text, change), "utf-8")
     for name, camera, problem in (
         ("gf7_pair", "gf7", "a figure on a grid"),
-        ("./pair.yaml", tmp_path / "camera.yaml", "Zernike terms of a sag beside a figure on a grid"),
+        ("./pair.yaml", tmp_path / "camera.yaml", "Zernike sag terms with a figure on a grid cannot be merged"),
     ):
         job.write_text(f"instrument: {name}\nperturb: {{base/forward/M1: {{deformation: m1.csv}}}}\n", "utf-8")
         code, said = run("write", camera, "--perturbed", job, "--camera", "forward", "--out", tmp_path / "b.zmx")

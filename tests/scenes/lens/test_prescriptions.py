@@ -374,9 +374,9 @@ DEEP = "opticalSystem:\n" + "".join(
 )
 ENDLESS = {
     "too many surfaces": ("a.seq", CODEV.replace("S 0.0 100.0\n", "S 0.0 100.0\n" * 2001)),
-    "a line too long": ("b.seq", CODEV.replace("TITLE 'folded'", "TITLE '" + "x" * 100_000 + "'")),
+    "the line is too long": ("b.seq", CODEV.replace("TITLE 'folded'", "TITLE '" + "x" * 100_000 + "'")),
     "not UTF-16 text": ("c.zmx", TMA.encode("utf-16")[:-1]),
-    "optics within optics without end": ("e.yaml", DEEP + " " * 90 + "{type: Detector}\n"),
+    "optics are nested too deeply": ("e.yaml", DEEP + " " * 90 + "{type: Detector}\n"),
     "too many surfaces; allowed": (
         "d.yaml",
         BATOID.replace("  items:\n", "  items:\n" + "    - {type: Mirror, surface: {type: Plane}}\n" * 2001, 1),
