@@ -88,8 +88,8 @@ def test_what_differs_is_found(runs: Path, tmp_path: Path) -> None:
         compare([runs / "a", runs / "again", runs / "b"], 1e-9, None),
         compare([runs / "b", runs / "a"], 1e-9, None),
     )
-    assert [one.same for one in there.found] == [True, False]
-    forward, backward = ({(n.file, n.key): n.difference for n in f.found[-1].numbers} for f in (there, back))
+    assert [one.same for one in there.diffs] == [True, False]
+    forward, backward = ({(n.file, n.key): n.difference for n in f.diffs[-1].numbers} for f in (there, back))
     assert forward.keys() == backward.keys()
     assert all(value is None or value == -backward[key] for key, value in forward.items())
 
@@ -99,12 +99,12 @@ def test_noise_alone_is_within_some_sigma(runs: Path, tmp_path: Path) -> None:
     """Another seed: every reading moves, none by more than 5 sigma (some 70 of them: 4e-5)."""
     folders = [runs / "a", runs / "seed"]
     strict, loose = compare(folders, 1e-9, None), compare(folders, 1e-9, 5.0)
-    readings = [one for one in strict.found[0].numbers if one.in_sigma is not None]
+    readings = [one for one in strict.diffs[0].numbers if one.in_sigma is not None]
     assert len(readings) > 40
     # also of the chi-square of the shifts, by their noise
     assert any(one.key == "disturbances.chi_square" for one in readings)
     assert loose.same
-    assert loose.found[0].compared > 500
+    assert loose.diffs[0].compared > 500
     assert "no input" not in " ".join(verdict(strict))  # the seed stands in config.yaml
 
 
@@ -127,7 +127,7 @@ def test_small_differences_count_by_the_tolerance(runs: Path, tmp_path: Path) ->
     (copy / "truth.json").write_text(json.dumps(truth))
     with h5py.File(copy / "irradiance.nc", "r+") as data:
         data["photons"][0, 0, 5, 5] += 1e-7 * data["photons"][...].max()
-    fine, wide = (compare([runs / "a", copy], rtol, None).found[0] for rtol in (1e-9, 1e-6))
+    fine, wide = (compare([runs / "a", copy], rtol, None).diffs[0] for rtol in (1e-9, 1e-6))
     assert [one.key for one in fine.numbers] == ["cameras.forward.d_f_um"]
     assert [(one.name, round(one.share * 4 * 2 * 96 * 96)) for one in fine.arrays] == [("photons", 1)]
     assert wide.same
@@ -148,11 +148,11 @@ def test_a_changed_file_of_a_run(runs: Path, tmp_path: Path) -> None:
         assert (code, said in text, (tmp_path / "out").exists()) == (2, True, False), text
 
     written("config.yaml", "3 um", "0.003 mm")
-    (found,) = compare([runs / "a", copy], 1e-9, None).found
+    (found,) = compare([runs / "a", copy], 1e-9, None).diffs
     assert not found.inputs
     assert found.same
     written("truth.json", '"nominal_deg"', '"other_deg"')
-    (found,) = compare([runs / "a", copy], 1e-9, None).found
+    (found,) = compare([runs / "a", copy], 1e-9, None).diffs
     assert {(one.key, one.other is None) for one in found.numbers} == {
         ("intersection_angle.nominal_deg", True),
         ("intersection_angle.other_deg", False),

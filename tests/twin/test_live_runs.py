@@ -132,7 +132,7 @@ def test_what_was_changed_after_the_run_is_told(tmp_path):
 def test_a_page_takes_so_many_frames_and_says_so(pair, tmp_path):
     many = JOB.replace("frames: 2", f"frames: {MOST_FRAMES + 1}")
     source = read_source(str(written(tmp_path, many)))
-    assert source.notes == (f"the page takes {MOST_FRAMES} frames in place of {MOST_FRAMES + 1}",)
+    assert source.notes == (f"the page uses {MOST_FRAMES} frames instead of {MOST_FRAMES + 1}",)
     assert bench_of(source, pair).initial_state.frames == MOST_FRAMES
     assert read_source(str(written(tmp_path, JOB.replace("frames: 2", f"frames: {MOST_FRAMES}")))).notes == ()
 

@@ -102,7 +102,7 @@ def test_what_is_gone_and_what_was_added_is_named(folder) -> None:
 
 def test_a_changed_config_is_not_run_again(folder) -> None:
     (folder / "config.yaml").write_text("a: 2\n")
-    assert obstacle(folder_state(folder)) == "what it was made of is not as it was: config.yaml"
+    assert obstacle(folder_state(folder)) == "its inputs in the folder were altered: config.yaml"
 
 
 def test_inputs_that_changed_or_are_gone_are_named(tmp_path) -> None:
@@ -124,7 +124,7 @@ def test_inputs_that_changed_or_are_gone_are_named(tmp_path) -> None:
         (str(tmp_path / "first.tiff"),),
         (str(tmp_path / "second.tiff"),),
     )
-    assert obstacle(state) == f"files that it read are gone: {tmp_path / 'second.tiff'}"
+    assert obstacle(state) == f"files that it read are missing: {tmp_path / 'second.tiff'}"
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +172,7 @@ def test_blocks_that_were_taken_out_are_missed(study, tmp_path) -> None:
     copy = shutil.copytree(study, tmp_path / "copy")
     (copy / BLOCKS).write_bytes(b"".join((copy / BLOCKS).read_bytes().splitlines(keepends=True)[:-1]))
     assert folder_state(copy).changed == (BLOCKS,)
-    with pytest.raises(CannotRepeat, match="its blocks are not whole; --all makes the whole study again"):
+    with pytest.raises(CannotRepeat, match="its blocks are incomplete; --all repeats the whole study"):
         repeat_block(folder_state(copy))
     (copy / "config.yaml").write_text("name: levels\n")
     with pytest.raises(CannotRepeat, match=r"config\.yaml:1: "):
@@ -419,7 +419,7 @@ def test_runs_that_cannot_be_made_again_are_told(tmp_path) -> None:
     for place, _ in cases:
         place.mkdir()
     for name, facts, said in (
-        ("gone", {"started_in": str(tmp_path / "none")}, "the folder in which it was started is gone"),
+        ("gone", {"started_in": str(tmp_path / "none")}, "the folder in which it was started is missing"),
         ("fails", {"started_in": str(tmp_path)}, "config.yaml ended with exit code 1"),
     ):
         with RunFolder(tmp_path / name) as made:

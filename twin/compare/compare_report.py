@@ -29,24 +29,24 @@ _MOST_IMAGES = 8
 def compare_report(comparison: Comparison) -> Report:
     """Return the report of a comparison."""
     names = comparison.names
-    told, more = answer(*verdict(comparison))
+    first_sentences, lead = answer(*verdict(comparison))
     summary = Table(
         "summary",
         "What differs",
         f"Differences from {names[0]}. A number differs if it deviates by more than {comparison.rtol:g} of its value"
         + ("." if comparison.sigmas is None else f" and, if it has a sigma, by more than {comparison.sigmas:g} sigma."),
         ("run", "inputs", "numbers", "images", "compared", "largest [sigma]"),
-        [_row(name, found) for name, found in zip(names[1:], comparison.found, strict=True)],
+        [_row(name, diff) for name, diff in zip(names[1:], comparison.diffs, strict=True)],
     )
     sections = []
-    for k, (name, run, found) in enumerate(zip(names[1:], comparison.runs[1:], comparison.found, strict=True), start=1):
-        artefacts = _artefacts(comparison.runs[0], run, found, (names[0], name), k)
+    for k, (name, run, diff) in enumerate(zip(names[1:], comparison.runs[1:], comparison.diffs, strict=True), start=1):
+        artefacts = _artefacts(comparison.runs[0], run, diff, (names[0], name), k)
         if artefacts:
             sections.append(Section(name, (), artefacts))
     return Report(
         title=f"{', '.join(names[1:])} against {names[0]}",
-        verdict=told,
-        lead=more,
+        verdict=first_sentences,
+        lead=lead,
         facts=tuple((name, str(run.folder)) for name, run in zip(names, comparison.runs, strict=True)),
         summary=summary,
         sections=tuple(sections),
@@ -54,10 +54,10 @@ def compare_report(comparison: Comparison) -> Report:
     )
 
 
-def _row(name: str, found: Differences) -> list[Cell]:
+def _row(name: str, diff: Differences) -> list[Cell]:
     """Return the row of a run in the summary."""
-    far = max((abs(one.in_sigma) for one in found.numbers if one.in_sigma is not None), default=None)
-    return [name, len(found.inputs), len(found.numbers), len(found.arrays), found.compared, far]
+    far = max((abs(one.in_sigma) for one in diff.numbers if one.in_sigma is not None), default=None)
+    return [name, len(diff.inputs), len(diff.numbers), len(diff.arrays), diff.compared, far]
 
 
 def _warnings(comparison: Comparison) -> tuple[str, ...]:
@@ -71,41 +71,41 @@ def _warnings(comparison: Comparison) -> tuple[str, ...]:
             if first.manifest.versions.get(package) != version
         }
         if other:
-            told = ", ".join(f"{package} {here} and {there}" for package, (here, there) in other.items())
-            out.append(f"{name} was made with other versions: {told}")
+            changes = ", ".join(f"{package} {here} and {there}" for package, (here, there) in other.items())
+            out.append(f"{name} was made with other versions: {changes}")
         out += [f"{name}: {text}" for text in run.manifest.warnings if text not in first.manifest.warnings]
         missing = [text for text in first.manifest.warnings if text not in run.manifest.warnings]
         out += [f"{comparison.names[0]} only: {text}" for text in missing]
     return tuple(dict.fromkeys(out))
 
 
-def _artefacts(reference: Run, run: Run, found: Differences, names: tuple[str, str], k: int) -> tuple[Artefact, ...]:
+def _artefacts(reference: Run, run: Run, diff: Differences, names: tuple[str, str], k: int) -> tuple[Artefact, ...]:
     """Return the tables and figures of one run against the reference."""
     out: list[Artefact] = []
-    if found.inputs:
-        rows: list[list[Cell]] = [[_text(value) for value in one.values()] for one in found.inputs]
+    if diff.inputs:
+        rows: list[list[Cell]] = [[_text(value) for value in one.values()] for one in diff.inputs]
         out.append(Table(f"inputs-{k}", "Inputs", "Keys of config.yaml.", ("key", *names), rows))
-    figure = _changes(found, names, k)
+    figure = _changes(diff, names, k)
     if figure is not None:
         out.append(figure)
-    if found.numbers:
+    if diff.numbers:
         rows = [
             [n.file, n.key, _value(n.reference), _value(n.other), n.difference, n.sigma, n.sigma_of, n.in_sigma]
-            for n in sorted(found.numbers, key=lambda one: one.file != "truth.json")
+            for n in sorted(diff.numbers, key=lambda one: one.file != "truth.json")
             if not is_sigma(n.key)
         ]
         columns = ("file", "key", *names, "difference", "sigma", "sigma from", "in sigma")
         about = "The keys end in their units. Sigma is that of the difference of two independent measurements: from "
         about += "image noise if stated, otherwise the total. Runs of one seed share their noise and differ by less."
-        left = len(found.numbers) - len(rows)
+        left = len(diff.numbers) - len(rows)
         about += f" compare.json lists {left} changed sigmas." if left else ""
         out.append(Table(f"numbers-{k}", "Results", about, columns, rows, (None,) * 7 + (1,)))
-    if found.arrays:
+    if diff.arrays:
         heads = ("file", "variable", "shape", "largest", "rms", "peak", "differing share")
-        rows = [[a.file, a.name, _shape(a), a.largest, a.rms, a.peak, a.share] for a in found.arrays]
+        rows = [[a.file, a.name, _shape(a), a.largest, a.rms, a.peak, a.share] for a in diff.arrays]
         about = f"Differences and the peak of {names[0]}, in the units of the file."
         out.append(Table(f"images-{k}", "Images", about, heads, rows))
-        out += _pictures(reference, run, found, names, k)
+        out += _pictures(reference, run, diff, names, k)
     return tuple(out)
 
 
@@ -125,10 +125,10 @@ def _shape(array: ArrayDifference) -> str:
     return here if here == there else f"{here}, {there}"
 
 
-def _changes(found: Differences, names: tuple[str, str], k: int) -> SvgFigure | None:
+def _changes(diff: Differences, names: tuple[str, str], k: int) -> SvgFigure | None:
     """Return the figure of the most significant changes; None if no number has a sigma."""
-    known = [one for one in found.numbers if one.in_sigma is not None]
-    chosen = sorted(known, key=lambda one: -abs(one.in_sigma or 0.0))[:MOST_BARS]
+    with_sigma = [one for one in diff.numbers if one.in_sigma is not None]
+    chosen = sorted(with_sigma, key=lambda one: -abs(one.in_sigma or 0.0))[:MOST_BARS]
     if not chosen:
         return None
     with look(f"changes-{k}"):
@@ -145,15 +145,15 @@ def _changes(found: Differences, names: tuple[str, str], k: int) -> SvgFigure | 
         drawn = to_svg(figure)
     caption = f"{names[1]} minus {names[0]}, divided by the sigma of the difference of two independent measurements "
     caption += "(from image noise if the runs state it)."
-    if len(known) > len(chosen):
-        caption += f" The {len(chosen)} largest of {len(known)}."
+    if len(with_sigma) > len(chosen):
+        caption += f" The {len(chosen)} largest of {len(with_sigma)}."
     return SvgFigure(f"changes-{k}", "Results that have a sigma", caption, drawn)
 
 
-def _pictures(reference: Run, run: Run, found: Differences, names: tuple[str, str], k: int) -> list[Artefact]:
+def _pictures(reference: Run, run: Run, diff: Differences, names: tuple[str, str], k: int) -> list[Artefact]:
     """Return images of both runs and their difference, averaged over all but the last two axes."""
     out: list[Artefact] = []
-    for array in found.arrays:
+    for array in diff.arrays:
         if array.largest is None or array.shape is None or len(array.shape) < 2 or min(array.shape[-2:]) < 8:
             continue
         if len(out) == _MOST_IMAGES:
@@ -293,12 +293,12 @@ def differences(reference: Run, other: Run, rtol: float, sigmas: float | None) -
     numbers: list[NumberDifference] = []
     arrays: list[ArrayDifference] = []
     for name in (*results, *images):
-        found = difference.file_difference(name, reference.file(name), other.file(name))
-        count += found.common_arrays
-        arrays += [array for array in found.arrays if not _same_array(array, rtol)]
+        diff = difference.file_difference(name, reference.file(name), other.file(name))
+        count += diff.common_arrays
+        arrays += [array for array in diff.arrays if not _same_array(array, rtol)]
         if name in results:
-            count += found.common_numbers
-            numbers += [one for one in found.numbers if not _same_number(one, rtol, sigmas)]
+            count += diff.common_numbers
+            numbers += [one for one in diff.numbers if not _same_number(one, rtol, sigmas)]
     return Differences(tuple(inputs), tuple(numbers), tuple(arrays), count)
 
 
@@ -339,7 +339,7 @@ class Comparison:
     ----------
     runs : tuple[Run, ...]
         The runs; the first is the reference.
-    found : tuple[Differences, ...]
+    diffs : tuple[Differences, ...]
         Differences of each other run from the reference.
     rtol : float
         Relative tolerance of numbers.
@@ -348,14 +348,14 @@ class Comparison:
     """
 
     runs: tuple[Run, ...]
-    found: tuple[Differences, ...]
+    diffs: tuple[Differences, ...]
     rtol: float
     sigmas: float | None
 
     @property
     def same(self) -> bool:
         """Whether no result of any run differs from the reference's."""
-        return all(one.same for one in self.found)
+        return all(one.same for one in self.diffs)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -381,15 +381,15 @@ def compare(folders: Sequence[Path], rtol: float, sigmas: float | None) -> Compa
 def numbers(comparison: Comparison) -> Mapping[str, Any]:
     """Return the content of compare.json."""
     others = []
-    for run, found in zip(comparison.runs[1:], comparison.found, strict=True):
+    for run, diff in zip(comparison.runs[1:], comparison.diffs, strict=True):
         others.append(
             {
                 "run": str(run.folder),
-                "same": found.same,
-                "compared": found.compared,
-                "inputs": found.inputs,
-                "numbers": [_plain(one, "scale", "difference", "in_sigma") for one in found.numbers],
-                "arrays": [_plain(array, "where reference other depth") for array in found.arrays],
+                "same": diff.same,
+                "compared": diff.compared,
+                "inputs": diff.inputs,
+                "numbers": [_plain(one, "scale", "difference", "in_sigma") for one in diff.numbers],
+                "arrays": [_plain(array, "where reference other depth") for array in diff.arrays],
             }
         )
     return {
@@ -412,22 +412,21 @@ def _plain(one: NumberDifference | ArrayDifference, without: str, *derived: str)
 def verdict(comparison: Comparison) -> list[str]:
     """Return a sentence for each run against the first, and one for its most significant change."""
     parts = []
-    for name, found in zip(comparison.names[1:], comparison.found, strict=True):
-        inputs = f"{len(found.inputs)} input{'s' * (len(found.inputs) != 1)}" if found.inputs else "no input"
-        if found.same:
+    for name, diff in zip(comparison.names[1:], comparison.diffs, strict=True):
+        inputs = f"{len(diff.inputs)} input{'s' * (len(diff.inputs) != 1)}" if diff.inputs else "no input"
+        if diff.same:
             parts.append(
-                f"run {name} has the same results as {comparison.names[0]} "
-                f"({inputs} changed, {found.compared} compared)"
+                f"run {name} has the same results as {comparison.names[0]} ({inputs} changed, {diff.compared} compared)"
             )
             continue
-        what = [f"{len(found.numbers)} numbers"] * bool(found.numbers) + [f"{len(found.arrays)} images"] * bool(
-            found.arrays
+        what = [f"{len(diff.numbers)} numbers"] * bool(diff.numbers) + [f"{len(diff.arrays)} images"] * bool(
+            diff.arrays
         )
         parts.append(
-            f"run {name} differs from {comparison.names[0]} in {' and '.join(what)} of {found.compared} results "
+            f"run {name} differs from {comparison.names[0]} in {' and '.join(what)} of {diff.compared} results "
             f"({inputs} changed)"
         )
-        far = max(found.numbers, key=lambda one: abs(one.in_sigma or 0.0), default=None)
+        far = max(diff.numbers, key=lambda one: abs(one.in_sigma or 0.0), default=None)
         if far is not None and far.in_sigma is not None:
             kind = "from image noise" if far.sigma_of == NOISE else "as stated"
             parts.append(f"the most significant change is {far.key}, {far.in_sigma:+.3g} sigma {kind}")

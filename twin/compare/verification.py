@@ -405,15 +405,15 @@ def _data_states(folder: Path, plan: Plan, whole: BlockResult) -> Iterable[FileS
     """Compare study.nc and study.json with the content of the blocks."""
     name = "study.nc"
     try:
-        kept = difference.content_of(folder / name, name).arrays
+        stored_arrays = difference.content_of(folder / name, name).arrays
         stored = read_json(folder / "study.json")
     except InputError as error:
         return (FileState(name, DIFFERENT, why=error.issues[0].problem),)
     data = make_dataset(plan, whole)
     repetition = {str(key): np.asarray(data[key].values) for key in data.data_vars}
-    held = {key: values for key, values in kept.items() if key in repetition}
+    common = {key: values for key, values in stored_arrays.items() if key in repetition}
     again = summary(data, plan)
-    arrays = (name, difference.Content({}, held, {}), difference.Content({}, repetition, {}))
+    arrays = (name, difference.Content({}, common, {}), difference.Content({}, repetition, {}))
     # the data set is the blocks', and the summary that of the data set
     numbers = ("study.json", difference.plain({key: stored.get(key) for key in again}), difference.plain(again))
     return [file_state_of(difference.content_difference(*pair)) for pair in (arrays, numbers)]

@@ -106,9 +106,11 @@ class CameraPictures:
             axes.set_title(f"knife edge {name}")
             curve.plot(1e-3 * reading.frequency, reading.true, color=colour, lw=1.2, label=f"{name}, traced")
             if reading.measured is not None:
-                own = reading.measured
+                measured = reading.measured
                 pitch = 1e3 * bench.ccd.band.pitch
-                curve.plot(own.frequency / pitch, own.mtf, ".", color=colour, ms=3.0, label=f"{name}, from the image")
+                curve.plot(
+                    measured.frequency / pitch, measured.mtf, ".", color=colour, ms=3.0, label=f"{name}, from the image"
+                )
             nyquist_mtf = reading.nyquist
             text = reading.reason if nyquist_mtf is None else f"{nyquist_mtf[0]:.4f} ± {nyquist_mtf[1]:.4f} at Nyquist"
             axes.set_xlabel(text, fontsize=7.5)
@@ -171,9 +173,9 @@ def _spot(figure: Figure, views: list[CameraView], field: float) -> None:
 def _mtf(figure: Figure, views: list[CameraView], field: float) -> None:
     """Draw the nominal and the present MTF."""
     for axes, one, name in zip(figure.subplots(1, 2, sharey=True), views, ("as designed", "now"), strict=True):
-        found = one.mtf((field, 0.0))
-        draw_mtf(axes, found)
-        along, across = found.at(found.nyquist)
+        mtf = one.mtf((field, 0.0))
+        draw_mtf(axes, mtf)
+        along, across = mtf.at(mtf.nyquist)
         axes.set_title(f"{name}: {along:.3f} along, {across:.3f} across at Nyquist")
     figure.axes[0].legend(fontsize=7)
 

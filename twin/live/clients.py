@@ -222,9 +222,9 @@ class Client:
         self._queued_texts.append(message)
         self._to_send.set()
 
-    def queue_json(self, told: dict[str, Any]) -> None:
+    def queue_json(self, data: dict[str, Any]) -> None:
         """Send plain data as JSON after the queued texts."""
-        self.queue_text(json.dumps(told))
+        self.queue_text(json.dumps(data))
 
     async def send(
         self, as_text: Callable[[str], Awaitable[None]], as_bytes: Callable[[bytes], Awaitable[None]]
@@ -363,12 +363,12 @@ class LiveApi:
 
     def _announce(self, state: str, problem: str = "") -> None:
         """Inform all present and later pages about the computing process; each change once."""
-        told = {"type": "computing", "state": state, "problem": problem}
-        if told == self.process_trouble or (state == "ended" and self.process_trouble.get("state") == "ended"):
+        news = {"type": "computing", "state": state, "problem": problem}
+        if news == self.process_trouble or (state == "ended" and self.process_trouble.get("state") == "ended"):
             return
-        self.process_trouble = told if problem else {}
+        self.process_trouble = news if problem else {}
         for client in self.clients:
-            client.queue_json(told)
+            client.queue_json(news)
 
     def _requeue_lost(self, client: Client, request: _Request, problem: str) -> None:
         """Put back a request during which the process ended, unless the process ended twice during it."""
@@ -406,9 +406,9 @@ class LiveApi:
         """Build the instrument with other values of a study's factors, and inform all pages."""
         for one in self.clients:
             one.queue_json({"type": "building"})
-        found = await self._ask("factors", asked.values)
-        if isinstance(found, str):
-            client.queue_json({"type": "refused", "problem": found})
+        answer = await self._ask("factors", asked.values)
+        if isinstance(answer, str):
+            client.queue_json({"type": "refused", "problem": answer})
         else:
             for one in self.clients:
                 one.shown = one.before = one.recorded = None

@@ -253,9 +253,9 @@ class Computer:
             try:
                 self._start()
                 if self._factors is not None:
-                    found = self._exchange("factors", self._factors)
-                    if not isinstance(found, str):
-                        self.opened = found
+                    answer = self._exchange("factors", self._factors)
+                    if not isinstance(answer, str):
+                        self.opened = answer
                 return
             except ComputerLost as error:
                 if attempt == ATTEMPTS or self._shutting_down:

@@ -66,12 +66,12 @@ def new_token(variable: str) -> str:
     BadToken
         The token of the environment is too short, or has characters that a cookie cannot have.
     """
-    named = os.environ.get(variable, "")
-    if not named:
+    token = os.environ.get(variable, "")
+    if not token:
         return secrets.token_urlsafe(24)
-    if len(named) < SHORTEST or not all(c.isascii() and (c.isalnum() or c in "-_") for c in named):
+    if len(token) < SHORTEST or not all(c.isascii() and (c.isalnum() or c in "-_") for c in token):
         raise BadToken(f"{variable} needs {SHORTEST} or more characters of A-Z, a-z, 0-9, - and _")
-    return named
+    return token
 
 
 @dataclass(frozen=True)
@@ -181,8 +181,8 @@ def names_of_this_machine() -> tuple[str, ...]:
 def _cookies(header: str, name: str) -> Iterator[str]:
     """Yield the values of all cookies of a name; cookies of other programs on this host may have any form."""
     for part in header.split(";"):
-        found, _, value = part.strip().partition("=")
-        if found == name:
+        key, _, value = part.strip().partition("=")
+        if key == name:
             yield value
 
 

@@ -121,17 +121,17 @@ def knobs_of(nodes: Mapping[str, NodeInfo], job: JobSpec) -> dict[str, Knob]:
     out = {}
     plain = job.plain().get("perturb", {})
     for node, info in nodes.items():
-        for kind, what in KINDS.items():
-            if what.key not in info.allows:
+        for kind, knob_kind in KINDS.items():
+            if knob_kind.key not in info.allows:
                 continue
-            given = _job_quantities(plain.get(node, {}), kind)
-            unit = _unit(given.values(), what.unit)
-            for axis in dict.fromkeys((*axes_of(kind), *given)):
-                value = _number(given.get(axis), unit, 0.0)
-                size = 1.0 if what.unit == unit else unit_ratio(what.unit, unit)
-                extent = max(what.extent * size, 2.0 * abs(value))
+            quantities = _job_quantities(plain.get(node, {}), kind)
+            unit = _unit(quantities.values(), knob_kind.unit)
+            for axis in dict.fromkeys((*axes_of(kind), *quantities)):
+                value = _number(quantities.get(axis), unit, 0.0)
+                size = 1.0 if knob_kind.unit == unit else unit_ratio(knob_kind.unit, unit)
+                extent = max(knob_kind.extent * size, 2.0 * abs(value))
                 name = knob_name(node, kind, axis)
-                out[name] = Knob(name, node, kind, axis, unit, value, extent, what.limit * size)
+                out[name] = Knob(name, node, kind, axis, unit, value, extent, knob_kind.limit * size)
     return out
 
 
@@ -301,8 +301,8 @@ def base_with_factors(setup: StudySetup, scalars: Mapping[str, Any]) -> Tree:
 
 def _fixed(factor: FactorSpec, scalar: Any) -> FactorSpec:
     """Return the factor with this value alone."""
-    kept = {"key": factor.key, "keys": factor.keys, "scales": factor.scales}
-    return FactorSpec.model_validate({**{k: v for k, v in kept.items() if v}, "values": (scalar,)})
+    keys = {"key": factor.key, "keys": factor.keys, "scales": factor.scales}
+    return FactorSpec.model_validate({**{k: v for k, v in keys.items() if v}, "values": (scalar,)})
 
 
 def _factor(name: str, factor: FactorSpec, setup: StudySetup) -> FactorKnob | None:
@@ -332,20 +332,20 @@ def _number(value: Any, unit: str, otherwise: float) -> float:
     part = split_quantity(value)
     if part is None:
         return otherwise
-    number, own = part
+    number, own_unit = part
     # dividing keeps decimal fractions where a product would not
-    return float(number) if own == unit else float(number) / unit_ratio(unit, own)
+    return float(number) if own_unit == unit else float(number) / unit_ratio(unit, own_unit)
 
 
-def _knobs(places: tuple[KeyPath, ...], unit: str) -> dict[str, float]:
+def _knobs(keys: tuple[KeyPath, ...], unit: str) -> dict[str, float]:
     """Return the knobs of a factor's keys; none if any key is not a knob."""
     out = {}
-    for place in places:
-        found = _knob(place)
-        if found is None:
+    for key in keys:
+        knob = _knob(key)
+        if knob is None:
             return {}
-        name, own = found
-        out[name] = 1.0 if unit == own else unit_ratio(unit, own) if unit else 0.0
+        name, knob_unit = knob
+        out[name] = 1.0 if unit == knob_unit else unit_ratio(unit, knob_unit) if unit else 0.0
     return out
 
 

@@ -345,8 +345,8 @@ class LiveBench:
         The job's own seed, such as that of a study's run, may exceed the numbers that a page represents exactly. The
         page then has its last bits, by which it is recognised.
         """
-        own = self.twin.resolved.job.render.seed
-        return own if asked == own & LARGEST_SEED else asked
+        job_seed = self.twin.resolved.job.render.seed
+        return job_seed if asked == job_seed & LARGEST_SEED else asked
 
     def _new_reader(self, frames: int, seed: int) -> StateReader:
         return StateReader(self.twin.experiment, frames, self.seed_of(seed), self.twin.resolved.job.analysis.centroid)
@@ -365,9 +365,9 @@ class LiveBench:
         # the knobs are a guess of what is hidden, which stands beside it and not on top of it
         state = hidden or self.states(asked)
         of_course = asked.time is not None and self.twin.resolved.job.course is not None
-        found = self._reader(asked.frames, asked.seed).read(state, asked.noise, asked.time or 0, of_course)
-        photons = found.light.photons[0]
-        frames = found.after[0] if asked.noise else None
+        reading = self._reader(asked.frames, asked.seed).read(state, asked.noise, asked.time or 0, of_course)
+        photons = reading.light.photons[0]
+        frames = reading.after[0] if asked.noise else None
         after = self._shown(frames, photons)
         run = RenderRun(
             resolved=self.twin.resolved,
@@ -375,16 +375,16 @@ class LiveBench:
             state=state,
             frames=asked.frames,
             seed=self.seed_of(asked.seed),
-            truth=found.truth,
+            truth=reading.truth,
             photons_before=experiment.nominal_photons,
             photons_after=photons,
             before=self.before(asked)[:, None],
             after=after[:, None] if frames is None else frames,
-            recovery=found.recovery,
+            recovery=reading.recovery,
             crosstalk=self._crosstalk,
             warnings=(),
         )
-        return run, after, found.light.placed
+        return run, after, reading.light.placed
 
     def _state_data(self, run: RenderRun, asked: AskedState, placed: PlacedBodies) -> dict[str, Any]:
         """Return the data of a state of an instrument with a monitor."""
@@ -407,10 +407,10 @@ class LiveBench:
     def _guess(self, asked: AskedState) -> dict[str, Any]:
         """Return the expected images and spots of the knobs as a guess of the hidden motions."""
         try:
-            made = self._reader(asked.frames, asked.seed).read(self.states(asked), noise=False)
+            reading = self._reader(asked.frames, asked.seed).read(self.states(asked), noise=False)
         except IMPOSSIBLE as error:
             return {"problem": str(error)}
-        return {"spots": made.recovery.after[0].tolist(), "image": self._shown(None, made.light.photons[0])}
+        return {"spots": reading.recovery.after[0].tolist(), "image": self._shown(None, reading.light.photons[0])}
 
     def _warnings(self, run: RenderRun, light: np.ndarray) -> list[str]:
         """Return warnings of coarse sampling, saturation and lost light."""

@@ -93,8 +93,8 @@ class Source:
             if name not in known:
                 raise InputError(unknown("no such factor", name, known).at())
         scalars = {**(self.scalars or {}), **{name: known[name].scalar(value) for name, value in values.items()}}
-        made: ResolvedJob = validate(ResolvedJob, YamlFile("", base_with_factors(self.study, scalars), {}))
-        return made.with_render(made.frames, self.resolved.job.render.seed) if self.has_own_seed else made
+        job: ResolvedJob = validate(ResolvedJob, YamlFile("", base_with_factors(self.study, scalars), {}))
+        return job.with_render(job.frames, self.resolved.job.render.seed) if self.has_own_seed else job
 
 
 def read_source(what: str, run: int | None = None) -> Source:
@@ -200,15 +200,15 @@ def _nothing_to_show(place: Path, what: str, folder: Path, data: Any = None) -> 
     remedies = []
     if (folder / REPORT).is_file():
         remedies.append(f"its results are in {folder / REPORT}")
-    found = sorted(one for one in (folder / "artefacts").glob("*.yaml") if _is_instrument(one))
-    given = data.get("instrument") if isinstance(data, dict) else None
-    name = given.get("name") if isinstance(given, dict) else None
-    if found:
-        remedies.append(f"python -m {PROGRAM} {found[0]} opens an instrument that it made")
+    instruments = sorted(one for one in (folder / "artefacts").glob("*.yaml") if _is_instrument(one))
+    instrument = data.get("instrument") if isinstance(data, dict) else None
+    name = instrument.get("name") if isinstance(instrument, dict) else None
+    if instruments:
+        remedies.append(f"python -m {PROGRAM} {instruments[0]} opens an instrument that it made")
     elif name in library_names(INSTRUMENTS):
         remedies.append(f"python -m {PROGRAM} {name} opens its instrument")
-    told = "; ".join(["this is " + what + ", which contains no state of a monitor to show", *remedies])
-    return Issue(told, str(place), allowed=ALLOWED)
+    text = "; ".join(["this is " + what + ", which contains no state of a monitor to show", *remedies])
+    return Issue(text, str(place), allowed=ALLOWED)
 
 
 def _is_instrument(file: Path) -> bool:

@@ -244,8 +244,8 @@ def _names_own_instrument(instrument: str | None, history: History) -> bool:
         return False
     digest = digest_of_job(resolve_with(instrument))
     if digest != history.sha256:
-        own = f"{history.name} ({history.sha256[:12]})"
-        raise InputErrorText(f"--instrument: the record is of {own}, not of {instrument} ({digest[:12]})")
+        expected = f"{history.name} ({history.sha256[:12]})"
+        raise InputErrorText(f"--instrument: the record is of {expected}, not of {instrument} ({digest[:12]})")
     return True
 
 
@@ -290,19 +290,21 @@ def status(
     Exit codes: 0 success, whether alarms are open or not, 2 bad input, 3 with --strict if the latest readings
     contradict the prior, 1 anything else.
     """
-    found = call.estimate(plan) if plan is not None or call.has_estimate else None
+    estimate_of_record = call.estimate(plan) if plan is not None or call.has_estimate else None
     rows = call.history.alarms()
     opened = sum(row["acknowledged"] is None for row in rows)
-    power = () if found is None else found[0].power()
+    power = () if estimate_of_record is None else estimate_of_record[0].power()
     detection_power = {one.body: one.plain for one in power}
-    estimate = None if found is None else {**found[1].to_dict(), "detectable_jumps": detection_power}
-    held = call.history.status(check_all)
-    data = {**held, "warnings": _record_warnings(held), "estimate": estimate, "open_alarms": opened}
+    estimate = (
+        None if estimate_of_record is None else {**estimate_of_record[1].to_dict(), "detectable_jumps": detection_power}
+    )
+    contents = call.history.status(check_all)
+    data = {**contents, "warnings": _record_warnings(contents), "estimate": estimate, "open_alarms": opened}
 
     def show(console: Console) -> None:
         _show(data, console)
-        if found is not None:
-            show_estimate(found[1], rows, console)
+        if estimate_of_record is not None:
+            show_estimate(estimate_of_record[1], rows, console)
         if power:
             show_power(power, console)
 

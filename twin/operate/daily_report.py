@@ -304,8 +304,8 @@ def _required_cells(overview: Overview, quantity: Quantity) -> list[Cell]:
 
 def _changed_section(overview: Overview, begin: int, end: int) -> Section:
     """Return the section on the changes of the day."""
-    found = [occurrence for occurrence in overview.changed(begin, end) if not occurrence.again]
-    lines = tuple(f"{minute_text(one.time)}: {one.text}" for one in found)
+    occurrences = [occurrence for occurrence in overview.changed(begin, end) if not occurrence.again]
+    lines = tuple(f"{minute_text(one.time)}: {one.text}" for one in occurrences)
     what = f"Between {minute_text(begin)} and {minute_text(end)} UTC.{'' if lines else ' Nothing occurrences.'}"
     shown = (Text("changed", "", "", lines[-MOST_SHOWN:], within=""),) if lines else ()
     return Section("What changed", (what,), shown, name="changed")
@@ -340,12 +340,15 @@ def _figure(name: str, title: str, svg: str) -> SvgFigure:
 
 def _motion_section(overview: Overview) -> Section | None:
     """Return the section of the most significant motions of bodies, all causes together; None without any."""
-    found, stated = overview.operation.motions(overview.time), overview.operation.experiment.stated
+    motions, stated = overview.operation.motions(overview.time), overview.operation.experiment.stated
     moving = () if stated is None else [component for component in stated.components if component.kind not in HEAT]
     rows: list[tuple[float, list[Cell]]] = []
     for name, unit in {one.name: one.unit for one in moving}.items():
-        own = np.array([label == name for label in found.labels], np.float64)
-        mean, sigma = float(own @ found.mean), math.sqrt(max(float(own @ found.covariance @ own), 0.0))
+        selected = np.array([label == name for label in motions.labels], np.float64)
+        mean, sigma = (
+            float(selected @ motions.mean),
+            math.sqrt(max(float(selected @ motions.covariance @ selected), 0.0)),
+        )
         places = decimals_for(sigma)
         ratio = abs(mean) / sigma if sigma else 0.0
         numbers = DecimalNumber(mean, places), DecimalNumber(sigma, places), DecimalNumber(ratio, 1)
@@ -444,8 +447,8 @@ def _jump_section(overview: Overview) -> Section | None:
             "readings. Its change of the line of sight is averaged over all bodies that can have jumped; others "
             "are listed with their log likelihood ratios. Times are UTC."
         )
-        own = Table("jumps", "Detected jumps", "", digits, full, within="")
-        artefacts.append(replace(_newest("jumps", own.title, caption, heads, rows), full=own))
+        table = Table("jumps", "Detected jumps", "", digits, full, within="")
+        artefacts.append(replace(_newest("jumps", table.title, caption, heads, rows), full=table))
     if events:
         artefacts.append(Text("events", "Events of the record", "", events[::-1][:MOST_SHOWN], within=""))
     words = () if artefacts else ("No jump was detected, and the record has no event.",)
@@ -514,12 +517,12 @@ def _excluded_section(history: History, overview: Overview) -> Section:
         caption = "In the record, but not used for the estimate. Times are UTC."
         artefacts.append(_newest("excluded", "Excluded readings", caption, ("time", "kind", "subject", "reason"), rows))
     if refused:
-        own: list[list[Cell]] = [
+        refused_rows: list[list[Cell]] = [
             [one["refused_utc"], f"{one['file']}{'' if one['line'] is None else ':' + str(one['line'])}", one["reason"]]
             for one in refused[::-1]
         ]
         caption = "Refused at the ingest of their files, and not in the record."
-        artefacts.append(_newest("refused", "Refused", caption, ("refused [UTC]", "file", "reason"), own))
+        artefacts.append(_newest("refused", "Refused", caption, ("refused [UTC]", "file", "reason"), refused_rows))
     words = () if artefacts else ("Nothing was excluded or refused.",)
     return Section("Excluded and refused", words, tuple(artefacts), name="excluded")
 

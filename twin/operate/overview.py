@@ -75,9 +75,9 @@ def readings(history: History, begin: int, end: int, most: int) -> list[dict[str
     c = ENTRY.c
     query = select(c.id).where(c.kind == KIND, c.time_us >= begin, c.time_us <= end).order_by(c.time_us, c.id)
     with history.reading() as connection:
-        found = list(connection.execute(query).scalars())
-        step = max(1, -(-len(found) // most))
-        chosen = found[::-1][::step][::-1]  # the newest is always among them
+        ids = list(connection.execute(query).scalars())
+        step = max(1, -(-len(ids) // most))
+        chosen = ids[::-1][::step][::-1]  # the newest is always among them
         rows: list[dict[str, Any]] = []
         for k in range(0, len(chosen), _BATCH):
             part = connection.execute(_rows().where(c.id.in_(chosen[k : k + _BATCH])).order_by(c.time_us, c.id))
@@ -319,8 +319,8 @@ class Overview:
 
     def changed(self, begin: int, end: int) -> list[Occurrence]:
         """Return the occurrences from a time on and before another one, in the order of time."""
-        found = [occurrence for occurrence in self.occurrences() if begin <= occurrence.time < end]
-        return sorted(found, key=lambda one: one.time)
+        occurrences = [occurrence for occurrence in self.occurrences() if begin <= occurrence.time < end]
+        return sorted(occurrences, key=lambda one: one.time)
 
     def state_sentence(self) -> str:
         """Return the sentence on the requirements: whether they hold, and which is the most critical."""
@@ -352,8 +352,8 @@ class Overview:
         when : str
             Name of the span in the sentence.
         """
-        found = self.changed(begin, end)
-        counts = {kind: sum(one.kind == kind for one in found) for kind in _COUNTED}
+        occurrences = self.changed(begin, end)
+        counts = {kind: sum(one.kind == kind for one in occurrences) for kind in _COUNTED}
         parts = [_count_text(n, *_COUNTED[kind]) for kind, n in counts.items() if n]
         if not parts:
             return f"Nothing happened {when}"
@@ -388,8 +388,8 @@ class Overview:
 
     def open_alarms(self) -> list[Mapping[str, Any]]:
         """Return the open alarms, the newest first."""
-        found = [alarm for alarm in self.alarms if alarm["acknowledged"] is None]
-        return sorted(found, key=lambda one: -int(one["time_us"]))
+        alarms = [alarm for alarm in self.alarms if alarm["acknowledged"] is None]
+        return sorted(alarms, key=lambda one: -int(one["time_us"]))
 
     def _name(self, one: RequirementStatus) -> str:
         return name_of(one.quantity, self.quantities)

@@ -174,9 +174,9 @@ def _jumps(
         return
     span = (int(times[-1]) - int(times[0])) / MICRO
     for body in dict.fromkeys(stated.components[k].body for k in motions):
-        own = [k for k in motions if stated.components[k].body == body]
+        stepping = [k for k in motions if stated.components[k].body == body]
         for second in np.sort(rng.uniform(0.0, span, rng.poisson(span / mean_interval))).tolist():
-            yield Step(int(times[0]) + round(second * MICRO), cause, body, "", _step(stated, own, rng))
+            yield Step(int(times[0]) + round(second * MICRO), cause, body, "", _step(stated, stepping, rng))
 
 
 def _step(stated: DisturbancePrior, where: Sequence[int], rng: np.random.Generator) -> Array:

@@ -350,16 +350,16 @@ class EstimatorState:
         """
         assert self.pending is not None
         number, time = self.pending
-        kept = [one for one in self.excluded if (one[0], one[1]) != (time, "monitor")]
+        entries = [one for one in self.excluded if (one[0], one[1]) != (time, "monitor")]
         bad = tuple(one for one in self.bad_readings if one[0] != time)
         if not excluded:
-            return replace(self, pending=None, excluded=tuple(kept), bad_readings=bad)
+            return replace(self, pending=None, excluded=tuple(entries), bad_readings=bad)
         good, bad = self.used != number, (*bad, (time, excluded))
-        kept = [*kept, (time, "monitor", "monitor", excluded)]
+        entries = [*entries, (time, "monitor", "monitor", excluded)]
         return replace(
             self,
             pending=None,
-            excluded=tuple(kept),
+            excluded=tuple(entries),
             bad_readings=bad,
             used=self.used[good],
             undetected_shares=self.undetected_shares[good],
@@ -380,8 +380,8 @@ class EstimatorState:
 
         Where several sensors disagree at the same time, the prior is wrong and not all of these sensors.
         """
-        found = tuple(sorted(sensor.body for sensor in self.sensors.values() if sensor.disagrees))
-        return found if len(found) > 1 else ()
+        bodies = tuple(sorted(sensor.body for sensor in self.sensors.values() if sensor.disagrees))
+        return bodies if len(bodies) > 1 else ()
 
     def with_innovation(self, time: int, found: Innovation) -> EstimatorState:
         """Return the state with the innovation of a reading of the monitor that was used."""
@@ -491,21 +491,21 @@ class EntryFilter:
             value, noise = np.array([float(content["values"][0]) - self.temperature]), float(content["sigma"]) ** 2
             return Observed(time, value, np.array([[noise]]), (number,))
         spots = content["numbers"]["spots"]
-        found = [spots[camera][channel]["after"] for camera, channel in self.model.spots]
-        place = np.array([(one["row"], one["column"]) for one in found])
-        sigma = np.array([(one["row_sigma"], one["column_sigma"]) for one in found])
-        return Observed(time, (place - self.reference).ravel(), np.diag(sigma.ravel() ** 2))
+        spots_after = [spots[camera][channel]["after"] for camera, channel in self.model.spots]
+        positions = np.array([(spot["row"], spot["column"]) for spot in spots_after])
+        sigma = np.array([(spot["row_sigma"], spot["column_sigma"]) for spot in spots_after])
+        return Observed(time, (positions - self.reference).ravel(), np.diag(sigma.ravel() ** 2))
 
     def _updated(
         self, state: EstimatorState, entry: Mapping[str, Any], observed: Observed
     ) -> tuple[EstimatorState, Innovation]:
         """Return the state updated with one observation, and the innovation."""
-        filter_state, found = self.series_filter.update(state.filter_state, observed, entry["decided"] is not None)
+        filter_state, innovation = self.series_filter.update(state.filter_state, observed, entry["decided"] is not None)
         used = np.append(state.used, np.int64(entry["id"]))
         # of no motion that may jump there is nothing to count rows by
         before = state.undetected_shares.reshape(len(state.used), len(self.series_filter.walking))
         left = np.concatenate([before, state.filter_state.undetected[None]])
-        return replace(state, filter_state=filter_state, used=used, undetected_shares=left), found
+        return replace(state, filter_state=filter_state, used=used, undetected_shares=left), innovation
 
     def _temperature(self, state: EstimatorState, entry: Mapping[str, Any]) -> EstimatorState:
         """Return the state updated with the reading of a temperature sensor."""
@@ -526,9 +526,9 @@ class EntryFilter:
         state = replace(state, sensors={**state.sensors, body: sensor})
         if body in state.jointly_disagreeing:  # then it is not the sensor that is wrong
             times = max(abs(white), 1.0)
-            loose = self.series_filter.inflated(there, observed, times) if times > INFLATION_SIGMAS else there
+            inflated = self.series_filter.inflated(there, observed, times) if times > INFLATION_SIGMAS else there
             disagreeing = tuple(sorted({*state.disagreeing, *state.jointly_disagreeing}))
-            state = replace(state, filter_state=loose, disagreeing=disagreeing)
+            state = replace(state, filter_state=inflated, disagreeing=disagreeing)
         elif abs(white) > OUTLIER_SIGMAS and not included:
             reason = f"{abs(white):.3g} standard deviations from its prediction"
             return state.excluding(time, "temperature", body, reason)
@@ -540,15 +540,15 @@ class EntryFilter:
         if entry["content"]["numbers"].get("sigma_holds") is False:
             return state.excluding(time, "monitor", "monitor", "its reported sigma does not hold")
         observed, before = self.observed(entry), state.filter_state.pending
-        state, found = self._updated(state, entry, observed)
-        if found.settled and state.pending is not None and before is not None:
+        state, innovation = self._updated(state, entry, observed)
+        if innovation.settled and state.pending is not None and before is not None:
             number, when = state.pending
-            state = state.with_decision("" if found.earlier else self._outlier_text(number, before.innovation))
-            if found.earlier is not None:
-                state = state.with_innovation(when, found.earlier)
-        if found.bad is not None:
+            state = state.with_decision("" if innovation.earlier else self._outlier_text(number, before.innovation))
+            if innovation.earlier is not None:
+                state = state.with_innovation(when, innovation.earlier)
+        if innovation.bad is not None:
             number = int(entry["id"])
-            reason = f"{self._outlier_text(number, found)}; the next reading decides whether it is excluded"
+            reason = f"{self._outlier_text(number, innovation)}; the next reading decides whether it is excluded"
             state = replace(
                 state, pending=(number, time), bad_readings=(*state.bad_readings, (time, reason))[-HISTORY_LENGTH:]
             )
@@ -558,15 +558,15 @@ class EntryFilter:
         rest = values - rows @ space.heat_outputs(filter_state.mean, observed.time)[space.width :]
         spread = np.stack([values, values**2, rest, rest**2])
         return replace(
-            state.with_innovation(time, found),
-            jumps=state.jumps if found.jump is None else (*state.jumps, JumpDetection(time, found.jump)),
-            scatter_sums=state.scatter_sums + (spread if found.earlier is None else 2.0 * spread),
+            state.with_innovation(time, innovation),
+            jumps=state.jumps if innovation.jump is None else (*state.jumps, JumpDetection(time, innovation.jump)),
+            scatter_sums=state.scatter_sums + (spread if innovation.earlier is None else 2.0 * spread),
         )
 
-    def _outlier_text(self, number: int, found: Innovation) -> str:
+    def _outlier_text(self, number: int, innovation: Innovation) -> str:
         """Return in words why a reading is rejected as an outlier."""
-        assert found.bad is not None
-        camera, channel = self.model.spots[found.bad.coordinate // 2]
-        axis = ("row", "column")[found.bad.coordinate % 2]
-        text = f"entry {number}: the {axis} of spot {camera}/{channel} is {abs(found.bad.z):.3g} sigma from its"
+        assert innovation.bad is not None
+        camera, channel = self.model.spots[innovation.bad.coordinate // 2]
+        axis = ("row", "column")[innovation.bad.coordinate % 2]
+        text = f"entry {number}: the {axis} of spot {camera}/{channel} is {abs(innovation.bad.z):.3g} sigma from its"
         return f"{text} prediction, and no jump of the stated size explains it"

@@ -107,15 +107,15 @@ class Operation:
         self.epoch = int(first["time_us"])
         before = [
             (camera, channel, one["before"])
-            for camera, own in content_of(first)["numbers"]["spots"].items()
-            for channel, one in own.items()
+            for camera, parts in content_of(first)["numbers"]["spots"].items()
+            for channel, one in parts.items()
         ]
         self._before = {(camera, channel): one for camera, channel, one in before}
         self._sensors = tuple(body for body in history.subjects("temperature") if body in history.bodies["warm"])
         self._plan_digest: str = plan_digest(plan) if previous is None else previous._plan_digest
         order = [list(plan.model.instrument.cameras), list(plan.disturbances.causes)]
-        own = [self._plan_digest, order, self.epoch, list(self._sensors), [list(one) for one in before]]
-        self.key = digest_of_data([source_digest(), *own])
+        parts = [self._plan_digest, order, self.epoch, list(self._sensors), [list(one) for one in before]]
+        self.key = digest_of_data([source_digest(), *parts])
         """By which it is recognised what an estimate rests on beside the readings."""
         if previous is not None and previous.key == self.key:
             known = vars(previous)
@@ -136,13 +136,13 @@ class Operation:
     @cached_property
     def model(self) -> OperationModel:
         """Traced model, read from the record if it is kept there."""
-        kept = self.history.checkpoint(self.key, number=_MODEL)
-        if kept is not None:
-            return cast("OperationModel", unpacked(kept.content, OperationModel))
+        checkpoint = self.history.checkpoint(self.key, number=_MODEL)
+        if checkpoint is not None:
+            return cast("OperationModel", unpacked(checkpoint.content, OperationModel))
         sigma = np.array([(one["row_sigma"], one["column_sigma"]) for one in self._before.values()])
-        made = traced_model(self.plan, sigma, self._sensors, self.experiment)
-        self.history.save_checkpoint(self.key, _MODEL, -(2**62), 0, packed(made))
-        return made
+        model = traced_model(self.plan, sigma, self._sensors, self.experiment)
+        self.history.save_checkpoint(self.key, _MODEL, -(2**62), 0, packed(model))
+        return model
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
@@ -152,17 +152,17 @@ class Operation:
     @cached_property
     def events(self) -> tuple[tuple[int, str, tuple[str, ...]], ...]:
         """(time_us, name, causes) of the record's events that step motions under the plan."""
-        found = ((int(entry["time_us"]), str(entry["subject"])) for entry in self.history.entries("event"))
+        events = ((int(entry["time_us"]), str(entry["subject"])) for entry in self.history.entries("event"))
         known = self.plan.operation.events
-        return tuple((time, name, tuple(known[name])) for time, name in found if known.get(name))
+        return tuple((time, name, tuple(known[name])) for time, name in events if known.get(name))
 
     @cached_property
     def _entry_filter(self) -> EntryFilter:
         """Filter with the record's events as steps."""
         causes = self.model.series_filter.stated.causes
         steps = []
-        for time, _, own in self.events:
-            motions = tuple(k for k, cause in enumerate(causes) if cause in own)
+        for time, _, stepping in self.events:
+            motions = tuple(k for k, cause in enumerate(causes) if cause in stepping)
             steps.append(Step(((motions, 1.0),), (((time - self.epoch) / MICRO, 1.0),)))
         series_filter = replace(self.model.series_filter, steps=tuple(steps))
         reference = np.array([(self._before[spot]["row"], self._before[spot]["column"]) for spot in self.model.spots])
@@ -170,8 +170,8 @@ class Operation:
 
     def _moments(self, after_us: int | None) -> Iterator[list[dict[str, Any]]]:
         """Yield the entries that the estimate uses, grouped by time, in the order of time."""
-        own = (entry for entry in self.history.entries(after_us=after_us) if entry["kind"] in USED)
-        for _, entries in groupby(own, key=lambda one: int(one["time_us"])):
+        used = (entry for entry in self.history.entries(after_us=after_us) if entry["kind"] in USED)
+        for _, entries in groupby(used, key=lambda one: int(one["time_us"])):
             yield [
                 {**entry, "content": content_of(entry), "decided": self._decisions.get(entry["id"])}
                 for entry in entries
@@ -180,8 +180,8 @@ class Operation:
     @cached_property
     def _decisions(self) -> dict[int, tuple[bool, str]]:
         """Id of an entry about which a person has decided -> whether it is included, and why."""
-        found = (content_of(entry) for entry in self.history.entries(DECISION))
-        return {int(one["entry"]): (bool(one["included"]), str(one["why"])) for one in found}
+        decisions = (content_of(entry) for entry in self.history.entries(DECISION))
+        return {int(decision["entry"]): (bool(decision["included"]), str(decision["why"])) for decision in decisions}
 
     @cached_property
     def estimator_state(self) -> EstimatorState:
@@ -225,12 +225,12 @@ class Operation:
         since = min(time for _, time in state.newly_stuck)
         self.history.drop_checkpoints(self.key, since)
         self._saved = 0
-        kept = self.history.checkpoint(self.key, before_us=since, valid=True)
+        checkpoint = self.history.checkpoint(self.key, before_us=since, valid=True)
         return (
             None
-            if kept is None
+            if checkpoint is None
             else replace(
-                EstimatorState.from_bytes(kept.content).with_counters_reset(), stuck_sensors=self._stuck_sensors
+                EstimatorState.from_bytes(checkpoint.content).with_counters_reset(), stuck_sensors=self._stuck_sensors
             )
         )
 
@@ -239,24 +239,24 @@ class Operation:
         state, newest = self._previous
         if state is not None and not self.history.came_late(newest, state.time):
             return state
-        kept = self.history.checkpoint(self.key, valid=True)
-        if kept is None:
+        checkpoint = self.history.checkpoint(self.key, valid=True)
+        if checkpoint is None:
             return None
-        state = EstimatorState.from_bytes(kept.content)
+        state = EstimatorState.from_bytes(checkpoint.content)
         self._saved = state.scores.readings
         if not self._has_same_basis(state):
             self.history.drop_checkpoints(self.key, self.epoch)
             self._saved = 0
             return None
         # what was used up to one that is kept for good is kept with it
-        return state.with_counters_reset() if kept.number > _HEAD else state
+        return state.with_counters_reset() if checkpoint.number > _HEAD else state
 
     def _has_same_basis(self, state: EstimatorState) -> bool:
         """Return whether a saved state uses the state basis that this computer's linear algebra gives."""
-        own = self._entry_filter.series_filter.space.basis
-        if state.basis.shape != own.shape:
+        basis = self._entry_filter.series_filter.space.basis
+        if state.basis.shape != basis.shape:
             return False
-        return bool(np.all(np.abs(state.basis - own) <= 1e-9 * np.abs(own).max(axis=1, keepdims=True)))
+        return bool(np.all(np.abs(state.basis - basis) <= 1e-9 * np.abs(basis).max(axis=1, keepdims=True)))
 
     def _save_state(self, state: EstimatorState, number: int, newest: int) -> None:
         """Save the estimator's state in the record under a number."""
@@ -314,7 +314,7 @@ class Operation:
         lasting = (k for k in heat.motions.tolist() if stated.bodies[k] in disagreeing and not stated.laws[k].white)
         return tuple(dict.fromkeys(stated.causes[k] for k in lasting))
 
-    def _detected_jump(self, told: int, jump: Jump) -> DetectedJump:
+    def _detected_jump(self, detected_us: int, jump: Jump) -> DetectedJump:
         """Return a jump with its sizes and its effect on every quantity, as it is reported."""
         sizes = tuple(zip(jump.labels, jump.units, jump.sizes, jump.sigmas, strict=True))
         after, until = (self.epoch + round(time * MICRO) for time in (jump.after, jump.until))
@@ -325,7 +325,7 @@ class Operation:
         each = zip(self.quantities, read.tolist(), changed.tolist(), sigma.tolist(), strict=True)
         line_changes = {one.name: (was, now, spread) for one, was, now, spread in each}
         return DetectedJump(
-            jump.body, after, until, told, sizes, jump.log_ratio, jump.chance, jump.rivals, line_changes
+            jump.body, after, until, detected_us, sizes, jump.log_ratio, jump.chance, jump.rivals, line_changes
         )
 
     def _requirement_status(self) -> tuple[RequirementStatus, ...]:
@@ -375,8 +375,8 @@ class Operation:
             raise Problem("the time of the forecast is in the past", utc_text(int(times.min())), allowed)
         series_filter = self._entry_filter.series_filter
         with one_blas_thread():
-            found = [series_filter.parameters(self._now, self._entry_filter.seconds(int(time))) for time in times]
-        return self._course(times, found, np.full(len(times), self._sigma_inflation))
+            estimates = [series_filter.parameters(self._now, self._entry_filter.seconds(int(time))) for time in times]
+        return self._course(times, estimates, np.full(len(times), self._sigma_inflation))
 
     @cached_property
     def _now(self) -> FilterState:
@@ -387,17 +387,17 @@ class Operation:
     def _sigma_inflation(self) -> float:
         """Factor of the present sigmas where the latest readings contradict the prior; 1 if they do not."""
         squares = self._unexplained(self.estimator_state.innovations)
-        told = [time for time, _, _ in self.estimator_state.innovations]
-        return float(inflation_factors(squares, [len(squares)], False, self._lasting(told))[0])
+        times = [time for time, _, _ in self.estimator_state.innovations]
+        return float(inflation_factors(squares, [len(squares)], False, self._lasting(times))[0])
 
-    def _lasting(self, told: Sequence[int]) -> list[tuple[int, Array]]:
+    def _lasting(self, times: Sequence[int]) -> list[tuple[int, Array]]:
         """Return contradictions that inflate sigma permanently, each with the number of readings before it.
 
         They are those of the first readings, and the residuals that a detected jump leaves unexplained.
         """
         out = [(0, self._unexplained(self.estimator_state.first_innovations))]
         jumps = [] if self.too_many_jumps else self.estimator_state.jumps
-        return out + [(int(np.searchsorted(told, jump.time)) + 1, np.array([jump.jump.rest])) for jump in jumps]
+        return out + [(int(np.searchsorted(times, jump.time)) + 1, np.array([jump.jump.rest])) for jump in jumps]
 
     @cached_property
     def too_many_jumps(self) -> bool:
@@ -406,8 +406,8 @@ class Operation:
         A body without a stated rate counts as one expected jump.
         """
         stated, lasted = self.model.series_filter.stated, (self.estimator_state.time - self.epoch) / MICRO
-        every = {body: law.every_s for body, law in zip(stated.bodies, stated.laws, strict=True) if law.jump}
-        mean = sum(1.0 if rate is None else lasted / rate for rate in every.values())
+        mean_intervals = {body: law.every_s for body, law in zip(stated.bodies, stated.laws, strict=True) if law.jump}
+        mean = sum(1.0 if rate is None else lasted / rate for rate in mean_intervals.values())
         count = len(self.estimator_state.jumps)
         return bool(count > 1 and pdtrc(count - 1, mean) < FALSE_ALARM)
 
@@ -427,11 +427,13 @@ class Operation:
             out[(times > jump.after_us) & (times <= jump.detected_us)] = 0.0
         return out
 
-    def _course(self, times: NDArray[np.int64], found: Sequence[tuple[Array, Array]], sigma_inflation: Array) -> Course:
+    def _course(
+        self, times: NDArray[np.int64], estimates: Sequence[tuple[Array, Array]], sigma_inflation: Array
+    ) -> Course:
         """Return the course of all quantities from parameters and covariances at the times."""
         rows = self.model.rows
-        changes = np.array([one for one, _ in found]).reshape(len(times), rows.shape[1])
-        covariance = np.array([one for _, one in found]).reshape(len(times), rows.shape[1], rows.shape[1])
+        changes = np.array([one for one, _ in estimates]).reshape(len(times), rows.shape[1])
+        covariance = np.array([one for _, one in estimates]).reshape(len(times), rows.shape[1], rows.shape[1])
         covariance = covariance * sigma_inflation[:, None, None] ** 2
         variance = np.einsum("qi,tij,qj->tq", rows, covariance, rows)
         sigmas = np.sqrt(np.maximum(variance, 0.0))
@@ -451,15 +453,15 @@ class Operation:
             A time is before the first reading.
         """
         times = np.asarray(times_us, np.int64)
-        found = self._states_at(times, self._entry_filter.series_filter.parameters_of)
-        return self._course(times, found, self._sigma_inflation_at(times))
+        estimates = self._states_at(times, self._entry_filter.series_filter.parameters_of)
+        return self._course(times, estimates, self._sigma_inflation_at(times))
 
     def _sigma_inflation_at(self, times: NDArray[np.int64]) -> Array:
         """Return the factors (T,) of sigmas at past times; after the newest reading the present factor."""
-        told = [one for span in self._segments(None) for one in span.new_innovations]
-        squares = self._unexplained(told)
-        number = np.searchsorted([time for time, _, _ in told], times, side="right")
-        out = inflation_factors(squares, number, True, self._lasting([time for time, _, _ in told]))
+        innovations = [one for span in self._segments(None) for one in span.new_innovations]
+        squares = self._unexplained(innovations)
+        counts = np.searchsorted([time for time, _, _ in innovations], times, side="right")
+        out = inflation_factors(squares, counts, True, self._lasting([time for time, _, _ in innovations]))
         out[times >= self.estimator_state.time] = self._sigma_inflation
         return out
 
@@ -484,11 +486,11 @@ class Operation:
             self._entry_filter.series_filter, steps=(*self._entry_filter.series_filter.steps, *self._steps())
         )
         since = self._entry_filter.seconds(self.epoch)
-        found = self._states_at(
+        estimates = self._states_at(
             np.array([time_us], np.int64),
             lambda mean, covariance, time: series_filter.motions_of(mean, covariance, time, since, acting),
         )
-        (mean, spread), size = found[0], stated.sigmas
+        (mean, spread), size = estimates[0], stated.sigmas
         spread = spread * self._sigma_inflation_at(np.array([time_us], np.int64))[0] ** 2
         return Motions(int(time_us), stated.labels, stated.units, size * mean, size[:, None] * spread * size)
 
@@ -598,12 +600,12 @@ class Operation:
     def _all_segments(self) -> list[EstimatorState]:
         """All permanent checkpoints, and the newest state."""
         last = self.estimator_state  # what is new is taken and kept first
-        kept = (
+        checkpoints = (
             EstimatorState.from_bytes(checkpoint.content)
             for checkpoint in self.history.checkpoints(self.key)
             if checkpoint.number > _HEAD
         )
-        return [*(replace(one, filter_state=_without_search(one.filter_state)) for one in kept), last]
+        return [*(replace(one, filter_state=_without_search(one.filter_state)) for one in checkpoints), last]
 
     def _begin(self) -> int:
         """Return the time of the first entry that the estimate uses, in microseconds of TAI since 2000."""
@@ -613,14 +615,16 @@ class Operation:
         """Return the newest permanent checkpoint before a time and before all jumps detected since; or None."""
         last = self.estimator_state
         while True:
-            kept = self.history.checkpoint(self.key, before_us=time, valid=True)
-            if kept is None:
+            checkpoint = self.history.checkpoint(self.key, before_us=time, valid=True)
+            if checkpoint is None:
                 return None
             earlier = [
-                self.epoch + int(jump.jump.chances[0][0] * MICRO) for jump in last.jumps if jump.time > kept.time_us
+                self.epoch + int(jump.jump.chances[0][0] * MICRO)
+                for jump in last.jumps
+                if jump.time > checkpoint.time_us
             ]
-            if not earlier or min(earlier) >= kept.time_us:
-                return EstimatorState.from_bytes(kept.content)
+            if not earlier or min(earlier) >= checkpoint.time_us:
+                return EstimatorState.from_bytes(checkpoint.content)
             time = min(earlier)
 
 

@@ -140,19 +140,21 @@ def heat_inputs(
     for column, k in enumerate(heat):
         one = stated.components[k]
         gradient = tuple(one.sigma if one.kind == "gradient" and one.axis == axis else 0.0 for axis in range(3))
-        own = Temperature(one.sigma if one.kind == "temperature" else 0.0, (gradient[0], gradient[1], gradient[2]))
-        fields = thermal.fields({**still, one.body: own})
+        temperature = Temperature(
+            one.sigma if one.kind == "temperature" else 0.0, (gradient[0], gradient[1], gradient[2])
+        )
+        fields = thermal.fields({**still, one.body: temperature})
         rows[:, column] = [fields[body].change if body in fields else 0.0 for body in sensors]
     read = np.any(rows != 0.0, axis=1)
-    seen = np.any(rows != 0.0, axis=0)
-    if not np.any(seen):
+    observed = np.any(rows != 0.0, axis=0)
+    if not np.any(observed):
         return None
-    motions = np.array(heat)[seen]
+    motions = np.array(heat)[observed]
     bodies = [stated.components[k].body for k in motions.tolist()]
     names = tuple(dict.fromkeys(bodies))
-    told = tuple(body for body, own in zip(sensors, read, strict=True) if own)
+    reading_bodies = tuple(body for body, temperature in zip(sensors, read, strict=True) if temperature)
     factors = np.array([names.index(body) for body in bodies])
-    return HeatInputs(motions, told, rows[np.ix_(read, seen)], factors, names, sigma)
+    return HeatInputs(motions, reading_bodies, rows[np.ix_(read, observed)], factors, names, sigma)
 
 
 def read_plan(path: Path, history: History) -> OperationSetup:
@@ -218,8 +220,8 @@ def plan_digest(setup: OperationSetup) -> str:
     The requirements, and the locations of its files, do not count.
     """
     plain = setup.plain()
-    own = {key: value for key, value in plain["operation"].items() if key not in _NO_PART}
-    return digest_of_data({"operation": own, "model": {k: v for k, v in plain["model"].items() if k != "job"}})
+    operation = {key: value for key, value in plain["operation"].items() if key not in _NO_PART}
+    return digest_of_data({"operation": operation, "model": {k: v for k, v in plain["model"].items() if k != "job"}})
 
 
 _NO_PART = ("instrument", "disturbances", "horizon", "requirements")

@@ -67,8 +67,8 @@ class Course:
         """Return plain data: group -> key -> values at all times, with the sigmas beside them."""
         out: dict[str, Any] = {"times_utc": list(self.utc)}
         for k, quantity in enumerate(self.quantities):
-            own = out.setdefault(quantity.group, {})
-            own |= {quantity.key: self.values[:, k].tolist(), f"{quantity.key}_sigma": self.sigmas[:, k].tolist()}
+            group = out.setdefault(quantity.group, {})
+            group |= {quantity.key: self.values[:, k].tolist(), f"{quantity.key}_sigma": self.sigmas[:, k].tolist()}
         return out
 
 

@@ -88,10 +88,10 @@ class History:
         self._engine = opened(url)
         self.url = url.render_as_string(hide_password=True)
         with self.reading() as connection:
-            found = schema.version(connection)
-            if found == 0:
+            version = schema.version(connection)
+            if version == 0:
                 raise NotARecord(f"no record in {self.url}; python -m twin.operate init makes one")
-            schema.require_version(found)
+            schema.require_version(version)
             row = connection.execute(select(INSTRUMENT)).mappings().one()
         self.name, self.sha256 = str(row["name"]), str(row["sha256"])
         self.temperature, self.simulated = float(row["temperature_k"]), bool(row["simulated"])
@@ -113,12 +113,12 @@ class History:
         with database_errors(), self._engine.connect() as connection, connection.begin():
             yield connection
 
-    def ingest(self, given: FileContent, late: bool = False) -> IngestResult:
+    def ingest(self, content: FileContent, late: bool = False) -> IngestResult:
         """Add the content of a file in one transaction: after an interruption all of it is in the record, or nothing.
 
         Parameters
         ----------
-        given : FileContent
+        content : FileContent
             Content of the file.
         late : bool
             Accept readings older than the newest of their kind and subject in the record.
@@ -140,7 +140,7 @@ class History:
         for attempt in (True, False):
             try:
                 with writing(self._engine) as connection:
-                    return Ingest(connection, self.simulated, late).ingest(given)
+                    return Ingest(connection, self.simulated, late).ingest(content)
             except IntegrityError as error:  # of databases without a lock: another writer was first
                 if not attempt:
                     raise RecordFailed(message_of(error)) from None
@@ -176,8 +176,8 @@ class History:
             if row is None:
                 allowed = "a reading of the monitor or a temperature; export writes the numbers of all entries"
                 raise Problem("no such reading", str(number), allowed)
-            own = select(c.content).where(c.kind == DECISION, c.subject == str(number)).order_by(c.id)
-            before = [parse_json(one, "the record") for one in connection.execute(own).scalars()]
+            decisions = select(c.content).where(c.kind == DECISION, c.subject == str(number)).order_by(c.id)
+            before = [parse_json(decision, "the record") for decision in connection.execute(decisions).scalars()]
             if before and before[-1]["included"] == included:
                 text = f"entry {number} is {'included' if included else 'excluded'} already"
                 raise Problem(text, None, f"another decision; the reason then: {before[-1]['why']}")
@@ -188,9 +188,11 @@ class History:
                 "why": why,
                 "number": len(before),
             }
-            one = Entry(DECISION, str(number), int(row["time_us"]), content)
-            given = FileContent("twin.operate exclude", digest_of_data(content), one.digest, [one], {})
-            Ingest(connection, self.simulated, True).write(given, one.digest, None, [(one, one.digest)], {})
+            decision = Entry(DECISION, str(number), int(row["time_us"]), content)
+            file_content = FileContent("twin.operate exclude", digest_of_data(content), decision.digest, [decision], {})
+            Ingest(connection, self.simulated, True).write(
+                file_content, decision.digest, None, [(decision, decision.digest)], {}
+            )
         keys = {key: row[key] for key in ("kind", "subject", "time_utc")}
         return {"entry": number, **keys, "included": included, "why": why}
 
@@ -429,7 +431,7 @@ class History:
         bool
             Whether it is new.
         """
-        if self._until is not None:  # what was to be told then was told then
+        if self._until is not None:  # alarms of an earlier time were raised at that time
             return False
         digest = alarm.digest
         row = {"sha256": digest, "kind": alarm.kind, "subject": alarm.subject, "time_us": alarm.time}
@@ -515,11 +517,11 @@ def _streams(connection: Connection) -> Iterator[tuple[str, str]]:
     """Yield kind and subject of all readings in order, by lookups in the index instead of a scan."""
     c = ENTRY.c
     in_order = select(c.kind, c.subject).order_by(c.kind, c.subject).limit(1)
-    found = connection.execute(in_order).first()
-    while found is not None:
-        yield found.kind, found.subject
-        same, next_kind = in_order.where(c.kind == found.kind, c.subject > found.subject), c.kind > found.kind
-        found = connection.execute(same).first() or connection.execute(in_order.where(next_kind)).first()
+    stream = connection.execute(in_order).first()
+    while stream is not None:
+        yield stream.kind, stream.subject
+        same, next_kind = in_order.where(c.kind == stream.kind, c.subject > stream.subject), c.kind > stream.kind
+        stream = connection.execute(same).first() or connection.execute(in_order.where(next_kind)).first()
 
 
 def _subjects(connection: Connection, kind: str) -> list[str]:
@@ -532,9 +534,9 @@ def _stream_extent(connection: Connection, kind: str, subject: str) -> tuple[int
     Each is one query that the index answers.
     """
     c = ENTRY.c
-    asked = (func.count(), func.min(c.time_us), func.max(c.time_us))
-    own = [select(one).select_from(ENTRY).where(c.kind == kind, c.subject == subject) for one in asked]
-    count, first, last = (int(connection.execute(query).scalar_one()) for query in own)
+    aggregates = (func.count(), func.min(c.time_us), func.max(c.time_us))
+    queries = [select(one).select_from(ENTRY).where(c.kind == kind, c.subject == subject) for one in aggregates]
+    count, first, last = (int(connection.execute(query).scalar_one()) for query in queries)
     return count, first, last
 
 
@@ -584,9 +586,9 @@ def initialise_record(place: str, job: ResolvedJob, simulated: bool = False) -> 
     engine, digest = engine_of(url), digest_of_job(job)
     try:
         with writing(engine) as connection:
-            found = schema.version(connection)
-            if found:
-                schema.require_version(found)
+            version = schema.version(connection)
+            if version:
+                schema.require_version(version)
             else:
                 schema.create(connection)
                 program = f"{WRITER} {importlib.metadata.version(WRITER)}"
@@ -596,14 +598,14 @@ def initialise_record(place: str, job: ResolvedJob, simulated: bool = False) -> 
                 row |= {"temperature_k": repr(job.instrument.temperature), "bodies": canonical(bodies_of(job))}
                 row |= {"plain": canonical(job.plain()["instrument"])}
                 connection.execute(insert(INSTRUMENT).values(**row))
-            own = connection.execute(select(INSTRUMENT)).mappings().one()
-            if own["sha256"] != digest:
+            instrument = connection.execute(select(INSTRUMENT)).mappings().one()
+            if instrument["sha256"] != digest:
                 raise NotARecord(
-                    f"the record is of {own['name']} ({own['sha256'][:12]}), not of {job.instrument.name} "
-                    f"({digest[:12]}): what an instrument is does not change in its record; make another record"
+                    f"the record is of {instrument['name']} ({instrument['sha256'][:12]}), not of "
+                    f"{job.instrument.name} ({digest[:12]}); a record has one instrument: make another record"
                 )
     finally:
         engine.dispose()
     if folder is not None:
         sync_folder(folder)
-    return () if found else (schema.VERSION,)
+    return () if version else (schema.VERSION,)

@@ -82,15 +82,15 @@ class Ingest:
         self.seen: dict[tuple[str, str], int] = {}
         self.first: tuple[str, Before] | None = None
 
-    def ingest(self, given: FileContent) -> IngestResult:
+    def ingest(self, content: FileContent) -> IngestResult:
         """Compare the content of the file with the record and add what is new."""
-        taking = digest_of_data([given.sha256, given.meaning])
+        taking = digest_of_data([content.sha256, content.meaning])
         source = self.connection.execute(select(SOURCE.c.id).where(SOURCE.c.taking == taking)).first()
-        entries = [(item, item.digest) for item in given.items if isinstance(item, Entry)]
+        entries = [(item, item.digest) for item in content.items if isinstance(item, Entry)]
         known = self._present(ENTRY.c.sha256, [digest for _, digest in entries])
-        digests, refused, kept = iter(entries), [], []
+        digests, refused, new_entries = iter(entries), [], []
         again = 0
-        for item in given.items:
+        for item in content.items:
             if isinstance(item, Refusal):
                 refused.append((item, item.entry.digest if item.entry else None))
                 continue
@@ -102,20 +102,20 @@ class Ingest:
                 refused.append((Refusal(reason, one.line, one), digest))
                 continue
             else:
-                kept.append((one, digest))
+                new_entries.append((one, digest))
                 known.add(digest)
                 if one.kind == "monitor" and self.first is None:
                     self.first = (utc_text(one.time), _before(one.content))
             self.seen[stream] = max(one.time, self.seen.get(stream, one.time))
         before = source is not None
-        fresh = self._new_refusals(given, refused, before)
-        if kept or fresh or not before:
-            self.write(given, taking, None if source is None else int(source[0]), kept, fresh)
+        fresh = self._new_refusals(content, refused, before)
+        if new_entries or fresh or not before:
+            self.write(content, taking, None if source is None else int(source[0]), new_entries, fresh)
         refusals_made = tuple((one.line, one.reason) for one, _ in refused)
-        return IngestResult(given.file, len(kept), again, refusals_made, before, len(refused) - len(fresh))
+        return IngestResult(content.file, len(new_entries), again, refusals_made, before, len(refused) - len(fresh))
 
     def _new_refusals(
-        self, given: FileContent, refused: list[tuple[Refusal, str | None]], before: bool
+        self, content: FileContent, refused: list[tuple[Refusal, str | None]], before: bool
     ) -> dict[str, tuple[Refusal, str | None]]:
         """Return the refusals that are new, by digest.
 
@@ -123,7 +123,7 @@ class Ingest:
         grows.
         """
         out = {
-            digest_of_data([entry] if entry else [given.file, given.meaning, one.line, one.reason]): (one, entry)
+            digest_of_data([entry] if entry else [content.file, content.meaning, one.line, one.reason]): (one, entry)
             for one, entry in refused
             if entry or not before  # the same file, wherever it lies
         }
@@ -133,47 +133,49 @@ class Ingest:
 
     def _present(self, column: Any, digests: list[str]) -> set[str]:
         """Return those of the digests that a column of the record contains."""
-        found: set[str] = set()
+        present: set[str] = set()
         for k in range(0, len(digests), _BATCH):
             query = select(column).where(column.in_(digests[k : k + _BATCH]))
-            found |= set(self.connection.execute(query).scalars())
-        return found
+            present |= set(self.connection.execute(query).scalars())
+        return present
 
-    def _refusal_reason(self, one: Entry) -> str:
+    def _refusal_reason(self, entry: Entry) -> str:
         """Return why a new reading cannot be true of this record; empty if it can."""
-        c, stream = ENTRY.c, (one.kind, one.subject)
-        if not self.simulated and one.time > now() + AHEAD:
+        c, stream = ENTRY.c, (entry.kind, entry.subject)
+        if not self.simulated and entry.time > now() + AHEAD:
             return (
-                f"{utc_text(one.time)} is in the future: the clock of the file, its time_scale or its epoch is wrong; "
+                f"{utc_text(entry.time)} is in the future: the clock of the file, its time_scale or epoch is wrong; "
                 "a record of simulated readings is made with init --simulated"
             )
-        if one.origin:
-            query = select(c.time_utc).where(c.origin == one.origin, c.time_us != one.time).limit(1)
+        if entry.origin:
+            query = select(c.time_utc).where(c.origin == entry.origin, c.time_us != entry.time).limit(1)
             if (other := self.connection.execute(query).scalar()) is not None:
                 return f"measured in the same frames as the reading of {other}; give it that time, or its own frames"
-        if one.kind == "monitor" and (reason := self._reference_conflict(one)):
+        if entry.kind == "monitor" and (reason := self._reference_conflict(entry)):
             return reason
         if stream not in self.newest:
-            query = select(func.max(c.time_us)).where(c.kind == one.kind, c.subject == one.subject)
+            query = select(func.max(c.time_us)).where(c.kind == entry.kind, c.subject == entry.subject)
             self.newest[stream] = self.connection.execute(query).scalar()
         newest, before = self.newest[stream], self.seen.get(stream)
-        if before is not None and one.time < before:
-            text = f"the clock runs backwards: {utc_text(one.time)} after {utc_text(before)}"
+        if before is not None and entry.time < before:
+            text = f"the clock runs backwards: {utc_text(entry.time)} after {utc_text(before)}"
             return f"{text}; sort the rows, or remove those before the clock was set"
-        if before is not None and one.time == before:
-            return f"another reading of {one.subject} at {utc_text(one.time)} in this file; one of them is wrong"
-        if newest is not None and one.time <= newest:
-            query = select(c.id).where(c.kind == one.kind, c.subject == one.subject, c.time_us == one.time).limit(1)
+        if before is not None and entry.time == before:
+            return f"another reading of {entry.subject} at {utc_text(entry.time)} in this file; one of them is wrong"
+        if newest is not None and entry.time <= newest:
+            query = (
+                select(c.id).where(c.kind == entry.kind, c.subject == entry.subject, c.time_us == entry.time).limit(1)
+            )
             if self.connection.execute(query).scalar() is not None:
-                return f"the record has another reading of {one.subject} at {utc_text(one.time)}, which is kept"
+                return f"the record has another reading of {entry.subject} at {utc_text(entry.time)}, which is kept"
             if not self.late:
-                text = f"{utc_text(one.time)} is before the newest reading of {one.subject}, {utc_text(newest)}"
+                text = f"{utc_text(entry.time)} is before the newest reading of {entry.subject}, {utc_text(newest)}"
                 return f"{text}: a clock that was set back, or a reading that comes late; --late takes it"
         return ""
 
-    def _reference_conflict(self, one: Entry) -> str:
+    def _reference_conflict(self, entry: Entry) -> str:
         """Return why a reading of the monitor cannot be compared with those of the record; empty if it can."""
-        own = _before(one.content)
+        spots = _before(entry.content)
         if self.first is None:
             c = ENTRY.c
             query = (
@@ -188,7 +190,9 @@ class Ingest:
             self.first = (str(row.time_utc), _before(parse_json(row.content, "the record")))
         when, first = self.first
         ratios = [
-            (own[key][0] - place) / max(sigma, own[key][1]) for key, (place, sigma) in first.items() if key in own
+            (spots[key][0] - position) / max(sigma, spots[key][1])
+            for key, (position, sigma) in first.items()
+            if key in spots
         ]
         apart = math.sqrt(sum(ratio * ratio for ratio in ratios) / len(ratios)) if ratios else 0.0
         if apart <= SAME_IMAGES:
@@ -200,33 +204,33 @@ class Ingest:
 
     def write(
         self,
-        given: FileContent,
+        content: FileContent,
         taking: str,
         source: int | None,
-        kept: list[tuple[Entry, str]],
+        new_entries: list[tuple[Entry, str]],
         refused: Mapping[str, tuple[Refusal, str | None]],
     ) -> None:
         """Add rows to the record, and drop the checkpoints that they invalidate.
 
         Parameters
         ----------
-        given : FileContent
+        content : FileContent
             File that they come from.
         taking : str
             Digest of the file and of the description by which it was read.
         source : int | None
             Id of the file's row; None if the record does not have it yet.
-        kept : list[tuple[Entry, str]]
+        new_entries : list[tuple[Entry, str]]
             New entries with their digests.
         refused : Mapping[str, tuple[Refusal, str | None]]
             Digest -> new refusal, and the digest of its entry if it has one.
         """
         moment = utc_text(now())
         if source is None:
-            row = {"file": given.file, "sha256": given.sha256, "taking": taking, "taken_utc": moment}
-            written = self.connection.execute(insert(SOURCE).values(**row, rows_read=len(given.items)))
+            row = {"file": content.file, "sha256": content.sha256, "taking": taking, "taken_utc": moment}
+            written = self.connection.execute(insert(SOURCE).values(**row, rows_read=len(content.items)))
             source = int(written.inserted_primary_key[0])  # type: ignore[index]
-            frames = [{"source_id": source, "file": f, "sha256": d} for f, d in given.frames.items()]
+            frames = [{"source_id": source, "file": f, "sha256": d} for f, d in content.frames.items()]
             self._insert(FRAME, frames)
         rows = [
             {
@@ -240,11 +244,11 @@ class Ingest:
                 "line": one.line,
                 "origin": one.origin or None,
             }
-            for one, digest in kept
+            for one, digest in new_entries
         ]
         self._insert(ENTRY, rows)
         if rows:  # estimates that went past the earliest of them do not hold it
-            earliest = min(one.time for one, _ in kept)
+            earliest = min(one.time for one, _ in new_entries)
             self.connection.execute(delete(CHECKPOINT).where(CHECKPOINT.c.time_us >= earliest))
         refusals_made = [
             {

@@ -137,21 +137,21 @@ def _require_instrument(folder: Path, history: History, assume_instrument: bool)
             return
         problem = f"{folder} does not name its instrument"
         raise Problem(problem, None, "a run whose config.yaml holds the instrument, or --instrument NAME")
-    found = instrument_digest(instrument, {k: v for k, v in cameras.items() if isinstance(v, Mapping)})
-    if found != history.sha256:
+    digest = instrument_digest(instrument, {k: v for k, v in cameras.items() if isinstance(v, Mapping)})
+    if digest != history.sha256:
         name = instrument.get("name", "without a name")
-        problem = f"{folder} is of another instrument, {name} ({found[:12]})"
+        problem = f"{folder} is of another instrument, {name} ({digest[:12]})"
         raise Problem(problem, None, f"runs of {history.name} ({history.sha256[:12]})")
 
 
-def _run_readings(kind: str, data: Any, moment: int, digest: str, frames: Mapping[str, str]) -> list[Entry]:
+def _run_readings(kind: str, data: Any, start: int, digest: str, frames: Mapping[str, str]) -> list[Entry]:
     """Return the reading of a run, or those of a series. Raise Problem if the results are not valid."""
     if not isinstance(data, Mapping):
         raise Problem("no results", None, RESULTS[kind])
     origin = digest_of_data(sorted(frames.values())) if frames else digest
     if kind != "monitor":
         content = {key: value for key, value in data.items() if key != "reference_frames"}
-        return [_entry(kind, moment, {"sha256": digest, "numbers": content}, origin)]
+        return [_entry(kind, start, {"sha256": digest, "numbers": content}, origin)]
     states, times = data.get("series") or [data], data.get("times_s") or [0.0]
     if not isinstance(states, list) or not isinstance(times, list) or len(states) != len(times):
         raise Problem("times and states differ in number", None, RESULTS[kind])
@@ -161,7 +161,7 @@ def _run_readings(kind: str, data: Any, moment: int, digest: str, frames: Mappin
             raise Problem("a state without cameras or without a time", None, RESULTS[kind])
         numbers = {key: state[key] for key in _STATE_KEYS if key in state}
         content = {"sha256": digest, "state": k, "numbers": numbers}
-        out.append(_entry(kind, moment + round(seconds * MICRO), content, digest_of_data([origin, k])))
+        out.append(_entry(kind, start + round(seconds * MICRO), content, digest_of_data([origin, k])))
     return out
 
 
@@ -389,12 +389,12 @@ def _require_plausible(subject: str, kelvin: float, unit: str, history: History)
 
 def _event(table: ReadingTableSpec, row: dict[str, str], moment: int, line: int) -> Entry:
     """Return one event. Raise Problem if its name is unknown."""
-    found = row[str(table.name)]
-    name = table.events.get(found, found)
+    text = row[str(table.name)]
+    name = table.events.get(text, text)
     if name not in EVENTS:
         known = (*table.events, *EVENTS)
         raise unknown(
-            "unknown event", found, known, allowed=f"{names_text(known)}; map other names in events: NAME: EVENT"
+            "unknown event", text, known, allowed=f"{names_text(known)}; map other names in events: NAME: EVENT"
         )
     detail: dict[str, Any] = {} if table.detail is None else {"detail": row[table.detail]}
     return Entry(EVENT, name, moment, detail, line)
@@ -413,10 +413,10 @@ def time_of_name(name: str) -> int | None:
 
     Examples are ``recover-2026-03-05T03-05-00Z`` and ``20260305T030500Z``.
     """
-    found = _TIME.search(name)
-    if found is None:
+    match = _TIME.search(name)
+    if match is None:
         return None
-    year, month, day, hour, minute, second = found.groups()
+    year, month, day, hour, minute, second = match.groups()
     try:
         return micros(f"{year}-{month}-{day}T{hour}:{minute}:{second}Z")
     except Problem:
