@@ -215,7 +215,7 @@ class CameraOptics:
         Raises
         ------
         AimError, BeamMissedError
-            As for ``rays``.
+            The conditions of ``rays``.
         """
         nodes = stop_nodes(self.model, RINGS, self.cut is not None)
         axis = np.linspace(-1.0, 1.0, points)
@@ -279,7 +279,7 @@ class CameraOptics:
         Raises
         ------
         AimError, BeamMissedError
-            As for ``rays``.
+            The conditions of ``rays``.
         """
         nodes = stop_nodes(self.model, RINGS, self.cut is not None)
         rings = [r / SPOT_RINGS * rim(6 * r) for r in range(1, SPOT_RINGS + 1)]
@@ -333,7 +333,7 @@ class CameraOptics:
         Raises
         ------
         AimError, BeamMissedError
-            As for ``rays``.
+            The conditions of ``rays``.
         InputError
             Edges block all of a field's light.
         """
@@ -368,7 +368,7 @@ class CameraOptics:
         Raises
         ------
         AimError, BeamMissedError
-            As for ``rays``.
+            The conditions of ``rays``.
         """
         all_fields, plane = np.asarray(fields, dtype=np.float64), FocalPlane.of(self.model.spec)
         step = max(1, MAX_RAYS // stop_nodes(self.model, RINGS, self.cut is not None).count)
@@ -384,7 +384,7 @@ class CameraOptics:
         Raises
         ------
         AimError, BeamMissedError
-            As for ``rays``.
+            The conditions of ``rays``.
         ValueError
             Edges cut a pupil into too many pieces, or a wavefront is too irregular for its polynomials.
         """
@@ -425,7 +425,7 @@ class CameraOptics:
         Raises
         ------
         AimError, BeamMissedError, ValueError
-            As for ``pupils``.
+            The conditions of ``pupils``.
         """
         colours = np.array([self.wavelength]) if wavelengths is None else np.asarray(wavelengths, float)
         shares = np.ones(len(colours)) if weights is None else np.asarray(weights, float)
@@ -445,9 +445,11 @@ class CameraOptics:
             perfect = [replace(pupil, eikonal_terms=np.zeros_like(pupil.eikonal_terms)) for pupil in field_pupils]
             values, limit = (
                 np.abs(
-                    polychromatic_transfer(one if len(one) > 1 else one[0], both, colours, shares, np.zeros(1))[0]
+                    polychromatic_transfer(
+                        pupil_set if len(pupil_set) > 1 else pupil_set[0], both, colours, shares, np.zeros(1)
+                    )[0]
                 ).reshape(2, -1)
-                for one in (field_pupils, perfect)
+                for pupil_set in (field_pupils, perfect)
             )
             place = (float(where[0]), float(where[1]))
             out.append(Mtf(place, frequency, values, limit, colours, self.nyquist, shares / np.sum(shares)))
@@ -497,7 +499,7 @@ class CameraOptics:
         Raises
         ------
         AimError, BeamMissedError, ValueError
-            As for ``pupils``.
+            The conditions of ``pupils``.
         """
         if not lenses(self.model.spec):
             return [(pupil,) for pupil in self.at(float(np.min(wavelengths))).pupils(fields)]

@@ -36,12 +36,12 @@ def wavefront_figure(run: CameraRun) -> Figure:
     """Draw wavefront maps at nine fields with a common colour scale."""
     figure, axes = _grid(9.6)
     most = max(float(np.nanmax(np.abs(wave.map))) for wave in run.waves)
-    for one, wave in zip(axes, run.waves, strict=True):
-        mesh = draw_wavefront(one, wave, most)
-        one.set_title(
+    for panel, wave in zip(axes, run.waves, strict=True):
+        mesh = draw_wavefront(panel, wave, most)
+        panel.set_title(
             f"{degrees_text(run, wave.field)}\n{wave.rms:.3g} rms, {wave.peak_to_valley:.3g} PV", fontsize=8.5
         )
-        one.set_axis_off()
+        panel.set_axis_off()
     bar = figure.colorbar(mesh, ax=list(axes), shrink=0.55, aspect=30, pad=0.02)
     bar.set_label(f"wavefront error, waves of {1e9 * run.camera.wavelength:.0f} nm")
     return figure
@@ -51,15 +51,15 @@ def spot_figure(run: CameraRun) -> Figure:
     """Draw spots at nine fields in boxes of equal size, with the Airy disk."""
     figure, axes = _grid(10.2)
     half = max(1.2 * run.spots[GRID.index((0.0, 0.0))].airy, 1.08 * max(spot.farthest for spot in run.spots))
-    for one, spot in zip(axes, run.spots, strict=True):
-        draw_spot(one, spot, half)
+    for panel, spot in zip(axes, run.spots, strict=True):
+        draw_spot(panel, spot, half)
         rms, far = (plain(1e6 * value, 3) for value in (spot.rms, spot.farthest))
-        one.set_title(f"{degrees_text(run, spot.field)}\nrms {rms}, largest {far} {MICRO}", fontsize=8.5)
-        one.tick_params(labelsize=7)
-    for one in axes[6:]:
-        one.set_xlabel(f"along the line, {MICRO}")
-    for one in axes[::3]:
-        one.set_ylabel(f"along the track, {MICRO}")
+        panel.set_title(f"{degrees_text(run, spot.field)}\nrms {rms}, largest {far} {MICRO}", fontsize=8.5)
+        panel.tick_params(labelsize=7)
+    for panel in axes[6:]:
+        panel.set_xlabel(f"along the line, {MICRO}")
+    for panel in axes[::3]:
+        panel.set_ylabel(f"along the track, {MICRO}")
     return figure
 
 
@@ -124,11 +124,11 @@ def mtf_figure(run: CameraRun) -> Figure:
     """Draw MTF curves of five fields, each with its diffraction limit, and the MTF at Nyquist along the line."""
     figure = new_figure(6.4)
     axes = np.ravel(figure.subplots(2, 3, sharey=True))
-    for k, (one, mtf) in enumerate(zip(axes, run.mtfs, strict=False)):
-        draw_mtf(one, mtf, label=k == 0)
-        one.set_title(degrees_text(run, mtf.field))
+    for k, (panel, mtf) in enumerate(zip(axes, run.mtfs, strict=False)):
+        draw_mtf(panel, mtf, label=k == 0)
+        panel.set_title(degrees_text(run, mtf.field))
         if k == 0:
-            one.legend(fontsize=7.5, loc="upper right", bbox_to_anchor=(1.0, 0.93))
+            panel.legend(fontsize=7.5, loc="upper right", bbox_to_anchor=(1.0, 0.93))
     last = axes[-1]
     x = np.degrees(run.curves.share * run.camera.field.x)
     for k, (colour, name) in enumerate(((LINE, "along the line"), (TRACK, "along the track"))):
@@ -150,11 +150,11 @@ def lateral_figure(run: CameraRun) -> Figure:
     figure = new_figure(3.3)
     axes = figure.subplots(1, 2, sharey=True)
     nm = 1e9 * colours.wavelengths
-    for direction, (one, name) in enumerate(zip(axes, ("along the line", "along the track"), strict=True)):
+    for direction, (panel, name) in enumerate(zip(axes, ("along the line", "along the track"), strict=True)):
         for f, colour in zip(range(len(colours.fields)), _FIELD_COLOURS, strict=True):
             text = degrees_text(run, colours.fields[f])
-            one.plot(nm, 1e6 * colours.lateral[f, :, direction], color=colour, lw=1.3, label=text, marker=_mark(nm))
-        _over_light(one, run, f"position {name}")
+            panel.plot(nm, 1e6 * colours.lateral[f, :, direction], color=colour, lw=1.3, label=text, marker=_mark(nm))
+        _over_light(panel, run, f"position {name}")
     axes[0].set_ylabel(f"relative to the reference wavelength, {MICRO}")
     axes[0].legend(fontsize=7.0, title="field", title_fontsize=7.5)
     return figure
@@ -212,8 +212,8 @@ def light_mtf_figure(run: CameraRun) -> Figure:
         lower.set_aspect("equal")
         lower.set_title(f"Strehl {psf.strehl:.2f}", fontsize=8.0)
         lower.set_xlabel(MICRO)
-        for one in (upper, lower):
-            one.tick_params(labelsize=7)
+        for panel in (upper, lower):
+            panel.tick_params(labelsize=7)
     rows[0, 0].legend(fontsize=6.5)
     rows[0, 0].set_ylabel("MTF of the optics")
     rows[1, 0].set_ylabel(f"along the track, {MICRO}")
@@ -235,13 +235,13 @@ def focus_figure(run: CameraRun) -> Figure:
     axes[0].set_title("wavefront error")
     axes[0].set_ylim(0.0, None)
     axes[0].legend(fontsize=7.0, title="field", title_fontsize=7.5)
-    for one, name in zip(axes[1:], ("along the line", "along the track"), strict=False):
-        one.set_title(f"MTF at Nyquist {name}")
-        one.set_ylim(0.0, None)
-    for one in axes:
-        one.axvline(0.0, color=LIGHT, lw=0.8, zorder=0)
-        one.set_xlabel(f"defocus of the detector, downstream, {MICRO}")
-        plain_axes(one)
+    for panel, name in zip(axes[1:], ("along the line", "along the track"), strict=False):
+        panel.set_title(f"MTF at Nyquist {name}")
+        panel.set_ylim(0.0, None)
+    for panel in axes:
+        panel.axvline(0.0, color=LIGHT, lw=0.8, zorder=0)
+        panel.set_xlabel(f"defocus of the detector, downstream, {MICRO}")
+        plain_axes(panel)
     return figure
 
 
@@ -265,9 +265,9 @@ def curves_figure(run: CameraRun) -> Figure:
     right.set_title("Illumination")
     right.set_ylabel("percent of the middle")
     right.legend(fontsize=7.5, loc="lower left")
-    for one in (left, right):
-        one.set_xlabel("field along the line, degrees")
-        plain_axes(one)
+    for panel in (left, right):
+        panel.set_xlabel("field along the line, degrees")
+        plain_axes(panel)
     return figure
 
 

@@ -243,7 +243,7 @@ def run_camera(
     state: State = {}
     if setup.instrument is not None or setup.perturb:
         instrument_spec, cameras, mounted = setup.mounted_instrument
-        cameras = {name: camera if one == setup.camera else one for name, one in cameras.items()}
+        cameras = {name: camera if spec == setup.camera else spec for name, spec in cameras.items()}
         instrument = build_instrument(instrument_spec, cameras, backend)
         optics = CameraOptics.within(instrument, mounted, backend)
         if setup.perturb:
@@ -360,7 +360,8 @@ def perturbed_text(run: CameraRun) -> str:
         return ""
     changes = zip(parameters.ESTIMATED, perturbed.change.vector[0].tolist(), strict=True)
     change_text = ", ".join(
-        f"{one.symbol} {one.per_si * value + 0.0:+.{one.decimals}f} {one.unit}" for one, value in changes
+        f"{parameter.symbol} {parameter.per_si * value + 0.0:+.{parameter.decimals}f} {parameter.unit}"
+        for parameter, value in changes
     )
     text = (
         f"Perturbed: {perturbed.words}. The geometry changes by {change_text}; the worst wavefront error changes from "
@@ -467,11 +468,11 @@ _PERTURBED: Record[Perturbed] = Record(
     Quantity("perturb", lambda p: p.job.plain()["perturb"], "perturbation as in a job's file"),
     *(
         Quantity(
-            one.key,
+            parameter.key,
             lambda p, k=k: p.change.vector[0, k],  # type: ignore[misc]
-            one.meaning,
+            parameter.meaning,
         )
-        for k, one in enumerate(parameters.ESTIMATED)
+        for k, parameter in enumerate(parameters.ESTIMATED)
     ),
     Quantity("worst_as_designed_waves", lambda p: p.errors.max(), "wavefront error of the worst field"),
     Quantity("mtf_as_designed", lambda p: p.mtf, "MTF at Nyquist, along the line and along the track, field by field"),

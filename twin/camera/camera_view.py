@@ -195,7 +195,7 @@ class CameraView(CameraOptics, Plottable):
         Raises
         ------
         AimError, BeamMissedError
-            As for ``CameraOptics.rays``.
+            The conditions of ``CameraOptics.rays``.
         """
         return _shown(WavefrontView, super().wavefront(field, points))
 
@@ -205,7 +205,7 @@ class CameraView(CameraOptics, Plottable):
         Raises
         ------
         AimError, BeamMissedError
-            As for ``CameraOptics.rays``.
+            The conditions of ``CameraOptics.rays``.
         """
         return _shown(SpotView, super().spot(field, defocus))
 
@@ -215,7 +215,7 @@ class CameraView(CameraOptics, Plottable):
         Raises
         ------
         AimError, BeamMissedError, ValueError
-            As for ``CameraOptics.pupils``.
+            The conditions of ``CameraOptics.pupils``.
         """
         return _shown(MtfView, super().mtf(field, frequency))
 
@@ -225,4 +225,4 @@ Shown = TypeVar("Shown")
 
 def _shown(kind: type[Shown], value: Any) -> Shown:
     """Convert a result to its class with a plot."""
-    return kind(**{own.name: getattr(value, own.name) for own in fields(value)})
+    return kind(**{field.name: getattr(value, field.name) for field in fields(value)})

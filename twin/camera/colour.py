@@ -221,8 +221,8 @@ def spectral_mtfs(
     Raises
     ------
     AimError, BeamMissedError, ValueError
-        As for ``CameraOptics.pupils``; also if the MTF still changes by more than ``WORST_CHANGE`` at ``LARGEST_RULE``
-        wavelengths.
+        The conditions of ``CameraOptics.pupils``; also an MTF that still changes by more than ``WORST_CHANGE`` at
+        ``LARGEST_RULE`` wavelengths.
     """
     if frequency is None:
         # up to the cut-off of the shortest wavelength, for any rule
@@ -248,7 +248,7 @@ def spectral_psfs(
     Raises
     ------
     AimError, BeamMissedError, ValueError
-        As for ``CameraOptics.pupils``.
+        The conditions of ``CameraOptics.pupils``.
     """
     colours, shares = np.asarray(wavelengths, float), np.asarray(weights, float) / np.sum(weights)
     ends = (int(np.argmin(colours)), int(np.argmax(colours)))
@@ -266,7 +266,11 @@ def spectral_psfs(
         sampled = [_sampled(pupil, float(colour), half) for pupil, colour in zip(pupils, colours, strict=True)]
 
         def over_light(x: Grid, y: Grid, sampled: Sequence[PupilField] = sampled) -> np.ndarray:
-            return np.asarray(sum(w * image(one, x, y, single=True)[0] for w, one in zip(shares, sampled, strict=True)))
+            return np.asarray(
+                sum(
+                    w * image(pupil_field, x, y, single=True)[0] for w, pupil_field in zip(shares, sampled, strict=True)
+                )
+            )
 
         step = 2.0 * half / (PSF_POINTS - 1)
         grid = Grid(-half, step, PSF_POINTS)
@@ -276,7 +280,8 @@ def spectral_psfs(
         x, y = (Grid(float(grid.points()[k]) - step, step / 8.0, 17) for k in (column, row))
         peak = float(np.max(over_light(x, y)))
         limit = sum(
-            w * float(np.sum(one.amplitude)) ** 2 / one.wavelength**2 for w, one in zip(shares, sampled, strict=True)
+            w * float(np.sum(pupil_field.amplitude)) ** 2 / pupil_field.wavelength**2
+            for w, pupil_field in zip(shares, sampled, strict=True)
         )
         out.append(Psf(design[f].field, grid.points(), values, peak / limit))
     return tuple(out)

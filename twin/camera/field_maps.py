@@ -198,7 +198,7 @@ def field_curves(optics: CameraOptics, sharp: bool, count: int = 21) -> FieldCur
     beam_focus = -np.sum(terms[:, [3, 5]] * defocus_terms, axis=-1) / np.sum(defocus_terms**2, axis=-1)
     mtf = np.full((count, 2), np.nan)
     if sharp:
-        mtf = np.array([one.values[:, 1] for one in optics.mtfs(fields, np.array([0.0, optics.nyquist]))])
+        mtf = np.array([at_nyquist.values[:, 1] for at_nyquist in optics.mtfs(fields, np.array([0.0, optics.nyquist]))])
     return FieldCurves(
         share=share,
         focus_line=focus[:, 0],

@@ -111,10 +111,18 @@ def obstacles(model: CameraModel) -> dict[str, Aperture]:
 def _body(model: CameraModel, name: str, edge: Aperture) -> Aperture:
     """Return the outline of a surface with the outer edge and hole of its file, else ``edge``."""
     edges = model.edges.get(name, ())
-    outlines = [one.shape for one in edges if not one.blocks and not one.rotation and isinstance(one.shape, Aperture)]
+    outlines = [
+        edge_spec.shape
+        for edge_spec in edges
+        if not edge_spec.blocks and not edge_spec.rotation and isinstance(edge_spec.shape, Aperture)
+    ]
     if outlines:
         edge = outlines[0]
-    holes = [one.shape for one in edges if one.blocks and isinstance(one.shape, Circle) and not any(one.shape.centre)]
+    holes = [
+        edge_spec.shape
+        for edge_spec in edges
+        if edge_spec.blocks and isinstance(edge_spec.shape, Circle) and not any(edge_spec.shape.centre)
+    ]
     if holes and isinstance(edge, Circle) and not any(edge.centre) and edge.inner < holes[0].radius < edge.radius:
         edge = Circle(edge.radius, edge.centre, holes[0].radius)
     return edge

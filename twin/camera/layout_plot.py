@@ -31,14 +31,14 @@ def layout_figure(model: CameraModel, backend: Backend) -> Figure:
     scale = 9.6 / (high - low)  # inches of the page per metre
     figure = new_figure(min(scale * sum(heights) + 1.5, 12.0))
     axes = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": heights})
-    for one, (axis, name, title), box in zip(axes, _VIEWS, boxes, strict=True):
-        _view(one, model, backend, axis, low)
-        one.set_xlim(low, high)
-        one.set_ylim(box[2], box[3])
-        one.set_aspect("equal")
-        one.set_title(title, loc="left")
-        one.set_ylabel(f"{name} [m]")
-        plain_axes(one)
+    for panel, (axis, name, title), box in zip(axes, _VIEWS, boxes, strict=True):
+        _view(panel, model, backend, axis, low)
+        panel.set_xlim(low, high)
+        panel.set_ylim(box[2], box[3])
+        panel.set_aspect("equal")
+        panel.set_title(title, loc="left")
+        panel.set_ylabel(f"{name} [m]")
+        plain_axes(panel)
     axes[1].set_xlabel("z along the parent axis [m]")
     return figure
 

@@ -194,7 +194,7 @@ class VariedBeams:
         """
         path, count = self.optics.path, len(states) // len(self._glass)
         to_stop = assemble(path.assembly, [f"{path.name}/to_stop"], states, placed=placed)
-        near, slope = (np.tile(one, (count, *[1] * (one.ndim - 1))) for one in self._aimed)
+        near, slope = (np.tile(array, (count, *[1] * (array.ndim - 1))) for array in self._aimed)
         systems, fan = to_stop.take(self._owners(count)), self._fan_for(count)
         return fan.at(aim(self.backend, systems, fan, self._target, near, slope, AIM_TOLERANCE)[0])[0]
 
@@ -223,7 +223,7 @@ class VariedBeams:
         rays = make_rays(self.backend, aimed.reshape(len(along), -1, 3), along)
         traced = trace(self.backend, imaging, rays).numpy()
         shape = (count, len(self._glass), len(self.fields), len(self.points))
-        reshaped = tuple(one.reshape(*shape, *one.shape[2:]) for one in traced)
+        reshaped = tuple(array.reshape(*shape, *array.shape[2:]) for array in traced)
         return reshaped, aimed.reshape(*shape, 3)  # type: ignore[return-value]
 
     def _coloured(self, states: Sequence[State]) -> list[State]:
@@ -238,10 +238,10 @@ class VariedBeams:
         """Return the ray fan of all beams of ``count`` states."""
         times = count * len(self._glass)
 
-        def every(array: np.ndarray) -> np.ndarray:
+        def tiled(array: np.ndarray) -> np.ndarray:
             return np.tile(array, (times, *[1] * (array.ndim - 1)))
 
-        return RayFan(every(self._fan.position), every(self._fan.direction), every(self._fan.axes), True)
+        return RayFan(tiled(self._fan.position), tiled(self._fan.direction), tiled(self._fan.axes), True)
 
     def _to_sphere(self, position: np.ndarray, direction: np.ndarray, paths: np.ndarray, radius: float) -> np.ndarray:
         """Return optical paths to spheres about the chief rays' images, minus those of the chief rays, (S, F, K N).
@@ -280,11 +280,11 @@ class VariedBeams:
         parts, step = [], max(1, AT_ONCE // len(self._glass))
         for start in range(0, len(states), step):
             batch = slice(start, start + step)
-            traced, own = self._rays(states[batch], None if aimed is None else aimed[batch])
+            traced, starts = self._rays(states[batch], None if aimed is None else aimed[batch])
             if not traced[3].all():
                 raise BeamMissedError("the edge of a surface blocks light of a field")
-            parts.append(self._light(traced, own))
-        return BeamLight(*(np.concatenate(own) for own in zip(*parts, strict=True)))
+            parts.append(self._light(traced, starts))
+        return BeamLight(*(np.concatenate(starts) for starts in zip(*parts, strict=True)))
 
     @property
     def free(self) -> bool:
@@ -297,8 +297,8 @@ class VariedBeams:
             nodes = quadrature.disk(self.degree)
             return [(nodes.x, nodes.y, nodes.share)] * len(self.fields)
         out = []
-        for own in self.pieces:
-            stop = IlluminatedStop.of(own[None], self.degree, max(6, self.degree // 2 + 2))
+        for field_pieces in self.pieces:
+            stop = IlluminatedStop.of(field_pieces[None], self.degree, max(6, self.degree // 2 + 2))
             out.append((stop.x[0], stop.y[0], stop.weight[0] / np.sum(stop.weight)))
         return out
 
