@@ -319,7 +319,7 @@ def _same_number(one: NumberDifference, rtol: float, sigmas: float | None) -> bo
     """Return whether two results are equal within the tolerances."""
     if sigmas is not None and is_sigma(one.key):
         return True
-    if one.difference is None:  # of which both are None one is no key of its file
+    if one.difference is None:  # if both are None, one file lacks the key
         return one.reference == one.other and one.reference is not None
     if math.isclose(float(one.reference or 0), float(one.other or 0), rel_tol=rtol):
         return True

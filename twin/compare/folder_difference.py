@@ -278,10 +278,10 @@ def array_difference(file: str, name: str, here: np.ndarray | None, there: np.nd
         )
     finite = np.isfinite(one) & np.isfinite(two)
     delta = np.zeros_like(one)
-    with np.errstate(over="ignore"):  # numbers at the end of the range differ by infinity
+    with np.errstate(over="ignore"):  # differences of extreme numbers overflow
         np.subtract(two, one, out=delta, where=finite)
     largest = float(np.max(np.abs(delta), initial=0.0))
-    scale = largest if 1e150 < largest < np.inf else 1.0  # whose squares are beyond the range
+    scale = largest if 1e150 < largest < np.inf else 1.0  # avoids overflow of the squares
     rms = scale * float(np.sqrt(np.mean((delta / scale) ** 2)))
     peak = float(np.max(np.abs(one), where=np.isfinite(one), initial=0.0))
     worst = np.where(unlike & ~finite, np.inf, np.abs(delta))
@@ -369,7 +369,7 @@ def _scales(*contents: Mapping[str, Leaf]) -> dict[str, float]:
     return out
 
 
-# what is in a file
+# content of a file
 
 
 def content_of(path: Path, name: str) -> Content:
@@ -394,7 +394,7 @@ def content_of(path: Path, name: str) -> Content:
         return READERS.get(ending(name), _text)(content)
     except InputError:
         raise
-    # readers of spoilt files fail in ways that cannot be foreseen
+    # readers of corrupted files fail in unforeseeable ways
     except Exception as error:
         kind = {"nc": "netCDF"}.get(ending(name), ending(name).upper())
         problem = f"cannot be read as a {kind} file: {why_unreadable(error)}"
@@ -458,7 +458,7 @@ def _yaml(content: bytes) -> Content:
     file = parse_yaml(content.decode("utf-8"))
     kind = kind_of(file.data)
     if kind is not None:
-        with suppress(InputError):  # a config.yaml holds such a file under a key
+        with suppress(InputError):  # a config.yaml contains such a file under a key
             return plain(validate(kind.model, file).plain())
     return plain(file.data)
 
@@ -561,6 +561,6 @@ READERS: dict[str, Callable[[bytes], Content]] = {
     "png": _png,
     "svg": _drawing,
     "glb": _scene,
-    "journal": lambda content: Content({}, {}, {}),  # of a study, whose numbers stand in study.nc
+    "journal": lambda content: Content({}, {}, {}),  # journal of a study, whose numbers are in study.nc
 }
 """Suffix of a file -> function that reads it."""

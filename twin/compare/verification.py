@@ -192,7 +192,7 @@ def _number(one: NumberDifference, elsewhere: bool) -> Quantity:
     off = None if one.difference is None else abs(one.difference)
     if off is None or not math.isfinite(off):
         return Quantity(one.key, _short(one.reference), _short(one.other))
-    in_sigma = off / (one.sigma / math.sqrt(2.0)) if one.sigma else None  # sigma is that of a difference of two
+    in_sigma = off / (one.sigma / math.sqrt(2.0)) if one.sigma else None  # sigma is that of the difference of two
     size = max(abs(float(one.reference or 0)), abs(float(one.other or 0)), one.scale)
     relative = off / size if size else 0.0
     limit = RELATIVE_OF_SIGMAS if difference.is_sigma(one.key) else RELATIVE_ELSEWHERE if elsewhere else RELATIVE
@@ -279,7 +279,7 @@ def obstacle(state: FolderState) -> str:
     return ""
 
 
-@recomputed()  # a repetition takes nothing over from the run that it checks
+@recomputed()  # a repetition must not reuse results of the run that it checks
 def repeat(state: FolderState, place: Path, quiet: bool) -> Repetition:
     """Repeat a whole run, and compare every file.
 
@@ -302,7 +302,7 @@ def repeat(state: FolderState, place: Path, quiet: bool) -> Repetition:
     started_in = manifest.started_in or str(place.parent)
     if not Path(started_in).is_dir():
         raise CannotRepeat(f"the folder in which it was started is missing: {started_in}")
-    # modules are those of this program, whatever lies in the folder where it starts
+    # -P: never import modules from the folder in which the run was started
     command = [
         sys.executable,
         "-P",
@@ -414,7 +414,7 @@ def _data_states(folder: Path, plan: Plan, whole: BlockResult) -> Iterable[FileS
     common = {key: values for key, values in stored_arrays.items() if key in repetition}
     again = summary(data, plan)
     arrays = (name, difference.Content({}, common, {}), difference.Content({}, repetition, {}))
-    # the data set is the blocks', and the summary that of the data set
+    # the data set follows from the blocks, and the summary from the data set
     numbers = ("study.json", difference.plain({key: stored.get(key) for key in again}), difference.plain(again))
     return [file_state_of(difference.content_difference(*pair)) for pair in (arrays, numbers)]
 

@@ -388,7 +388,7 @@ class LiveApi:
         await self.computer.restart()
         for client in self.clients:
             client.before = None
-            if self.computer.opened.greeting != before:  # its files were changed meanwhile
+            if self.computer.opened.greeting != before:  # the instrument's files have changed
                 client.queue_json({"type": "hello", **self.computer.opened.greeting})
         self._announce("runs")
 

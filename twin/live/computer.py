@@ -188,7 +188,7 @@ class Computer:
         self._pipe: Connection | None = None
         self._request_lock = asyncio.Lock()
         self._starting = self._asked = self._shutting_down = False
-        # two threads that ask the system for one process' end take it from each other
+        # two threads that poll the exit of one process would take its status from each other
         self._process_lock = threading.Lock()
         self._factors: Any = None
         self.opened = Opened({}, b"")
@@ -383,14 +383,14 @@ def compute(pipe: Connection, what: str, backend: str, run: int | None) -> None:
     run : int | None
         Number of a study's run.
     """
-    # Ctrl-C goes to the whole group of the terminal; the server ends this process by closing the pipe
+    # Ctrl-C reaches the whole process group; the server ends this process by closing the pipe
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _end_with(os.getppid())
     with one_blas_thread():
         try:
             answers = RequestHandler(what, backend, lambda part: pipe.send(("part", part)), run)
             pipe.send(("ready", answers.opened))
-            # what is built stays; looking through it again and again would cost every state some milliseconds
+            # what is built stays; collecting garbage in it would cost every state some milliseconds
             gc.collect()
             gc.freeze()
         except (InputError, BackendUnavailable, LibraryMissing, ValueError) as error:
@@ -401,7 +401,7 @@ def compute(pipe: Connection, what: str, backend: str, run: int | None) -> None:
                 kind, question = pipe.recv()
             except (EOFError, OSError):
                 return
-            # a state is many small kernels; whatever else is asked for may have large ones
+            # a state consists of many small kernels; other requests may have large ones
             kernel_threads(1 if kind == "state" else cores())
             pipe.send(answers.handle(kind, question))
 

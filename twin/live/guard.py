@@ -220,7 +220,7 @@ class Connections:
 
     def __init__(self, is_token: Callable[[Mapping[str, str]], bool]) -> None:
         self.is_token = is_token
-        # in the order in which they came
+        # in the order of their connection
         self._unauthenticated: dict[Connection, str] = {}
         self._authenticated: dict[Connection, None] = {}
 
@@ -298,7 +298,7 @@ class Connection(H11Protocol):
         self._idle = True
         self._set_deadline(ANSWER_TIMEOUT if self.transport.get_write_buffer_size() else KEEP_ALIVE)
         super().on_response_complete()
-        if self.cycle is not answered:  # the next request was there already
+        if self.cycle is not answered:  # the next request had arrived already
             self._idle = False
             self._request_received()
 
@@ -308,7 +308,7 @@ class Connection(H11Protocol):
             try:
                 super().send_400_response(msg)
                 return
-            except Exception:  # h11 is past a state in which it could answer
+            except Exception:  # h11 is in a state in which it cannot answer
                 pass
         self.cut()
 

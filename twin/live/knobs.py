@@ -333,7 +333,7 @@ def _number(value: Any, unit: str, otherwise: float) -> float:
     if part is None:
         return otherwise
     number, own_unit = part
-    # dividing keeps decimal fractions where a product would not
+    # division keeps decimal fractions that a product would not
     return float(number) if own_unit == unit else float(number) / unit_ratio(unit, own_unit)
 
 

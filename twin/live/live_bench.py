@@ -74,7 +74,7 @@ class LiveBench:
         named = job if job is not twin.resolved.job else None
         self.twin = twin if named is None else InstrumentTwin.of(twin.resolved.with_job(named), like=twin)
         self._reader = lru_cache(maxsize=4)(self._new_reader)
-        # while a course is played the knobs stand
+        # the knobs do not move while a course is played
         self._perturbed_twin = lru_cache(maxsize=2)(self._new_perturbed_twin)
 
     @cached_property
@@ -89,7 +89,7 @@ class LiveBench:
 
     @cached_property
     def _crosstalk(self) -> Any:
-        # any covariance will do: only what motions do to spots is used of the table
+        # any covariance suffices: only the effects of motions on spots are used
         return crosstalk(self.twin.experiment, np.eye(2 * len(self.twin.experiment.path.channels)))
 
     @cached_property
@@ -362,7 +362,7 @@ class LiveBench:
     def _run(self, asked: AskedState, hidden: State) -> tuple[RenderRun, np.ndarray, PlacedBodies]:
         """Compute a state, and return its run, its images and the placed bodies."""
         experiment = self.twin.experiment
-        # the knobs are a guess of what is hidden, which stands beside it and not on top of it
+        # the knobs are a guess of the hidden motions, and are not added to them
         state = hidden or self.states(asked)
         of_course = asked.time is not None and self.twin.resolved.job.course is not None
         reading = self._reader(asked.frames, asked.seed).read(state, asked.noise, asked.time or 0, of_course)
@@ -561,7 +561,7 @@ def _split(
             moving[name] = values
     if not moving:
         raise ValueError("nothing moved while recording; save the job instead")
-    # what a course adds to a body's motion stands in one place with it
+    # a body's constant motion belongs to its course, too
     bodies = {(knobs[name].node, knobs[name].kind) for name in moving}
     for name in list(fixed):
         if (knobs[name].node, knobs[name].kind) in bodies:

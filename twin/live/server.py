@@ -103,7 +103,7 @@ class LiveServer:
         """
         config = uvicorn.Config(
             self.app,
-            # whatever a stranger sends is nothing to tell a terminal; errors of the program are
+            # print errors of the program, but not those of foreign requests
             log_level="error",
             access_log=False,
             server_header=False,
@@ -121,7 +121,7 @@ class LiveServer:
             backlog=ACCEPT_BACKLOG,
         )
         self._uvicorn = PatientServer(config)
-        # it ends in order and then repeats the signal, which here is no accident
+        # uvicorn shuts down in order and then raises the signal again
         with contextlib.suppress(KeyboardInterrupt):
             self._uvicorn.run(sockets=[listening])
         if self._failed is not None:
@@ -290,7 +290,7 @@ def listen(host: str, port: int) -> socket.socket:
     out.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         out.bind((host, port))
-        # who opens the address before the server is up waits for it
+        # connections made before the server runs wait for it
         out.listen()
     except OSError:
         out.close()

@@ -105,7 +105,7 @@ def init(
     from twin.operate.record.history import History, initialise_record
 
     with errors_reported() as errors:
-        if plan is not None:  # a mistake in it is told before anything is made
+        if plan is not None:  # report errors of the plan before the record is created
             read_operation(plan)
         passed = initialise_record(record, resolve_with(instrument), simulated)
         with History(record) as history:
@@ -200,7 +200,7 @@ def ingest(
                     break
                 time.sleep(POLL)
         except KeyboardInterrupt:
-            if not watch:  # a watching command has no other end
+            if not watch:  # Ctrl-C is the normal end of a watching command
                 print_error(call.errors, "interrupted: the files reported above are in the record, the others are not")
                 raise typer.Exit(cli.INTERRUPTED) from None
         done = {**totals, "files": files_told, "alarms": raised}

@@ -228,7 +228,7 @@ def report(
     words = [call.location, *([] if plan is None else [str(plan)]), *([] if day is None else ["--day", day])]
     with History(call.location, end) as then:
         own = then if end <= newest else call.history
-        if own is then:  # it goes on from what was kept of the whole record before the day's end
+        if own is then:  # reuses the checkpoints of the whole record before the day's end
             operation = call.filtered_operation(operation.plan, then)
         made = write_report(call, own, operation, end, words, out)
     data = {"report": str(out), "verdict": made.verdict, "warnings": list(made.warnings)}

@@ -126,7 +126,7 @@ def perturbation(found: EstimatedMotions, thermal: ThermalModel) -> dict[str, Pe
             slope = (amount * (one.axis == 0), amount * (one.axis == 1), amount * (one.axis == 2))
             field = Temperature(amount) if one.kind == "temperature" else Temperature(0.0, slope)
             heat[one.body] = heat.get(one.body, Temperature()) + field
-    # of checked parts: to validate them would ask for quantities as text
+    # the parts are checked already; validation would require quantities as text
     return {body: _perturbed(moves.get(body, Motion()), heat.get(body)) for body in dict.fromkeys((*moves, *heat))}
 
 

@@ -140,7 +140,7 @@ def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance:
             assert operation is not None  # a life has a reading
             smoothed = operation.smoothed(times)
             ground = _prior(operation, times)
-    # the record keeps no errors on the ground of a reading, the run that read it does
+    # the record has no ground errors of a reading; its run folder has
     single = _single(read_json(files.parent / RESULTS["monitor"])["series"], operation.quantities)
     quantities = operation.quantities
     true = true_changes(truth, quantities, times)
@@ -478,7 +478,7 @@ def judged_svg(life: JudgedLife, quantities: Sequence[tuple[str, str]]) -> str:
                 size = f"RMS {rms(life.errors(method)[:, number]):.2g} {one.parameter.unit}"
                 axes.set_title(f"{title}: {size}", loc="left", fontsize=8.0)
                 axes.set_ylabel(f"error of {own}{one.parameter.label}")
-                if row > 2:  # the operation's two panels are compared with each other
+                if row > 2:  # same scale for the filtered and the smoothed estimate
                     axes.sharey(grid[row - 1, column])
             grid[-1, column].set_xlabel("years in operation")
         svg.shared_legend(figure, grid[-1, 0])

@@ -77,7 +77,7 @@ def readings(history: History, begin: int, end: int, most: int) -> list[dict[str
     with history.reading() as connection:
         ids = list(connection.execute(query).scalars())
         step = max(1, -(-len(ids) // most))
-        chosen = ids[::-1][::step][::-1]  # the newest is always among them
+        chosen = ids[::-1][::step][::-1]  # the newest reading is always included
         rows: list[dict[str, Any]] = []
         for k in range(0, len(chosen), _BATCH):
             part = connection.execute(_rows().where(c.id.in_(chosen[k : k + _BATCH])).order_by(c.time_us, c.id))
@@ -307,7 +307,7 @@ class Overview:
             if sensor.state != "ok":
                 yield Occurrence(sensor.since_us, "sensor", f"the sensor of {sensor.body} is {sensor.state}")
         for alarm in self.alarms:
-            # one of what is still to come was raised with the newest reading at the latest
+            # an alarm about the future was raised with the newest reading at the latest
             yield Occurrence(
                 min(int(alarm["time_us"]), self.latest),
                 "alarm",
@@ -443,7 +443,7 @@ def line_change_text(overview: Overview, jump: DetectedJump) -> str:
         change = jump.line_changes.get(quantity.name)
         if change is not None and (overview.required(quantity) is not None or not overview.filter_result.requirements):
             _, changed, sigma = change
-            if abs(changed) + sigma < SAME:  # the body is none of that camera
+            if abs(changed) + sigma < SAME:  # the body does not belong to that camera
                 continue
             name = name_of(quantity.name, overview.quantities)
             parts.append(f"{name} {with_sigma(changed, sigma, quantity.parameter.unit)}")
@@ -497,7 +497,7 @@ def trend(history: History, overview: Overview, begin: int, end: int, count: int
     past = operation.smoothed(
         np.unique(np.concatenate([evenly_spaced(begin, last, count), np.array(edge_times, np.int64)]))
     )
-    if past.times[-1] == now:  # as all that is told of now and later
+    if past.times[-1] == now:  # use the same present values as the rest of the report
         current = overview.filter_result.now
         parts = ("values", "sigmas", "changes", "covariance")
         joined: dict[str, Any] = {

@@ -304,7 +304,7 @@ def make_products(
         allowed = f"a time from {utc_text(ends[0].time)} to {utc_text(ends[1].time)}"
         remedy = "" if early else "; ingest newer readings, or lengthen the plan's horizon"
         raise Problem(text, utc_text(time), allowed + remedy)
-    # at the very moment of a reading white motions are known, and a microsecond later they are not
+    # white motions are known at the time of a reading, but not a microsecond later
     both = operation.smoothed([time, min(time + 1, ends[1].time)])
     course, beside = _at(both, 0), _at(both, 1)
     far = round(operation.plan.operation.horizon * MICRO)
@@ -402,10 +402,10 @@ def _changes(
     size = np.array([component.unit_size for component in motions.components]) * stated.sigmas
     rows = stated.parameters / np.where(size > 0.0, size, np.inf)  # (4 K, M) per SI unit of each motion
     other_rows, white_rows = rows * ~white, rows * white
-    # p = p_other + p_white: their covariance goes out with that of the white part
+    # p = p_other + p_white: remove the white part with its covariance to the others
     across = white_rows @ motions.covariance @ other_rows.T
     constant = course.covariance[0] - white_rows @ motions.covariance @ white_rows.T - across - across.T
-    # ERR_RAND comes from here alone: the stated sizes of motions that are white in time
+    # ERR_RAND consists of the stated sizes of motions that are white in time
     prior = stated.parameters * white
     random = prior @ stated.correlation @ prior.T
     values = course.changes[0] - white_rows @ motions.mean
@@ -429,7 +429,7 @@ def _notes(time: int, valid: Validity, result: FilterResult, version: str) -> tu
 def _exported(scene: ExportSource, backend: Backend, changes: Mapping[str, EstimatedChange]) -> Export:
     """Return the camera models of a scene. Raise InputError if they cannot be made."""
     test = scene.setup.test
-    # what a test perturbs is what it pretends to be the truth; here the record says what the cameras are
+    # the test's perturbation is its simulated truth; here the record determines the cameras
     setup = scene.setup.model_copy(update={"test": test.model_copy(update={"perturb": FrozenMap()})})
     try:
         return run_export(replace(scene, setup=setup), backend, _heights(scene), changes=changes)

@@ -180,12 +180,12 @@ def simulate_into(
     target = Path(record) / FOLDER if out is None and record is not None else chosen(out, LIFE)
     readings = len(what.times)
     require_memory(Lowered(_Options(), ("--every",), readings, "readings", lambda count: count * _READING))
-    if out is not None:  # what is there is told before there is a record, which is never altered
+    if out is not None:  # report an existing folder before the record, which cannot be altered, is created
         RunFolder(out, force)
     advance(CALIBRATE, 0, 1)
     experiment = MonitorExperiment(plan.model, backend)
     experiment.nominal_focus  # noqa: B018 - an instrument without spots is told first
-    # before there is a record, which is never altered
+    # check before the record, which cannot be altered, is created
     _require_known_sensors(experiment, what)
     with ExitStack() as open_record:
         history = None
@@ -193,7 +193,7 @@ def simulate_into(
             initialise_record(record, plan.model, simulated=True)
             history = open_record.enter_context(History(record))
             _require_empty(history)
-            # requirements are checked against the instrument; those of a life were when it was simulated
+            # requirements are checked against the instrument; those of a config.yaml were checked already
             store_plan(plan if complete else read_plan(file, history), file, history)
         folder = RunFolder(target, force)
         advance(CALIBRATE, 1, 1)
@@ -234,7 +234,7 @@ def simulate_into(
 def _again(truth: Path | None, what: Simulation, backend: Backend) -> Iterator[str]:
     """Yield the words of the command that repeats the files in their folder."""
     yield from (PROGRAM, "simulate", CONFIG, *what.words, "--seed", str(what.seed), "--backend", backend.name)
-    if truth is not None:  # nothing outside of the folder is written by who makes a run again
+    if truth is not None:  # a repetition writes no files outside its folder
         yield from ("--truth", NO_TRUTH)
 
 

@@ -248,7 +248,7 @@ def on_record(work: Callable[..., None]) -> Callable[..., None]:
     def command(record: str, options: cli.Options, **arguments: Any) -> None:
         with errors_reported() as errors:
             if (file := file_of(record)) is not None:
-                require_file(file)  # before what reads a database is imported
+                require_file(file)  # check before the database library is imported
             from twin.operate.record.history import History
 
             with History(record) as history:

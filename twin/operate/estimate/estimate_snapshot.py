@@ -152,7 +152,7 @@ class Sensor:
         again = value == self.value
         step = self.step if again or not self.readings else min(self.step, abs(value - self.value))
         repeats = self.repeats + 1 if again else 0
-        # two readings of a working sensor agree in its last digit with this chance
+        # probability that two readings of a working sensor agree in the last digit
         alike = float(erf(0.5 * step / (2.0 * sigma))) if math.isfinite(step) else 0.0
         return replace(
             self,
@@ -502,7 +502,7 @@ class EntryFilter:
         """Return the state updated with one observation, and the innovation."""
         filter_state, innovation = self.series_filter.update(state.filter_state, observed, entry["decided"] is not None)
         used = np.append(state.used, np.int64(entry["id"]))
-        # of no motion that may jump there is nothing to count rows by
+        # the number of columns is zero if no motion may jump
         before = state.undetected_shares.reshape(len(state.used), len(self.series_filter.walking))
         left = np.concatenate([before, state.filter_state.undetected[None]])
         return replace(state, filter_state=filter_state, used=used, undetected_shares=left), innovation
@@ -524,7 +524,7 @@ class EntryFilter:
         white = float(self.series_filter.whitened(there.state, observed).white[0])
         sensor = sensor.with_residual(white)
         state = replace(state, sensors={**state.sensors, body: sensor})
-        if body in state.jointly_disagreeing:  # then it is not the sensor that is wrong
+        if body in state.jointly_disagreeing:  # the prior is wrong, not the sensor
             times = max(abs(white), 1.0)
             inflated = self.series_filter.inflated(there, observed, times) if times > INFLATION_SIGMAS else there
             disagreeing = tuple(sorted({*state.disagreeing, *state.jointly_disagreeing}))

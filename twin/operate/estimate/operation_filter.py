@@ -248,7 +248,7 @@ class Operation:
             self.history.drop_checkpoints(self.key, self.epoch)
             self._saved = 0
             return None
-        # what was used up to one that is kept for good is kept with it
+        # a permanent checkpoint lists the entries used before it
         return state.with_counters_reset() if checkpoint.number > _HEAD else state
 
     def _has_same_basis(self, state: EstimatorState) -> bool:
@@ -599,7 +599,7 @@ class Operation:
     @cached_property
     def _all_segments(self) -> list[EstimatorState]:
         """All permanent checkpoints, and the newest state."""
-        last = self.estimator_state  # what is new is taken and kept first
+        last = self.estimator_state  # filters new readings and saves their checkpoints first
         checkpoints = (
             EstimatorState.from_bytes(checkpoint.content)
             for checkpoint in self.history.checkpoints(self.key)

@@ -440,10 +440,10 @@ def alarms_of(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
 def _is_repeated(alarm: Alarm, before: Sequence[Row]) -> bool:
     """Return whether an alarm repeats an earlier one."""
     same = [one for one in before if (one["kind"], one["subject"]) == (alarm.kind, alarm.subject)]
-    if alarm.kind == JUMP:  # of a jump the time is known the better the more readings have come
+    if alarm.kind == JUMP:  # later readings determine the time of a jump better
         began, ended = alarm.content["after_us"], alarm.content["until_us"]
         return any(one["content"]["after_us"] < ended and began < one["content"]["until_us"] for one in same)
-    if alarm.kind == CONTRADICTION:  # every reading is one of its own
+    if alarm.kind == CONTRADICTION:  # each reading raises its own alarm
         return any(one["acknowledged"] is None or alarm.time <= one["time_us"] for one in same)
     return any(one["acknowledged"] is None or abs(alarm.time - one["time_us"]) < AGAIN for one in same)
 
@@ -515,7 +515,7 @@ def _contradictions(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm
     """
     spans = [(jump.after_us, jump.detected_us) for jump in result.jumps]
     innovations = result.innovations
-    # the first of all has no other before it, and a chance of a false alarm of its own
+    # the first reading has none before it, and a false-alarm probability of its own
     previous_times = (
         [innovations[0][0] - round(plan.mission * MICRO) if result.readings == len(innovations) else innovations[0][0]]
         if innovations

@@ -141,7 +141,7 @@ class History:
             try:
                 with writing(self._engine) as connection:
                     return Ingest(connection, self.simulated, late).ingest(content)
-            except IntegrityError as error:  # of databases without a lock: another writer was first
+            except IntegrityError as error:  # in databases without a lock another writer may be first
                 if not attempt:
                     raise RecordFailed(message_of(error)) from None
         raise AssertionError
@@ -222,7 +222,7 @@ class History:
         with self.reading() as connection:
             if kind and not (
                 after_us is None and self._until is None
-            ):  # a look into the index for each subject, and no walk through all
+            ):  # one index lookup for each subject instead of a scan
                 query = query.where(c.subject.in_(_subjects(connection, kind)))
             yield from map(dict, connection.execute(query.order_by(c.time_us, c.id)).mappings())
 
@@ -293,7 +293,7 @@ class History:
             newest = select(PLAN.c.sha256).order_by(PLAN.c.id.desc()).limit(1)
             if connection.execute(newest).scalar() == digest:
                 return False
-            # cameras and causes keep their order, which is that of all results
+            # keep the order of cameras and causes, which is that of all results
             text = json.dumps(content, allow_nan=False, ensure_ascii=False)
             row = {"sha256": digest, "file": file, "content": text, "kept_utc": utc_text(now())}
             connection.execute(insert(PLAN).values(**row))
@@ -309,7 +309,7 @@ class History:
         """Return the earliest entry of a kind, as from `entries`; None if there is none."""
         c = ENTRY.c
         with self.reading() as connection:
-            # of each subject by the index, which has it before the time
+            # query each subject by the index, which orders by subject before time
             rows = [
                 connection.execute(
                     select(*c).where(c.kind == kind, c.subject == one).order_by(c.time_us, c.id).limit(1)
@@ -404,7 +404,7 @@ class History:
         bool
             Whether it was saved; it is not if a reading up to that time has come since.
         """
-        if self._until is not None and number >= 0:  # the newest estimate stays where it is
+        if self._until is not None and number >= 0:  # the newest estimate is not replaced
             return False
         row = {"plan": plan, "number": number, "time_us": time_us, "entry_id": entry_id, "content": content}
         with writing(self._engine) as connection:
@@ -494,7 +494,7 @@ class History:
 
 def _late(after_id: Any, until_us: Any) -> tuple[Any, Any]:
     """Return the conditions of entries up to a time that were ingested after another one."""
-    # few are newer and all are older: the sum keeps databases from a walk through the index of the times
+    # few ids are newer, but all times are earlier: the sum prevents a scan of the index of times
     return ENTRY.c.id > after_id, ENTRY.c.time_us + 0 <= until_us
 
 

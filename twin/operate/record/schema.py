@@ -217,7 +217,7 @@ def altered(connection: Connection, newest: int | None) -> tuple[int, list[str]]
         for row in rows
         if _digest_of(row) != row["sha256"] or row["time_utc"] != utc_text(row["time_us"])
     ]
-    if connection.dialect.name == "sqlite":  # it counts without gaps
+    if connection.dialect.name == "sqlite":  # its ids have no gaps
         held, last = connection.execute(select(func.count(), func.max(c.id)).select_from(ENTRY)).one()
         if held != (last or 0):
             wrong.append(f"{(last or 0) - held} entries have been removed")

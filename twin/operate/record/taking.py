@@ -125,7 +125,7 @@ class Ingest:
         out = {
             digest_of_data([entry] if entry else [content.file, content.meaning, one.line, one.reason]): (one, entry)
             for one, entry in refused
-            if entry or not before  # the same file, wherever it lies
+            if entry or not before  # the same file at any path
         }
         known = self._present(REFUSED.c.sha256, list(out))
         readings = self._present(REFUSED.c.entry, [entry for _, entry in out.values() if entry])
@@ -247,7 +247,7 @@ class Ingest:
             for one, digest in new_entries
         ]
         self._insert(ENTRY, rows)
-        if rows:  # estimates that went past the earliest of them do not hold it
+        if rows:  # checkpoints after the earliest new entry do not contain it
             earliest = min(one.time for one, _ in new_entries)
             self.connection.execute(delete(CHECKPOINT).where(CHECKPOINT.c.time_us >= earliest))
         refusals_made = [

@@ -278,7 +278,7 @@ def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[
             continue
         if table.kind in VALUES:
             read = ((one, column, [row[head] for head in column.column]) for one, column in table.columns.items())
-            # cells that are empty say nothing
+            # empty cells are not readings
             items += [_entry_or_refusal(_reading, table, history, *one, moment, number) for one in read if any(one[2])]
         elif table.kind == EVENT:
             items.append(_entry_or_refusal(_event, table, row, moment, number))
@@ -471,7 +471,7 @@ class Sources:
             for file in described:
                 yield from self._tables(file, history, named)
             for run in runs:
-                if (run / MANIFEST).resolve() not in named:  # the time of others stands in a table
+                if (run / MANIFEST).resolve() not in named:  # a table gives the times of the named ones
                     yield from self._run(run, None, history)
 
     def _tables(self, file: Path, history: History, named: set[Path]) -> Iterator[FileContent]:
