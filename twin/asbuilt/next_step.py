@@ -59,7 +59,7 @@ def optimal_move(bench: AsBuiltBench, mean: np.ndarray, after: str | None) -> Ne
     move = None
     for _ in range(MOST_ROUNDS):
         residual, slope = _about(bench, mean, after, amounts)
-        # the merit at no move, as it looks from where the last search led to
+        # the merit without a move, extrapolated linearly from the state after the last one
         move = best_move(residual - slope @ amounts, slope, actuators)
         if np.array_equal(move.amounts, amounts):
             break

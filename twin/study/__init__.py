@@ -13,7 +13,7 @@ class _Study(ModuleType):
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         """See `twin.study.scripted.study`."""
-        # nothing of it is needed to import a part of the package
+        # imported late, since parts of the package do not need it
         from twin.study.scripted import study
 
         return study(*arguments, **options)

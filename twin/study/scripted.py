@@ -131,7 +131,7 @@ def study(
     with scratch("twin-study") as folder:
         file, target = folder / "config.yaml", folder / "study" if out is None else Path(out)
         file.write_text(config, "utf-8")
-        # A process of its own: workers started from here would run the caller's script once more, each of them.
+        # a separate process, since workers started from here would each run the caller's script again
         command = [sys.executable, "-m", str(__package__), str(file), "--out", str(target), "--yes", "--json"]
         command += [] if workers is None else ["--workers", str(workers)]
         code, message = _run(command, quiet, progress)
@@ -187,7 +187,7 @@ def _progress_bar() -> ProgressCallback:
         spent = time.monotonic() - begun
         remaining = f", about {spent * (total - done) / done:.0f} s left" if 0 < done < total else ""
         bar = f"runs {'#' * full}{'.' * (_WIDTH - full)} {done} of {total}, {spent:.0f} s{remaining}"
-        # the line before may have been longer
+        # padded, since the previous line may have been longer
         stream.write(f"\r{bar:<79}" + ("\n" if done == total else ""))
         stream.flush()
 

@@ -256,7 +256,7 @@ def sight_gradient(
     heading_step = np.einsum("bnk,bnkx->bnx", rotation, np.repeat(axes, m, axis=0))
     pushed = jvp(backend, to_object, positions, heading, moved, heading_step)
     local = pushed.traced.numpy()[1]
-    # from the frame of the last element, which moves too, to the world
+    # transformed from the moving frame of the last element to the world
     assert to_object.world_tangents is not None
     pose, pose_step = (poses.rotation[:, -1] for poses in (to_object.world, to_object.world_tangents))
     world = np.einsum("bij,bnj->bni", pose, pushed.direction) + np.einsum("bij,bnj->bni", pose_step, local)

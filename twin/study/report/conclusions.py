@@ -164,7 +164,7 @@ def conclusions(analysis: StudyAnalysis) -> list[str]:
     out = [_requirement_text(analysis)] if analysis.requirements else []
     out += [_knee(analysis, k) for k in range(len(analysis.fronts))]
     out += [_contributors(analysis, response) for response in analysis.runs.responses]
-    # a stated sigma is a response of its own where it is all a grid is about; among drawn runs it hardly changes
+    # the reported sigmas of a grid count as responses; among drawn runs they hardly vary
     if not analysis.runs.sampled:
         out += [_contributors(analysis, sigma) for sigma in analysis.runs.sigmas]
     return [text for text in out if text]

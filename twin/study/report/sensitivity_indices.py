@@ -380,7 +380,7 @@ class _Chaos:
                 continue
             tried.add(terms.tobytes())
             model = cls._fit(axes, functions, terms, degree, y[:few], good)
-            # a little better is not better: more terms only where they pay
+            # more terms only if they reduce the cross-validation error by more than 2 %
             if model is not None and (best is None or 1.0 - model.held_out < 0.98 * (1.0 - best.held_out)):
                 best = model
         if best is None or few == len(y):

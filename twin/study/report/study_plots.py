@@ -298,7 +298,7 @@ def pareto_figure(analysis: StudyAnalysis) -> Figure:
         shown = thinned(front.ranks > 0, 1000)
         axes.plot(x.values[shown], y.values[shown], ".", color=GREY, ms=3.5, alpha=0.6, label="dominated runs")
         if len(front.runs):
-            # between two runs of the front nothing is known: only steps are sure
+            # nothing is known between two runs of the front, so it is drawn as steps
             axes.step(front.x, front.y, where="post", color=BLUE, lw=1.0)
             axes.plot(front.x, front.y, "o", color=BLUE, ms=5, label=f"front, {len(front.runs)} runs")
         if front.knee is not None:

@@ -597,7 +597,7 @@ def _effect(
     low, high = _span(factor, values)
     b, influence = float(coefficient[0]), moved[0]
     spread = float(np.std(y))
-    # a standardised coefficient moves with the sigmas of the runs, too, which belong to the same runs
+    # a standardised coefficient also depends on the standard deviations of the same runs
     widths = 0.5 * (((values - values.mean()) / values.std()) ** 2 - ((y - y.mean()) / spread) ** 2) / len(y)
     rank = float(stats.spearmanr(values, y).statistic)
     return Effect(

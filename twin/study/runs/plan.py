@@ -85,7 +85,7 @@ def _quantile(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
         return np.asarray(numbers[0] + numbers[1] * ndtri(u))
     if factor.kind == "truncated":
         mean, sigma, low, high = numbers
-        # the inverse is taken in the nearer tail, where it has digits
+        # the inverse is computed in the nearer tail, where it does not lose digits
         a, b = (low - mean) / sigma, (high - mean) / sigma
         if a > FAR or b < -FAR:
             return np.asarray(np.clip(mean + sigma * _far(a, b, u), low, high))
@@ -438,7 +438,7 @@ def _column(setup: StudySetup, name: str, sampled: np.ndarray) -> Column:
         return Column(name, numbers.unit or "", _like(setup, name, sampled))
     if numbers.numeric:
         listed = np.array(numbers.values, np.float64)
-        # a whole number beyond these is none of a base job, which says so when it reads it
+        # larger whole numbers are not exact in float64; the base job refuses them
         whole = numbers.whole and bool(np.all(np.abs(listed) < 2.0**53))
         return Column(name, numbers.unit or "", (listed.astype(np.int64) if whole else listed)[sampled])
     scalars = factor.scalars()

@@ -212,7 +212,7 @@ def _placed(study: StudySpec, tree: Tree) -> StudySetup:
                 base = with_place(base, model, place, neutral=is_set)
         except Problem as problem:
             raise setup.error(problem, at) from None
-    # an entry that was made for one factor may need another factor's value to be valid
+    # an entry created for one factor may need the value of another to be valid
     tree = with_values(tree, [(place, f.scalars()[-1]) for f in study.factors.values() for place in _unset(tree, f)])
     return StudySetup(study, tree, base)
 
