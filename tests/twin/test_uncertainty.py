@@ -216,9 +216,9 @@ def test_doubts_about_random_states_are_warnings():
     assert uncertainty_report(replace(run, coverage=counted(alarms=2))).warnings == ()
     limits = run.limits
     for changes, text in (
-        ({"limits": replace(limits, outside=0.3)}, "In 30.0% of all states that orbit allows a spot leaves"),
+        ({"limits": replace(limits, outside=0.3)}, "In 30.0 % of all states of the prior orbit a spot leaves"),
         ({"limits": replace(limits, without="no room")}, "it cannot be built: no room"),
-        ({"coverage": counted(doubted=1)}, "in 1 of 400 random states spots are not as calibrated"),
+        ({"coverage": counted(doubted=1)}, "in 1 of 400 random states spots differ from their calibration"),
         ({"coverage": counted(alarms=3)}, "in 3 of 400 random states the shifts contradict the prior"),
         ({"coverage": counted(1.25)}, "sigmas do not hold in the random states: posterior of"),
     ):

@@ -51,7 +51,7 @@ class MonitorReading:
         Number of frames of each spot after the change.
     centroid : str
         Method that locates the spots.
-    found_wrong : tuple of str
+    earlier_doubts : tuple of str
         Reasons why sigma does not hold that were known before the spots were read.
     truth : Truth or None
         True changes, for simulated states.
@@ -128,7 +128,7 @@ class MonitorReading:
         )
 
     @cached_property
-    def unseen(self) -> tuple[str, ...]:
+    def unobserved(self) -> tuple[str, ...]:
         """Warnings of bodies whose motions hardly move the spots but contribute to sigma, without full stops."""
         prior, noise = self.disturbances, self.recovery.shift_covariance[0]
         if prior is None or not np.any(noise):
@@ -137,10 +137,10 @@ class MonitorReading:
 
     def _error_text(self, name: str) -> str:
         """Return the quantity whose linear reading departs most from the retraced state, and by how much, as text."""
-        worst, size = self.recovery.curvature[name].worst()
+        index, size = self.recovery.curvature[name].worst()
         if not math.isfinite(size):
             return "light is lost"
-        return f"the linear {short_text(self._quantities[worst])} is off by {size:.3g} σ"
+        return f"the linear {short_text(self._quantities[index])} is off by {size:.3g} σ"
 
     @cached_property
     def _quantities(self) -> tuple[Quantity, ...]:
@@ -188,7 +188,7 @@ class MonitorReading:
 
         Parameters
         ----------
-        stated : Disturbances
+        prior : Disturbances
             Prior, which gives the number of spot coordinates.
 
         Returns
@@ -302,9 +302,9 @@ def contradicted(
 
     Parameters
     ----------
-    stated : Disturbances or None
+    prior : Disturbances or None
         Prior on the disturbances.
-    found : Consistency or None
+    test : Consistency or None
         Test of the shifts against the prior.
     when : str
         Text that names the measurement, where there are several.
@@ -353,7 +353,7 @@ def prior_check(name: str, test: Consistency) -> SelfCheck:
     ----------
     name : str
         Name of the check.
-    told : Consistency
+    test : Consistency
         Test of the shifts against the prior.
     """
     meaning = (
@@ -382,14 +382,14 @@ SHARE_DECIMALS, OFF_DECIMALS = 3, 1
 READING_DECIMALS = 6
 """Decimals of a reading in files, counted in units of its sigma."""
 _TEST_KEYS: Mapping[str, Callable[[Consistency], Any]] = {
-    "chi_square": lambda found: _to_digits(found.chi_square),
-    "chi_square_sigma_noise": lambda found: found.sigma_noise,
-    "degrees_of_freedom": lambda found: found.degrees,
-    "limit": lambda found: _to_digits(found.limit),
-    "false_alarm": lambda found: found.false_alarm,
-    "chance": lambda found: _to_digits(found.chance),
-    "chance_sigma_noise": lambda found: found.chance_sigma_noise,
-    "agrees": lambda found: found.agrees,
+    "chi_square": lambda test: _to_digits(test.chi_square),
+    "chi_square_sigma_noise": lambda test: test.sigma_noise,
+    "degrees_of_freedom": lambda test: test.degrees,
+    "limit": lambda test: _to_digits(test.limit),
+    "false_alarm": lambda test: test.false_alarm,
+    "chance": lambda test: _to_digits(test.chance),
+    "chance_sigma_noise": lambda test: test.chance_sigma_noise,
+    "agrees": lambda test: test.agrees,
 }
 """Key in files -> number of the test against the prior."""
 _SIGMA_DIGITS = 8

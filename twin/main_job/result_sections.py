@@ -358,10 +358,10 @@ def residual_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
     rows: list[list[Cell]] = []
     full: list[list[Cell]] = []
     notes = []
-    own = [r for r in run.reading.table.of(run.judged) if r.camera]
+    judged_rows = [r for r in run.reading.table.of(run.judged) if r.camera]
     for name in run.experiment.instrument.cameras:
         found = systematics(run, name)
-        for k, r in enumerate(one for one in own if one.camera == name):
+        for k, r in enumerate(one for one in judged_rows if one.camera == name):
             bias, places = float(found.bias[run.judged][k]), decimals_for(r.noise)
             error, expected, left = (fixed(v, places, sign=True) for v in (r.error, bias, r.error - bias))
             texts = (error, residual_text(residual(r.error, r.sigma)), expected, left)

@@ -336,7 +336,7 @@ def limits(reading: MonitorReading, change: Reading) -> tuple[str, float]:
     ----------
     reading : MonitorReading
         Reading of the instrument, with a prior.
-    one : Reading
+    change : Reading
         The change, as the judged estimator reads it.
     """
     prior = reading.disturbances

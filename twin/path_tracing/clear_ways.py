@@ -224,13 +224,13 @@ def _shortest(choices: Sequence[Sequence[Patch]]) -> list[Patch]:
     return min(lines, key=lambda one: one[0])[1]
 
 
-def _faces(one: Patch, other: Patch, side: float) -> bool:
+def _faces(patch: Patch, other: Patch, side: float) -> bool:
     """Return True if all of one aperture is visible from the given side of the other."""
-    apart = (other.corners[None] - one.corners[:, None]).reshape(-1, 3)
-    if len(one.normals) == 1:
-        return bool(np.min(side * (apart @ one.normals[0])) > 0.0)
+    apart = (other.corners[None] - patch.corners[:, None]).reshape(-1, 3)
+    if len(patch.normals) == 1:
+        return bool(np.min(side * (apart @ patch.normals[0])) > 0.0)
     apart /= np.linalg.norm(apart, axis=-1, keepdims=True)
-    return bool(np.min(side * (apart @ one.normals.T)) > FACING)
+    return bool(np.min(side * (apart @ patch.normals.T)) > FACING)
 
 
 def _patches(number: int, surface: SceneSurface) -> list[Patch]:

@@ -279,11 +279,11 @@ def _step(
             outgoing, event, onward, rng = sample_bsdf(
                 backend, rng, met, shared.scattered, lobe, scatter_floor, near_share, leaving, drawn
             )
-            spreading = event >= int(Event.DIFFUSE)
+            scattering = event >= int(Event.DIFFUSE)
             # after scattering, directions are drawn in proportion to power
             more = dr.select(chosen.unlikely, UInt(UNLIKELY), 0)
             more = dr.select(unlikely < 2, more, 0)
-            history = dr.select(met, dr.select(spreading, STRAY + 2 * UNLIKELY, history + more), history)
+            history = dr.select(met, dr.select(scattering, STRAY + 2 * UNLIKELY, history + more), history)
         else:
             onward = weight * continuing
         if features.segments:

@@ -134,11 +134,11 @@ def family_name(family: tuple[SurfaceEvent, ...], nominal: tuple[SurfaceEvent, .
     ghosts, others, positions = [], [], []
     for position, hit in enumerate(family):
         name = _short(hit.part, nominal)
-        known = (hit.part, hit.event) in usual
-        if known and not hit.outside:
+        is_nominal = (hit.part, hit.event) in usual
+        if is_nominal and not hit.outside:
             continue
         positions.append(position)
-        if hit.event == Event.REFLECT and hit.part in parts and not known:
+        if hit.event == Event.REFLECT and hit.part in parts and not is_nominal:
             ghosts.append(name + " outside its aperture" * hit.outside)
         else:
             others.append(f"{_VERBS[hit.event]} {name}" + " outside its aperture" * hit.outside)
@@ -149,13 +149,13 @@ def family_name(family: tuple[SurfaceEvent, ...], nominal: tuple[SurfaceEvent, .
     if not words:
         return "the nominal surfaces in another order"
     # light returns at the surface in the middle of the nominal path
-    turn = nominal[len(nominal) // 2].part
-    turns = [position for position, hit in enumerate(family) if hit.part == turn]
-    if not turns:
-        words.append(f"without {_short(turn, nominal)}")
-    elif positions[-1] < turns[0]:
+    turning_part = nominal[len(nominal) // 2].part
+    turning_positions = [position for position, hit in enumerate(family) if hit.part == turning_part]
+    if not turning_positions:
+        words.append(f"without {_short(turning_part, nominal)}")
+    elif positions[-1] < turning_positions[0]:
         words.append("on the way out")
-    elif positions[0] > turns[-1]:
+    elif positions[0] > turning_positions[-1]:
         words.append("on the way back")
     return ", ".join(words)
 

@@ -256,7 +256,7 @@ class _NominalTracer:
 
         Parameters
         ----------
-        place : int
+        number : int
             Index of the step.
         state : tuple of Any
             Position, direction, weight, length, state of the random generator, surfaces passed, reason why a path has

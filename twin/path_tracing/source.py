@@ -205,12 +205,12 @@ def _drawn(backend: Backend, source: DiskSource, numbers: Any, total: int, seed:
 
     # neighbours have similar directions; in a collimated beam, similar positions
     first_two, last_two = (independent(), stratified()) if source.cone > 0.0 else (stratified(), independent())
-    r, turn = radius * dr.sqrt(first_two[0]), 2.0 * dr.pi * first_two[1]
-    sine, cosine = dr.sincos(turn)
+    r, angle = radius * dr.sqrt(first_two[0]), 2.0 * dr.pi * first_two[1]
+    sine, cosine = dr.sincos(angle)
     position = centre + (r * cosine) * first + (r * sine) * second
     aimed = fraction(dr.fma(block, share, shift[2])) < share
-    r, turn = dr.sqrt(last_two[0]), 2.0 * dr.pi * last_two[1]
-    sine, cosine = dr.sincos(turn)
+    r, angle = dr.sqrt(last_two[0]), 2.0 * dr.pi * last_two[1]
+    sine, cosine = dr.sincos(angle)
     r = r * dr.select(aimed, narrow, cone)
     u, v = r * cosine + dr.select(aimed, x, 0.0), r * sine + dr.select(aimed, y, 0.0)
     direction = u * first + v * second + dr.sqrt(1.0 - u * u - v * v) * axis

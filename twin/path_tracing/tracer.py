@@ -263,17 +263,19 @@ class PathTracer:
         self.backend = backend
         self.scenery = scenery
         self.nominal = dict(nominal or {})
-        known = [d.name for d in scenery.detectors]
-        if unknown := sorted(set(self.nominal) - set(known)):
-            there = ", ".join(known)
-            raise ValueError(f"families of unknown detectors: {', '.join(unknown)}; detectors of the scene: {there}")
+        names = [d.name for d in scenery.detectors]
+        if unknown := sorted(set(self.nominal) - set(names)):
+            detector_names = ", ".join(names)
+            raise ValueError(
+                f"families of unknown detectors: {', '.join(unknown)}; detectors of the scene: {detector_names}"
+            )
         self.sampling = sampling
         mi = load_mitsuba(backend)
         signatures = {name: signature(codes) for name, codes in self.nominal.items()}
         self._clear = ClearSegments(scenery, self.nominal if segments else {})
         tables = upload(backend, scenery, signatures, self._clear.segments)
         self.prepared = PreparedScene(backend, mi, build_scene(mi, scenery), tables)
-        self._signatures = [signatures.get(name, 0) for name in known]
+        self._signatures = [signatures.get(name, 0) for name in names]
 
     def features(self, keep_nominal: bool = False, log: bool = False) -> Features:
         """Return the features of the kernel for this scene."""

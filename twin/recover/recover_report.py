@@ -207,12 +207,16 @@ def _estimators(run: RecoverRun) -> Section:
     for estimator in reading.estimators.values():
         heads += [estimator.title, f"{estimator.title} σ", f"{estimator.title} σ of noise"]
     rows: list[list[Cell]] = []
-    for same in reading.table.by_change():
-        row: list[Cell] = [same[0].camera or "both", same[0].parameter.symbol, same[0].parameter.unit]
-        for one in same:
-            row += [one.value, one.sigma, one.noise]
+    for rows_of_change in reading.table.by_change():
+        row: list[Cell] = [
+            rows_of_change[0].camera or "both",
+            rows_of_change[0].parameter.symbol,
+            rows_of_change[0].parameter.unit,
+        ]
+        for reading_row in rows_of_change:
+            row += [reading_row.value, reading_row.sigma, reading_row.noise]
         rows.append(row)
-    notes = [f"{one.title}: {one.note}." for one in reading.estimators.values()]
+    notes = [f"{reading_row.title}: {reading_row.note}." for reading_row in reading.estimators.values()]
     table = Table("estimators", "All estimators", " ".join(notes), heads, rows, digits=5)
     return Section("Estimators", (_NOT_IN_SIGMA,), (table,), 1)
 

@@ -192,7 +192,7 @@ def run_recover(
         readings.append(MonitorReading(names, *arguments, together=len(recoveries)))
     frame_warnings = (*_shape_warnings(results, times), *_noise_warnings(results, times, source))
     input_warnings = (*bench.warnings, *order_warnings(channels, times), *_coarse_warnings(channels, setup))
-    warnings = (*input_warnings, *frame_warnings, *_reading_warnings(readings, times), *readings[-1].unseen)
+    warnings = (*input_warnings, *frame_warnings, *_reading_warnings(readings, times), *readings[-1].unobserved)
     return RecoverRun(setup, tuple(readings), results, bench.pitch, smoothed, warnings)
 
 
@@ -330,17 +330,22 @@ def _smoother(setup: MeasurementSetup, bench: _Calibrated) -> CourseSmoother | N
     return CourseSmoother(bench.disturbances, bench.cameras, ground, times)
 
 
-def _joint_noise(each: Sequence[NoiseParts]) -> NoiseParts:
+def _joint_noise(parts_of_spots: Sequence[NoiseParts]) -> NoiseParts:
     """Return the joint noise of spots on different CCDs."""
-    return NoiseParts(np.concatenate([one.temporal for one in each]), np.concatenate([one.pattern for one in each]))
+    return NoiseParts(
+        np.concatenate([parts.temporal for parts in parts_of_spots]),
+        np.concatenate([parts.pattern for parts in parts_of_spots]),
+    )
 
 
 def _joint_positions(positions: Sequence[SpotPositions]) -> SpotPositions:
     """Return all spots together, without their maps, which may differ in size."""
     names = ["row", "column", "temporal_covariance", "fixed_covariance", "flux", "background", "converged"]
     names.append("reduced_chi_square")
-    values: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in positions]) for name in names}
-    return SpotPositions(**values, iterations=max(one.iterations for one in positions))
+    values: dict[str, Any] = {
+        name: np.concatenate([getattr(spot_positions, name) for spot_positions in positions]) for name in names
+    }
+    return SpotPositions(**values, iterations=max(spot_positions.iterations for spot_positions in positions))
 
 
 def _spot_issues(setup: MeasurementSetup, channels: Sequence[ChannelFrames], error: SpotError) -> list[Issue]:

@@ -277,13 +277,13 @@ def find_limits(
     )
 
 
-def _left(rows: np.ndarray, stated: Disturbances, noise: np.ndarray) -> np.ndarray:
-    return limits.posterior_sigma(rows, stated, noise)
+def _left(rows: np.ndarray, prior: Disturbances, noise: np.ndarray) -> np.ndarray:
+    return limits.posterior_sigma(rows, prior, noise)
 
 
-def _own(stated: Disturbances) -> list[bool]:
+def _own(prior: Disturbances) -> list[bool]:
     """Return for each motion True if a second monitor has its own such body: prisms, not cameras or central prism."""
-    return ["/monitor/" in body for body in stated.bodies]
+    return ["/monitor/" in body for body in prior.bodies]
 
 
 def _second_monitor(experiment: MonitorExperiment) -> Disturbances:
@@ -296,11 +296,11 @@ def _second_monitor(experiment: MonitorExperiment) -> Disturbances:
     return disturbances_of(experiment.stated, other.path, other.thermal, other.instrument, other.backend)
 
 
-def _outside(experiment: MonitorExperiment, stated: Disturbances, noise: np.ndarray) -> float:
+def _outside(experiment: MonitorExperiment, prior: Disturbances, noise: np.ndarray) -> float:
     """Return the probability that a spot is beyond its CCD or too near its edge, from a fixed set of random shifts."""
     half = 0.5 * (np.array(experiment.path.shape) - 1) - EDGE_PX
     middle = experiment.path.coarse_trace([{}]).centre[:, 0]
-    root = np.linalg.cholesky(stated.spot_covariance + noise)
+    root = np.linalg.cholesky(prior.spot_covariance + noise)
     shifts = np.random.default_rng(1).standard_normal((_DRAWS, len(root))) @ root.T
     positions = middle + shifts.reshape(_DRAWS, *middle.shape)
     return float(np.mean(np.any(np.abs(positions) > half, axis=(1, 2))))
@@ -327,13 +327,13 @@ def unit_text(quantity: Quantity) -> str:
 
 
 def unobserved_texts(
-    stated: Disturbances, noise: np.ndarray, quantities: Sequence[Quantity], gain: np.ndarray
+    prior: Disturbances, noise: np.ndarray, quantities: Sequence[Quantity], gain: np.ndarray
 ) -> tuple[str, ...]:
     """Return a warning for each body whose motions in the prior hardly move the spots but contribute to sigma.
 
     Parameters
     ----------
-    stated : Disturbances
+    prior : Disturbances
         Prior on the disturbances.
     noise : (D, D) ndarray
         Noise covariance of the shifts, px^2.
@@ -344,7 +344,7 @@ def unobserved_texts(
     """
     rows = np.stack([quantity.row for quantity in quantities])
     out = []
-    for body, shares in unobserved_bodies(rows, stated, noise, gain).items():
+    for body, shares in unobserved_bodies(rows, prior, noise, gain).items():
         worst = int(np.argmax(shares))
         out.append(
             f"{body}: its motions in the prior move no spot; {100.0 * float(shares[worst]):.0f} % of the variance of "

@@ -149,19 +149,19 @@ _REMEDY: Record[tuple[Remedy, Sequence[limits.Quantity]]] = Record(
 )
 LIMITS: Record[MonitorLimits] = Record(
     "uncertainty.json",
-    Quantity("name", lambda found: found.instrument, "the instrument"),
-    Quantity("disturbances", lambda found: found.stated.name, "name of the prior on disturbances"),
-    Quantity("frames", lambda found: found.frames, "frames of each state"),
-    Quantity("outside", lambda found: found.outside, "probability that a spot leaves its CCD"),
+    Quantity("name", lambda result: result.instrument, "the instrument"),
+    Quantity("disturbances", lambda result: result.stated.name, "name of the prior on disturbances"),
+    Quantity("frames", lambda result: result.frames, "frames of each state"),
+    Quantity("outside", lambda result: result.outside, "probability that a spot leaves its CCD"),
     Quantity(
         "quantities",
-        lambda found: _by_quantity(found.quantities, [_Limited(found, q) for q in range(len(found.quantities))]),
+        lambda result: _by_quantity(result.quantities, [_Limited(result, q) for q in range(len(result.quantities))]),
         "what limits each quantity",
         record=_LIMITED,
     ),
     Quantity(
         "remedies",
-        lambda found: {one.name: (one, found.quantities) for one in found.remedies},
+        lambda result: {one.name: (one, result.quantities) for one in result.remedies},
         "further measurements",
         record=_REMEDY,
     ),
@@ -211,24 +211,24 @@ _OUTLIER: Record[tuple[str, str, str, float, int]] = Record(
 )
 STATES: Record[Coverage] = Record(
     "Coverage in random states.",
-    Quantity("drawn", lambda found: found.drawn, "number of states drawn"),
-    Quantity("measured", lambda found: found.measured, "number of states whose spots stay on their CCDs"),
-    Quantity("false_alarm", lambda found: FALSE, "probability that any count is outside its limits by chance"),
+    Quantity("drawn", lambda result: result.drawn, "number of states drawn"),
+    Quantity("measured", lambda result: result.measured, "number of states whose spots stay on their CCDs"),
+    Quantity("false_alarm", lambda result: FALSE, "probability that any count is outside its limits by chance"),
     Quantity(
         "estimators",
-        lambda found: {
-            name: _by_quantity(found.quantities, [_Counted(found, q, name) for q in range(len(found.quantities))])
-            for name in found.errors
+        lambda result: {
+            name: _by_quantity(result.quantities, [_Counted(result, q, name) for q in range(len(result.quantities))])
+            for name in result.errors
         },
         "errors of each quantity by each estimator",
         record=COUNT,
     ),
-    Quantity("outliers", lambda found: found.outliers, "counts outside their limits", record=_OUTLIER),
-    Quantity("chi_square_mean", lambda found: float(np.mean(found.chi_square)), "mean chi-square of the shifts"),
-    Quantity("alarms", lambda found: found.alarms, "number of states whose chi-square exceeds its limit"),
-    Quantity("alarms_limit", lambda found: found.alarm_limit, "largest number of alarms by chance"),
-    Quantity("doubted", lambda found: found.doubted, "number of states in which the measurement contradicts sigma"),
-    Quantity("sigma_holds", lambda found: found.sigma_holds, "no count outside its limits, no state doubted"),
+    Quantity("outliers", lambda result: result.outliers, "counts outside their limits", record=_OUTLIER),
+    Quantity("chi_square_mean", lambda result: float(np.mean(result.chi_square)), "mean chi-square of the shifts"),
+    Quantity("alarms", lambda result: result.alarms, "number of states whose chi-square exceeds its limit"),
+    Quantity("alarms_limit", lambda result: result.alarm_limit, "largest number of alarms by chance"),
+    Quantity("doubted", lambda result: result.doubted, "number of states in which the measurement contradicts sigma"),
+    Quantity("sigma_holds", lambda result: result.sigma_holds, "no count outside its limits, no state doubted"),
 )
 
 
