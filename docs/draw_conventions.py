@@ -255,6 +255,7 @@ def draw_pixels(ax: Any) -> None:
 
 
 def _box(corner: Point, width: float, height: float, face: str, edge: str, line: float) -> Any:
+    """Return a rectangle patch."""
     from matplotlib.patches import Rectangle
 
     return Rectangle(corner, width, height, facecolor=face, edgecolor=edge, lw=line, zorder=2)

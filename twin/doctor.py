@@ -40,7 +40,7 @@ Status = Literal["ok", "note", "failed"]
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the doctor's report. Only the status "failed" makes the exit code 1; "note" is information."""
+    """Line of the doctor's report. Only the status "failed" makes the exit code 1; "note" is information."""
 
     name: str
     status: Status

@@ -102,17 +102,17 @@ def measured() -> Mapping[str, tuple[float, int, str]]:
     out: dict[str, tuple[float, int, str]] = {}
     for life, words in LIVES.items():
         with tempfile.TemporaryDirectory(prefix="operation-") as place:
-            found = judged(words, Path(place), life == "pair")
+            errors = judged(words, Path(place), life == "pair")
         for name, (group, key, unit) in _QUANTITIES.items():
-            own = found["quantities"][group][key]
+            own = errors["quantities"][group][key]
             for way in _WAYS if life in _DIGITS else ():
                 digits = 1 if way == "ground" else _DIGITS[life][name]
                 out[f"operation.{life}.{name}.{way}"] = (own[way]["rms"], digits, unit)
             if name in ("forward", "backward") and life != "two":
-                share = found["explained_by_temperatures"][f"{group} {key}"]
+                share = errors["explained_by_temperatures"][f"{group} {key}"]
                 out[f"operation.{life}.{name}.explained"] = (100.0 * share, 0, "%")
         for share in ("within_one", "within_two"):
-            out[f"operation.{life}.{share}"] = (100.0 * found["predictions"][share], 0, "%")
+            out[f"operation.{life}.{share}"] = (100.0 * errors["predictions"][share], 0, "%")
     return out
 
 
@@ -134,14 +134,14 @@ def loop_measured() -> dict[str, tuple[float, int, str]]:
         run = Path(place, "run")
         words = ("twin.orbit", "monitor", "scenes/orbit/loop.yaml", "--seed", str(SEED), "--quiet", "--out", str(run))
         subprocess.run([sys.executable, "-m", *words], cwd=ROOT, check=True)
-        found = json.loads((run / "monitor.json").read_text("utf-8"))["loop"]
+        loop = json.loads((run / "monitor.json").read_text("utf-8"))["loop"]
         LOOP_PICTURE.write_text(short((run / "artefacts/course.svg").read_text("utf-8")), "utf-8")
-    out = {f"loop.{name}": (float(found[key]), digits, unit) for name, (key, digits, unit) in _LOOP.items()}
+    out = {f"loop.{name}": (float(loop[key]), digits, unit) for name, (key, digits, unit) in _LOOP.items()}
     for course in ("open", "closed"):
-        out[f"loop.points.{course}"] = (float(found[course]["height_rms_m"]), 2, "m")
+        out[f"loop.points.{course}"] = (float(loop[course]["height_rms_m"]), 2, "m")
         for camera in ("forward", "backward"):
-            focus = found[course]["focus"][camera]["defocus_rms_um"]
+            focus = loop[course]["focus"][camera]["defocus_rms_um"]
             out[f"loop.focus.{camera}.{course}"] = (float(focus), 0, "um")
-    for camera, unseen in zip(("forward", "backward"), found["unobservable_defocus_um"], strict=True):
+    for camera, unseen in zip(("forward", "backward"), loop["unobservable_defocus_um"], strict=True):
         out[f"loop.focus.{camera}.unseen"] = (float(unseen), 0, "um")
     return out

@@ -64,10 +64,10 @@ def _at(file: str, *keys: str, per: float = 1.0) -> Read:
     """Return a reader of the number below these keys of a JSON file, times ``per``."""
 
     def read(run: Path) -> float:
-        found = json.loads((run / file).read_text("utf-8"))
+        value = json.loads((run / file).read_text("utf-8"))
         for key in keys:
-            found = found[key]
-        return per * float(found)
+            value = value[key]
+        return per * float(value)
 
     return read
 
@@ -76,10 +76,10 @@ def _share(quantity: tuple[str, ...], motion: str) -> Read:
     """Return a reader of the share of motions, by name prefix, in the variance of a `posterior` reading, in percent."""
 
     def read(run: Path) -> float:
-        found = json.loads((run / "uncertainty.json").read_text("utf-8"))["quantities"]
+        value = json.loads((run / "uncertainty.json").read_text("utf-8"))["quantities"]
         for key in quantity:
-            found = found[key]
-        lines = found["after"]["posterior"]["lines"]
+            value = value[key]
+        lines = value["after"]["posterior"]["lines"]
         return 100.0 * sum(one["share"] for one in lines if one["motion"].startswith(motion))
 
     return read
@@ -147,8 +147,8 @@ def _doubt(of: str) -> Read:
     """Return a reader of the largest elasticity of the height's sigma with respect to the prior."""
 
     def read(run: Path) -> float:
-        found = json.loads((run / "uncertainty.json").read_text("utf-8"))["quantities"]["ground"]["height_m"]
-        return float(found["elasticities"][0][of])
+        height = json.loads((run / "uncertainty.json").read_text("utf-8"))["quantities"]["ground"]["height_m"]
+        return float(height["elasticities"][0][of])
 
     return read
 

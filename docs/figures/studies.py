@@ -145,6 +145,7 @@ def _errors_of_best(design: dict[str, Any]) -> float:
 
 
 def _of_design(when: str, camera: str) -> dict[str, tuple[int, str, Read]]:
+    """Return the figures of a camera design, before or after the optimisation."""
     return {
         f"studies.design.rms_{camera}": (4, "waves", _design(lambda d: np.sqrt(np.mean(_errors(d, when) ** 2)))),
         f"studies.design.worst_{camera}": (4, "waves", _design(lambda d: _errors(d, when).max())),
@@ -156,6 +157,7 @@ def _of_design(when: str, camera: str) -> dict[str, tuple[int, str, Read]]:
 
 
 def _study(name: str) -> tuple[str, ...]:
+    """Return the command that runs a shipped study."""
     return ("twin.study", f"scenes/examples/study_{name}.yaml", "--yes")
 
 

@@ -50,6 +50,7 @@ def golden_fields(job: str) -> dict[str, Any]:
 
 
 def _fields(name: str, tree: dict[str, Any]) -> dict[str, Any]:
+    """Return the structure of a file's content by its kind."""
     if name.endswith(".json") and "definitions" not in tree:
         return {"fields": sorts(tree)}
     if name.endswith(".csv"):
@@ -125,12 +126,12 @@ def grouped(tree: Tree, above: str = "") -> Tree:
 
     Numbers are merged as well where the key above them has the unit.
     """
-    below = {key: grouped(one, key) if isinstance(one, dict) else one for key, one in tree.items()}
+    below = {key: grouped(subtree, key) if isinstance(subtree, dict) else subtree for key, subtree in tree.items()}
     named = bool(unit((above,)))
     alike: dict[str, list[str]] = {}
-    for key, one in below.items():
-        leaf = not isinstance(one, dict) and not named and not key.startswith("{")
-        alike.setdefault(f"leaf {key}" if leaf else f"{one!r}{lists(key)}", []).append(key)
+    for key, subtree in below.items():
+        leaf = not isinstance(subtree, dict) and not named and not key.startswith("{")
+        alike.setdefault(f"leaf {key}" if leaf else f"{subtree!r}{lists(key)}", []).append(key)
     return {_together(keys): below[keys[0]] for keys in alike.values()}
 
 
@@ -145,6 +146,7 @@ def lists(part: str) -> str:
 
 
 def _together(keys: list[str]) -> str:
+    """Return one segment for several keys."""
     if len(keys) == 1:
         return keys[0]
     merged = dict.fromkeys(name for key in keys for name in names(key))
@@ -204,18 +206,19 @@ def meaning(kind: str, path: tuple[str, ...]) -> str:
 def declared(kind: str, path: tuple[str, ...]) -> tuple[str, str]:
     """Return the description of a field in the record of a kind of file, and that in the record below it."""
     record = _records().get(kind)
-    here, said = record, ""
+    fields, description = record, ""
     for part in path:
-        found = next((one for one in here or () if one.key in names(part)), None)
-        if found is not None:
-            said, here = found.meaning, found.below
-        elif not part.startswith("{") and (here is None or here is record):
+        match = next((entry for entry in fields or () if entry.key in names(part)), None)
+        if match is not None:
+            description, fields = match.meaning, match.below
+        elif not part.startswith("{") and (fields is None or fields is record):
             # A name of a mapping leads to the record in the mapping; anything else is not declared.
             return "", ""
-    return said, "" if here is None else here.meaning
+    return description, "" if fields is None else fields.meaning
 
 
 def _sources() -> Iterator[tuple[Path, ast.Module]]:
+    """Yield the parsed source files of the package twin."""
     for path in sorted((ROOT / "twin").rglob("*.py")):
         yield path.relative_to(ROOT), ast.parse(path.read_text("utf-8"))
 
@@ -241,10 +244,10 @@ def artefact_titles() -> tuple[tuple[str, str, str], ...]:
     for path, module in _sources():
         for node in ast.walk(module):
             if isinstance(node, ast.Call):
-                given = dict(zip(("name", "title"), node.args, strict=False))
-                given |= {one.arg: one.value for one in node.keywords if one.arg in ("name", "title")}
-                if len(given) == 2 and (title := _text(given["title"], "…"))[:1].isupper():
-                    out.append((path.parent.as_posix(), _text(given["name"], r"[\w-]+"), title))
+                passed = dict(zip(("name", "title"), node.args, strict=False))
+                passed |= {keyword.arg: keyword.value for keyword in node.keywords if keyword.arg in ("name", "title")}
+                if len(passed) == 2 and (title := _text(passed["title"], "…"))[:1].isupper():
+                    out.append((path.parent.as_posix(), _text(passed["name"], r"[\w-]+"), title))
     # Literal names precede names that are partly filled in.
     return tuple(sorted(out, key=lambda found: "[" in found[1]))
 
@@ -281,12 +284,14 @@ def run_pages() -> dict[str, str]:
 
 
 def _list(entries: list[dict[str, str]]) -> str:
+    """Return a list of files with their descriptions."""
     return table(
         ["File", "What is in it"], ([code(one["file"]), prose(sentence(one["what"]))] for one in entries), "files"
     )
 
 
 def _index(files: dict[str, str]) -> str:
+    """Return the index page of the run folders."""
     every = DESCRIBED["everywhere"]
     kinds = {command: [code(one["file"]) for one in described(command) if one not in every] for command in files}
     rows = ([f"[{code(command)}]({name}.md)", ", ".join(kinds[command])] for command, name in files.items())
@@ -315,6 +320,7 @@ These pages are made from small runs of every command; a run has fewer files whe
 
 
 def _page(command: str) -> str:
+    """Return the page of a command's run folder."""
     artefacts, tiffs, parts = [], [], [f"# Files of {code(command)}\n\n{_list(described(command))}"]
     for name, several in golden_runs()[command].items():
         columns = ", ".join(dict.fromkeys(code(column) for told in several for column in told.get("columns", ())))
@@ -338,6 +344,7 @@ def _page(command: str) -> str:
 
 
 def _json(kind: str, several: list[Any]) -> str:
+    """Return the table of a JSON file's fields."""
     blocks: dict[tuple[str, ...], list[list[str]]] = {}
     for path, sort in leaves(field_tree(several)):
         if path[0] != "reference_frames":
@@ -355,6 +362,7 @@ def _json(kind: str, several: list[Any]) -> str:
 
 
 def _netcdf(several: list[Any]) -> str:
+    """Return the table of a netCDF file's variables."""
     variables = {place: told for one in several for place, told in one["variables"].items()}
     rows = (
         [

@@ -74,7 +74,7 @@ class Takes:
 
 @dataclass(frozen=True)
 class Key:
-    """One key of a mapping.
+    """Key of a mapping.
 
     Attributes
     ----------
@@ -185,6 +185,7 @@ def taken(schema: Mapping[str, Any]) -> Takes:
 
 
 def _either(schemas: list[dict[str, Any]]) -> Takes:
+    """Return the values that any of several schemas allows."""
     # A mapping without keys represents the file that a name means; a vector may be a text as well.
     named = [one for one in schemas if one.get("type") != "null" and one.get("additionalProperties") is not True]
     alike = {json.dumps(one.get("items", one).get("description", one)): one for one in reversed(named)}
@@ -195,6 +196,7 @@ def _either(schemas: list[dict[str, Any]]) -> Takes:
 
 
 def _list(schema: Mapping[str, Any]) -> Takes:
+    """Return the values of a list."""
     items = schema.get("prefixItems") or [schema["items"]] * schema.get("minItems", 0)
     if not items or schema.get("maxItems") != len(items):
         return taken(schema["items"]).within("list", LISTED)
@@ -206,6 +208,7 @@ def _list(schema: Mapping[str, Any]) -> Takes:
 
 
 def _mapping(schema: Mapping[str, Any]) -> Takes:
+    """Return the values of a mapping."""
     if "properties" in schema:
         each = {key: taken(one) for key, one in schema["properties"].items()}
         parts = (f"`{key}` in `{one.units[0]}`" if one.units else f"`{key}`: {one.what}" for key, one in each.items())
@@ -286,6 +289,7 @@ def kinds_of(path: Path) -> tuple[str, ...]:
 
 @cache
 def _read(path: Path) -> YamlFile:
+    """Return the content of a YAML file, cached."""
     return read_yaml(path)
 
 

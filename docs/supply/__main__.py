@@ -46,6 +46,7 @@ def _exit_on_failure() -> Iterator[None]:
 
 
 def _layers(names: str) -> list[str]:
+    """Return the layers of the lock that an option names."""
     chosen = [name.strip() for name in names.split(",")]
     unknown = [name for name in chosen if name not in LAYERS]
     if unknown:
@@ -54,6 +55,7 @@ def _layers(names: str) -> list[str]:
 
 
 def _refuse(text: object) -> NoReturn:
+    """Print an error and exit."""
     sys.stderr.write(f"error: {text}\n")
     raise typer.Exit(2)
 

@@ -156,6 +156,7 @@ def _fetched(packages: Iterable[Locked]) -> Mapping[tuple[str, str], tuple[str, 
 
 
 def _read(packages: Iterable[Locked], python: str, markers: bool) -> dict[tuple[str, str], tuple[str, str]]:
+    """Return the licences of packages fetched for one Python."""
     lines = []
     for p in packages:
         where = f" ; {p.marker}" if markers and p.marker else ""
@@ -217,6 +218,7 @@ def _is_spdx(text: str) -> bool:
 
 
 def _licence_files(package: importlib.metadata.Distribution) -> list[str]:
+    """Return the texts of a package's licence files."""
     found = [path for path in package.files or [] if re.match(r"(?i)(licen[cs]e|copying)", path.name)]
     # a package's own before those of what it carries
     return [str(path.locate().read_text("utf-8", "replace")) for path in sorted(found, key=lambda p: len(str(p)))]

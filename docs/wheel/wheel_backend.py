@@ -67,6 +67,7 @@ def rewritten(source: str) -> str:
 
 
 def _ours(module: str) -> bool:
+    """Return True if a module belongs to the project."""
     return module.partition(".")[0] in PACKAGES
 
 
@@ -96,6 +97,7 @@ def arrange(source: Path, place: Path) -> None:
 
 @contextlib.contextmanager
 def _arranged() -> Iterator[None]:
+    """Arrange the project in a temporary folder and work there."""
     with tempfile.TemporaryDirectory(prefix="wheel-") as place:
         arrange(Path.cwd(), Path(place))
         with contextlib.chdir(place):

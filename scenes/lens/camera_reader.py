@@ -508,7 +508,7 @@ def _derived(lens: Prescription, plain: dict[str, Any], backend: Backend) -> Cam
         problem = error.problem if isinstance(error, Problem) else reason.splitlines()[0]
         raise lens.error(f"a camera's file cannot represent this: {problem}") from error
     try:
-        return derive_camera(spec, backend, stated=False)
+        return derive_camera(spec, backend, check_stated=False)
     except InputError as error:
         raise lens.error(error.issues[0].problem, allowed="a system that images its field") from error
 

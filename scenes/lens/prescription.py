@@ -335,7 +335,7 @@ class Note:
 
 @dataclass(frozen=True, eq=False)
 class LensSurface:
-    """One surface of a prescription.
+    """Surface of a prescription.
 
     Attributes
     ----------

@@ -1,1 +1,1 @@
-"""From specifications to bodies, elements and solids."""
+"""Optical models of specifications: bodies, elements, solids, thermal and disturbance models."""

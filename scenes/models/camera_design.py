@@ -27,7 +27,7 @@ _ACROSS, _ALONG = (0.0, 0.5, 1.0), (-1.0, 0.0, 1.0)
 
 
 class CameraDesignSetup(ExperimentSetup[CameraDesignSpec]):
-    """An optimisation with the camera that it starts from."""
+    """Optimisation with the camera that it starts from."""
 
     camera: CameraSpec
 

@@ -146,8 +146,8 @@ def check_entrance_pupil(spec: CameraSpec, traced: float) -> None:
             problem, ("stop",), allowed="a stop away from a focus, which rays of each height meet elsewhere"
         )
     if off > LARGEST_PUPIL_DIFFERENCE:
-        stated, found = (format_quantity(float(f"{d:.4g}"), LENGTH) for d in (spec.entrance_pupil, traced))
-        problem = f"a stop of this size has an entrance pupil of {found} on the axis, but the file states {stated}"
+        stated, actual = (format_quantity(float(f"{d:.4g}"), LENGTH) for d in (spec.entrance_pupil, traced))
+        problem = f"a stop of this size has an entrance pupil of {actual} on the axis, but the file states {stated}"
         allowed = f"both within {100 * LARGEST_PUPIL_DIFFERENCE:.0f} %, or the entrance pupil alone"
         raise spec.error(problem, ("stop_diameter",), allowed=allowed)
 
@@ -196,9 +196,9 @@ def _single(spec: CameraSpec) -> Candidates:
 
 def _together(spec: CameraSpec) -> Candidates:
     """Yield the camera with the opposite sign of all radii, the convention of some other programs."""
-    turned = {name: mirror.model_copy(update={"radius": -mirror.radius}) for name, mirror in spec.mirrors.items()}
+    flipped = {name: mirror.model_copy(update={"radius": -mirror.radius}) for name, mirror in spec.mirrors.items()}
     line = "radius of every surface with the other sign: positive if its centre of curvature lies toward +z"
-    yield "the sign of every radius", line, spec.model_copy(update={"mirrors": FrozenMap(turned)})
+    yield "the sign of every radius", line, spec.model_copy(update={"mirrors": FrozenMap(flipped)})
 
 
 def _places(spec: CameraSpec) -> Candidates:
@@ -230,10 +230,10 @@ def _changes(mirror: MirrorSpec) -> Iterator[tuple[str, str, Any, str]]:
     if mirror.conic:
         yield "conic", "the sign of the conic constant", -mirror.conic, f"{-mirror.conic:g}"
     for key, words, kind in (("rotate", "the tilt about", ANGLE), ("decentre", "the decentre along", LENGTH)):
-        given = getattr(mirror, key) or ()
-        for axis, value in enumerate(given):
+        values = getattr(mirror, key) or ()
+        for axis, value in enumerate(values):
             if value:
-                other = (*given[:axis], -value, *given[axis + 1 :])
+                other = (*values[:axis], -value, *values[axis + 1 :])
                 text = ", ".join(format_quantity(v, kind) for v in other)
                 yield key, f"the sign of {words} {'xyz'[axis]}", other, f"[{text}]"
 
@@ -285,8 +285,8 @@ class CameraAxis:
 
     def moved(self, pose: Pose) -> CameraAxis:
         """Return the axis of a camera whose prescription frame has a pose in the world."""
-        turned = pose.rotation @ self.direction
-        return CameraAxis(turned, pose.apply(self.base), pose.apply(self.centre), self.on_axis)
+        direction = pose.rotation @ self.direction
+        return CameraAxis(direction, pose.apply(self.base), pose.apply(self.centre), self.on_axis)
 
 
 def find_axis(
@@ -340,16 +340,16 @@ def _along(
 
 def _ring() -> np.ndarray:
     """Return the points of the rim of a unit circle, (_RIM, 2)."""
-    turn = 2.0 * np.pi * np.arange(_RIM) / _RIM
-    return np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    angle = 2.0 * np.pi * np.arange(_RIM) / _RIM
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def _require_light(backend: Backend, systems: SystemBatch, launch: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Return the points (N, 2) where rays from launch points (N, 3) end. Raises BeamMissedError."""
-    place, _, _, valid = trace(backend, systems, make_rays(backend, launch, direction)).numpy()
+    position, _, _, valid = trace(backend, systems, make_rays(backend, launch, direction)).numpy()
     if not np.all(valid):
         raise BeamMissedError("the beam along the axis misses a surface")
-    return np.asarray(place[0, :, :2])
+    return np.asarray(position[0, :, :2])
 
 
 def pupil_diameter(backend: Backend, to_stop: SystemBatch, axis: CameraAxis, radius: float) -> float:
@@ -438,8 +438,8 @@ def camera_bodies(root: str, pose: Pose, model: CameraModel) -> list[Body]:
     for mirror in model.mirrors:
         x, y = model.clear_aperture(mirror).centre
         centre = (x, y, float(model.surfaces[mirror].sag(x, y)))
-        own = into_camera @ model.mirror_pose(mirror)
-        bodies.append(Body(f"{root}/{mirror}", own, pivots={"centre": centre}))
+        pose_in_camera = into_camera @ model.mirror_pose(mirror)
+        bodies.append(Body(f"{root}/{mirror}", pose_in_camera, pivots={"centre": centre}))
     x, y, z = model.focal_plane.inverse().apply(model.rear_node)
     pivots = {"rear_node": (float(x), float(y), float(z)), "line_centre": (0.0, 0.0, 0.0)}
     plane_root = focal_plane_body(root)
@@ -618,8 +618,8 @@ class CameraModel:
     @cached_property
     def edges(self) -> Mapping[str, tuple[Edge, ...]]:
         """Mirror name -> edges that vignette light at that surface beside the stop, for the surfaces that have any."""
-        given = {name: mirror.edges for name, mirror in self.spec.mirrors.items()}
-        return {name: tuple(edge.to_edge() for edge in edges) for name, edges in given.items() if edges}
+        listed = {name: mirror.edges for name, mirror in self.spec.mirrors.items()}
+        return {name: tuple(edge.to_edge() for edge in edges) for name, edges in listed.items() if edges}
 
     def clear_aperture(self, mirror: str) -> Aperture:
         """Return the outer edge of a surface's clear aperture, over which its figure terms are defined."""
@@ -627,20 +627,20 @@ class CameraModel:
         assert outer is not None
         return outer
 
-    def unvignetted(self, met: Callable[[str], np.ndarray]) -> np.ndarray | bool:
+    def unvignetted(self, hits: Callable[[str], np.ndarray]) -> np.ndarray | bool:
         """Return a mask of the rays that pass all edges, or True if the camera has no edges.
 
         Parameters
         ----------
-        met : callable
+        hits : callable
             Function from a mirror's name to the points (..., 2 or 3) at which rays meet it, in the mirror's own frame,
             in metres of the nominal mirror.
         """
         through: np.ndarray | bool = True
         for name, edges in self.edges.items():
-            place = met(name)
+            points = hits(name)
             for edge in edges:
-                through = through & edge.passes(place[..., 0], place[..., 1])
+                through = through & edge.passes(points[..., 0], points[..., 1])
         return through
 
     @property
@@ -716,11 +716,11 @@ def collimated(backend: Backend, to_stop: SystemBatch, directions: np.ndarray, t
     (F, N, 3) ndarray
         Points on a plane before the first mirror, in the prescription frame.
     """
-    every = to_stop.take(np.zeros(len(directions), dtype=int))
-    return aim_collimated(backend, every, directions, -LAUNCH_DISTANCE * directions, targets)[0]
+    systems = to_stop.take(np.zeros(len(directions), dtype=int))
+    return aim_collimated(backend, systems, directions, -LAUNCH_DISTANCE * directions, targets)[0]
 
 
-def derive_camera(spec: CameraSpec, backend: Backend, stated: bool = True) -> CameraModel:
+def derive_camera(spec: CameraSpec, backend: Backend, check_stated: bool = True) -> CameraModel:
     """Trace a prescription and derive frames, stop, apertures and first-order numbers from it.
 
     Parameters
@@ -729,7 +729,7 @@ def derive_camera(spec: CameraSpec, backend: Backend, stated: bool = True) -> Ca
         The prescription.
     backend : Backend
         Backend that traces the rays.
-    stated : bool
+    check_stated : bool
         Whether the stated focal length is compared with the traced one; False while a file is made, whose focal length
         follows from the trace.
 
@@ -740,7 +740,7 @@ def derive_camera(spec: CameraSpec, backend: Backend, stated: bool = True) -> Ca
         differs from the stated one.
     """
     try:
-        return _derived(spec, backend, stated)
+        return _derived(spec, backend, check_stated)
     except AfocalError as error:
         raise spec.error(str(error), ("mirrors",), allowed="surfaces that focus light on the image") from error
     except (AimError, BeamMissedError) as error:
@@ -779,7 +779,7 @@ def _chief(
     return to_stop, imaging, launch, ray_matrix(backend, imaging, stop, launch, centre[None], axes)
 
 
-def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
+def _derived(spec: CameraSpec, backend: Backend, check_stated: bool) -> CameraModel:
     """Return the model as `derive_camera` does. Raises AimError, BeamMissedError and AfocalError."""
     surfaces = {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}
     names = tuple(spec.mirrors)
@@ -790,9 +790,9 @@ def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
     axis, stop_radius = find_axis(spec, backend, to_stop, imaging, centre)
     about_axis = axis_data(backend, imaging, spec, axis, LINE_AXIS)
     pupil = pupil_diameter(backend, to_stop, axis, stop_radius)
-    if stated:
-        traced_here = _focal_lengths(matrix, about_axis)
-        check_focal_length(spec, traced_here, lambda other: _traced_focal_lengths(other, backend))
+    if check_stated:
+        focal_lengths = _focal_lengths(matrix, about_axis)
+        check_focal_length(spec, focal_lengths, lambda other: _traced_focal_lengths(other, backend))
 
     traced = trace(backend, imaging, make_rays(backend, launch, centre), keep=range(len(names)), world=True)
     assert traced.world is not None
@@ -812,7 +812,7 @@ def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
     apertures = _apertures(spec, backend, to_stop, imaging, stop_radius)
     distance = float(abs(chief.scale[0, 0, 0]))  # along the line, as in the papers
     rear_node = image_centre - distance * image_direction
-    if stated or spec.stop_diameter is None:
+    if check_stated or spec.stop_diameter is None:
         check_entrance_pupil(spec, pupil)
     frames = (camera_frame, focal_plane, chief, image_direction, rear_node)
     return CameraModel(spec, surfaces, apertures, *frames, axis, about_axis, pupil)

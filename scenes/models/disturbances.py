@@ -74,7 +74,7 @@ _Where = Callable[[str, KeyPath, Problem], Issue]
 
 @dataclass(frozen=True)
 class Component:
-    """One component of the motion or of the temperature of one body.
+    """Component of the motion or of the temperature of one body.
 
     Attributes
     ----------

@@ -108,9 +108,9 @@ def behind(model: CameraModel, mirror: str) -> float:
     It is the side on which the light would continue.
     """
     k = model.mirrors.index(mirror)
-    own = model.mirror_pose(mirror)
+    pose = model.mirror_pose(mirror)
     after = model.image_body.translation if k + 1 == len(model.mirrors) else model.vertex(model.mirrors[k + 1])
-    return 1.0 if float(own.rotation[:, 2] @ (own.translation - after)) > 0.0 else -1.0
+    return 1.0 if float(pose.rotation[:, 2] @ (pose.translation - after)) > 0.0 else -1.0
 
 
 def board_size(model: CameraModel, pinholes: list[tuple[float, float]]) -> tuple[float, float]:

@@ -100,7 +100,7 @@ class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
 
 @dataclass(frozen=True)
 class Beam:
-    """One beam of a layout, at both ends of both cameras' lines.
+    """Beam of a layout, at both ends of both cameras' lines.
 
     Attributes
     ----------
@@ -177,10 +177,10 @@ def start_beams(setup: MonitorDesignSetup) -> Layout:
     return tuple(beams)
 
 
-def _prisms_of(setup: MonitorDesignSetup, one: instruments.ChannelParts) -> str:
+def _prisms_of(setup: MonitorDesignSetup, channel: instruments.ChannelParts) -> str:
     """Return the design's name for the prisms of a channel of the start."""
     monitor = setup.instrument.autocollimator
-    has = [(prism.material, prism.kind) for prism in (one.prism_180, one.prism_0)]
+    has = [(prism.material, prism.kind) for prism in (channel.prism_180, channel.prism_0)]
     known = {AS_STARTED: [(prism.material, prism.kind) for prism in (monitor.prism_180, monitor.prism_0)]}
     for name, chosen in (setup.test.prisms or {}).items():
         known[name] = [(prism.material, prism.kind) for prism in (chosen.prism_180, chosen.prism_0)]
@@ -194,9 +194,9 @@ def _prisms_of(setup: MonitorDesignSetup, one: instruments.ChannelParts) -> str:
 
 def _ccd_of(setup: MonitorDesignSetup) -> str:
     """Return the design's name for the area CCD of the start."""
-    own = setup.instrument.autocollimator.area_ccd
-    for name, one in (setup.test.area_ccds or {}).items():
-        if (one.detector, one.pitch, one.rows, one.columns) == (own.detector, own.pitch, own.rows, own.columns):
+    ccd = setup.instrument.autocollimator.area_ccd
+    for name, sheet in (setup.test.area_ccds or {}).items():
+        if (sheet.detector, sheet.pitch, sheet.rows, sheet.columns) == (ccd.detector, ccd.pitch, ccd.rows, ccd.columns):
             return name
     return AS_STARTED
 
@@ -293,8 +293,8 @@ def _parts(chosen: PrismChoiceSpec | None) -> Iterator[Mapping[str, object]]:
 def kinds_of(setup: MonitorDesignSetup, beam: Beam) -> tuple[str | None, str | None]:
     """Return the kinds of a beam's two reflectors; None for a glass prism."""
     monitor, chosen = setup.instrument.autocollimator, (setup.test.prisms or {}).get(beam.prisms)
-    own = (monitor.prism_180.kind, monitor.prism_0.kind)
-    return own if chosen is None else (chosen.prism_180.kind, chosen.prism_0.kind)
+    kinds = (monitor.prism_180.kind, monitor.prism_0.kind)
+    return kinds if chosen is None else (chosen.prism_180.kind, chosen.prism_0.kind)
 
 
 def drawn_beam(setup: MonitorDesignSetup, rng: np.random.Generator) -> Beam:
@@ -379,14 +379,14 @@ class ImagingBeams:
 
     def taken(self, instrument: Instrument) -> np.ndarray:
         """Return a mask of the rays that prisms of an instrument block, (cameras, 3, RAYS)."""
-        placed, out = instrument.assembly.place(), np.zeros((len(self.segments), 3, RAYS), dtype=bool)
+        placed, blocked = instrument.assembly.place(), np.zeros((len(self.segments), 3, RAYS), dtype=bool)
         for solid in instrument.solids:
             corners = placed.pose(solid.path).apply(solid_mesh(solid, placed).vertices)
             planes = convex_hull(corners).equations
             for c, beams in enumerate(self.segments.values()):
                 for k, rays in enumerate(beams):
-                    out[c, k] |= blocked_rays(rays, planes)
-        return out
+                    blocked[c, k] |= blocked_rays(rays, planes)
+        return blocked
 
 
 def pupil_share(taken: np.ndarray) -> float:

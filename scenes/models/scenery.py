@@ -118,7 +118,7 @@ class Detector:
 
 @dataclass(frozen=True, eq=False)
 class SceneSurface:
-    """One surface in one state.
+    """Surface of a scene in one state.
 
     Attributes
     ----------
@@ -228,27 +228,27 @@ def solid_surfaces(
         A face carries more than two elements with apertures.
     """
     mesh = solid_mesh(solid, placed)
-    own = placed.pose(solid.path)
+    pose_of_solid = placed.pose(solid.path)
     index = assembly.index(solid.path, state.get(solid.path, AT_REST)) if solid.transparent else 1.0
     nominal = assembly.place()
     out = []
     for face, polygon in zip(solid.faces, mesh.polygons, strict=True):
         if not len(polygon):
             continue
-        on_it = _elements_on(face, solid, assembly, nominal)
+        elements = _elements_on(face, solid, assembly, nominal)
         scale = float(placed.size(face.body)[0])
-        apertures = tuple(dict.fromkeys(aperture.scaled(scale) for _, aperture in on_it if aperture is not None))
+        apertures = tuple(dict.fromkeys(aperture.scaled(scale) for _, aperture in elements if aperture is not None))
         if len(apertures) > 2:
             raise ValueError(f"{solid.path}: face {face.name!r} has {len(apertures)} clear apertures, not at most 2")
         pose = placed.pose(face.body) @ Pose(face.pose.rotation, scale * face.pose.translation)
-        vertices, triangles = polygon_mesh(pose.inverse().apply(own.apply(polygon)))
+        vertices, triangles = polygon_mesh(pose.inverse().apply(pose_of_solid.apply(polygon)))
         finish = finishes.of(face.coating)
         name = f"{solid.path}/{face.name}"
         out.append(
             SceneSurface(
                 name,
                 name,
-                tuple(name for name, _ in on_it),
+                tuple(name for name, _ in elements),
                 pose,
                 plane(),
                 vertices,

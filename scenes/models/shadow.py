@@ -153,11 +153,11 @@ def casters(instrument: Instrument, camera: str) -> tuple[Caster, ...]:
     """Return all bodies that may cast a shadow into a camera's beam."""
     placed = instrument.assembly.place()
     root = f"{BASE}/{camera}"
-    own = {f"{root}/focal_plane", *(f"{root}/{mirror}" for mirror in instrument.cameras[camera].mirrors)}
+    own_parts = {f"{root}/focal_plane", *(f"{root}/{mirror}" for mirror in instrument.cameras[camera].mirrors)}
     out = [
         Caster(path, path, placed.pose(path).inverse().apply(corners))
         for path, corners in convex_bodies(instrument, placed).items()
-        if path not in own
+        if path not in own_parts
     ]
     return (*out, *(caster for plate in instrument.baffles for caster in _plate(plate)))
 

@@ -49,7 +49,7 @@ from scenes.specs.instrument import BASE
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """One lens of an instrument.
+    """Lens of an instrument.
 
     Attributes
     ----------
@@ -707,5 +707,6 @@ def _upward(path: str) -> Iterator[str]:
 
 
 def _unit_load(axis: int, about: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the temperature field of a gradient of 1 K/m along an axis."""
     # The load is zero at the point about which the uniform part, the body's expansion, is taken.
     return lambda points: points[:, axis] - about[axis]

@@ -136,7 +136,7 @@ class LegalInstrument:
         """
         try:
             spec = validate(CameraSpec, YamlFile("", self.camera, {}))
-            focal_length = derive_camera(spec, load_backend("llvm"), stated=False).line_principal_distance
+            focal_length = derive_camera(spec, load_backend("llvm"), check_stated=False).line_principal_distance
             self.camera["focal_length"] = format_quantity(float(f"{focal_length:.3g}"), LENGTH)
         except InputError:
             pass  # that is told by whoever reads it

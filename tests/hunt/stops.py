@@ -83,7 +83,7 @@ edge_margin: 0.1 mm
 
 
 def _judged(case: str, text: str, backend: Backend) -> Outcome:
-    model = derive_camera(validate(CameraSpec, parse_yaml(text)), backend, stated=False)
+    model = derive_camera(validate(CameraSpec, parse_yaml(text)), backend, check_stated=False)
     told = FIRST_ORDER(first_order_data(CameraOptics.alone(model, backend)))
     spec, pupil = model.spec, model.spec.entrance_pupil
     matrices, used, toward = _matrices(spec)

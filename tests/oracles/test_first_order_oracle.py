@@ -112,7 +112,7 @@ image: {{z: {system.image if image is None else image!r} m}}
 line: {{pixels: 100, pitch: 7 um}}
 edge_margin: 1 mm
 """
-    return derive_camera(validate(CameraSpec, parse_yaml(text)), backend, stated=False)
+    return derive_camera(validate(CameraSpec, parse_yaml(text)), backend, check_stated=False)
 
 
 def travels(system: System) -> list[float]:

@@ -50,7 +50,7 @@ class Twin(Protocol):
 
     @property
     def experiment(self) -> MonitorExperiment:
-        """The modelled instrument."""
+        """Modelled instrument."""
 
     @property
     def state(self) -> State:
@@ -121,7 +121,7 @@ class _Bench:
 
     @cached_property
     def experiment(self) -> MonitorExperiment:
-        """The modelled instrument."""
+        """Modelled instrument."""
         if self._like is not None:
             return self._like.experiment.stating(self._resolved)
         return MonitorExperiment(self._resolved, self.backend)
@@ -202,7 +202,7 @@ class InstrumentTwin:
 
     @property
     def experiment(self) -> MonitorExperiment:
-        """The modelled instrument, for what this class does not offer."""
+        """Modelled instrument. for what this class does not offer."""
         return self._bench.experiment
 
     @cached_property
@@ -427,7 +427,7 @@ class InstrumentTwin:
 
     @cached_property
     def _plain(self) -> Mapping[str, Any]:
-        """The job as its file has it."""
+        """Job as its file has it."""
         return self.resolved.job.plain()
 
     def _with_job(self, plain: Mapping[str, Any]) -> InstrumentTwin:
