@@ -45,9 +45,9 @@ WORTH = 1e-3
 optimised.
 """
 ROOM, ROOM_STEP = 8, 0.06
-"""How often room is sought for a step, and by how much all else is changed then, relative to its range, rms."""
-_KEPT = 0.2  # share of what a step promised that makes it a good one
-_ORDER = 2  # of the differences: right to a per cent, which is all that a step can make use of
+"""Number of draws of the idle parameters to make room for a step, and their rms change relative to the ranges."""
+_KEPT = 0.2  # share of the predicted improvement above which the box grows
+_ORDER = 2  # order of the differences: accurate to 1 %, which suffices for a step
 
 Ask = Callable[[str, Sequence[Any]], list[Any]]
 """Function from a part of the search and items to evaluate to their results."""

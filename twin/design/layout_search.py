@@ -31,7 +31,7 @@ from twin.framework.procedure import Advance
 
 FIRST_STEP = 0.15
 """Size of the first change of a beam, relative to the range of each parameter."""
-_BATCHES = 4  # of layouts that are built until one stands
+_BATCHES = 4  # batches of layouts that are built until one is feasible
 KEPT = 2
 """Number of layouts, for each number of beams, whose beams are varied in the next round."""
 ALIKE = 0.02
