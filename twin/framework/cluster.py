@@ -247,7 +247,7 @@ def _restored_environment() -> Iterator[None]:
 
 
 @contextmanager
-def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Workers]:
+def remote_workers(address: str, notify: Callable[[str], None]) -> Iterator[Workers]:
     """Connect to the workers of a running cluster.
 
     Parameters
@@ -255,7 +255,7 @@ def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Worker
     address : str
         Address of the scheduler, ``tls://host:port`` or ``tcp://host:port``. For TLS, Dask reads the certificates from
         its own configuration, ``distributed.comm.tls``.
-    tell : callable
+    notify : callable
         Called with a message if there are no workers yet.
 
     Raises
@@ -286,7 +286,7 @@ def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Worker
             raise cli.InputErrorText(text) from None
         try:
             workers = Workers(client, False)
-            _wait_for_worker(workers, address, tell)
+            _wait_for_worker(workers, address, notify)
             workers.warnings += _differences(client)
             yield workers
         finally:
@@ -376,13 +376,13 @@ def _check_address(address: str) -> None:
         raise cli.InputErrorText(f"--scheduler {address}: TLS needs certificates; configure them for Dask with {names}")
 
 
-def _wait_for_worker(workers: Workers, address: str, tell: Callable[[str], None]) -> None:
+def _wait_for_worker(workers: Workers, address: str, notify: Callable[[str], None]) -> None:
     """Wait for the first worker of a running cluster."""
     end = time.monotonic() + WORKER_SECONDS
     announced = False
     while not workers.count:
         if not announced:
-            tell(f"the scheduler {address} has no workers yet; waiting for `dask worker {address} --nthreads 1`")
+            notify(f"the scheduler {address} has no workers yet; waiting for `dask worker {address} --nthreads 1`")
             announced = True
         if time.monotonic() > end:
             raise ClusterError(f"the scheduler {address} had no workers for {WORKER_SECONDS:.0f} s")
