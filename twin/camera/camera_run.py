@@ -400,7 +400,7 @@ def refocus_text(run: CameraRun) -> str:
         else ""
     )
     return (
-        f"Refocusing moves image.z by {shift:+.4g} mm{tilt_text}: the worst wavefront error decreases from "
+        f"Refocusing moves image.z by {shift:+.4g} mm{tilt_text}: the worst wavefront error changes from "
         f"{refocused.errors_before.max():.3g} to {refocused.errors_after.max():.3g} waves rms, its rms over the field "
         "from "
         f"{np.sqrt(np.mean(refocused.errors_before**2)):.3g} to {np.sqrt(np.mean(refocused.errors_after**2)):.3g}."

@@ -322,9 +322,7 @@ class VariedBeams:
             try:
                 root = np.linalg.cholesky(gram)
             except np.linalg.LinAlgError as error:
-                raise UnphysicalError(
-                    f"{last} Zernike terms are not independent over the light that comes through"
-                ) from error
+                raise UnphysicalError(f"{last} Zernike terms are not independent over the light that passes") from error
             out.append(-np.linalg.solve(root, basis.T @ (share[:, None] * table)))
         return np.stack(out)
 

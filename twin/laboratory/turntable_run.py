@@ -461,7 +461,7 @@ COMPENSATION: Record[DividingCompensation] = Record(
     "Standard deviations of the errors of a compensated angle beyond the calibration's noise.",
     Quantity("common_arcsec", lambda c: c.common, "a constant, the same at all readings", decimals=4),
     Quantity("smooth_arcsec", lambda c: c.smooth, "misfit along the curve, correlated over one step", decimals=4),
-    Quantity("white_arcsec", lambda c: c.white, "misfit of each reading by itself", decimals=4),
+    Quantity("white_arcsec", lambda c: c.white, "misfit, independent from reading to reading", decimals=4),
 )
 TRUE_FIT: Record[Any] = Record(
     "A fit minus the true curve.",
