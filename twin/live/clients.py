@@ -23,7 +23,7 @@ from twin.live.computer import BeforeKey, Computer, ComputerLost, Kind
 MOST_CLIENTS = 8
 """Largest number of connected pages."""
 RATE, BURST = 400.0, 2000
-"""Messages a second that a page may send, and how many at once: four times what the fastest pointer does."""
+"""Messages per second that a page may send, and largest burst: four times the rate of the fastest pointer."""
 BAD_MESSAGES = 20
 """Number of invalid messages after which a page is disconnected."""
 MOST_RECORDED = 20_000
@@ -274,7 +274,7 @@ class LiveApi:
         self.states = 0
         """Number of states computed so far."""
         self.process_trouble: dict[str, Any] = {}
-        """What is wrong with the process that computes, as pages are told; empty if nothing is."""
+        """Message to the pages about a problem of the computing process; empty without a problem."""
         self._wake = asyncio.Event()
         self._suspect_message: object = None
 

@@ -177,7 +177,7 @@ def ingest(
         if page is not None:
             call.resolve_plan(None)
         sources = Sources(files, start, _names_own_instrument(instrument, call.history), watch)
-        totals, files_told, first = Counter({"new": 0, "known": 0, "refused": 0, "refused_before": 0}), [], ""
+        totals, files_reported, first = Counter({"new": 0, "known": 0, "refused": 0, "refused_before": 0}), [], ""
         raised: list[str] = []
         stale = page is not None
         try:
@@ -188,7 +188,7 @@ def ingest(
                     totals.update(taken.counts)
                     first = first or (f"{taken.file}: {taken.refused[0][1]}" if taken.refused else "")
                     if listed:
-                        files_told.append(_taken(taken))
+                        files_reported.append(_taken(taken))
                     else:
                         call.print_result(_taken(taken), partial(print_line, text=_line(taken)))
                 if totals["new"] > before or stale:
@@ -203,7 +203,7 @@ def ingest(
             if not watch:  # Ctrl-C is the normal end of a watching command
                 print_error(call.errors, "interrupted: the files reported above are in the record, the others are not")
                 raise typer.Exit(cli.INTERRUPTED) from None
-        done = {**totals, "files": files_told, "alarms": raised}
+        done = {**totals, "files": files_reported, "alarms": raised}
         call.print_result(done, partial(print_verdict, verdict=_counted(totals)))
         if refused := totals["refused"] + totals["refused_before"]:
             if call.options.silent:

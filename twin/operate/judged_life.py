@@ -83,7 +83,7 @@ class JudgedLife:
     methods: Mapping[str, Estimate | Course]
     horizon: float
     forecast: Estimate
-    updated: Array
+    outcomes: Array
     interrupted: NDArray[np.bool_]
     filter_result: FilterResult
 
@@ -144,9 +144,9 @@ def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance:
     single = _single(read_json(files.parent / RESULTS["monitor"])["series"], operation.quantities)
     quantities = operation.quantities
     true = true_changes(truth, quantities, times)
-    updated = np.full_like(true, np.nan)
+    outcomes = np.full_like(true, np.nan)
     there = ahead < len(times)
-    updated[there] = true[ahead[there]]
+    outcomes[there] = true[ahead[there]]
     targets = np.where(there, times[np.minimum(ahead, len(times) - 1)], times)
     dates = np.array([time for time, *_ in filter_result.events], np.int64)
     interrupted = np.any((dates > times[:, None]) & (dates <= targets[:, None]), axis=1)
@@ -156,7 +156,7 @@ def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance:
     )
     methods: dict[str, Estimate | Course] = {"ground": ground, "single": single}
     methods |= {"filtered": filtered, "smoothed": smoothed}
-    return JudgedLife(times, quantities, true, methods, horizon, forecast, updated, interrupted, filter_result)
+    return JudgedLife(times, quantities, true, methods, horizon, forecast, outcomes, interrupted, filter_result)
 
 
 def _prior(operation: Operation, times: NDArray[np.int64]) -> Estimate:
@@ -303,7 +303,7 @@ def judged_numbers(life: JudgedLife) -> dict[str, Any]:
             for method, estimate in life.methods.items()
         }
         for name, which in ((FORECAST, ~life.interrupted), ("forecast_over_events", life.interrupted)):
-            error = (life.forecast.values - life.updated)[which, number]
+            error = (life.forecast.values - life.outcomes)[which, number]
             own[name] = _error_summary(error, life.forecast.sigmas[which, number])
         out_by_group.setdefault(quantity.group, {})[quantity.key] = own
     filter_result = life.filter_result.to_dict()

@@ -40,7 +40,7 @@ from twin.operate.record.telemetry import CONFIG, RESULTS
 Moments = NDArray[np.int64]
 
 _MOTIONS, _JUMPS, _EVENTS, _DATES, _COEFFICIENTS = 10, 11, 12, 13, 14
-"""Random streams of a seed; the exposures of the detectors have the first ones (`MonitorExperiment.frames_after`)."""
+"""Random streams of a seed; the detectors' exposures use the first ones (`MonitorExperiment.frames_after`)."""
 _MARGIN = 0.1
 """Share of a life at its beginning and its end without random dates of events, so that their effect can be observed."""
 
@@ -154,15 +154,15 @@ def drawn_life(
     own, steps = causes_of(stated), list[Step]()
     for number, (cause, where) in enumerate(own.items()):
         steps += _jumps(stated, cause, where, times, np.random.default_rng(stream(seed, _JUMPS, number)))
-    updated = _drawn_dates(sorted(causes), times, seed) if dates is None else tuple(sorted(dates))
-    for number, (moment, name) in enumerate(updated):
+    event_dates = _drawn_dates(sorted(causes), times, seed) if dates is None else tuple(sorted(dates))
+    for number, (moment, name) in enumerate(event_dates):
         for k, cause in enumerate(causes.get(name, ())):
             rng = np.random.default_rng(stream(seed, _EVENTS, number, k))
             steps.append(Step(moment, cause, "", name, _step(stated, own.get(cause, []), rng)))
     rng = np.random.default_rng(stream(seed, _COEFFICIENTS))
     warm = dict.fromkeys(c.body for c in stated.components if c.kind == "temperature")
     coefficients = dict(zip(warm, (coefficient_error * rng.standard_normal(len(warm))).tolist(), strict=True))
-    return Life(times, stated.components, drawn, tuple(sorted(steps, key=_when)), updated, coefficients)
+    return Life(times, stated.components, drawn, tuple(sorted(steps, key=_when)), event_dates, coefficients)
 
 
 def _jumps(

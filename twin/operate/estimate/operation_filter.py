@@ -57,7 +57,7 @@ CHECKPOINT_READINGS = 1000
 HEAD_READINGS = 16
 """Number of new readings after which the newest state is saved: filtering as many again is as fast as writing it."""
 _MODEL, _HEAD = -1, 0
-"""Numbers under which a record keeps what was traced, and where the estimate stands after all readings."""
+"""Numbers of the checkpoints that hold the traced model, and the newest state of the estimator."""
 
 
 class Operation:
@@ -116,7 +116,7 @@ class Operation:
         order = [list(plan.model.instrument.cameras), list(plan.disturbances.causes)]
         parts = [self._plan_digest, order, self.epoch, list(self._sensors), [list(one) for one in before]]
         self.key = digest_of_data([source_digest(), *parts])
-        """By which it is recognised what an estimate rests on beside the readings."""
+        """SHA-256 of everything besides the readings that the estimate depends on."""
         if previous is not None and previous.key == self.key:
             known = vars(previous)
             vars(self).update({name: known[name] for name in ("experiment", "model") if name in known})

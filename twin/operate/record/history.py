@@ -136,7 +136,7 @@ class History:
             The record is that of an earlier time.
         """
         if self._until is not None:
-            raise TypeError("nothing is taken into a record as it was")
+            raise TypeError("an earlier state of a record cannot be changed")
         for attempt in (True, False):
             try:
                 with writing(self._engine) as connection:
