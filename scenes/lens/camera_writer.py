@@ -126,10 +126,10 @@ def perturbed_prescription(instrument: Instrument, camera: str, state: State) ->
     surfaces.append(replace(nominal.image, pose=image))
     radius = float(surfaces[nominal.stop].aperture.bounds[1])  # type: ignore[union-attr]
     moved = replace(nominal, surfaces=tuple(surfaces), pupil=Pupil("stop", radius))
-    return moved.with_notes(*_left_out(state, root))
+    return moved.with_notes(*_omitted_bodies(state, root))
 
 
-def _left_out(state: Mapping[str, object], root: str) -> list[Note]:
+def _omitted_bodies(state: Mapping[str, object], root: str) -> list[Note]:
     """Return notes on the bodies of a state that do not belong to a camera's prescription."""
     ours = {BASE, root}
     carried = [

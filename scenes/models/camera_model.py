@@ -970,7 +970,7 @@ def _apertures(
         box = Rectangle(float(half[0]), float(half[1]), (float(middle[0]), float(middle[1])))
         hits = np.where(valid[0, :, None], traced.hit(i)[0, :, :2], np.nan).reshape(len(fields), _RIM_POINTS, 2)
         hits = hits[~np.isnan(hits).all(axis=(1, 2))]  # fields without light do not determine an outline
-        out[name] = box if spec.mirrors[name].light == "passes" else _made(box, hits, spec, name)
+        out[name] = box if spec.mirrors[name].light == "passes" else _manufactured_outline(box, hits, spec, name)
     return out
 
 
@@ -980,7 +980,7 @@ surface counts as centred on its own axis. Mirrors of on-axis telescopes are bel
 """
 
 
-def _made(box: Rectangle, hits: np.ndarray, spec: CameraSpec, name: str) -> Aperture:
+def _manufactured_outline(box: Rectangle, hits: np.ndarray, spec: CameraSpec, name: str) -> Aperture:
     """Return the outline of a manufactured surface for beams whose rims meet it at (F, N, 2), NaN for lost rays."""
     margin = spec.edge_margin
     if np.hypot(*box.centre) > _ABOUT_AXIS * min(box.half_x, box.half_y):

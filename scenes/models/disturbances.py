@@ -220,7 +220,7 @@ def prior_of_spec(spec: DisturbancesSpec, instrument: Instrument, issue: _Where 
     components: list[Component] = []
     laws: list[TimeLawSpec] = []
     blocks: list[np.ndarray] = []
-    issues, nodes = _strangers(spec, instrument, issue_at), instrument.nodes
+    issues, nodes = _unmatched_patterns(spec, instrument, issue_at), instrument.nodes
     for name, cause in spec.causes.items():
         bodies = [path for pattern in cause.bodies for path in nodes if _matches(pattern, path, instrument.cameras)]
         members, faults = _of_cause(spec, name, cause, list(dict.fromkeys(bodies)), instrument, glass, issue_at)
@@ -391,7 +391,7 @@ def _issue_at(resolved: ResolvedJob, cause: str, key: KeyPath, wrong: Problem) -
     return resolved.disturbances.issue(wrong, ("causes", cause, *key))
 
 
-def _strangers(spec: DisturbancesSpec, instrument: Instrument, where: _Where) -> list[Issue]:
+def _unmatched_patterns(spec: DisturbancesSpec, instrument: Instrument, where: _Where) -> list[Issue]:
     """Return an issue for each pattern that matches no body of the instrument, at the first cause that has it."""
     first: dict[str, tuple[str, int]] = {}
     causes: dict[str, list[str]] = {}

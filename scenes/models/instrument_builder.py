@@ -274,7 +274,7 @@ def _build(
         if not instrument.as_built:
             raise
         _check_room(drawn, backend, free_beams, free_bodies)
-        raise InputError(_cannot_stand(spec, error)) from error
+        raise InputError(_collision_issue(spec, error)) from error
     return instrument
 
 
@@ -287,7 +287,7 @@ def _check_room(instrument: Instrument, backend: Backend, free_beams: bool, free
         check_beams(instrument, backend)
 
 
-def _cannot_stand(spec: InstrumentSpec, error: MisplacedError | InputError) -> Issue:
+def _collision_issue(spec: InstrumentSpec, error: MisplacedError | InputError) -> Issue:
     """Return the issue of an instrument that collides as built, though not as drawn."""
     problem = error.issues[0].problem if isinstance(error, InputError) else str(error)
     first = next(iter((spec.as_built or {}).values()))

@@ -59,7 +59,7 @@ class Overlap:
     depth : float
         Distance by which one of them has to move so that they just touch, in metres; negative for a gap below
         ``LEAST_GAP``.
-    way : tuple[int, float] or None
+    move : tuple[int, float] or None
         Axis of the base (0 to 2) and signed distance in metres by which the second body has to move to leave
         ``LEAST_GAP``, the shortest of the three axes; None if it was not computed.
     """
@@ -67,7 +67,7 @@ class Overlap:
     first: str
     second: str
     depth: float
-    way: tuple[int, float] | None = None
+    move: tuple[int, float] | None = None
 
 
 def convex_hull(points: np.ndarray) -> ConvexHull:
@@ -274,8 +274,8 @@ def _issue(instrument: Instrument, overlap: Overlap) -> Issue:
     how = f"extends {mm:.3g} mm into" if mm > 0.0 else f"is only {-1e3 * mm:.2g} um from"
     problem = f"{overlap.first} {how} {overlap.second}"
     allowed = f"{allowed} that leaves a gap of at least {1e6 * LEAST_GAP:.3g} um"
-    if overlap.way is not None:
-        axis, way = overlap.way
+    if overlap.move is not None:
+        axis, way = overlap.move
         allowed += f": move it by {_move_text(axis, way if path == overlap.second else -way)} of the base"
     return instrument.spec.issue(problem, key, allowed=allowed)
 
@@ -354,11 +354,11 @@ def _check_inside(element: Element, face: Face, solid: Solid, placed: PlacedBodi
     if over > 0.0:
         what = f"the clear aperture of {element.name} extends {1e3 * over:.3g} mm over the edge of its face"
         camera, side = element.name.split("/")[:2]
-        key, choice = _way_to_edge(solid.path, across, over, 2.0 * element.aperture.inscribed)
+        key, choice = _edge_remedy(solid.path, across, over, 2.0 * element.aperture.inscribed)
         raise MisplacedError(f"{solid.path}: {what}, beyond {across}", key, choice, (camera, side))
 
 
-def _way_to_edge(path: str, across: str, over: float, wide: float) -> tuple[KeyPath, str]:
+def _edge_remedy(path: str, across: str, over: float, wide: float) -> tuple[KeyPath, str]:
     """Return the key to change, and what to choose there, when an aperture extends over the edge of its face.
 
     ``across`` names the neighbouring face, ``over`` is the excess and ``wide`` the aperture's width, in metres.
@@ -463,14 +463,14 @@ def _disk(rays: int = RAYS) -> np.ndarray:
     return np.stack([nodes.x, nodes.y], axis=-1)
 
 
-def _whole() -> np.ndarray:
+def _full_disk() -> np.ndarray:
     """Return points over a unit disk up to just inside its edge, by the tolerance of aiming, (N, 2)."""
     angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return np.concatenate([np.zeros((1, 2)), *((k + 1) / _RINGS * (1.0 - 1e-3) * ring for k in range(_RINGS))])
 
 
-_WHOLE = _whole()
+_WHOLE = _full_disk()
 
 
 def imaging_segments(instrument: Instrument, backend: Backend, camera: str, rays: int = RAYS) -> list[np.ndarray]:
@@ -496,7 +496,7 @@ def imaging_segments(instrument: Instrument, backend: Backend, camera: str, rays
     radius = stop.inscribed
     start = np.repeat(points, rays, axis=0)[None]
     chain = assembly.sequences[f"{camera}/image_to_object"]
-    position, direction = _aimed(
+    position, direction = _aimed_rays(
         instrument, backend, camera, f"{camera}/image_to_stop", start, np.tile(radius * _disk(rays), (3, 1))
     )
     systems = assemble(assembly, [chain])
@@ -601,11 +601,11 @@ def check_beams(instrument: Instrument, backend: Backend) -> None:
         problem = f"light of the monitor does not reach its return faces: {error}"
         choice = "a field, prisms and a pupil_offset with which the whole beam passes the mirrors of both cameras"
         raise MisplacedError(problem, ("monitor",), choice) from error
-    issues = [_cut(instrument, backend, beam) for beam in beams if not beam.valid.all()]
-    for beam, name, plate, blocked in _standing_in(instrument, beams, instrument.assembly.place(), _TOUCHING):
+    issues = [_vignetting_issue(instrument, backend, beam) for beam in beams if not beam.valid.all()]
+    for beam, name, plate, blocked in _blocking_bodies(instrument, beams, instrument.assembly.place(), _TOUCHING):
         text = f"{name} blocks {_count(blocked)} of the beam {beam.channel.key}"
         if plate is None:
-            where, choice = _way_out(instrument, beam.channel, name)
+            where, choice = _beam_remedy(instrument, beam.channel, name)
         else:
             where = ("baffles", plate.name) if plate.name in instrument.spec.baffles else ("baffles",)
             choice = "a size and position beside the beam"
@@ -626,7 +626,9 @@ def moved_into_beams(instrument: Instrument, backend: Backend, state: State) -> 
     except AimError:
         return ()  # The spots themselves are lost; that is reported elsewhere with its cause.
     blocked_by: dict[tuple[str, str], np.ndarray] = {}
-    for beam, name, _, blocked in _standing_in(instrument, beams, instrument.assembly.place([state]), _TOUCHING_MOVED):
+    for beam, name, _, blocked in _blocking_bodies(
+        instrument, beams, instrument.assembly.place([state]), _TOUCHING_MOVED
+    ):
         # A baffle has several plates.
         blocked_by[beam.channel.key, name] = blocked | blocked_by.get((beam.channel.key, name), False)
     return tuple(
@@ -635,7 +637,7 @@ def moved_into_beams(instrument: Instrument, backend: Backend, state: State) -> 
     )
 
 
-def _standing_in(
+def _blocking_bodies(
     instrument: Instrument, beams: list[MonitorBeam], placed: PlacedBodies, touching: float
 ) -> Iterator[tuple[MonitorBeam, str, Plate | None, np.ndarray]]:
     """Yield beam, name of the blocking body or plate, the plate if it is one, and a mask (N,) of blocked rays."""
@@ -663,7 +665,7 @@ def _standing_in(
                 yield beam, f"a plate of {plate.name}", plate, blocked
 
 
-def _way_out(instrument: Instrument, channel: Channel, path: str) -> tuple[KeyPath, str]:
+def _beam_remedy(instrument: Instrument, channel: Channel, path: str) -> tuple[KeyPath, str]:
     """Return the key that takes a body out of a channel's beam, and what to choose there.
 
     It is that of a prism if the body is one, else that of the beam.
@@ -690,7 +692,7 @@ def _crossing(segments: np.ndarray, plate: Plate, placed: PlacedBodies) -> np.nd
     return np.asarray(np.any(crosses & plate.outline.contains(point[..., 0], point[..., 1]), axis=-1))
 
 
-def _cut(instrument: Instrument, backend: Backend, beam: MonitorBeam) -> Issue:
+def _vignetting_issue(instrument: Instrument, backend: Backend, beam: MonitorBeam) -> Issue:
     """Return the issue of a vignetted beam: the element at which it loses its first rays, and by how much."""
     assembly, channel = instrument.assembly, beam.channel
     names = assembly.sequences[f"{channel.key}/monitor"]
@@ -717,7 +719,7 @@ def _segments(places: list[np.ndarray]) -> np.ndarray:
     return np.stack([way[:, :-1], way[:, 1:]], axis=2)
 
 
-def _aimed(
+def _aimed_rays(
     instrument: Instrument, backend: Backend, camera: str, sequence: str, start: np.ndarray, target: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return rays from points (1, N, 3) of a focal plane through targets (N, 2) of a sequence's last element."""
