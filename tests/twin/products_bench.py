@@ -65,7 +65,9 @@ class StandIn:
     @property
     def model(self) -> Any:
         cameras = self.experiment.instrument.cameras
-        return SimpleNamespace(series_filter=SimpleNamespace(stated=self.stated), spots=tuple((c, "left") for c in cameras))
+        return SimpleNamespace(
+            series_filter=SimpleNamespace(stated=self.stated), spots=tuple((c, "left") for c in cameras)
+        )
 
     @cached_property
     def quantities(self) -> tuple:
