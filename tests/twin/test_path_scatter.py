@@ -446,8 +446,8 @@ def test_too_many_and_turned_apertures_of_a_face_are_refused() -> None:
     entry = frame((0, 0, -1), (0, 0, 0))
     turned = Pose(entry.rotation @ rotation_matrix(np.array([0.0, 0.0, 0.3])), entry.translation)
     for pose, apertures, words in (
-        (entry, [Circle(0.01), Circle(0.02), Circle(0.03)], "face 'entry' has 3 clear apertures; at most two"),
-        (turned, [Rectangle(0.01, 0.02)], "its clear aperture is turned against the face 'entry'"),
+        (entry, [Circle(0.01), Circle(0.02), Circle(0.03)], "face 'entry' has 3 clear apertures, not at most 2"),
+        (turned, [Rectangle(0.01, 0.02)], "its clear aperture is rotated relative to the face 'entry'"),
     ):
         common = ("glass/e", plane(), Interaction.REFRACT)
         made = [Element(f"e{k}", *common, one, solid="glass") for k, one in enumerate(apertures)]

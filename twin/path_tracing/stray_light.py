@@ -215,11 +215,11 @@ def trace_stray(
         source = pinhole(instrument, backend, state, channel, cone, aimed)
         channel_seed = int(np.random.SeedSequence([seed, instrument.channels.index(channel)]).generate_state(1)[0])
 
-        def tell(done: int, _: int, before: int = number) -> None:
+        def report(done: int, _: int, before: int = number) -> None:
             if progress is not None:
                 progress(before * paths + done, len(sources) * paths)
 
-        run = tracer.run(source, paths, channel_seed, chunk=chunk, progress=tell, toward=f"{channel.key}/area_ccd")
+        run = tracer.run(source, paths, channel_seed, chunk=chunk, progress=report, toward=f"{channel.key}/area_ccd")
         nominal = run.of(f"{channel.key}/area_ccd", "nominal")
         if not nominal:
             raise NominalPathLost(
