@@ -267,7 +267,7 @@ def test_ends_are_told_apart_by_two_percent(bench: LayoutBench) -> None:
     found = Found(LayoutFacts((FIRST,)), (), ends, 0.0)
     assert [[one.name for one in group] for group in optima(found, bench)] == [["a", "b"], ["c"], ["d"]]
     assert found.refused == {"a": 5}
-    assert (found.beams, found.standing, found.compared, found.built) == (5, 5, 5, 5)
+    assert (found.beams, found.feasible, found.compared, found.built) == (5, 5, 5, 5)
 
 
 def test_layouts_beyond_their_limits_say_which() -> None:

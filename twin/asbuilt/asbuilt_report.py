@@ -131,9 +131,9 @@ def _move_words(run: AsBuiltRun) -> list[str]:
         f"Next move: {text}; the expected merit falls from {step.before:.3g} to {step.after:.3g}, of which "
         f"{step.uncertainty:.3g} could be removed if the state were known"
     ]
-    worth = sorted(step.worth.items(), key=lambda item: -item[1])[:_FEW]
-    if worth:
-        text = ", ".join(f"{name} by {value:.3g}" for name, value in worth)
+    reductions = sorted(step.merit_reductions.items(), key=lambda item: -item[1])[:_FEW]
+    if reductions:
+        text = ", ".join(f"{name} by {value:.3g}" for name, value in reductions)
         out.append(f"One more measurement before the move would reduce it further: {text}")
     return out
 
@@ -263,13 +263,15 @@ def _move_sections(run: AsBuiltRun) -> tuple[Section, ...]:
     heads = ("actuator", "motion", "position", "move by", "range", "step")
     caption = "Position: estimated sum of all moves so far."
     tables: list[Table] = [Table("move", "Next move", caption, heads, rows)]
-    if step.worth:
-        worth: list[list[Cell]] = [
-            [name, value] for name, value in sorted(step.worth.items(), key=lambda item: -item[1])
+    if step.merit_reductions:
+        reductions: list[list[Cell]] = [
+            [name, value] for name, value in sorted(step.merit_reductions.items(), key=lambda item: -item[1])
         ]
         caption = "Expected reduction of the merit after the move if this is measured before it."
         tables.append(
-            Table("worth", "Benefit of further measurements", caption, ("measurement", "reduction"), worth, (None, 4))
+            Table(
+                "worth", "Benefit of further measurements", caption, ("measurement", "reduction"), reductions, (None, 4)
+            )
         )
     estimates = responses(run)
     if estimates:

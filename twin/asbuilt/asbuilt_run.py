@@ -366,7 +366,7 @@ def _advice_plain(run: AsBuiltRun) -> dict[str, Any] | None:
         "merit_before": step.before,
         "merit_after": step.after,
         "merit_of_uncertainty": step.uncertainty,
-        "merit_reductions": dict(step.worth),
+        "merit_reductions": dict(step.merit_reductions),
     }
 
 

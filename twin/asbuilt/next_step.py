@@ -34,7 +34,7 @@ class Advice:
     before: float
     after: float
     uncertainty: float
-    worth: dict[str, float]
+    merit_reductions: dict[str, float]
 
 
 def optimal_move(bench: AsBuiltBench, mean: np.ndarray, after: str | None) -> NextMove:
@@ -111,9 +111,9 @@ def advice(bench: AsBuiltBench, estimate: StateEstimate, draws: np.ndarray, rng:
         white = kind.group(np.zeros(len(kind.labels))).whitener()
         candidates[kind.name] = white @ rows @ estimate.prior.root
     everything: dict[str, np.ndarray] = {"": np.asarray(np.linalg.pinv(estimate.root) * 1e6)}
-    worth = merit_reduction(estimate.root, unit_slope, bench.actuators, by_actuators, {**candidates, **everything})
-    uncertainty = worth.pop("")
-    return Advice(move, merits[0], merits[1], uncertainty, worth)
+    reductions = merit_reduction(estimate.root, unit_slope, bench.actuators, by_actuators, {**candidates, **everything})
+    uncertainty = reductions.pop("")
+    return Advice(move, merits[0], merits[1], uncertainty, reductions)
 
 
 def expected(

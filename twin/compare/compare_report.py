@@ -226,7 +226,7 @@ class Differences:
 
     @property
     def same(self) -> bool:
-        """Whether no result differs."""
+        """True if no result differs."""
         return not self.numbers and not self.arrays
 
 
@@ -354,7 +354,7 @@ class Comparison:
 
     @property
     def same(self) -> bool:
-        """Whether no result of any run differs from the reference's."""
+        """True if no result of any run differs from the reference's."""
         return all(one.same for one in self.diffs)
 
     @property

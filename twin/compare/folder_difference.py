@@ -155,7 +155,7 @@ class ArrayDifference:
 
     @property
     def finite(self) -> bool:
-        """Whether the element that differs most is finite in both arrays."""
+        """True if the element that differs most is finite in both arrays."""
         return self.largest is not None and math.isfinite(float(self.other or 0) - float(self.reference or 0))
 
 

@@ -47,17 +47,17 @@ class FolderState:
 
     @property
     def whole(self) -> bool:
-        """Whether the folder holds exactly the files of the run."""
+        """True if the folder holds exactly the files of the run."""
         return not (self.changed or self.missing or self.additional)
 
     @property
     def sealed(self) -> bool:
-        """Whether the manifest has a checksum of itself."""
+        """True if the manifest has a checksum of itself."""
         return self.manifest.digest is not None
 
     @property
     def is_study(self) -> bool:
-        """Whether the folder is that of a study's runs, a part of which can be repeated."""
+        """True if the folder is that of a study's runs, a part of which can be repeated."""
         return self.manifest.program == "twin.study" and not self.manifest.gradient
 
 

@@ -133,7 +133,7 @@ class FileState:
 
     @property
     def drawn(self) -> bool:
-        """Whether the file is a picture."""
+        """True if the file is a picture."""
         return difference.ending(self.file) in ("svg", "png", "glb")
 
 

@@ -36,7 +36,7 @@ line CCD. Made by python -m twin.design from {start}: least squares of the wavef
 """Comment at the top of the new camera's file."""
 
 
-WORTH = 0.01
+LEAST_BENEFIT = 0.01
 """Smallest improvement of the error per millimetre of easing, as a share of the error, for which a constraint is named.
 """
 
@@ -232,7 +232,9 @@ def verdict(run: DesignRun) -> str:
     across = design.before.distance_across
     errors = f"{rms_error(design.after):.4f} waves rms over the field ({rms_error(design.before):.4f} in {start})"
     held = tuple(
-        constraint for constraint in design.active if 1e-3 * constraint.sensitivity > WORTH * rms_error(design.after)
+        constraint
+        for constraint in design.active
+        if 1e-3 * constraint.sensitivity > LEAST_BENEFIT * rms_error(design.after)
     )
     if design.improved:
         text = f"Improved: {name} has a wavefront error of {errors}"

@@ -40,7 +40,7 @@ FIRST_BOX = 0.1
 """Initial half-width of the box, relative to the range of each parameter."""
 LEAST_BOX = 2e-3
 """Half-width of the box below which the refinement ends."""
-WORTH = 1e-3
+LEAST_BENEFIT = 1e-3
 """Smallest change of a ratio over a parameter's whole range, relative to the largest ratio, for which the parameter is
 optimised.
 """
@@ -102,7 +102,7 @@ def refined(
     for _ in range(steps):
         current = path[-1]
         slopes = ask(f"{part}: slopes", [replace(number, beams=current.beams) for number in numbers])
-        slopes = [slope for slope in slopes if not slope.refused and _worth(bench, current, slope) > WORTH]
+        slopes = [slope for slope in slopes if not slope.refused and _benefit(bench, current, slope) > LEAST_BENEFIT]
         if not slopes:
             break
         # parameters without effect on any goal here have none a step away either
@@ -149,7 +149,7 @@ def _slopes_of(bench: LayoutBench, facts: LayoutFacts, slope: Slope) -> np.ndarr
     return np.array(out)
 
 
-def _worth(bench: LayoutBench, facts: LayoutFacts, slope: Slope) -> float:
+def _benefit(bench: LayoutBench, facts: LayoutFacts, slope: Slope) -> float:
     """Return the largest change of a ratio over a parameter's range, relative to the largest ratio."""
     return float(np.max(np.abs(_slopes_of(bench, facts, slope)))) / _largest(facts, bench)
 

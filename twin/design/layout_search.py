@@ -85,7 +85,7 @@ class End:
     progress: tuple[float, ...]
     refined: tuple[float, ...]
     tried: int
-    standing: int
+    feasible: int
     compared: int
     built: int
     refused: Mapping[str, int]
@@ -126,9 +126,9 @@ class Found:
         return sum(end.tried for end in self.ends)
 
     @property
-    def standing(self) -> int:
+    def feasible(self) -> int:
         """Number of beams that are feasible alone."""
-        return sum(end.standing for end in self.ends)
+        return sum(end.feasible for end in self.ends)
 
     @property
     def compared(self) -> int:
@@ -386,7 +386,7 @@ class _OneSearch:
             self._build(self._part(f"round {number + 1}: layouts"), spec.exact)
             progress.append(self._best())
             step = step if progress[-1] < 0.98 * progress[-2] else 0.5 * step
-        layouts = self._standing()
+        layouts = self._feasible()
         path = (
             refined(self.bench, self.ask, self._part("refinement"), layouts[0], spec.refine, self.rng)
             if layouts
@@ -407,14 +407,14 @@ class _OneSearch:
     def _part(self, words: str) -> str:
         return f"{self.name}: {words}" if self.name else words
 
-    def _standing(self) -> list[LayoutFacts]:
-        standing = [facts for facts in self.built.values() if not facts.refused]
-        return sorted(standing, key=lambda layout: merit(layout.sigmas, self.bench))
+    def _feasible(self) -> list[LayoutFacts]:
+        feasible = [facts for facts in self.built.values() if not facts.refused]
+        return sorted(feasible, key=lambda layout: merit(layout.sigmas, self.bench))
 
     def _with_other_ccds(self) -> list[Beam]:
         """Return the beams of the best layout with each other area CCD, which only all of them together can have."""
-        others, standing = self.setup.test.area_ccds or {}, self._standing()
-        beams = standing[0].beams if standing else ()
+        others, feasible = self.setup.test.area_ccds or {}, self._feasible()
+        beams = feasible[0].beams if feasible else ()
         wanted = [replace(beam, area_ccd=name) for name in others for beam in beams]
         return [beam for beam in wanted if beam not in self.tried]
 
@@ -469,12 +469,12 @@ class _OneSearch:
                 if k not in candidate.beams
             }
             promising = sorted((self._candidate(beams) for beams in sets if self._alike(beams)), key=_promise)
-            standing = (
+            feasible = (
                 candidate
                 for candidate in promising
                 if candidate.beams in self.built or self._may_stand(candidate.beams)
             )
-            level = [*islice(standing, width + len(self.built))]
+            level = [*islice(feasible, width + len(self.built))]
             levels.append(level)
         return levels
 
@@ -532,7 +532,7 @@ class _OneSearch:
 
         A pair may have to change before it is better than a single beam.
         """
-        best = self._standing()
+        best = self._feasible()
         sizes = sorted({len(layout.beams) for layout in best})
         groups = [[layout for layout in best if len(layout.beams) == size][:KEPT] for size in sizes]
         return list(dict.fromkeys(beam for group in reversed(groups) for layout in group for beam in layout.beams))

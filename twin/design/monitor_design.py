@@ -316,7 +316,7 @@ LAYOUT: Record[_Part] = Record(
 SEARCH: Record[Found] = Record(
     "Extent of the search.",
     Quantity("beams_tried", lambda found: found.beams, "beams that were evaluated alone"),
-    Quantity("beams_feasible", lambda found: found.standing, "feasible ones of these"),
+    Quantity("beams_feasible", lambda found: found.feasible, "feasible ones of these"),
     Quantity("layouts_compared", lambda found: found.compared, "combinations whose merit was computed"),
     Quantity("layouts_built", lambda found: found.built, "those of these that were built as a whole"),
     Quantity("layouts_feasible", lambda found: len(found.layouts), "feasible ones of these"),

@@ -94,7 +94,7 @@ def _row(run: MonitorDesignRun, name: str, facts: LayoutFacts) -> list[str | int
 def _search_text(run: MonitorDesignRun) -> str:
     results = run.results
     text = (
-        f"{results.beams} beams were evaluated alone, of which {results.standing} are feasible; {results.compared} "
+        f"{results.beams} beams were evaluated alone, of which {results.feasible} are feasible; {results.compared} "
         f"combinations were compared and {results.built} built as a whole, {len(results.layouts)} of them feasible."
     )
     refused = sorted(results.refused.items(), key=lambda item: -item[1])[:3]

@@ -128,7 +128,7 @@ class Client:
 
     @property
     def busy(self) -> bool:
-        """Whether it has an open request."""
+        """True if the client has an open request."""
         return bool(self.state or self.view or self.factors or self.saves or self.reveal)
 
     def next_request(self) -> _Request:

@@ -107,7 +107,7 @@ class LiveBench:
 
     @property
     def monitored(self) -> bool:
-        """Whether the instrument has a monitor; without one the page shows the trace and the cameras' image quality."""
+        """True if the instrument has a monitor; without one the page shows the trace and the cameras' image quality."""
         return self.twin.experiment.monitored
 
     def warm(self, advance: Callable[[str], None] = lambda part: None) -> None:

@@ -85,7 +85,7 @@ class LiveServer:
 
     @property
     def started(self) -> bool:
-        """Whether the server answers."""
+        """True if the server answers."""
         return self._uvicorn is not None and self._uvicorn.started
 
     def run(self, listening: socket.socket) -> None:

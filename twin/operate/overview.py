@@ -139,7 +139,7 @@ class Coverage:
 
     @property
     def holds(self) -> bool:
-        """Whether the interval contains the expected share."""
+        """True if the interval contains the expected share."""
         return self.count == 0 or self.low <= self.expected <= self.high
 
 

@@ -192,7 +192,7 @@ class Call:
 
     @property
     def has_estimate(self) -> bool:
-        """Whether the record has a plan and a reading of the monitor."""
+        """True if the record has a plan and a reading of the monitor."""
         return self.history.plan() is not None and self.history.first("monitor") is not None
 
     def estimate(self, plan: Path | None = None) -> tuple[Operation, FilterResult, list[Alarm]]:

@@ -1,1 +1,1 @@
-"""What limits a monitor's readings: the command ``python -m twin.uncertainty``, and the main job's section of it."""
+"""Accuracy limits of a monitor's readings, for ``python -m twin.uncertainty`` and the main job."""

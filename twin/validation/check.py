@@ -458,7 +458,7 @@ class Check(Spec):
         return {"basis": basis, "expected": agreed, **row}
 
     @model_validator(mode="after")
-    def _can_tell(self) -> Check:
+    def _can_separate(self) -> Check:
         """Refuse ids that cannot be selected, and rows that cannot distinguish what they test."""
         for name in self.names:
             parts = name.split(".")

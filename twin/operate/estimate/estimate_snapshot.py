@@ -178,7 +178,7 @@ class Sensor:
 
     @property
     def disagrees(self) -> bool:
-        """Whether the chi-square of the latest residuals exceeds its limit."""
+        """True if the chi-square of the latest residuals exceeds its limit."""
         square = sum(white**2 for white in self.recent)
         return bool(self.recent) and square > float(limit_of(FALSE_ALARM, len(self.recent)))
 

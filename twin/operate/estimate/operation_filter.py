@@ -401,7 +401,7 @@ class Operation:
 
     @cached_property
     def too_many_jumps(self) -> bool:
-        """Whether more jumps were detected than the plan states, at a false-alarm rate of one in a thousand.
+        """True if more jumps were detected than the plan specifies, at a false-alarm rate of one in a thousand.
 
         A body without a stated rate counts as one expected jump.
         """

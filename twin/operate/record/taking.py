@@ -84,8 +84,8 @@ class Ingest:
 
     def ingest(self, content: FileContent) -> IngestResult:
         """Compare the content of the file with the record and add what is new."""
-        taking = digest_of_data([content.sha256, content.meaning])
-        source = self.connection.execute(select(SOURCE.c.id).where(SOURCE.c.taking == taking)).first()
+        source_digest = digest_of_data([content.sha256, content.meaning])
+        source = self.connection.execute(select(SOURCE.c.id).where(SOURCE.c.taking == source_digest)).first()
         entries = [(item, item.digest) for item in content.items if isinstance(item, Entry)]
         known = self._present(ENTRY.c.sha256, [digest for _, digest in entries])
         digests, refused, new_entries = iter(entries), [], []
@@ -110,7 +110,7 @@ class Ingest:
         before = source is not None
         fresh = self._new_refusals(content, refused, before)
         if new_entries or fresh or not before:
-            self.write(content, taking, None if source is None else int(source[0]), new_entries, fresh)
+            self.write(content, source_digest, None if source is None else int(source[0]), new_entries, fresh)
         refusals_made = tuple((one.line, one.reason) for one, _ in refused)
         return IngestResult(content.file, len(new_entries), again, refusals_made, before, len(refused) - len(fresh))
 
@@ -205,7 +205,7 @@ class Ingest:
     def write(
         self,
         content: FileContent,
-        taking: str,
+        source_digest: str,
         source: int | None,
         new_entries: list[tuple[Entry, str]],
         refused: Mapping[str, tuple[Refusal, str | None]],
@@ -216,7 +216,7 @@ class Ingest:
         ----------
         content : FileContent
             File that they come from.
-        taking : str
+        source_digest : str
             Digest of the file and of the description by which it was read.
         source : int | None
             Id of the file's row; None if the record does not have it yet.
@@ -227,7 +227,7 @@ class Ingest:
         """
         moment = utc_text(now())
         if source is None:
-            row = {"file": content.file, "sha256": content.sha256, "taking": taking, "taken_utc": moment}
+            row = {"file": content.file, "sha256": content.sha256, "taking": source_digest, "taken_utc": moment}
             written = self.connection.execute(insert(SOURCE).values(**row, rows_read=len(content.items)))
             source = int(written.inserted_primary_key[0])  # type: ignore[index]
             frames = [{"source_id": source, "file": f, "sha256": d} for f, d in content.frames.items()]

@@ -153,7 +153,7 @@ def _round_up(count: int) -> int:
     return -(-count // step) * step
 
 
-WORTH = 0.02
+LEAST_SHARE = 0.02
 """Share of the variance below which a factor is not named."""
 LINEAR = 0.5
 """Share of the variance below which a linear model describes a response poorly."""
@@ -240,7 +240,7 @@ def _contributors(analysis: StudyAnalysis, response: Response) -> str:
     text = f"{name}: mean {mean}, standard deviation {std}{where}."
     indices = analysis.indices.get(name)
     if isinstance(indices, Indices):
-        big = [index for index in indices.axes if index.total.value >= WORTH][:3]
+        big = [index for index in indices.axes if index.total.value >= LEAST_SHARE][:3]
         parts = [f"{index.name} {percent(index.total.value, 0)}" for index in big]
         if parts:
             together = sum(index.first.value for index in indices.axes) < 0.5 and indices.rest < 0.5
