@@ -449,7 +449,9 @@ def check_term(term: Any, backend: Any) -> None:
     for nothing in type(term)().height(backend.Float(x), backend.Float(y)):
         assert np.all(np.array(nothing) == 0.0)
     # rounding, also of sums that cancel
-    np.testing.assert_allclose(scaled_term(term, 3.0).sag(3.0 * x, 3.0 * y), 3.0 * term.sag(x, y), rtol=1e-13, atol=1e-16)
+    np.testing.assert_allclose(
+        scaled_term(term, 3.0).sag(3.0 * x, 3.0 * y), 3.0 * term.sag(x, y), rtol=1e-13, atol=1e-16
+    )
 
 
 # --- reflectors of the monitor ----------------------------------------------------------------------------------------

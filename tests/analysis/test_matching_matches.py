@@ -162,7 +162,10 @@ def test_reasons(texture):
     assert not far.accepted[0]
     holes = image.astype(float)
     holes[352, 352] = np.nan
-    assert match_windows(holes, texture.patches([[350.0, 350.0]]), [[350.0, 350.0]], search_radius=10).reason[0] == Reason.IMAGE
+    assert (
+        match_windows(holes, texture.patches([[350.0, 350.0]]), [[350.0, 350.0]], search_radius=10).reason[0]
+        == Reason.IMAGE
+    )
     # at the image's side the window is cut, and the point is found all the same
     side = match_windows(image, texture.patches([[17.3, 150.4]]), [[20.0, 150.0]], search_radius=10)
     assert side.accepted[0]

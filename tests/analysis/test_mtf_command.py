@@ -185,7 +185,10 @@ PAGES = {
     "single pages are too noisy": lambda: [page(-12, 1), page(12, 2), flat(3)],
     "page 6, not counting copies, shows no edge": lambda: [*(page(k / 2, k) for k in range(6)), flat(9)],
     "4000000 in all are possible": lambda: [page(12 * (-1) ** (k % 2), k % 10) + k for k in range(1000)],
-    "the edge does not have the same shape in them": lambda: [*(page(k / 2, k) for k in range(4)), SOFT + 0.01 * flat(9)],
+    "the edge does not have the same shape in them": lambda: [
+        *(page(k / 2, k) for k in range(4)),
+        SOFT + 0.01 * flat(9),
+    ],
     "within 10 px of the region's side": lambda: [*(page(k / 5, k) for k in range(20)), page(25, 99)],
 }
 

@@ -156,7 +156,14 @@ def test_printed_equation_turns_every_plane_by_half_a_turn_about_z():
     a, b = intersection_angles(*printed), intersection_angles(*corrected)
     assert a.values == pytest.approx(b.values, abs=1e-14)
     assert a.covariance == pytest.approx(b.covariance, rel=1e-9)
-    refuses(AngleError, "printed cannot be compared with one of corrected", intersection_angles, printed[0], corrected[1], printed[2])
+    refuses(
+        AngleError,
+        "printed cannot be compared with one of corrected",
+        intersection_angles,
+        printed[0],
+        corrected[1],
+        printed[2],
+    )
 
 
 def test_coefficients_solve_the_papers_least_squares():

@@ -294,7 +294,9 @@ def test_both_sides_need_the_same_margin(turned):
     enough = math.ceil(end + 10.0)
     for level in (image, BRIGHT + DARK - image):
         assert slanted_edge_mtf(level[:, : enough + 1][:, turned]).mtf[0] == pytest.approx(1.0)
-        refuses(EdgeError, r"comes within 9\.\d px of the region's side", slanted_edge_mtf, level[:, :enough][:, turned])
+        refuses(
+            EdgeError, r"comes within 9\.\d px of the region's side", slanted_edge_mtf, level[:, :enough][:, turned]
+        )
 
 
 def test_stated_saturation():

@@ -129,7 +129,9 @@ def test_uneven_light_is_fitted_and_reported():
         np.testing.assert_allclose([found.at(f)[0] for f in FREQUENCIES], truth(FREQUENCIES, -7, 0.6), atol=5e-5)
         # rows and columns end half a pixel inside of the region
         np.testing.assert_allclose(found.light, sign * 19000.0 * np.array([0.2, 0.01, 0.0, 0.0]) * 63 / 64, atol=3.0)
-    assert abs(slanted_edge_mtf(image, saturation=np.inf, uniform_light=True).at(0.05)[0] - truth(0.05, -7, 0.6)) > 0.004
+    assert (
+        abs(slanted_edge_mtf(image, saturation=np.inf, uniform_light=True).at(0.05)[0] - truth(0.05, -7, 0.6)) > 0.004
+    )
 
 
 @pytest.mark.second

@@ -216,7 +216,10 @@ BAD = {
     "size": (lambda p: p.write_text("t\nGRD 2 0 SUR SSZ 2 WVL 1\n1 2 3 4\n"), "grid of 2 x 0"),
     "short": (lambda p: p.write_text("t\nGRD 2 2 SUR SSZ 2 WVL 1\n1 2 3\n"), "has 3 points"),
     "zernikes": (lambda p: p.write_text("t\nZFR 2 SUR SSZ 2 WVL 1\n1 2\n"), "Zernike terms"),
-    "huge": (lambda p: p.write_text("t\nGRD 2 2 SUR SSZ 1e-300 WVL 1e20\n1 2 3 4\n"), "inf m, which is too large for a wavefront"),
+    "huge": (
+        lambda p: p.write_text("t\nGRD 2 2 SUR SSZ 1e-300 WVL 1e20\n1 2 3 4\n"),
+        "inf m, which is too large for a wavefront",
+    ),
     "unit of a table": (lambda p: write.table(p, WAVE, "# unit: m\n"), "check its unit"),
     "letters": (lambda p: p.write_text("t\nGRD 2 2 SUR SSZ 2 WVL 1\n1 2\n3 o\n"), "line 4: 'o' is not a number"),
     "steps": (lambda p: p.write_text("5 5 1 2 0 0 0\n" + "1 0 0 0 0\n" * 25), "not square pixels"),

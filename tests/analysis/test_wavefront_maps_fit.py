@@ -203,7 +203,8 @@ def test_the_right_reading_is_rejected_as_often_as_stated():
     rng = np.random.default_rng(8)
     draws = rng.multivariate_normal(expected.ravel(), covariance, 400).reshape(400, *expected.shape)
     rejected = sum(
-        ORIENTATIONS[0] not in orientation_evidence(one, expected, covariance, USED, false_alarm=0.1).allowed for one in draws
+        ORIENTATIONS[0] not in orientation_evidence(one, expected, covariance, USED, false_alarm=0.1).allowed
+        for one in draws
     )
     # 400 draws of a chance of 0.1: three binomial sigmas
     assert 40 - 18 <= rejected <= 40 + 18

@@ -89,9 +89,7 @@ def test_bad_figures_are_refused(backend) -> None:
         plane().figure_disk(None)
     with pytest.raises(ValueError, match="needs an aperture"):
         run(backend, build(Stage(plane())), np.zeros((1, 3)), Z[None], {"e0": Motion(figure={4: 1e-9})})
-    with pytest.raises(
-        ValueError, match="supports no figure of type str"
-    ):  # it would be left out without a word
+    with pytest.raises(ValueError, match="supports no figure of type str"):  # it would be left out without a word
         run(backend, build(Stage(plane().with_figure("bump"))), np.zeros((1, 3)), Z[None])  # type: ignore[arg-type]
 
 

@@ -238,7 +238,9 @@ def run_mutant(case: Case, number: int, root: Path, spoilt: Mutant | None = None
             nullcontext() if depth == "whole" else cut(soon=depth == "soon"),
             mock.patch.object(tempfile, "tempdir", str(folder / "tmp")),
             # one core is no reason for a second process
-            mock.patch.dict(os.environ, {THREADS_VARIABLE: "1", "TMPDIR": str(folder / "tmp"), "TWIN_CALIBRATIONS": "off"}),
+            mock.patch.dict(
+                os.environ, {THREADS_VARIABLE: "1", "TMPDIR": str(folder / "tmp"), "TWIN_CALIBRATIONS": "off"}
+            ),
             _stderr_into(raw) as errors,
             warnings.catch_warnings(record=True) as told,
             _watching(folder, case.starts and depth == "whole") as seen,

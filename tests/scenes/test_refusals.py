@@ -79,7 +79,14 @@ LIMITS = (
     (node_table, "LARGEST_TABLE", 99, "heated", MESH, "heat.vtu: too large"),
     (spectrum, "MOST_SAMPLES", 5, "filter", "", "table: the table has too many rows; found 6"),
     (disturbances, "MOST_JOINT", 2, "joint disturbances", "", "components: too many components; found 3"),
-    (camera_reader, "SAME", 0.0, "camera of a prescription", "", "rays of the camera differ from those of the prescription"),
+    (
+        camera_reader,
+        "SAME",
+        0.0,
+        "camera of a prescription",
+        "",
+        "rays of the camera differ from those of the prescription",
+    ),
 )
 
 

@@ -91,7 +91,9 @@ def test_beams_of_which_nothing_can_be_told_are_refused(backend, camera, monkeyp
     with pytest.raises(UnphysicalError, match="11 Zernike terms are not independent"):
         beams.zernike_rows(11)
     monkeypatch.setattr(varied_beams, "RESIDUAL", 0.0)
-    with pytest.raises(varied_beams.RoughWavefrontError, match=r"polynomials do not represent the wavefronts: they leave \S+ waves"):
+    with pytest.raises(
+        varied_beams.RoughWavefrontError, match=r"polynomials do not represent the wavefronts: they leave \S+ waves"
+    ):
         VariedBeams(optics, [(0.0, 0.0)], None, None)
     rays = VariedBeams._rays
 

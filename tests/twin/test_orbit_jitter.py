@@ -68,9 +68,7 @@ def test_every_warning_of_a_search_is_told_when_and_only_when_it_holds(oscillati
     for nothing in ({}, {"used": used < 0.71}, {"factors": 0.0 * one.result.factors + 1.29**2}):
         assert told(**nothing) == (), nothing
     assert any("31% of the observations of jitter were rejected as wrong" in text for text in told(used=used < 0.69))
-    assert any(
-        "the remaining noise in jitter is" in text for text in told(factors=0.0 * one.result.factors + 1.31**2)
-    )
+    assert any("the remaining noise in jitter is" in text for text in told(factors=0.0 * one.result.factors + 1.31**2))
     (text,) = told(lines=replace(lines, aliases=((8.5, 9.1),)))
     assert "jitter: 0.65 Hz may also be 8.5, 9.1 Hz" in text.replace(f"{lines.frequency[0]:.4g}", "0.65")
     (text,) = told(lines=replace(lines, frequency=np.array([21.0])))

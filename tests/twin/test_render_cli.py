@@ -125,7 +125,9 @@ def test_all_that_is_drawn_can_be_sent_to_the_second_process(computed):
 @pytest.mark.second
 def test_what_cannot_be_drawn_costs_nothing_else(ready, tmp_path, monkeypatch):
     """A file that cannot be drawn is not there; all else is, and exit code and manifest say so."""
-    monkeypatch.setattr(twin.main_job.render_folder, "drawings", lambda _: {SUMMARY: partial(_attempt, SUMMARY, no_font)})
+    monkeypatch.setattr(
+        twin.main_job.render_folder, "drawings", lambda _: {SUMMARY: partial(_attempt, SUMMARY, no_font)}
+    )
     done = run(EXAMPLE, "--out", tmp_path / "run", "--frames", FRAMES, "--quiet")
     told = "the file summary.png could not be drawn: RuntimeError: no such font <x>"
     assert (done.exit_code, told in " ".join(done.stderr.split())) == (1, True)

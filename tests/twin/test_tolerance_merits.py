@@ -219,12 +219,7 @@ def test_colours_too_far_apart_for_a_sum_are_told_at_the_light(backend: Backend,
 @pytest.mark.parametrize(
     ("place", "name", "error", "words"),
     [
-        (
-            tolerance_bench,
-            "VariedBeams",
-            VignettedBeamError("cut"),
-            "merits: cut.*fields whose light is not vignetted",
-        ),
+        (tolerance_bench, "VariedBeams", VignettedBeamError("cut"), "merits: cut.*fields whose light is not vignetted"),
         (tolerance_bench, "VariedBeams", RoughWavefrontError("rough"), "merits: rough.*a sharper camera"),
         (CameraOptics, "colour_pupils", UnphysicalError("more light"), r"merits\.mtf: .* has no MTF: more light"),
     ],

@@ -394,7 +394,7 @@ LEAST = 1e-6
 """Probability below which only a bound is printed."""
 _CLOSE = 3.0
 """Difference of log likelihood ratios (a factor of 20) below which another body explains a jump nearly as well."""
-BROKEN, BREAKS, JUMP, SENSOR, CONTRADICTION = "broken", "requirements", "jump", "sensor", "contradiction"
+BROKEN, BREAKS, JUMP, SENSOR, CONTRADICTION = "broken", "breaks", "jump", "sensor", "contradiction"
 Row = Mapping[str, Any]
 
 
