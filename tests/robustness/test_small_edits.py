@@ -159,7 +159,7 @@ def test_a_monitor_that_misses_says_by_how_much(tmp_path, backend, monkeypatch) 
     (issue,) = caught.value.issues
     assert issue.file.endswith("instrument.yaml")
     assert issue.key == ("monitor",)
-    assert "even as designed" in issue.problem
+    assert "does not work as designed" in issue.problem
     match = re.search(r"the spot (\w+/\w+) falls on row .*: ([\d.]+) px or ([\d.]+) mm beyond its edge", issue.problem)
     assert match is not None, issue.problem
     assert float(match[3]) == pytest.approx(0.012 * float(match[2]), rel=1e-2)  # pixels of 12 um, three digits
