@@ -37,7 +37,7 @@ def with_ccd(bench: Workbench, side: int) -> MonitorExperiment:
 def of_states(bench: Workbench, count: int) -> Callable[[], object]:
     """States observed, with one frame of small CCDs, that nobody keeps."""
     experiment = with_ccd(bench, SIDE)
-    how = ObservationOptions(shared_detector(experiment, 1, 1), stated=False)
+    how = ObservationOptions(shared_detector(experiment, 1, 1), use_prior=False)
     every = random_states(count, 2)
 
     def observed() -> int:
