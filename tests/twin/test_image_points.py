@@ -26,6 +26,7 @@ from twin.orbit.images import image_points
 from twin.orbit.images.image_points import MatchedPoints, map_points, tie_points
 from twin.orbit.images.patch import judged, true_ground
 from twin.orbit.images.simulate_run import Simulation, run_simulation
+from twin.orbit.matching import match_run
 from twin.orbit.matching.match_run import Match, run_match
 
 pytestmark = pytest.mark.second
@@ -219,6 +220,25 @@ def test_points_in_files_are_where_the_true_sensor_has_them(flown: Simulation, f
     role = found.measurements.ground.role
     assert {*role} == {"control", "check", "tie"}
     assert np.all(np.isnan(found.measurements.ground.itrs[role == "tie"]))
+
+
+def test_an_unknown_accuracy_is_not_hidden_by_a_known_one(files, monkeypatch: pytest.MonkeyPatch) -> None:
+    """PROJ gives -1 for a transformation whose accuracy its authority does not state."""
+    opened = match_run.UserMap.open
+
+    class Unknown:
+        accuracy = -1.0
+
+        def __init__(self, transformer: Any) -> None:
+            self.transform = transformer.transform
+
+    def dem_unknown(*what: Any, **how: Any) -> Any:
+        user_map = opened(*what, **how)
+        return replace(user_map, to_geographic=Unknown(user_map.to_geographic)) if how.get("heights") else user_map
+
+    assert matched(*files).accuracy == 0.0
+    monkeypatch.setattr(match_run.UserMap, "open", dem_unknown)
+    assert matched(*files).accuracy is None
 
 
 def test_a_mirrored_image_and_a_window_change_nothing(flown: Simulation, files, tmp_path: Path) -> None:

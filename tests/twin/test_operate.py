@@ -418,7 +418,7 @@ def test_the_status_finds_what_was_altered_behind_the_guard(record: Path) -> Non
     base.close()
     held = status(record)
     assert (held["guarded"], held["entries_checked"]) == (True, 500)
-    assert [text.split(",")[0] for text in held["altered"]] == ["1 entries have been removed", "entry 690", "entry 695"]
+    assert [text.split(",")[0] for text in held["altered"]] == ["1 entry has been removed", "entry 690", "entry 695"]
     held = json.loads(run("status", record, "--check-all", "--json").stdout)
     assert held["entries_checked"] == 699
     assert [text.split(",")[0] for text in held["warnings"]][1:] == ["entry 1", "entry 690", "entry 695"]

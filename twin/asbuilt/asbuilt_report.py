@@ -104,9 +104,20 @@ def _percent(share: float) -> str:
     return f"{100.0 * share:.0f} %"
 
 
+_CERTAIN = 0.95
+"""Probability from which the verdict says that a requirement is met, and, as its complement, that it fails."""
+
+
 def _verdict(run: AsBuiltRun) -> str:
-    parts = [f"{prediction.merit.name} {_percent(prediction.meets)}" for prediction in run.predictions]
-    return f"Probability that {run.bench.camera}, as built, meets its requirements: {', '.join(parts)}"
+    """Return the sentence on which requirements the instrument meets, with their probabilities."""
+    groups: dict[str, list[str]] = {"meets": [], "fails": [], "may meet or fail": []}
+    for prediction in run.predictions:
+        outcome = "meets" if prediction.meets >= _CERTAIN else "fails"
+        if 1.0 - _CERTAIN < prediction.meets < _CERTAIN:
+            outcome = "may meet or fail"
+        groups[outcome].append(f"{prediction.merit.name} ({_percent(prediction.meets)})")
+    outcomes = [f"{outcome} {', '.join(names)}" for outcome, names in groups.items() if names]
+    return f"As built, {run.bench.camera} {' and '.join(outcomes)}"
 
 
 def _known_words(run: AsBuiltRun) -> str:

@@ -220,7 +220,8 @@ def altered(connection: Connection, newest: int | None) -> tuple[int, list[str]]
     if connection.dialect.name == "sqlite":  # its ids have no gaps
         held, last = connection.execute(select(func.count(), func.max(c.id)).select_from(ENTRY)).one()
         if held != (last or 0):
-            wrong.append(f"{(last or 0) - held} entries have been removed")
+            missing = (last or 0) - held
+            wrong.append(f"{missing} {'entry has' if missing == 1 else 'entries have'} been removed")
     return len(rows), wrong[::-1]
 
 

@@ -139,7 +139,9 @@ def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Ad
         raise BenchError(f"the images cannot be matched: {error}", ("images",), "images of the map's ground") from error
     advance("points", 3, 3)
     measured = PassMeasurements(spec.name, table, FrozenMap(times), *_measured(points, spec))
-    return Match(setup, ground, points, measured, max((photo.to_geographic.accuracy, dem.to_geographic.accuracy)))
+    accuracies = photo.to_geographic.accuracy, dem.to_geographic.accuracy
+    # a negative accuracy is an unknown one: the known accuracy of the other map does not replace it
+    return Match(setup, ground, points, measured, max(accuracies) if min(accuracies) >= 0.0 else None)
 
 
 def _times(spec: OrbitMatchSpec, clock: LineClock, epoch: str) -> LineTimes:
