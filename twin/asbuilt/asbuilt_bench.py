@@ -136,12 +136,18 @@ class AsBuiltBench(Site):
     # predictions
 
     def view(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> View:
-        """Return the states of parameters (S, K) after a move."""
+        """Return the states of parameters (S, K) after a move.
+
+        Array dimensions: S states, K parameters.
+        """
         states: Sequence[State] = self.parameters.states(values, after, further)
         return View(values, states, lambda bodies: self.parameters.temperatures(values, bodies))
 
     def predict(self, values: np.ndarray) -> np.ndarray:
-        """Return the error-free readings of all measurements, (S, D); NaN where the light of a state is lost."""
+        """Return the error-free readings of all measurements, (S, D); NaN where the light of a state is lost.
+
+        Array dimensions: S states, D readings.
+        """
         return self._predicted(values, self.kinds, self.afters)
 
     def _predicted(self, values: np.ndarray, kinds: Sequence[MeasuredKind], afters: Sequence[str | None]) -> np.ndarray:
@@ -155,12 +161,18 @@ class AsBuiltBench(Site):
     def slope(
         self, values: np.ndarray, kinds: Sequence[MeasuredKind] | None = None, afters: Sequence[str | None] = ()
     ) -> np.ndarray:
-        """Return the derivatives (D, K) of the predictions at parameters (K,), by central differences."""
+        """Return the derivatives (D, K) of the predictions at parameters (K,), by central differences.
+
+        Array dimensions: D readings, K parameters.
+        """
         kinds, afters = (self.kinds, self.afters) if kinds is None else (kinds, afters)
         return self._by_parameters(values, lambda moved: self._predicted(moved, kinds, afters))
 
     def _by_parameters(self, values: np.ndarray, work: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """Return the derivatives (D, K) of a function of states, (S, K) -> (S, D), at parameters (K,)."""
+        """Return the derivatives (D, K) of a function of states, (S, K) -> (S, D), at parameters (K,).
+
+        Array dimensions: D readings, K parameters, S states.
+        """
         steps = STEP * self.parameters.prior.sigma
         outputs = work(np.concatenate([values + np.diag(steps), values - np.diag(steps)]))
         ahead, behind = outputs[: len(steps)], outputs[len(steps) :]
@@ -201,6 +213,8 @@ class AsBuiltBench(Site):
     def draw(self, rng: np.random.Generator, law: str) -> np.ndarray:
         """Draw the parameters (K,) of an instrument from the prior, or from the prior given under ``simulate``.
 
+        Array dimensions: K parameters.
+
         Parameters
         ----------
         rng : Generator
@@ -233,6 +247,8 @@ class AsBuiltBench(Site):
     def measured(self, true: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
         """Return simulated readings, with their errors, of an instrument with parameters (K,).
 
+        Array dimensions: K parameters.
+
         Raises
         ------
         PhysicalError
@@ -251,7 +267,10 @@ class AsBuiltBench(Site):
         return self.parameters.moves[-1] if self.parameters.moves else None
 
     def merit_parts(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> np.ndarray:
-        """Return the parts of the merits, (S, P), for parameters (S, K); NaN where the light is lost."""
+        """Return the parts of the merits, (S, P), for parameters (S, K); NaN where the light is lost.
+
+        Array dimensions: S states, P parts of the merits, K parameters.
+        """
         return nan_where_lost(
             lambda rows: self.merits.parts_of(
                 self.parameters.states(values[rows], after, selected_moves(further, rows))
@@ -264,6 +283,8 @@ class AsBuiltBench(Site):
         """Return residuals (S, R) whose sum of squares a move minimises.
 
         It is the sum over the merits of the mean square over fields or points, in units of the requirement.
+
+        Array dimensions: S states, R residuals.
 
         Raises
         ------
@@ -288,12 +309,18 @@ class AsBuiltBench(Site):
         )
 
     def merit_slope(self, values: np.ndarray, after: str | None) -> np.ndarray:
-        """Return the derivatives (R, K) of the merits' residuals with respect to the parameters, at parameters (K,)."""
+        """Return the derivatives (R, K) of the merits' residuals with respect to the parameters, at parameters (K,).
+
+        Array dimensions: R residuals, K parameters.
+        """
         return self._by_parameters(values, lambda moved: self.merit_residuals(moved, after))
 
     @cached_property
     def actuator_steps(self) -> np.ndarray:
-        """Steps of the numerical derivatives by the actuators, SI, (C,)."""
+        """Steps of the numerical derivatives by the actuators, SI, (C,).
+
+        Array dimensions: C actuators.
+        """
         return _SHARE * np.array([spec.range_si or 1.0 for spec in self.test.actuators.values()])
 
 
@@ -301,6 +328,8 @@ def nan_where_lost(
     work: Callable[[slice], np.ndarray], count: int, shape: tuple[int, ...], first: int = 0
 ) -> np.ndarray:
     """Evaluate a function of states, (S, *shape), with NaN for each state whose light is lost.
+
+    Array dimensions: S states.
 
     Parameters
     ----------
@@ -324,5 +353,8 @@ def nan_where_lost(
 
 
 def selected_moves(further: np.ndarray | None, rows: slice) -> np.ndarray | None:
-    """Return the moves of selected states; a move (C,) common to all states, or None, is returned unchanged."""
+    """Return the moves of selected states; a move (C,) common to all states, or None, is returned unchanged.
+
+    Array dimensions: C actuators.
+    """
     return further if further is None or further.ndim == 1 else further[rows]

@@ -79,6 +79,8 @@ class MeritPrediction:
 class AsBuiltRun:
     """Estimated as-built state of an instrument and its consequences.
 
+    Array dimensions: F fields.
+
     Attributes
     ----------
     setup : AsBuiltSetup
@@ -350,7 +352,10 @@ def _known_plain(run: AsBuiltRun) -> list[dict[str, Any]]:
 
 
 def moves_plain(run: AsBuiltRun, amounts: np.ndarray) -> dict[str, Any]:
-    """Return amounts of the actuators (C,) in the form of the files."""
+    """Return amounts of the actuators (C,) in the form of the files.
+
+    Array dimensions: C actuators.
+    """
     kinds = [number.kind for number in run.bench.parameters.actuators]
     names = run.bench.parameters.names
     return {name: amount_text(float(a), kind) for name, a, kind in zip(names, amounts, kinds, strict=True)}

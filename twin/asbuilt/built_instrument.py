@@ -51,6 +51,8 @@ def unknown(run: AsBuiltRun) -> tuple[list[Component], np.ndarray]:
     """Return the components of motions that are uncertain, without thermal ones, and their covariance (C, C), SI.
 
     Errors of moves are added to the components of the bodies that were moved.
+
+    Array dimensions: C uncertain components.
     """
     parameters, estimate = run.bench.parameters, run.estimate
     components = [component for component in parameters.components if component.kind not in HEAT]
@@ -95,7 +97,10 @@ def unknown(run: AsBuiltRun) -> tuple[list[Component], np.ndarray]:
 
 
 def _pull(run: AsBuiltRun, actuator: int) -> np.ndarray:
-    """Return the derivatives of an actuator's total travel with respect to all parameters, (K,)."""
+    """Return the derivatives of an actuator's total travel with respect to all parameters, (K,).
+
+    Array dimensions: K parameters.
+    """
     parameters, last = run.bench.parameters, run.bench.last
     count = len(run.estimate.mean)
     if last is None:

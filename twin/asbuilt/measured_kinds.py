@@ -45,6 +45,8 @@ _LINE_DEGREE = 7
 class View:
     """States of the instrument at the time of a measurement.
 
+    Array dimensions: K parameters.
+
     Attributes
     ----------
     values : (S, K) ndarray
@@ -79,6 +81,8 @@ class Site(ABC):
 
 class MeasuredKind(ABC):
     """Measurement on an instrument; base class of all kinds.
+
+    Array dimensions: D readings.
 
     Parameters
     ----------
@@ -119,11 +123,17 @@ class MeasuredKind(ABC):
 
     @abstractmethod
     def predict(self, view: View) -> np.ndarray:
-        """Return the error-free readings, (S, D); raise PhysicalError if the light of a state is lost."""
+        """Return the error-free readings, (S, D); raise PhysicalError if the light of a state is lost.
+
+        Array dimensions: S states, D readings.
+        """
 
     @abstractmethod
     def covariance(self) -> np.ndarray:
-        """Return the covariance of the random errors, (D, D)."""
+        """Return the covariance of the random errors, (D, D).
+
+        Array dimensions: D readings.
+        """
 
     def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the design matrix (D, B) of systematic errors, and their standard deviations (B,).
@@ -131,15 +141,23 @@ class MeasuredKind(ABC):
         The first standard deviations are for the estimate, the second ones for simulated data.
 
         A free bias has an infinite standard deviation in the estimate.
+
+        Array dimensions: D readings, B systematic errors.
         """
         return np.zeros((len(self.labels), 0)), np.zeros(0), np.zeros(0)
 
     @abstractmethod
     def read(self) -> np.ndarray:
-        """Return the data, (D,), SI; raise InputError if a file does not hold them."""
+        """Return the data, (D,), SI; raise InputError if a file does not hold them.
+
+        Array dimensions: D readings.
+        """
 
     def group(self, values: np.ndarray) -> MeasuredGroup:
-        """Return the measurement with data (D,) for the estimate."""
+        """Return the measurement with data (D,) for the estimate.
+
+        Array dimensions: D readings.
+        """
         columns, sigmas, _ = self.biases()
         used = sigmas > 0.0
         return MeasuredGroup(
@@ -147,7 +165,10 @@ class MeasuredKind(ABC):
         )
 
     def drawn(self, true: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Return readings (D,) with simulated random errors and biases added to the true ones."""
+        """Return readings (D,) with simulated random errors and biases added to the true ones.
+
+        Array dimensions: D readings.
+        """
         columns, _, typical = self.biases()
         noise = np.linalg.cholesky(self.covariance()) @ rng.standard_normal(len(true))
         return np.asarray(true + noise + columns @ (typical * rng.standard_normal(len(typical))))

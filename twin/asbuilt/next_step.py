@@ -40,6 +40,8 @@ class Advice:
 def optimal_move(bench: AsBuiltBench, mean: np.ndarray, after: str | None) -> NextMove:
     """Return the move that minimises the expected merit, linearised about the state to which it leads.
 
+    Array dimensions: K parameters.
+
     Parameters
     ----------
     bench : AsBuiltBench
@@ -71,7 +73,10 @@ def optimal_move(bench: AsBuiltBench, mean: np.ndarray, after: str | None) -> Ne
 def _about(
     bench: AsBuiltBench, mean: np.ndarray, after: str | None, amounts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the residuals of the merits (R,) after a move, and their derivatives by the actuators (R, C)."""
+    """Return the residuals of the merits (R,) after a move, and their derivatives by the actuators (R, C).
+
+    Array dimensions: R residuals, C actuators.
+    """
     count = len(amounts)
     steps = np.diag(bench.actuator_steps)
     moves = np.concatenate([amounts[None], amounts + steps, amounts - steps])
@@ -81,6 +86,8 @@ def _about(
 
 def advice(bench: AsBuiltBench, estimate: StateEstimate, draws: np.ndarray, rng: np.random.Generator) -> Advice:
     """Return the next move, its effect over the posterior, and the expected benefit of measurements before it.
+
+    Array dimensions: S states, K parameters.
 
     Parameters
     ----------
@@ -119,7 +126,10 @@ def advice(bench: AsBuiltBench, estimate: StateEstimate, draws: np.ndarray, rng:
 def expected(
     bench: AsBuiltBench, values: np.ndarray, after: str | None, further: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the merits of states (S,), sums of squares in units of the requirements; NaN where the light is lost."""
+    """Return the merits of states (S,), sums of squares in units of the requirements; NaN where the light is lost.
+
+    Array dimensions: S states.
+    """
     return nan_where_lost(
         lambda rows: np.sum(bench.merit_residuals(values[rows], after, selected_moves(further, rows)) ** 2, axis=1),
         len(values),

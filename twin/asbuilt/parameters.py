@@ -29,6 +29,8 @@ from twin.tolerance.variations import BodyMove, VariedParameter, actuator_parame
 class Parameters:
     """Parameters of an as-built estimate.
 
+    Array dimensions: M components, J moves, C actuators.
+
     Attributes
     ----------
     stated : DisturbancePrior
@@ -131,6 +133,8 @@ class Parameters:
     def moved(self, values: np.ndarray, after: str | None) -> np.ndarray:
         """Return the total travel of the actuators for parameters (S, K), (S, C), SI.
 
+        Array dimensions: S states, K parameters, C actuators.
+
         Parameters
         ----------
         values : (S, K) ndarray
@@ -150,7 +154,10 @@ class Parameters:
         return out
 
     def gain(self, values: np.ndarray) -> np.ndarray:
-        """Return the ratio of each actuator's response to the traced one, (S, C)."""
+        """Return the ratio of each actuator's response to the traced one, (S, C).
+
+        Array dimensions: S states, C actuators.
+        """
         out = np.ones((len(values), len(self.names)))
         start = len(self.components)
         out[:, list(self.gains)] += values[:, start : start + len(self.gains)]
@@ -158,6 +165,8 @@ class Parameters:
 
     def states(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> list[State]:
         """Return the states of the instrument.
+
+        Array dimensions: S states, K parameters, C actuators.
 
         Parameters
         ----------
@@ -178,6 +187,8 @@ class Parameters:
         """Return the temperatures of bodies above nominal, (S, bodies), kelvin.
 
         A body without its own temperature has that of the nearest body that carries it.
+
+        Array dimensions: S states.
         """
         out = np.zeros((len(values), len(bodies)))
         heated = {component.body for component in self.components if component.kind == "temperature"}

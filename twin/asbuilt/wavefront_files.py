@@ -51,6 +51,8 @@ def stated_orientation(measurement: WavefrontMeasurement) -> Orientation:
 def read_coefficients(measurement: WavefrontMeasurement, orientation: Orientation | None = None) -> np.ndarray:
     """Return the Zernike terms of every field, (F, T), metres rms of the wavefront in single pass.
 
+    Array dimensions: F fields, T Zernike terms.
+
     Parameters
     ----------
     measurement : NamesWavefronts

@@ -166,7 +166,10 @@ def _layout(axes: Axes, design: Design, prescription: Prescription) -> None:
 
 
 def _edges(hits: np.ndarray) -> tuple[int, int]:
-    """Return the indices of the rays (N, 2) of a beam with the smallest and the largest y."""
+    """Return the indices of the rays (N, 2) of a beam with the smallest and the largest y.
+
+    Array dimensions: N rays.
+    """
     return int(np.argmin(hits[:, 0])), int(np.argmax(hits[:, 0]))
 
 

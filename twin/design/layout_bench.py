@@ -47,6 +47,8 @@ electrons.
 class Seen:
     """Observation model of the spots of one beam under one prior on disturbances; D = 8 coordinates, K cameras.
 
+    Array dimensions: M independent motions.
+
     Attributes
     ----------
     shared : (D, M) ndarray
@@ -65,6 +67,8 @@ class Seen:
 @dataclass(frozen=True, eq=False)
 class BeamFacts:
     """Properties of a beam that was evaluated alone.
+
+    Array dimensions: P corners, N segments, K cameras.
 
     Attributes
     ----------
@@ -98,13 +102,18 @@ class BeamFacts:
 
     @cached_property
     def planes(self) -> list[np.ndarray]:
-        """Planes of the faces of each of its prisms, (F, 4) each."""
+        """Planes of the faces of each of its prisms, (F, 4) each.
+
+        Array dimensions: F faces.
+        """
         return [ConvexHull(corners).equations for corners in self.bodies]
 
 
 @dataclass(frozen=True, eq=False)
 class LayoutFacts:
     """Properties of a layout that was built as a whole.
+
+    Array dimensions: C spots.
 
     Attributes
     ----------
@@ -346,6 +355,8 @@ def _light(instrument: Instrument, backend: Backend) -> np.ndarray:
     """Return segments (N, K, 2, 3), metres, of the edge rays of all outgoing beams, in front of the cameras.
 
     Segments inside glass are omitted.
+
+    Array dimensions: N segments, K cameras.
     """
     angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
     edge = 0.999 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -396,6 +407,8 @@ def touching(one: BeamFacts, other: BeamFacts) -> bool:
 
 def combined(facts: Sequence[BeamFacts], name: str) -> np.ndarray:
     """Return the posterior covariance of the cameras' parameters from several beams together, (4 K, 4 K), rad and m.
+
+    Array dimensions: K cameras.
 
     Parameters
     ----------

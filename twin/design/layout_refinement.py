@@ -140,7 +140,10 @@ def _largest(facts: LayoutFacts, bench: LayoutBench) -> float:
 
 
 def _slopes_of(bench: LayoutBench, facts: LayoutFacts, slope: Slope) -> np.ndarray:
-    """Return the linear change of every ratio over the whole range of a parameter, (Q,)."""
+    """Return the linear change of every ratio over the whole range of a parameter, (Q,).
+
+    Array dimensions: Q ratios of sigma to goal.
+    """
     low, high = ranges(bench.setup)[slope.number.name]
     out, goal = [], bench.setup.test.goal.wanted
     for name, key in ratios(facts.sigmas, bench):

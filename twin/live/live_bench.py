@@ -218,6 +218,8 @@ class LiveBench:
     def state(self, asked: AskedState) -> tuple[dict[str, Any], np.ndarray | None]:
         """Compute a state of the knobs.
 
+        Array dimensions: C area CCDs, H rows, W columns.
+
         Parameters
         ----------
         asked : AskedState
@@ -266,7 +268,10 @@ class LiveBench:
         }
 
     def before(self, asked: AskedState) -> np.ndarray:
-        """Return the images before the perturbation, uint16 (C, H, W); empty without a monitor."""
+        """Return the images before the perturbation, uint16 (C, H, W); empty without a monitor.
+
+        Array dimensions: C area CCDs, H rows, W columns.
+        """
         if not self.monitored:
             return np.zeros((0, 0, 0), np.uint16)
         frames = self._reader(asked.frames, asked.seed).before if asked.noise else None
@@ -352,7 +357,10 @@ class LiveBench:
         return StateReader(self.twin.experiment, frames, self.seed_of(seed), self.twin.resolved.job.analysis.centroid)
 
     def _shown(self, frames: np.ndarray | None, photons: np.ndarray) -> np.ndarray:
-        """Return the image of a state on the page, uint16 (C, H, W): its first frame, or the rounded expected image."""
+        """Return the image of a state on the page, uint16 (C, H, W): its first frame, or the rounded expected image.
+
+        Array dimensions: C area CCDs, H rows, W columns.
+        """
         if frames is not None:
             return frames[:, 0]
         experiment = self.twin.experiment

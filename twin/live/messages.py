@@ -189,6 +189,8 @@ def read_message(text: str | bytes) -> Message:
 def packed(data: Mapping[str, Any], images: Mapping[str, np.ndarray]) -> bytes:
     """Return a binary message of the program.
 
+    Array dimensions: C images, H rows, W columns.
+
     Parameters
     ----------
     data : Mapping[str, Any]

@@ -77,7 +77,10 @@ class EstimatedMotions:
 
     @property
     def sigma(self) -> Array:
-        """(M,) standard deviations, in SI units."""
+        """(M,) standard deviations, in SI units.
+
+        Array dimensions: M motions.
+        """
         return np.sqrt(np.maximum(np.diagonal(self.covariance), 0.0))
 
 
@@ -189,6 +192,8 @@ def _short(perturb: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, o
 def merge_components(motions: EstimatedMotions, instrument: Instrument) -> tuple[tuple[Component, ...], Array]:
     """Merge components of the same body, kind and axis, and return the (J, M) matrix from motions to merged components.
 
+    Array dimensions: J components of the file.
+
     Parameters
     ----------
     motions : EstimatedMotions
@@ -233,6 +238,8 @@ def _pivot_shift(body: Body, component: Component, pivot: str) -> Array:
 @dataclass(frozen=True, eq=False)
 class Prior:
     """Uncertainty of an estimated state, as a file of disturbances.
+
+    Array dimensions: M motions.
 
     Attributes
     ----------

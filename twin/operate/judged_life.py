@@ -45,7 +45,10 @@ METHODS = {
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Values and standard deviations (T, Q) of one estimate at T times, in each quantity's unit; NaN where unknown."""
+    """Values and standard deviations (T, Q) of one estimate at T times, in each quantity's unit; NaN where unknown.
+
+    Array dimensions: Q quantities.
+    """
 
     values: Array
     sigmas: Array
@@ -54,6 +57,8 @@ class Estimate:
 @dataclass(frozen=True, eq=False)
 class JudgedLife:
     """Four estimates of a simulated instrument, and the truth.
+
+    Array dimensions: T times.
 
     Attributes
     ----------
@@ -88,7 +93,10 @@ class JudgedLife:
     filter_result: FilterResult
 
     def errors(self, method: str) -> Array:
-        """Return the errors (T, Q) of an estimate, in each quantity's unit."""
+        """Return the errors (T, Q) of an estimate, in each quantity's unit.
+
+        Array dimensions: T times, Q quantities.
+        """
         return self.methods[method].values - self.true
 
     def number(self, group: str, key: str) -> int:
@@ -173,6 +181,8 @@ def _prior(operation: Operation, times: NDArray[np.int64]) -> Estimate:
 class StepwiseIngest:
     """Files of a life, ingested into a record up to one time after the other.
 
+    Array dimensions: T times.
+
     Parameters
     ----------
     history
@@ -216,6 +226,8 @@ def _entries(given: FileContent) -> list[Entry]:
 
 def true_changes(truth: Mapping[str, Any], quantities: Sequence[Quantity], times: NDArray[np.int64]) -> Array:
     """Return the true changes (T, Q) in each quantity's unit.
+
+    Array dimensions: T times.
 
     Parameters
     ----------

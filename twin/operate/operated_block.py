@@ -79,6 +79,8 @@ def posterior(
     The work is that of one smoothing pass, plus T^2 times the square of the number of states: some hundred times of a
     pass take seconds.
 
+    Array dimensions: T times.
+
     Parameters
     ----------
     operation : Operation
@@ -204,6 +206,8 @@ def _prior_of_record(
 
 def camera_prior(estimate: Posterior, cameras: Sequence[str], passes: Sequence[int]) -> JointCameraPrior:
     """Return the estimate of cameras as a prior of a block adjustment.
+
+    Array dimensions: P passes.
 
     Parameters
     ----------

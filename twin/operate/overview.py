@@ -163,6 +163,8 @@ def coverage(sigmas: int, within: int, count: int) -> Coverage:
 class SingleReadings:
     """Values of single readings of the monitor.
 
+    Array dimensions: N readings, Q quantities.
+
     Attributes
     ----------
     times : (N,) ndarray of int64

@@ -159,6 +159,8 @@ def _limits_of_validity(
 
     Each is the last valid distance and the first invalid one, in microseconds, and the reason.
 
+    Array dimensions: T times.
+
     Parameters
     ----------
     estimates : Callable[[Sequence[int]], Course]

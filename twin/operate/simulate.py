@@ -49,6 +49,8 @@ _MARGIN = 0.1
 class Step:
     """Step of motions at one moment.
 
+    Array dimensions: M motions.
+
     Attributes
     ----------
     time : int
@@ -99,7 +101,10 @@ class Life:
 
     @cached_property
     def amounts(self) -> Array:
-        """(T, M) amounts including steps, in SI units."""
+        """(T, M) amounts including steps, in SI units.
+
+        Array dimensions: T times, M motions.
+        """
         out = self.drawn.copy()
         for step in self.steps:
             out[self.times >= step.time] += step.sizes
@@ -107,13 +112,19 @@ class Life:
 
     @cached_property
     def acting(self) -> Array:
-        """(T, M) amounts as they act on light, in SI units: temperatures are scaled by their body's coefficient."""
+        """(T, M) amounts as they act on light, in SI units: temperatures are scaled by their body's coefficient.
+
+        Array dimensions: T times, M motions.
+        """
         factor = [1.0 + self.coefficients.get(c.body, 0.0) * (c.kind == "temperature") for c in self.components]
         return np.asarray(self.amounts * np.array(factor))
 
     @cached_property
     def temperatures(self) -> dict[str, Array]:
-        """Body -> (T,) change of its temperature against the instrument's, in kelvin."""
+        """Body -> (T,) change of its temperature against the instrument's, in kelvin.
+
+        Array dimensions: T times.
+        """
         out: dict[str, Array] = {}
         for k, component in enumerate(self.components):
             if component.kind == "temperature":
@@ -131,6 +142,8 @@ def drawn_life(
     coefficient_error: float = 0.0,
 ) -> Life:
     """Draw the course of every motion.
+
+    Array dimensions: T times.
 
     Parameters
     ----------
@@ -180,7 +193,10 @@ def _jumps(
 
 
 def _step(stated: DisturbancePrior, where: Sequence[int], rng: np.random.Generator) -> Array:
-    """Return random sizes (M,) of a step of some motions in SI units, correlated as stated; zero for the others."""
+    """Return random sizes (M,) of a step of some motions in SI units, correlated as stated; zero for the others.
+
+    Array dimensions: M motions.
+    """
     out = np.zeros(len(stated.components))
     root = covariance_root(stated.correlation[np.ix_(where, where)])
     out[list(where)] = rng.standard_normal(len(where)) @ root * stated.sigma[list(where)]
@@ -259,7 +275,10 @@ class Simulation:
 
     @property
     def times(self) -> np.ndarray:
-        """(T,) times of the readings within the life, in microseconds of TAI since 2000."""
+        """(T,) times of the readings within the life, in microseconds of TAI since 2000.
+
+        Array dimensions: T times.
+        """
         count = max(1, math.ceil(self.seconds / self.every - 1e-9))
         return self.start + np.array([round(k * self.every * MICRO) for k in range(count)], np.int64)
 
@@ -267,6 +286,8 @@ class Simulation:
 @dataclass(frozen=True, eq=False)
 class SimulatedRecord:
     """Result of a simulated life.
+
+    Array dimensions: R readings.
 
     Attributes
     ----------
@@ -400,6 +421,8 @@ def write_simulated(
 
 def sensed_temperatures(reference: float, what: Simulation, life: Life) -> dict[str, np.ndarray]:
     """Return body -> (T,) readings of its sensor in kelvin; NaN where it gives none.
+
+    Array dimensions: T times.
 
     Parameters
     ----------

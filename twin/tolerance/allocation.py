@@ -51,6 +51,8 @@ _SAFE = 1.0
 class Allocation:
     """Result of an allocation: the chosen limits with their costs and yields.
 
+    Array dimensions: E tolerances.
+
     Attributes
     ----------
     scales, rounded : (E,) ndarray
@@ -187,6 +189,8 @@ class CostCurve:
 class _Costs:
     """Costs of all limits of a budget.
 
+    Array dimensions: E tolerances.
+
     Attributes
     ----------
     curves : tuple of CostCurve
@@ -209,7 +213,10 @@ class _Costs:
         return cls(tuple(CostCurve(tolerance.cost_points) for tolerance in entries), np.array(fixed))
 
     def of_each(self, level: np.ndarray) -> np.ndarray:
-        """Return the cost of every limit, (E,), with limits at exp(level) times the specified ones."""
+        """Return the cost of every limit, (E,), with limits at exp(level) times the specified ones.
+
+        Array dimensions: E tolerances.
+        """
         return np.exp([curve(x)[0] for curve, x in zip(self.curves, level.tolist(), strict=True)])
 
     def of_level(self, level: np.ndarray) -> float:
@@ -217,13 +224,18 @@ class _Costs:
         return float(np.sum(self.of_each(level)))
 
     def slope(self, level: np.ndarray) -> np.ndarray:
-        """Return the derivatives of the costs with respect to the level, (E,)."""
+        """Return the derivatives of the costs with respect to the level, (E,).
+
+        Array dimensions: E tolerances.
+        """
         values = np.array([curve(x) for curve, x in zip(self.curves, level.tolist(), strict=True)])
         return np.asarray(np.exp(values[:, 0]) * values[:, 1])
 
 
 class _MarginModel:
     """Worst margins of cameras as functions of the limits, about the limits of a bench.
+
+    Array dimensions: S cameras, M merits.
 
     Parameters
     ----------
@@ -264,12 +276,18 @@ class _MarginModel:
     def at(
         cls, bench: ToleranceBench, total: np.ndarray, samples: Samples, costs: _Costs, share: float
     ) -> _MarginModel:
-        """Return the margins about limits at exp(total) (E,) times those of a bench."""
+        """Return the margins about limits at exp(total) (E,) times those of a bench.
+
+        Array dimensions: E tolerances.
+        """
         now = bench.scaled(np.exp(total))
         return cls(now, sensitivities(now).model, samples, costs, share)
 
     def _margins(self, values: np.ndarray) -> np.ndarray:
-        """Return the worst margin of every camera, (S,), from merits (S, M); large but finite without light."""
+        """Return the worst margin of every camera, (S,), from merits (S, M); large but finite without light.
+
+        Array dimensions: S cameras, M merits.
+        """
         worst = self.bench.worst_margins(values)
         return np.asarray(np.where(np.isinf(worst), 1e3, worst))
 
@@ -297,6 +315,8 @@ class _MarginModel:
 
     def cheapest(self, low: np.ndarray, high: np.ndarray, total: np.ndarray) -> np.ndarray:
         """Return the step to the cheapest limits within bounds that pass, or to the tightest ones if none passes.
+
+        Array dimensions: E tolerances.
 
         Parameters
         ----------
@@ -330,7 +350,10 @@ class _MarginModel:
         return self._between(start, np.clip(solution.x, low, high), total)
 
     def tightened(self, low: np.ndarray) -> np.ndarray:
-        """Return the first step (E,) towards the tightest limits, ``low``, that passes, or ``low`` if none does."""
+        """Return the first step (E,) towards the tightest limits, ``low``, that passes, or ``low`` if none does.
+
+        Array dimensions: E tolerances.
+        """
         for part in np.linspace(0.0, 1.0, 33):
             if self.quantile(part * low)[0] <= 0.0:
                 return np.asarray(part * low)
@@ -351,6 +374,8 @@ def _rounded_to_grades(
     setup: ToleranceSetup, trade: _MarginModel, total: np.ndarray, spec: AllocationSpec, looser: bool
 ) -> tuple[dict[str, str | float], np.ndarray]:
     """Round limits down to grades and, if ``looser``, raise one after the other by grades where the yield allows.
+
+    Array dimensions: E tolerances.
 
     Returns
     -------

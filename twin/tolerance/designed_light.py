@@ -42,6 +42,8 @@ def budget_spectrum(test: ToleranceBudgetSpec, camera: CameraSpec) -> SpectrumSp
 class WavefrontNorm:
     """Square roots of the quadratic forms from wavefront coefficients (T,) to mean squares over the illuminated pupil.
 
+    Array dimensions: T polynomial coefficients, F fields.
+
     Attributes
     ----------
     rest : (F, T, T) ndarray
@@ -82,6 +84,8 @@ class WavefrontNorm:
 
         The mean tilt of all wavelengths is removed; a tilt that differs between wavelengths blurs the image and stays.
 
+        Array dimensions: S cameras, F fields, T polynomial coefficients, R residuals.
+
         Parameters
         ----------
         terms : (S, F, K, T) ndarray
@@ -112,6 +116,8 @@ def fixed_transfers(
     degree: int,
 ) -> dict[int, list[list[VariedTransfer]]]:
     """Return the transfer functions of every merit of kind mtf, by field and direction.
+
+    Array dimensions: F fields, C wavelengths, N rays.
 
     Parameters
     ----------

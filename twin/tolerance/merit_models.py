@@ -40,6 +40,8 @@ class MeritModel:
 
     x are the varied parameters in units of their sizes; the compensators are adjusted ideally.
 
+    Array dimensions: P parts of the merits, K varied parameters.
+
     Attributes
     ----------
     nominal : (P,) ndarray
@@ -58,11 +60,17 @@ class MeritModel:
     paired: bool = True
 
     def linear(self, x: np.ndarray) -> np.ndarray:
-        """Return the parts (S, P) to the first order at x (S, K)."""
+        """Return the parts (S, P) to the first order at x (S, K).
+
+        Array dimensions: S cameras, P parts of the merits, K varied parameters.
+        """
         return np.asarray(self.nominal + x @ self.slope.T)
 
     def quadratic(self, x: np.ndarray) -> np.ndarray:
-        """Return the parts (S, P) to the second order at x (S, K)."""
+        """Return the parts (S, P) to the second order at x (S, K).
+
+        Array dimensions: S cameras, P parts of the merits, K varied parameters.
+        """
         step = max(1, _AT_ONCE // max(1, self.curvature.shape[0] * x.shape[1]))
         parts = [
             self.linear(block) + 0.5 * self._second_order(block)
@@ -77,6 +85,8 @@ class MeritModel:
 @dataclass(frozen=True, eq=False)
 class ScaledModel:
     """Second-order model at fixed random draws in which every tolerance can be scaled.
+
+    Array dimensions: P parts of the merits, S cameras (random draws), E tolerances.
 
     Attributes
     ----------
@@ -95,6 +105,8 @@ class ScaledModel:
     @classmethod
     def of(cls, model: MeritModel, x: np.ndarray, entries: Sequence[Sequence[int]]) -> ScaledModel:
         """Evaluate a model at random draws.
+
+        Array dimensions: S cameras (random draws), K varied parameters.
 
         Parameters
         ----------
@@ -117,17 +129,25 @@ class ScaledModel:
         return cls(model.nominal, first, second)
 
     def parts(self, scales: np.ndarray) -> np.ndarray:
-        """Return the parts (S, P) with the tolerances scaled by scales (E,)."""
+        """Return the parts (S, P) with the tolerances scaled by scales (E,).
+
+        Array dimensions: S cameras, P parts of the merits, E tolerances.
+        """
         return np.asarray(self.nominal + (self.first + self.second @ scales) @ scales)
 
     def slope(self, scales: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Return the derivatives (W, P, E) of the parts of selected draws by the logarithms of the scales."""
+        """Return the derivatives (W, P, E) of the parts of selected draws by the logarithms of the scales.
+
+        Array dimensions: W selected cameras, P parts of the merits, E tolerances.
+        """
         return np.asarray((self.first[rows] + 2.0 * (self.second[rows] @ scales)) * scales)
 
 
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
     """Merits and compensator moves with each tolerance alone at its limits.
+
+    Array dimensions: M merits, E tolerances, C compensators.
 
     Attributes
     ----------
@@ -191,6 +211,8 @@ def _figure_error_parts(bench: ToleranceBench, model: MeritModel, rows: np.ndarr
     """Return the parts (L, P) that represent a figure error at shares (L,) of its limit.
 
     Parts that depend quadratically on the wavefront get their mean over the random terms, the others their rms.
+
+    Array dimensions: L shares, P parts of the merits.
     """
     mean = 0.5 * np.outer(share**2, model.curvature[:, rows, rows].sum(axis=1))
     rms = np.outer(share, np.sqrt(np.sum(model.slope[:, rows] ** 2, axis=1)))
@@ -203,6 +225,8 @@ def _figure_error_parts(bench: ToleranceBench, model: MeritModel, rows: np.ndarr
 @dataclass(frozen=True, eq=False)
 class InverseLimits:
     """Ratio to its limit at which each tolerance alone degrades each merit by its loss.
+
+    Array dimensions: M merits, E tolerances.
 
     Attributes
     ----------
@@ -222,6 +246,8 @@ def default_losses(bench: ToleranceBench, nominal: np.ndarray) -> np.ndarray:
 
     It is the specified loss, or the margin between the nominal camera and the requirement over the square root of the
     number of tolerances; NaN where there is no margin.
+
+    Array dimensions: M merits.
     """
     share = 1.0 / np.sqrt(len(bench.entries))
     out = []
@@ -294,6 +320,8 @@ def _roots(excess: Callable[[np.ndarray, np.ndarray], np.ndarray], start: np.nda
 
     Steps grow threefold until two levels bracket the zero; then the method of false position (Illinois variant)
     converges.
+
+    Array dimensions: R functions.
 
     Parameters
     ----------

@@ -53,6 +53,9 @@ STEP = 0.1
 class MonitorMerit:
     """Monitor of the instrument of a budget, with the merits about its readings.
 
+    Array dimensions: D spot coordinates, K varied parameters and compensators, M independent motions, J cameras with 4
+    parameters each, Q readings.
+
     Attributes
     ----------
     experiment : MonitorExperiment
@@ -91,6 +94,8 @@ class MonitorMerit:
         ranges: np.ndarray,
     ) -> MonitorMerit | None:
         """Return the monitor of a budget; None if no merit is about a monitor.
+
+        Array dimensions: C compensators.
 
         Parameters
         ----------
@@ -155,6 +160,8 @@ class MonitorMerit:
     def variances(self, amounts: np.ndarray, states: Sequence[State]) -> dict[str, np.ndarray]:
         """Return the variances (S, Q) of all readings of every merit, SI.
 
+        Array dimensions: Q readings, K varied parameters and compensators.
+
         Parameters
         ----------
         amounts : (S, K) ndarray
@@ -191,7 +198,10 @@ class MonitorMerit:
         }
 
     def _noise(self, states: Sequence[State]) -> np.ndarray:
-        """Return the covariance of the spot shifts by image noise in every state, (S, D, D), px^2."""
+        """Return the covariance of the spot shifts by image noise in every state, (S, D, D), px^2.
+
+        Array dimensions: S states, D spot coordinates.
+        """
         out = np.tile(self.noise, (len(states), 1, 1))
         keys = [channel.key for channel in self.images.channels]
         indices = [
@@ -203,7 +213,10 @@ class MonitorMerit:
         return out
 
     def _read(self, spots: np.ndarray, parameters: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the variances for changes of the derivatives (S, D, M), (S, 4 J, M) and noise (S, D, D)."""
+        """Return the variances for changes of the derivatives (S, D, M), (S, 4 J, M) and noise (S, D, D).
+
+        Array dimensions: S states, D spot coordinates, M independent motions, J cameras with 4 parameters each.
+        """
         out = {name: np.empty((len(noise), len(rows))) for name, (rows, _) in self.asked.items()}
         for s, covariance in enumerate(noise):
             stated = replace(
@@ -256,6 +269,8 @@ class Merit:
     Parts are mean square wavefront errors by field, MTF by field and direction, components of a rotation, residual
     positions along the line, obstructed shares of a beam by field, or variances of readings.
 
+    Array dimensions: F fields.
+
     Attributes
     ----------
     name : str
@@ -274,7 +289,10 @@ class Merit:
     parts: slice
 
     def values(self, parts: np.ndarray) -> np.ndarray:
-        """Return the merit (...,) from the bench's parts (..., P), SI; a change counts by its absolute value."""
+        """Return the merit (...,) from the bench's parts (..., P), SI; a change counts by its absolute value.
+
+        Array dimensions: P parts of the merits.
+        """
         selected = parts[..., self.parts]
         match self.spec.kind:
             case "wavefront":
@@ -333,6 +351,8 @@ def merits_of(
     specs: dict[str, MeritSpec], line_points: int, cameras: Sequence[str] = ()
 ) -> tuple[tuple[Merit, ...], np.ndarray]:
     """Return the merits of a budget and all fields (F, 2) that they use.
+
+    Array dimensions: F fields.
 
     Parameters
     ----------
@@ -394,6 +414,8 @@ def obstructed_shares(
     path: TargetPath, states: Sequence[State], directions: np.ndarray, start: np.ndarray
 ) -> np.ndarray:
     """Return the share of the stop's area that all bodies together block in every beam, (S, F).
+
+    Array dimensions: F fields.
 
     Parameters
     ----------

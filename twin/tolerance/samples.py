@@ -89,6 +89,8 @@ class ToleranceBase:
 def outcomes(bench: ToleranceBench, x: np.ndarray, seeds: Sequence[int]) -> list[Outcome]:
     """Trace and adjust cameras and return their merits and compensator moves.
 
+    Array dimensions: K varied parameters.
+
     Parameters
     ----------
     bench : ToleranceBench
@@ -118,7 +120,10 @@ def outcomes(bench: ToleranceBench, x: np.ndarray, seeds: Sequence[int]) -> list
 
 
 def adjustment_errors(bench: ToleranceBench, seeds: Sequence[int]) -> np.ndarray | None:
-    """Return adjustment errors in standard deviations, (S, C); None without steps and errors."""
+    """Return adjustment errors in standard deviations, (S, C); None without steps and errors.
+
+    Array dimensions: S cameras, C compensators.
+    """
     if not np.any((bench.grid_steps > 0.0) | (bench.accuracies > 0.0)):
         return None
     return np.stack([np.random.default_rng([seed, 1]).standard_normal(len(bench.ranges)) for seed in seeds])
@@ -179,6 +184,8 @@ def sampling_study(setup: ToleranceSetup, bench: ToleranceBench, samples: int, s
 @dataclass(frozen=True, eq=False)
 class Samples:
     """Monte Carlo cameras of a budget.
+
+    Array dimensions: S cameras, K varied parameters, M merits, C compensators.
 
     Attributes
     ----------

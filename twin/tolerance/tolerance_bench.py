@@ -36,13 +36,18 @@ from twin.tolerance.variations import VariedParameter, compensator_parameters, s
 
 
 def residual_change(slopes: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Return the linear change (S, R) of the residuals by slopes (S, R, C) for a change of the moves (S, C)."""
+    """Return the linear change (S, R) of the residuals by slopes (S, R, C) for a change of the moves (S, C).
+
+    Array dimensions: S cameras, R residuals, C compensators.
+    """
     return np.asarray((slopes @ change[..., None])[..., 0])
 
 
 @dataclass(frozen=True, eq=False)
 class Adjustments:
     """Compensators and their effect on the residuals of the wavefront.
+
+    Array dimensions: C compensators, R residuals.
 
     Attributes
     ----------
@@ -63,6 +68,8 @@ class Adjustments:
 
     def best(self, slopes: np.ndarray, residuals: np.ndarray, moves: np.ndarray, free: np.ndarray) -> np.ndarray:
         """Return the moves within their ranges that minimise the linearised residuals.
+
+        Array dimensions: S cameras, R residuals, C compensators.
 
         Parameters
         ----------
@@ -106,6 +113,8 @@ class Adjustments:
     def corrected(self, slopes: np.ndarray, change: np.ndarray, miss: np.ndarray) -> np.ndarray:
         """Return slopes (S, R, C) updated by the outcome of a step, by Broyden's rank-one update.
 
+        Array dimensions: S cameras, R residuals, C compensators.
+
         Parameters
         ----------
         slopes : (S, R, C) ndarray
@@ -130,6 +139,8 @@ class Adjustments:
         """Return the moves as executed one after the other, in whole steps and with errors.
 
         The later ones compensate the errors of the earlier.
+
+        Array dimensions: S cameras, R residuals, C compensators.
 
         Parameters
         ----------
@@ -177,6 +188,8 @@ _MOVE = 1e-3
 class AdjustedCameras:
     """Perturbed cameras after their adjustments.
 
+    Array dimensions: S cameras, C compensators, P parts of the merits, F fields, K wavelengths, N rays.
+
     Attributes
     ----------
     moves : (S, C) ndarray
@@ -213,6 +226,8 @@ class AdjustedCameras:
 
 class ToleranceBench:
     """Camera with its varied parameters, compensators and merits.
+
+    Array dimensions: F fields, C wavelengths.
 
     Parameters
     ----------
@@ -325,6 +340,8 @@ class ToleranceBench:
     def _prepare_in(self, colours: np.ndarray, shares: np.ndarray) -> None:
         """Compute what all cameras share, for given wavelengths.
 
+        Array dimensions: C wavelengths.
+
         Parameters
         ----------
         colours : (C,) ndarray
@@ -357,6 +374,8 @@ class ToleranceBench:
         """Return the derivatives (R, C) of the residuals by the compensators, waves per SI unit.
 
         They are 0 where the range is zero.
+
+        Array dimensions: R residuals, C compensators.
         """
         used = np.flatnonzero(self.ranges)
         slope = np.zeros((self._residuals(self.beams.designed.paths).shape[1], len(self.ranges)))
@@ -375,6 +394,8 @@ class ToleranceBench:
         """Return residuals (S, R) whose squares sum to the mean square wavefront errors of all fields.
 
         They are in waves of the design wavelength.
+
+        Array dimensions: S cameras, R residuals.
         """
         terms = paths.reshape(len(paths), len(self.fields), len(self.traced_shares), -1) @ self.beams.solve.T
         return self._roots.residuals(terms / self.wavelength, self.traced_shares)
@@ -385,6 +406,8 @@ class ToleranceBench:
         self, amounts: np.ndarray, errors: np.ndarray | None = None, paths: bool = False
     ) -> AdjustedCameras:
         """Trace perturbed cameras, adjust them, and compute their merits.
+
+        Array dimensions: S cameras, K varied parameters, C compensators.
 
         Parameters
         ----------
@@ -473,7 +496,10 @@ class ToleranceBench:
     # merits
 
     def parts_of(self, states: Sequence[State]) -> np.ndarray:
-        """Return the parts of all merits (S, P) in given states; raise PhysicalError if the light is lost."""
+        """Return the parts of all merits (S, P) in given states; raise PhysicalError if the light is lost.
+
+        Array dimensions: S cameras, P parts of the merits.
+        """
         amounts, moves = np.zeros((len(states), len(self.numbers))), np.zeros((len(states), len(self.ranges)))
         return self._parts(states, amounts, moves, self.beams.light(states) if len(self.fields) else None)
 
@@ -482,6 +508,8 @@ class ToleranceBench:
 
         They change linearly with small motions. An MTF is represented by the wavefront at its fields, in units of a
         quarter of a wavelength rms. Obstruction and monitor merits have no residuals.
+
+        Array dimensions: S cameras, R residuals.
 
         Raises
         ------
@@ -512,6 +540,8 @@ class ToleranceBench:
         Mean squares and MTFs are quadratic in a wavefront that itself is nearly linear in the parameters. Parts that
         are no function of a wavefront get 0.
 
+        Array dimensions: P parts of the merits, K varied parameters, F fields, C wavelengths, N rays.
+
         Parameters
         ----------
         slopes : (K, F, C N) ndarray
@@ -535,7 +565,10 @@ class ToleranceBench:
     def _parts(
         self, states: Sequence[State], amounts: np.ndarray, moves: np.ndarray, light: BeamLight | None
     ) -> np.ndarray:
-        """Return the parts of all merits, (S, P)."""
+        """Return the parts of all merits, (S, P).
+
+        Array dimensions: S cameras, P parts of the merits.
+        """
         out = np.empty((len(states), self.parts))
         known: dict[str, np.ndarray] = {}
         if self.monitor is not None:
@@ -611,7 +644,10 @@ class ToleranceBench:
         return np.arange(0, LINE_POINTS, EVERY)
 
     def scaled(self, scales: np.ndarray) -> ToleranceBench:
-        """Return the same bench with limits scaled by scales (E,)."""
+        """Return the same bench with limits scaled by scales (E,).
+
+        Array dimensions: E tolerances.
+        """
         other = copy(self)
         by_entry = dict(zip(self.entries, scales.tolist(), strict=True))
         other.numbers = tuple(replace(number, size=number.size * by_entry[number.entry]) for number in self.numbers)
@@ -628,19 +664,31 @@ class ToleranceBench:
 
     @cached_property
     def sizes(self) -> np.ndarray:
-        """SI amount of one unit of every varied parameter, (K,)."""
+        """SI amount of one unit of every varied parameter, (K,).
+
+        Array dimensions: K varied parameters.
+        """
         return np.array([number.size for number in self.numbers])
 
     def values(self, parts: np.ndarray) -> np.ndarray:
-        """Return the values of all merits, (..., M), from their parts (..., P)."""
+        """Return the values of all merits, (..., M), from their parts (..., P).
+
+        Array dimensions: M merits, P parts of the merits.
+        """
         return np.stack([merit.values(parts) for merit in self.merits], axis=-1)
 
     def worst_margins(self, values: np.ndarray) -> np.ndarray:
-        """Return the worst margin of each camera, (S,), from merits (S, M); infinite without light."""
+        """Return the worst margin of each camera, (S,), from merits (S, M); infinite without light.
+
+        Array dimensions: S cameras, M merits.
+        """
         margins = np.stack([merit.margin(values[:, k]) for k, merit in enumerate(self.merits)])
         return np.asarray(np.where(np.isnan(margins), np.inf, margins).max(axis=0))
 
     def passing(self, values: np.ndarray) -> np.ndarray:
-        """Return True where merits (..., M) meet their requirements."""
+        """Return True where merits (..., M) meet their requirements.
+
+        Array dimensions: M merits.
+        """
         passes: Iterable[np.ndarray] = (merit.passes(values[..., k]) for k, merit in enumerate(self.merits))
         return np.stack(list(passes), axis=-1)

@@ -70,7 +70,10 @@ class Yield:
 
     @classmethod
     def count(cls, passing: np.ndarray) -> Yield:
-        """Return the yield of cameras that pass or not, (S,)."""
+        """Return the yield of cameras that pass or not, (S,).
+
+        Array dimensions: S cameras.
+        """
         passed, total = int(np.sum(passing)), len(passing)
         return cls(passed, total, *proportion_interval(passed, total, CONFIDENCE))
 
@@ -248,7 +251,10 @@ def run_tolerance(
 
 
 def _amounts(bench: ToleranceBench, samples: Samples, rows: np.ndarray) -> np.ndarray:
-    """Return the amounts of the parameters and the compensators of selected cameras, SI, (W, K)."""
+    """Return the amounts of the parameters and the compensators of selected cameras, SI, (W, K).
+
+    Array dimensions: W selected cameras, K varied parameters.
+    """
     return np.concatenate([samples.x[rows] * bench.sizes, np.nan_to_num(samples.moves[rows])], axis=1)
 
 
@@ -305,6 +311,8 @@ def _validated_yield(
 @dataclass(frozen=True, eq=False)
 class ModelPredictions:
     """Merits of the Monte Carlo cameras predicted by the models.
+
+    Array dimensions: S cameras, M merits, E tolerances.
 
     Attributes
     ----------

@@ -273,6 +273,8 @@ def spectrum_shares(terms: Sequence[int], power: float) -> np.ndarray:
 
     The variance of a term with radial order n is proportional to (n + 1)^-power.
 
+    Array dimensions: T polynomial terms.
+
     Parameters
     ----------
     terms : sequence of int
@@ -290,6 +292,8 @@ def spectrum_over(element: Element, terms: Sequence[int], power: float) -> np.nd
 
     The mean square is that of an ensemble of surfaces, about each surface's mean over its clear aperture. Terms have
     unit rms over the smallest circle round that aperture, and another rms over a rectangle or a ring in it.
+
+    Array dimensions: T polynomial terms.
 
     Parameters
     ----------

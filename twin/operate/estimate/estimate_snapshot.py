@@ -261,6 +261,9 @@ class JumpDetection:
 class EstimatorState:
     """State of the estimator after the entries up to a time.
 
+    Array dimensions: Q quantities, D spot coordinates, P camera parameters, n filter states, U used entries, m motions
+    that may jump.
+
     Attributes
     ----------
     filter_state : FilterState
@@ -325,6 +328,8 @@ class EstimatorState:
         """(Q,) share of the scatter of every quantity that the measured temperatures explain.
 
         NaN before there are two readings.
+
+        Array dimensions: Q quantities.
         """
         count = self.scores.readings
         if count < 2:
@@ -410,6 +415,8 @@ class EstimatorState:
 @dataclass(frozen=True, eq=False)
 class EntryFilter:
     """Filter that updates an estimator's state with the entries of a record.
+
+    Array dimensions: C spots.
 
     Attributes
     ----------

@@ -359,6 +359,8 @@ class Operation:
     def forecast(self, times_us: Sequence[int] | NDArray[np.int64]) -> Course:
         """Return the expected values at future times, given all readings.
 
+        Array dimensions: T times.
+
         Parameters
         ----------
         times_us : (T,) sequence of int
@@ -415,6 +417,8 @@ class Operation:
         """Return chi-square and degrees of freedom (N, 2) of readings, zero for readings that detected jumps explain.
 
         If more jumps were detected than the plan states, none is taken as an explanation.
+
+        Array dimensions: N readings.
         """
         jumps = (
             []
@@ -442,6 +446,8 @@ class Operation:
     def smoothed(self, times_us: Sequence[int] | NDArray[np.int64]) -> Course:
         """Return the smoothed estimate at given times from all readings; after the newest reading it is the forecast.
 
+        Array dimensions: T times.
+
         Parameters
         ----------
         times_us : (T,) sequence of int
@@ -457,7 +463,10 @@ class Operation:
         return self._course(times, estimates, self._sigma_inflation_at(times))
 
     def _sigma_inflation_at(self, times: NDArray[np.int64]) -> Array:
-        """Return the factors (T,) of sigmas at past times; after the newest reading the present factor."""
+        """Return the factors (T,) of sigmas at past times; after the newest reading the present factor.
+
+        Array dimensions: T times.
+        """
         innovations = [one for span in self._segments(None) for one in span.new_innovations]
         squares = self._unexplained(innovations)
         counts = np.searchsorted([time for time, _, _ in innovations], times, side="right")
@@ -522,6 +531,8 @@ class Operation:
 
     def smooth_jointly(self, times_us: Sequence[int] | NDArray[np.int64]) -> tuple[Array, Array]:
         """Return the smoothed estimate at several times with the covariance between times.
+
+        Array dimensions: T times, K cameras with 4 parameters each.
 
         Parameters
         ----------

@@ -42,6 +42,8 @@ time, and its part of the false-alarm probability, are proportional to it.
 class OperationModel:
     """Traced model of the instrument under a plan of operation.
 
+    Array dimensions: K cameras with 4 parameters each, D spot coordinates.
+
     Attributes
     ----------
     series_filter : SeriesFilter
@@ -65,6 +67,8 @@ class OperationModel:
         """(Q, 4 K) derivatives of the quantities by the parameters.
 
         Numerators are in the quantities' units; denominators are rad and m of one camera after the other.
+
+        Array dimensions: Q quantities, K cameras with 4 parameters each.
         """
         return np.stack([quantity.row for quantity in self.quantities])
 
@@ -73,6 +77,8 @@ def traced_model(
     setup: OperationSetup, reference_sigma: Array, sensors: Sequence[str], experiment: MonitorExperiment
 ) -> OperationModel:
     """Trace the effects of all stated motions and build the filter.
+
+    Array dimensions: C spots.
 
     Parameters
     ----------

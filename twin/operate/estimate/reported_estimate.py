@@ -35,6 +35,8 @@ MOST_BAD = 2
 class Course:
     """Estimate of all quantities at T times.
 
+    Array dimensions: K cameras with 4 parameters each.
+
     Attributes
     ----------
     times : (T,) ndarray of int64
@@ -360,6 +362,8 @@ def inflation_factors(
     The factor is the root of chi-square over its degrees of freedom, of the last reading or of several consecutive
     ones, whichever is larger; it is 1 if chance explains them. A contradiction of the first readings, or of a jump,
     lasts: the unobservable part of the state depends on it for as long as nothing explains it.
+
+    Array dimensions: T times, N readings, n readings from that one on.
 
     Parameters
     ----------

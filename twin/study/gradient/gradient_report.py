@@ -190,7 +190,10 @@ NEGLIGIBLE = 1e-3
 
 
 def _normalised(gradient: Gradient) -> np.ndarray:
-    """Return the changes per spread (R, F) relative to each response's largest; zero where no factor moves it."""
+    """Return the changes per spread (R, F) relative to each response's largest; zero where no factor moves it.
+
+    Array dimensions: R responses, F factors.
+    """
     change = gradient.change
     largest = np.max(np.abs(change), axis=1, initial=0.0, keepdims=True)
     return np.asarray(np.where(largest > 0.0, change / np.where(largest > 0.0, largest, 1.0), 0.0))

@@ -126,6 +126,8 @@ class Chain:
     def spots(self, states: Sequence[State]) -> np.ndarray:
         """Return the spot positions (S, C, 2), row and column, px from the first pixel's centre.
 
+        Array dimensions: S states, C spots.
+
         Raises
         ------
         AimError, BeamMissedError
@@ -137,6 +139,8 @@ class Chain:
 
     def sight(self, states: Sequence[State]) -> np.ndarray:
         """Return the directions of the line CCDs' points, (S, cameras, points, 3).
+
+        Array dimensions: S states.
 
         Raises
         ------
@@ -154,13 +158,18 @@ class Chain:
 
     @cached_property
     def nominal(self) -> np.ndarray:
-        """Spots of the unperturbed instrument, (1, C, 2)."""
+        """Spots of the unperturbed instrument, (1, C, 2).
+
+        Array dimensions: C spots.
+        """
         return self.spots([{}])
 
     def outcome(self, state: State, spots: np.ndarray, sight: np.ndarray) -> dict[str, Any]:
         """Return ``truth`` and ``recovered`` of one state with spots (C, 2) and directions (cameras, points, 3).
 
         Without a monitor there is ``truth`` alone.
+
+        Array dimensions: C spots.
         """
         truth = self.experiment.sight.truth_of(sight[:, None])
         if not self.experiment.monitored:
@@ -180,6 +189,8 @@ class Chain:
 
         ``at`` holds the spots and directions of the state; the derivatives have the shapes (C, 2) and (cameras, points,
         3).
+
+        Array dimensions: C spots.
         """
         largest = max(np.abs(spots).max(initial=0.0) / SPOT_REACH, np.abs(sight).max() / self.reach)
         step = 1.0 / float(largest) if largest > 0.0 else 1.0
@@ -443,17 +454,26 @@ class Gradient:
 
     @property
     def best(self) -> np.ndarray:
-        """Derivatives (R, F): by automatic differentiation where available, else by differences."""
+        """Derivatives (R, F): by automatic differentiation where available, else by differences.
+
+        Array dimensions: R responses, F factors.
+        """
         return np.where(np.isnan(self.ad), self.differences, self.ad)
 
     @property
     def change(self) -> np.ndarray:
-        """Change of each response when the factor changes by its spread, (R, F)."""
+        """Change of each response when the factor changes by its spread, (R, F).
+
+        Array dimensions: R responses, F factors.
+        """
         return np.asarray(self.best * np.array([factor.spread for factor in self.factors]))
 
     @property
     def relative(self) -> np.ndarray:
-        """Relative deviation of the differences from AD, (R, F), NaN without AD; see ``SMALL`` for small entries."""
+        """Relative deviation of the differences from AD, (R, F), NaN without AD; see ``SMALL`` for small entries.
+
+        Array dimensions: R responses, F factors.
+        """
         spread = np.array([factor.spread for factor in self.factors])
         size = self.scale * spread
         largest = np.max(np.nan_to_num(size), axis=1, initial=0.0, keepdims=True)

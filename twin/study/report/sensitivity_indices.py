@@ -30,6 +30,8 @@ def axis_functions(axis: tuple[Factor, ...], good: np.ndarray, degree: int) -> t
     polynomials for a uniform factor, Hermite polynomials for a normal one, Gram-Schmidt on the distribution itself for
     others, lists and texts. All functions of a text have degree 1.
 
+    Array dimensions: n runs, m functions.
+
     Parameters
     ----------
     axis : tuple of Factor
@@ -342,6 +344,8 @@ def _between(cells: np.ndarray, values: np.ndarray) -> float:
 class _Chaos:
     """Polynomial chaos model fitted to the runs.
 
+    Array dimensions: m terms, n runs.
+
     Attributes
     ----------
     terms : (m, axes) ndarray of int
@@ -467,6 +471,8 @@ class _Chaos:
         """Return sums of squared coefficients (..., m) for each axis alone and with interactions, (..., 2, axes).
 
         With interactions an axis explains no less than alone, although the noise correction may exceed the sum.
+
+        Array dimensions: m terms.
         """
         used = self.terms > 0
         alone = used & (used.sum(axis=1) == 1)[:, None]
@@ -475,7 +481,10 @@ class _Chaos:
 
     @cached_property
     def _fit_rest(self) -> tuple[np.ndarray, float]:
-        """Leave-one-out residuals of the runs, (n,), and the residual variance."""
+        """Leave-one-out residuals of the runs, (n,), and the residual variance.
+
+        Array dimensions: n runs.
+        """
         centred = self.y - self.y.mean()
         residuals = centred - self.q @ (self.q.T @ centred)
         rest = float(np.sum(residuals**2)) / (len(self.y) - len(self.terms) - 1)
@@ -485,7 +494,10 @@ class _Chaos:
 
     @cached_property
     def _squares(self) -> np.ndarray:
-        """Squared coefficients (m,), corrected for the bias by their variance."""
+        """Squared coefficients (m,), corrected for the bias by their variance.
+
+        Array dimensions: m terms.
+        """
         inverse = np.linalg.inv(self.r)
         return np.asarray(self.coefficients**2 - np.sum(inverse**2, axis=1)[1:] * self._fit_rest[1])
 
@@ -528,7 +540,10 @@ class _Chaos:
 
 
 def _columns(functions: Sequence[np.ndarray], terms: np.ndarray) -> np.ndarray:
-    """Return the constant and the products of functions (n, m + 1) that terms (m, axes) name."""
+    """Return the constant and the products of functions (n, m + 1) that terms (m, axes) name.
+
+    Array dimensions: n runs, m terms.
+    """
     columns = np.ones((len(functions[0]), len(terms) + 1))
     for k, values in enumerate(functions):
         used = terms[:, k] > 0

@@ -22,6 +22,8 @@ from twin.study.report.study_statistics import Estimate, Response, StudyRuns
 class ParetoFront:
     """Non-dominated runs of a pair of factors or responses.
 
+    Array dimensions: m runs on the front, n runs.
+
     Attributes
     ----------
     spec : ParetoSpec
@@ -47,6 +49,8 @@ class ParetoFront:
 def pareto_front(spec: ParetoSpec, x: np.ndarray, y: np.ndarray) -> ParetoFront:
     """Return the Pareto front of (n,) ``x`` and ``y``.
 
+    Array dimensions: n runs.
+
     Parameters
     ----------
     spec : ParetoSpec
@@ -69,6 +73,8 @@ def ranks_of(costs: np.ndarray) -> np.ndarray:
 
     Rank 0 holds the points that no other point dominates, rank 1 those that only points of rank 0 dominate, and so on.
     Equal points share a rank.
+
+    Array dimensions: n runs.
     """
     order = np.lexsort((costs[:, 1], costs[:, 0]))
     ranks = np.empty(len(costs), np.int64)
@@ -95,6 +101,8 @@ def knee(costs: np.ndarray) -> int | None:
 
     The front is sorted by the first cost, and both costs are scaled to its range. None for fewer than three different
     points, or if no point lies below the line by more than rounding.
+
+    Array dimensions: m points.
     """
     if len(np.unique(costs, axis=0)) < 3:
         return None
@@ -173,7 +181,10 @@ class Requirement:
 
 
 def _is_met(spec: ThresholdSpec, values: np.ndarray) -> np.ndarray:
-    """Return True where a value meets the requirement, (n,); NaN does not."""
+    """Return True where a value meets the requirement, (n,); NaN does not.
+
+    Array dimensions: n runs.
+    """
     judged = np.abs(values) if spec.magnitude else values
     good = np.isfinite(judged)
     if spec.at_most is not None:
@@ -238,6 +249,8 @@ POINTS = 40
 class Convergence:
     """Convergence of a statistic with the number of runs.
 
+    Array dimensions: m points of the curve.
+
     Attributes
     ----------
     name : str
@@ -267,7 +280,10 @@ class Convergence:
 
 
 def convergences(values: np.ndarray) -> tuple[Convergence, ...]:
-    """Return the convergence of the statistics of (n,) finite values; none below 20 runs and for constant values."""
+    """Return the convergence of the statistics of (n,) finite values; none below 20 runs and for constant values.
+
+    Array dimensions: n runs.
+    """
     n = len(values)
     if n < 20 or np.ptp(values) == 0.0:
         return ()

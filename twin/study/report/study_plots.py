@@ -73,7 +73,10 @@ def name_texts(axes: Axes, series: Series, axis: str) -> None:
 
 
 def thinned(good: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
-    """Return the indices of up to ``most`` runs of (n,) ``good``, evenly spaced through the study."""
+    """Return the indices of up to ``most`` runs of (n,) ``good``, evenly spaced through the study.
+
+    Array dimensions: n runs.
+    """
     indices = np.flatnonzero(good)
     return indices if len(indices) <= most else indices[np.linspace(0, len(indices) - 1, most).astype(int)]
 

@@ -289,6 +289,8 @@ def describe(values: np.ndarray, sampled: bool) -> Description:
     The intervals assume independent runs. Stratified designs (Latin hypercube, Sobol) determine the mean better, so
     that their intervals are conservative.
 
+    Array dimensions: n runs.
+
     Parameters
     ----------
     values : (n,) ndarray
@@ -324,7 +326,10 @@ def describe(values: np.ndarray, sampled: bool) -> Description:
 
 
 def mean_interval(values: np.ndarray) -> Interval:
-    """Return Student's interval of the mean of (n,) values; open for a single value."""
+    """Return Student's interval of the mean of (n,) values; open for a single value.
+
+    Array dimensions: n runs.
+    """
     n = len(values)
     if n < 2:
         return None, None
@@ -338,6 +343,8 @@ def std_interval(values: np.ndarray) -> Interval:
 
     It is symmetric in the logarithm, whose variance (k - (n-3)/(n-1)) / (4n) follows from the kurtosis k of the values;
     for a normal distribution it equals the chi-square interval for large n.
+
+    Array dimensions: n runs.
     """
     n = len(values)
     if n < 4:
@@ -377,7 +384,10 @@ def runs_for_quantile(q: float) -> int:
 
 
 def normality(values: np.ndarray) -> Normality | None:
-    """Test (n,) values for normality; None for fewer than 20 values and for constant ones."""
+    """Test (n,) values for normality; None for fewer than 20 values and for constant ones.
+
+    Array dimensions: n runs.
+    """
     if len(values) < LEAST or np.ptp(values) == 0.0:
         return None
     p = float(stats.normaltest(values).pvalue)
@@ -570,7 +580,10 @@ def linear_model(factors: Sequence[Factor], response: Response) -> LinearModel |
 
 
 def _columns(factor: Factor, good: np.ndarray) -> np.ndarray:
-    """Return the columns (n, m) of a factor: standardised numbers, or for a text one indicator per further value."""
+    """Return the columns (n, m) of a factor: standardised numbers, or for a text one indicator per further value.
+
+    Array dimensions: n runs, m columns.
+    """
     values = factor.values[good]
     if factor.numeric:
         span = np.ptp(values) if len(values) else 0.0
@@ -586,6 +599,8 @@ def _effect(
     """Return the effect of a factor from its coefficients.
 
     ``moved`` (m, n) is the influence of each run on each coefficient, ``t`` the quantile of Student's distribution.
+
+    Array dimensions: m coefficients, n runs.
     """
     values = factor.values[good]
     if not factor.numeric:
@@ -622,6 +637,8 @@ def _largest_difference(means: np.ndarray, moved: np.ndarray, t: float) -> Estim
     """Return the largest difference of two of (m,) means, the first of which is 0 by definition.
 
     The interval covers all pairs simultaneously (Bonferroni), so that it remains valid for the largest.
+
+    Array dimensions: m means.
     """
     moved = np.concatenate([np.zeros((1, moved.shape[1])), moved])
     first, last = np.triu_indices(len(means), 1)
@@ -651,6 +668,8 @@ def _rank_interval(rank: float, n: int) -> Interval:
 @dataclass(frozen=True, eq=False)
 class MainEffect:
     """Means of a response over the runs of a grid, for each value of a factor.
+
+    Array dimensions: m values of the factor.
 
     Attributes
     ----------

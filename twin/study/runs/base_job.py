@@ -311,6 +311,8 @@ def leaf(tree: Any, key: KeyPath) -> Any:
 class BlockResult:
     """Responses of n consecutive runs.
 
+    Array dimensions: R responses.
+
     Attributes
     ----------
     values : (n, R) ndarray
@@ -345,7 +347,10 @@ class BlockResult:
 
     @property
     def failed(self) -> np.ndarray:
-        """True for failed runs, (n,)."""
+        """True for failed runs, (n,).
+
+        Array dimensions: n runs.
+        """
         return np.array([bool(message) for message in self.messages], bool)
 
     @classmethod

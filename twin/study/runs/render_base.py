@@ -70,6 +70,8 @@ def _run_together(
 ) -> list[Outcome]:
     """Return the results of runs of one instrument with one number of frames, as in truth.json and recovered.json.
 
+    Array dimensions: C area CCDs.
+
     Parameters
     ----------
     experiment : MonitorExperiment
