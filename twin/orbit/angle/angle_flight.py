@@ -63,7 +63,7 @@ class AngleCamera:
 
 
 def angle_camera(setup: AngleSetup, backend: Backend | None) -> AngleCamera:
-    """Return the lines before and after the changes: of a payload rotated, of an instrument traced.
+    """Return the line cameras before and after the test's changes: rotated for a payload, traced for an instrument.
 
     Parameters
     ----------
@@ -130,8 +130,8 @@ _LINE_TIME = 1e-3
 LEAST_SIGMA = 1e-3
 """Sigma of points without errors, in metres: an adjustment needs weights."""
 _LEAST_CONVERGENCE = np.radians(1.0)
-"""Least angle between lines, in radians, at which heights are intersected: below it one arcsecond is half a kilometre
-and more.
+"""Smallest angle between lines, in radians, at which heights are intersected: below it one arcsecond is half a
+kilometre and more.
 """
 
 
@@ -147,7 +147,7 @@ class Measurement:
         Measured station, with its covariance.
     strips : Mapping[str, Strip]
         Line -> measured ground points, with their covariances.
-    tangent : Mapping[str, (n, 2) ndarray]
+    tangent : Mapping[str, (n, 2) ndarray for n points]
         Line -> laboratory's tangents of the points' directions from the line's centre, across the line and along it; X
         forward, Y to the right.
     along : Mapping[str, (n,) ndarray]
@@ -191,7 +191,7 @@ class Measurement:
 
     @property
     def which(self) -> list[tuple[int, int]]:
-        """Pairs of lines as pairs of indices into the strips."""
+        """Pairs of indices into `strips`, in their order: the two lines of each angle."""
         lines = list(self.strips)
         return [(lines.index(a), lines.index(b)) for a, b in self.pairs.values()]
 
@@ -232,8 +232,8 @@ class AnglePass(LineAngles):
     trace : Mapping[str, float]
         Angle -> its change by `twin.monitor.truth.trace_truth`, in radians; empty where no trace of two cameras gives
         it.
-    height : Mapping[str, (n,) ndarray]
-        Line -> heights of its points above the ellipsoid.
+    height : Mapping[str, (n,) ndarray for n points]
+        Line -> heights of its points above the ellipsoid, in metres.
     """
 
     spec: OrbitAngleSpec
@@ -304,7 +304,7 @@ class AnglePass(LineAngles):
         return np.stack([x, np.cross(z, x), z]) @ self.trajectory.body_to_itrs(self.spec.time).T
 
     def ground(self, effects: LightEffects) -> dict[str, np.ndarray]:
-        """Return the true ground points (n, 3) of each line under these effects on the light.
+        """Return the (n, 3) true ground points of each line for these effects on the light, ITRS, in metres.
 
         Raises
         ------
@@ -449,7 +449,7 @@ def fly(setup: AngleSetup, camera: AngleCamera, seed: np.random.SeedSequence) ->
 
 
 def _interior(camera: LineCamera, pixel: np.ndarray) -> dict[str, Any]:
-    """Return the laboratory's interior of a line's pixels (N,) as fields of a `Measurement`.
+    """Return the laboratory's interior of a line's pixels (N,), one for each of N points, as fields of a `Measurement`.
 
     Tangents count across the line (forward) and along it (to the right) in the body's axes pitched to the line's
     centre; the angle within the line is positive to the right.
@@ -508,7 +508,7 @@ def without_effects(
 
 
 def _spread(camera: LineCamera, pixel: np.ndarray) -> np.ndarray:
-    """Return positions (N,) on flat ground along the strip, in units of the satellite's height."""
+    """Return the (N,) positions on flat ground that N pixels see, along the line, in units of the satellite's height."""
     look = camera.look(pixel)
     return np.asarray(look[:, 1] / look[:, 2])
 
@@ -521,6 +521,6 @@ def _terrain(spec: OrbitAngleSpec, position: np.ndarray, random: np.random.Gener
 
 
 def _nearest(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the (3,) point nearest to two rays."""
+    """Return the (3,) point nearest to two rays, each given as origin and direction, in metres."""
     weights = [np.eye(3) - np.outer(d, d) for _, d in (a, b)]
     return np.linalg.solve(weights[0] + weights[1], weights[0] @ a[0] + weights[1] @ b[0])

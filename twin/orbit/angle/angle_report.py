@@ -52,7 +52,7 @@ def listed(words: Sequence[str]) -> str:
 
 
 def angle_report(run: AngleRun) -> Report:
-    """Return the report of a simulated or a measured test."""
+    """Return the report of a simulated or measured test of intersection angles: verdict, tables and figures."""
     first = run.passes[0]
     lead: tuple[str, ...] = ()
     along = first.estimate.along

@@ -66,7 +66,7 @@ class Estimate:
         Method -> planes of the lines.
     angles : Mapping[Method, PlaneAngles]
         Method -> dihedral angles between these planes.
-    look : (m,) ndarray
+    look : (m,) ndarray for m angles
         Angles between the lines of sight of the lines' centres, from tls planes and positions on the line, in radians.
     along : AlongTrackAngles
         Signed parts of these angles along the track.
@@ -86,7 +86,7 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class FrameRow:
-    """Angles by one method in one frame.
+    """Angles that one method of fitting planes gives in one coordinate frame.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class FrameRow:
         Name of the frame.
     method : Method
         Method of fitting the planes.
-    values : (m,) ndarray
+    values : (m,) ndarray for m angles
         Angles, in radians; NaN where a plane is singular for the method.
     sigma : (m,) ndarray
         Standard deviations predicted by the method, in radians.
@@ -114,7 +114,8 @@ class FrameRow:
 
 @dataclass(frozen=True, eq=False)
 class EffectRow:
-    """Error of the angles of tls planes by an effect on the light or a common shift of the points, in radians.
+    """Error of the angles between planes (total least squares, tls) due to an effect on the light or a common shift of
+    the points, in radians.
 
     Attributes
     ----------
@@ -122,7 +123,7 @@ class EffectRow:
         Names of the angles.
     what : str
         Name of the effect.
-    bias : (m,) ndarray
+    bias : (m,) ndarray for m angles
         Angles minus truth without correction.
     remaining : (m,) ndarray
         Angles minus truth after the correction; NaN where there is none.
@@ -136,7 +137,7 @@ class EffectRow:
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """Estimates of m angles by one method, over passes with errors drawn anew.
+    """Estimates of m angles by one method, over simulated passes with new random errors.
 
     Attributes
     ----------
@@ -251,7 +252,7 @@ class SimulatedAngleRun(AngleRun):
     Attributes
     ----------
     flight : AnglePass
-        Truth.
+        True geometry at the moment of the angles.
     frames : tuple of FrameRow
         All methods in all frames.
     effects : tuple of EffectRow
@@ -299,14 +300,16 @@ class SimulatedAngleRun(AngleRun):
 
     @property
     def narrow(self) -> np.ndarray:
-        """Mask of angles so small that a rotation about the lines of sight changes the dihedral angle, (m,)."""
+        """Mask (m,), True for angles below 5 deg, whose dihedral angle changes with a rotation about the lines of
+        sight.
+        """
         return narrow(self.flight)
 
     @property
     def difference(self) -> np.ndarray:
-        """Planes (tls) minus resection, (m,), in radians.
+        """Angles from planes (total least squares) minus angles from the resection, (m,) for m angles, in radians.
 
-        Dihedral angles are compared, but angles along the track where they are `narrow`.
+        Dihedral angles are compared; where angles are `narrow`, the angles along the track are compared instead.
         """
         estimate = self.estimate
         dihedral = estimate.angles["tls"].values - np.abs(estimate.resection_angles.values)
@@ -319,12 +322,12 @@ class SimulatedAngleRun(AngleRun):
 
 
 def narrow(flight: AnglePass) -> np.ndarray:
-    """Return the mask of angles below 5 deg in the laboratory, (m,)."""
+    """Return the mask (m,), True for each of the m angles that the laboratory measured below 5 deg."""
     return values_of(flight.before_launch.look) < np.radians(5.0)
 
 
 def values_of(angles: Mapping[str, float]) -> np.ndarray:
-    """Return the values of a mapping by angle as an array (m,)."""
+    """Return the values of a mapping (name of an angle -> value) as an array, in the order of the mapping."""
     return np.array(list(angles.values()))
 
 
@@ -437,7 +440,7 @@ def reduce_to_station(measurement: Measurement, section: Resection) -> Measureme
 
 
 def tls_angles(common: Measurement) -> PlaneAngles:
-    """Return the angles between planes by total least squares, for a measurement from `reduce_to_station`."""
+    """Return the angles between planes fitted by total least squares to a measurement from `reduce_to_station`."""
     return angles_between([fit_plane(common.station, strip) for strip in common.strips.values()], common.which)
 
 
@@ -470,7 +473,9 @@ def estimate_angles(measurement: Measurement) -> Estimate:
 
 
 def frame_rows(flight: AnglePass, common: Measurement) -> tuple[FrameRow, ...]:
-    """Estimate the angles by every method in every frame, from a measurement of `reduce_to_station`."""
+    """Estimate the angles by every plane-fitting method in every coordinate frame, from a measurement of
+    `reduce_to_station`.
+    """
     places = {
         "Earth-fixed": (np.eye(3), np.zeros(3)),
         "local level": (flight.local, flight.middle_point),
@@ -497,9 +502,9 @@ def frame_rows(flight: AnglePass, common: Measurement) -> tuple[FrameRow, ...]:
 
 
 def effect_rows(flight: AnglePass) -> tuple[EffectRow, ...]:
-    """Compute the errors of the angles by each effect on the light alone and by all three, on the true points.
+    """Compute the errors of the angles due to each effect on the light alone and due to all three, on the true points.
 
-    Where the file has a shift of the datum, its error follows.
+    Where the file has a shift of the datum, the error due to it comes last.
     """
     truth, names = values_of(flight.dihedral), tuple(flight.pairs)
     none = (0.0, 0.0, 0.0)

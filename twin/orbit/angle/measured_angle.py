@@ -1,8 +1,9 @@
 """Intersection angles from a measured pass: image points, their ground points, orbit and attitude.
 
-Lines see ground points at many moments, but a plane passes through one station. Each arm from the station of its own
-moment to its ground point, corrected for the effects on the light, is therefore transferred in the body frame to one
-moment: S + R R_i' (G_i - S_i). Biases of the attitude rotate all arms alike and do not change the angles; errors that
+Lines see ground points at many moments, but a plane passes through one station. The vector from the station S_i at a
+point's own moment to its ground point G_i, corrected for the effects on the light, is therefore transferred in the body
+frame to one moment with station S: S + R R_i' (G_i - S_i), where R_i and R are the attitudes (body to Earth-fixed axes)
+at the two moments. Biases of the attitude rotate all these vectors alike and do not change the angles; errors that
 differ from moment to moment are included in the sigmas of the points.
 
 A simulated test can be written as such measurements, a folder of tables with a test file that reads them back.
@@ -48,7 +49,7 @@ def run_angle_test(setup: AnyAngle, backend: Backend | None, seed: int, advance:
     Raises
     ------
     InputError, BenchError
-        See `run_angle` and `run_measured_angle`.
+        Files cannot be used, or the angles cannot be determined.
     """
     if isinstance(setup, MeasuredAngleSetup):
         return run_measured_angle(setup, seed, advance)
@@ -195,19 +196,25 @@ def _strip(
 
 
 def _shared(offset: np.ndarray, path: TabulatedTrajectory, errors: ReadingErrorsSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Return variances (n,) of attitude, in rad^2, and station, in m^2, of points relative to the moment.
+    """Return each point's variances of attitude, in rad^2, and station, in m^2, relative to the moment of the angles.
 
-    Points of one reading have the same error: each of n points is given n times the variance, so that their mean has
-    the right one. A point of the moment's own reading shares the error of the moment, which does not change the angles.
+    Points whose attitude or station comes from the same reading of the orbit or attitude share its error: each of n
+    such points is given n times the variance, so that their mean has the right one. A point of the moment's own reading
+    shares the error of the moment, which does not change the angles.
 
     Parameters
     ----------
     offset : (n,) ndarray
-        Times of the points from the moment, in seconds.
+        Times of the n points from the moment, in seconds.
     path : TabulatedTrajectory
         Trajectory that gives the intervals of the readings.
     errors : ReadingErrorsSpec
         Errors of the readings.
+
+    Returns
+    -------
+    tuple of (n,) ndarray
+        Variance of the attitude and variance of the station, for each point.
     """
     tracker, gps = errors.star_tracker, errors.gps
     attitude = _of_readings(offset, tracker.interval or path.attitude_interval, tracker.noise)

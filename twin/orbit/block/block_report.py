@@ -1,7 +1,7 @@
 """Report and result keys (block.json) of a block adjustment.
 
 The report begins with the errors on the ground in metres, then gives the contribution of each sensor and the tests of
-the stated errors.
+the error laws that the file specifies.
 """
 
 from __future__ import annotations
@@ -143,8 +143,8 @@ BLOCK: Record[BlockRun] = Record(
 
 
 _WEAK = 0.1
-"""Observability below which a combination is listed as determined by the priors: prior sigma over the sigma of the
-observations alone.
+"""Observability below which a combination of unknowns is listed as determined by the priors: its prior sigma divided by
+its sigma from the observations alone.
 """
 
 

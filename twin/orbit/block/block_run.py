@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.adjust import OrbitAdjustSpec
 
 _LEAST_CHECK = 2
-"""Least number of check points from which errors are computed."""
+"""Smallest number of check points from which errors are computed."""
 _OBSERVED = 3e3
 """Memory per image point of a block that is simulated and adjusted, in bytes."""
 Rejected = tuple[tuple[str, str], ...]
@@ -42,9 +42,11 @@ Rejected = tuple[tuple[str, str], ...]
 DATUM_ALARM = 1e-3
 """p-value below which a common shift of the control points is reported."""
 ALL = "all"
-"""Case of the table of sensors with all sensors."""
+"""Name, in the table of sensors, of the adjustment with all sensors."""
 TIES_ALONE = "ties alone"
-"""Case of the table of sensors with image points of unknown ground alone, beside the priors of readings and cameras."""
+"""Name, in the table of sensors, of the adjustment with image points of unknown ground points alone, besides the priors
+of orbit and attitude readings and of the cameras.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +65,7 @@ class SensorContribution:
         Mean square of the errors over their sigmas, of the three coordinates (chi-square per degree of freedom): 1
         where the sigmas are right; None without check points.
     plan, height : float
-        Predicted CE90 and LE90 over those with all sensors.
+        Predicted CE90 and LE90, divided by those of the adjustment with all sensors.
     """
 
     excluded: tuple[str, ...]
@@ -78,7 +80,8 @@ class SensorContribution:
 class CameraChange:
     """Change of a camera in one scene since its calibration.
 
-    Each attribute is a (4,) ndarray of d_alpha, d_beta, d_gamma and d_f, in radians and metres.
+    Each attribute is a (4,) ndarray: the three rotations d_alpha, d_beta, d_gamma, in radians, and the change d_f of
+    the principal distance, in metres.
 
     Attributes
     ----------
@@ -132,13 +135,13 @@ class BlockRun:
     adjustment : BlockAdjustment
         Adjustment with all sensors that the file does not exclude.
     contributions : Mapping[str, SensorContribution]
-        Case -> errors at check points: with all sensors, without each, and with ties alone.
+        Name of the adjustment -> errors at check points: with all sensors, without each, and with tie points alone.
     network : Network
         Connections between the scenes.
     open : tuple of OpenCombination
         Combinations of unknowns that the observations leave to the priors.
     laws : tuple of LawTest
-        Tests of the error laws with a course in time.
+        Tests of the error laws whose errors vary with time.
     datum : DatumTest or None
         Test of a common shift of the control points; None without control points.
     cameras : Mapping[str, CameraChange]
@@ -369,7 +372,7 @@ class PointWorkers:
     count: int
 
     def hold(self, things: Sequence[Any]) -> Sequence[Any]:
-        """Send each object to a worker, in turn, and return the futures."""
+        """Send each object to a worker, the workers taking turns, and return the futures of the objects."""
         client = self.workers.client
         addresses = sorted(client.scheduler_info(n_workers=-1)["workers"])
         return [

@@ -1,4 +1,4 @@
-"""Simulated block of scenes with all its measurements, drawn from stated laws of errors.
+"""Simulated block of scenes with all its measurements, drawn from the error laws of the file.
 
 The readings of orbit and attitude are those of a smooth orbit; the true platform departs from them by random processes,
 each drawn by its own definition: readings interpolated by a cubic spline, sums of steps, amplitudes. The images are
@@ -44,14 +44,14 @@ from twin.orbit.measured.pass_measurements import ImagePoints, point_names
 Course = Callable[[np.ndarray], np.ndarray]
 Monitored = dict[str, model.CameraPrior] | model.JointCameraPrior
 _BEYOND = 30
-"""Number of readings drawn beyond the ends of a course: the influence of the ends on a cubic spline falls by a factor
-of 0.27 per reading.
+"""Number of readings drawn beyond the ends of a time series of errors: the influence of the ends on a cubic spline
+falls by a factor of 0.27 per reading.
 """
 _SPARE = 4.0
 """Number of candidates drawn per point; those that fewer than two scenes see are dropped."""
 _DAY = 86400.0
 _MOST_STEPS = 1e5
-"""Largest number of values of a law with a course in time."""
+"""Largest number of values in the time series of one error law."""
 _PLACES, _IMAGES, _LASER, _TERRAIN, _CONTROL, _COURSES, _CAMERAS, _GROSS = range(8)
 """Random streams of the seed."""
 
@@ -81,16 +81,16 @@ class TruePlatform:
     begin: float
 
     def position(self, seconds: np.ndarray) -> np.ndarray:
-        """Return positions; see `Platform`."""
+        """Return the true (n, 3) positions at times (n,) of the readings, ITRS, in metres."""
         position: np.ndarray = self.readings.position(seconds) + self.shift(seconds + self.begin) @ self.axes.T
         return position
 
     def inertial_velocity(self, seconds: np.ndarray) -> np.ndarray:
-        """Return velocities; see `Platform`."""
+        """Return the true (n, 3) inertial velocities at times (n,) of the readings, in axes of the ITRS, in m/s."""
         return self.readings.inertial_velocity(seconds)
 
     def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
-        """Return attitudes; see `Platform`."""
+        """Return the true (n, 3, 3) rotation matrices from body to ITRS axes at times (n,) of the readings."""
         rotation = Rotation.from_rotvec(self.rotation(seconds + self.begin)).as_matrix()
         return np.asarray(self.readings.body_to_itrs(seconds) @ rotation)
 
@@ -103,14 +103,14 @@ class DrawnBlock:
     ----------
     block : analysis.block.block.Block
         Priors and measurements.
-    ground : (m, 3) ndarray
+    ground : (m, 3) ndarray for m points
         True points, ITRS, in metres.
     change : Mapping[str, ndarray]
         Scene -> (4,) true change of its camera, in radians and metres.
     platforms : Mapping[str, TruePlatform]
         Pass -> true platform.
     gross : Mapping[str, ndarray]
-        Scene -> (k,) indices of points whose image points are wrong.
+        Scene -> (k,) indices of the k points whose image points have gross errors.
     """
 
     block: model.Block
@@ -121,7 +121,7 @@ class DrawnBlock:
 
 
 def draw_course(law: Law, first: float, last: float, random: np.random.Generator) -> Course:
-    """Draw one course of a law of errors between two times, in seconds."""
+    """Draw one time series of an error law between two times, in seconds, and return it as a function of time."""
     sigma, middle = np.array(law.sigma), 0.5 * (first + last)
     if law.kind in ("constant", "rate"):
         value = sigma * random.standard_normal(3)
@@ -154,7 +154,7 @@ def draw_course(law: Law, first: float, last: float, random: np.random.Generator
 
 
 def _slow(steps: np.ndarray, law: Law) -> np.ndarray:
-    """Return (k, 3) values of a stationary first-order process of unit variance from independent normals (k, 3)."""
+    """Return a stationary first-order process of unit variance from independent normal numbers, (k, 3) for k times."""
     correlation = np.exp(-law.interval / law.time)
     values = steps.copy()
     for k in range(1, len(steps)):
@@ -165,7 +165,7 @@ def _slow(steps: np.ndarray, law: Law) -> np.ndarray:
 def _courses(
     spec: OrbitAdjustSpec, laws: ReadingLawsSpec, begin: Mapping[str, float], seed: np.random.SeedSequence
 ) -> tuple[dict[str, list[Course]], dict[str, list[Course]], dict[str, np.ndarray]]:
-    """Draw the courses of attitude and station of each pass, and the constant rotation of each star tracker."""
+    """Draw the errors of attitude and station over time for each pass, and the constant rotation of each star tracker."""
     attitudes: dict[str, list[Course]] = {name: [] for name in begin}
     stations: dict[str, list[Course]] = {name: [] for name in begin}
     constants: dict[str, np.ndarray] = {}
@@ -203,7 +203,9 @@ def _summed(parts: list[Course]) -> Course:
 def _cameras(
     spec: OrbitAdjustSpec, days: np.ndarray, random: np.random.Generator, recorded: model.JointCameraPrior | None
 ) -> tuple[dict[str, np.ndarray], dict[str, model.CameraPrior], Monitored | None]:
-    """Draw the true changes (T, 4) of each line; return them with the priors before and after monitor readings."""
+    """Draw the true changes (T, 4) of each line in T passes; return them with the priors before and after monitor
+    readings.
+    """
     if recorded is not None:
         drawn = covariance_root(recorded.covariance) @ random.standard_normal(len(recorded.covariance))
         changes = recorded.mean + drawn.reshape(recorded.mean.shape)
@@ -313,7 +315,7 @@ Seen = Mapping[str, tuple[np.ndarray, np.ndarray]]
 def _points(
     setup: AdjustSetup, sensors: Mapping[str, Sensor], earth: Earth, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, Seen]:
-    """Draw points (m, 3) and roles; return them with line and pixel by scene, NaN where a point is not seen."""
+    """Draw m points (m, 3) with their roles; return them with line and pixel by scene, NaN where a point is not seen."""
     spec = setup.test
     area, wanted = spec.area, spec.points.control + spec.points.tie + spec.points.check
     count = int(np.ceil(_SPARE * wanted))

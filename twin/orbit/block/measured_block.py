@@ -1,4 +1,4 @@
-"""Block of measured passes, read from the tables that a calibration also reads.
+"""Block of measured passes, read from the same tables as a calibration in orbit.
 
 Functions here also build the priors of a block for the analysis: laws of errors, and changes of the cameras before and
 after the monitor's readings.
@@ -36,7 +36,7 @@ of the monitor.
 
 
 def law_of(name: str, spec: LawSpec) -> Term:
-    """Return a law of errors of the file as the analysis takes it."""
+    """Return an error law of the file as the term of the analysis's noise model."""
     sigma: tuple[float, float, float] = spec.sigma  # type: ignore[attr-defined]
     return Term(Law(name, spec.law, sigma, spec.interval, spec.time or 0.0, spec.frequency or 0.0), spec.shared_by)
 
@@ -47,7 +47,7 @@ def camera_sigmas(spec: CameraDriftSpec | MonitorReadingSpec) -> np.ndarray:
 
 
 def change_covariance(spec: CameraChangeSpec, days: np.ndarray) -> np.ndarray:
-    """Return the (4 T, 4 T) prior covariance of a camera's changes in passes at `days` (T,) from the first."""
+    """Return the (4 T, 4 T) prior covariance of a camera's four changes in T passes, at `days` (T,) after the first."""
     lasting, each, walk = (np.diag(camera_sigmas(s) ** 2) for s in (spec.lasting, spec.each_pass, spec.walk))
     ones = np.ones((len(days), len(days)))
     earlier = np.minimum(days[:, None], days)
@@ -59,7 +59,7 @@ def monitored_camera(law: np.ndarray, reading: np.ndarray, sigma: np.ndarray) ->
 
     Parameters
     ----------
-    law : (4 T, 4 T) ndarray
+    law : (4 T, 4 T) ndarray, for 4 changes in T passes
         Prior covariance before the readings.
     reading : (4 T,) ndarray
         Readings of the changes, in radians and metres.
@@ -87,7 +87,7 @@ def seconds_from_first(epochs: Mapping[str, str]) -> dict[str, float]:
 def measured_block(
     setup: MeasuredAdjustSetup, advance: Advance = silent, monitor: MonitorSource | None = None
 ) -> tuple[model.Block, np.ndarray]:
-    """Return the block of the tables of all passes, and the given coordinates (m, 3) of its points.
+    """Return the block from the tables of all passes, and the given coordinates (m, 3) of its m points.
 
     The coordinates are in ITRS, in metres, and NaN for tie points.
 

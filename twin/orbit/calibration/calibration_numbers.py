@@ -193,7 +193,7 @@ MATCHING: Record[Sequence[LineComparison]] = Record(
 
 
 def _by_line(images: FieldImages) -> dict[str, dict[str, list[LineComparison]]]:
-    """Return the judgements of all patches of a field: sort of points -> line -> one judgement per patch."""
+    """Return the comparisons of all patches of a field with the truth: sort of points -> line -> one per patch."""
     parts: dict[str, dict[str, list[LineComparison]]] = {}
     for patch in images.patches:
         for sort, lines in patch.judgements.items():

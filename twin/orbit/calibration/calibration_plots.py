@@ -15,10 +15,10 @@ from twin.orbit.calibration.schemes import RMS, FieldErrors, Monitoring, values_
 
 
 def _expected_height(run: CalibrationRun, study: Monitoring, factor: np.ndarray) -> np.ndarray:
-    """Return the (n,) mean height RMS of many campaigns without a monitor, in metres, for drifts scaled by `factor`.
+    """Return the expected height RMS without a monitor, in metres, for the file's drift times each `factor` (n,).
 
-    All fields are adjusted at once and each has one drift. The mean over the fields of the outer lines' d_alpha goes
-    into the parameters and is therefore taken out.
+    It is the mean over many campaigns. All fields are adjusted at once and each has one drift. The mean over the fields
+    of the outer lines' d_alpha goes into the parameters and is therefore taken out.
     """
     spec = run.campaign.simulated
     square = sum(drift.angles[0] ** 2 for name, drift in spec.drift.items() if name != "nadir")
@@ -143,7 +143,7 @@ def _latitude_figure(run: CalibrationRun) -> Figure:
 
 
 def _correlation_figure(run: CalibrationRun) -> Figure:
-    """Draw the correlation matrix of the simultaneous adjustment, held unknowns excluded."""
+    """Draw the correlation matrix of the simultaneous adjustment, without the unknowns that the gauge holds."""
     adjustment = run.together
     sigma = adjustment.sigma
     free = [k for k, name in enumerate(adjustment.names) if sigma[name] > 0.0]

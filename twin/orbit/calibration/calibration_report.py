@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import CalibrationSetup
 
 _FEW = 30
-"""Least degrees of freedom of the check points' intersections for which a small p-value is worth a warning."""
+"""Smallest number of degrees of freedom of the check points' intersections for which a small p-value is worth a
+warning.
+"""
 _LEAST_CHANCE = 1e-3
 """p-value of the check points' intersections below which there is a warning."""
 _WIDE = 2.0

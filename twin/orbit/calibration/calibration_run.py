@@ -72,7 +72,7 @@ _EVEN = 1e-3
 as evenly spaced.
 """
 _LEAST_EVEN = 5
-"""Least number of evenly spaced readings from which third differences are computed."""
+"""Smallest number of evenly spaced readings from which third differences are computed."""
 STEPWISE_TOLERANCE = 1e-3
 """Largest step of the last round of the stepwise solution, in sigmas, at which it counts as converged."""
 _TIE = 1.7e5
@@ -114,7 +114,7 @@ class CalibrationRun:
     together : Adjustment
         Simultaneous adjustment of all fields, with the offsets of the orbit and, where the fit against latitude
         determines it, the drift of the biases during the passes.
-    truth : (P,) ndarray or None
+    truth : (P,) ndarray for P unknowns, or None
         True values of the unknowns of `together`, in metres and radians; None for measured passes.
     fields : Mapping[str, FieldResult]
         Calibration of each field by itself, by name of the field.
@@ -142,7 +142,7 @@ class CalibrationRun:
     chip_steps : tuple of ChipStep
         Steps between the chips of a line, tested on the residuals.
     repeats : Repeats or None
-        Campaigns repeated with all errors drawn anew; None where the file asks for none.
+        Campaigns repeated with new random errors; None where the file asks for none.
     monitoring : Monitoring or None
         Comparison of calibrations with and without the on-board monitor; None for cameras without drift.
     strips : Strips or None
@@ -361,7 +361,7 @@ def source_of(setup: AnyCalibration, seed: np.random.SeedSequence, advance: Adva
     InputError
         Files cannot be used.
     BenchError, CalibrationError
-        See `fly_fields`.
+        The passes cannot be simulated, or their points cannot be used.
     """
     if isinstance(setup, MeasuredCalibrationSetup):
         measured = read_measurements(setup.data, setup.camera, advance)
@@ -375,7 +375,7 @@ def source_of(setup: AnyCalibration, seed: np.random.SeedSequence, advance: Adva
 
 
 def true_values(campaign: Campaign, names: tuple[str, ...]) -> np.ndarray:
-    """Return the (P,) true values of unknowns by name, in metres and radians.
+    """Return the (P,) true values of the P named unknowns, in metres and radians.
 
     Biases and offsets are those at the middle of the field, rates the mean of the fields.
     """

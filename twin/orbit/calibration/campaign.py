@@ -360,7 +360,8 @@ class PassTruth:
     errors : MeasurementErrors
         Errors of the readings.
     drift : Mapping[str, ndarray]
-        Line -> (4,) true d_alpha, d_beta, d_gamma, d_f of its camera, in radians and metres; empty for no drift.
+        Line -> (4,) true changes of its camera: rotations d_alpha, d_beta, d_gamma, in radians, and principal distance
+        d_f, in metres; empty without drift.
     """
 
     bias: np.ndarray
@@ -386,7 +387,7 @@ class PassTruth:
 
 @dataclass(frozen=True, eq=False)
 class PatchRecord:
-    """Measured points of one patch, and their matching errors by the truth.
+    """Measured points of one patch, and their matching errors against the truth.
 
     Attributes
     ----------
@@ -402,7 +403,7 @@ class PatchRecord:
 
 @dataclass(frozen=True, eq=False)
 class FieldImages:
-    """Image measurements of a field's points, with the matches that are wrong by the truth.
+    """Image measurements of a field's points, with the matches that the truth shows to be wrong.
 
     Attributes
     ----------
@@ -470,7 +471,7 @@ class FieldPass:
         Mean latitude of the control points, in radians.
     control_images : Mapping[str, ImagePoints]
         Line -> image points of control points, and of tie points that are used in the calibration.
-    control_ground : (n, 3) ndarray
+    control_ground : (n, 3) ndarray for n points
         Given coordinates of control points and, for tie points, those of a first intersection; ITRS, in metres.
     control_covariance : (n, 3, 3) ndarray
         Covariances of the given coordinates, in m^2.
@@ -480,12 +481,12 @@ class FieldPass:
         Names of these points.
     check_images : Mapping[str, ImagePoints]
         Line -> image points of the check points.
-    check_ground : (m, 3) ndarray
+    check_ground : (m, 3) ndarray for m check points
         Given coordinates of the check points, ITRS, in metres.
     check_ids : (m,) ndarray
         Names of the check points.
     tie_images : Mapping[str, ImagePoints]
-        Line -> image points of tie points that are reserved for the strip; empty for none.
+        Line -> image points of tie points that are reserved for the strip; empty if there are none.
     control : CalibrationField
         Control points and rays that the calibration uses.
     check : Mapping[str, Rays]
@@ -493,7 +494,7 @@ class FieldPass:
     ties : Mapping[str, Rays]
         Line -> rays of the tie points that are reserved for the strip.
     readings : Mapping[str, ndarray]
-        Line -> (4,) reading of the monitor of its camera; empty for no monitor.
+        Line -> (4,) change of its camera that the monitor measured; empty without a monitor.
     known_truth : PassTruth or None
         Truth of a simulated pass; None for a measured one.
     """
@@ -534,7 +535,7 @@ class FieldPass:
 
     @property
     def bias(self) -> np.ndarray:
-        """True (3,) roll, pitch and yaw from measured to true attitude, in radians; see `PassTruth`."""
+        """True (3,) roll, pitch and yaw from measured to true attitude, in radiansat the middle of the field."""
         return self.truth.bias
 
     @property
@@ -574,7 +575,7 @@ class FieldPass:
         return float(self.data.earth.geodetic(path.position(self.middle))[2])
 
     def shifted(self, datum: tuple[float, float, float]) -> FieldPass:
-        """Return the pass with control points shifted by `datum` (east, north, up), in metres; rays do not change."""
+        """Return the pass with control points shifted by `datum`, in metres east, north and up; rays do not change."""
         lon, lat, _ = self.data.earth.geodetic(self.control_ground.mean(axis=0))
         ground = self.control_ground + np.array(datum) @ east_north_up(lon, lat)
         return replace(self, control_ground=ground, control=replace(self.control, ground=ground))
@@ -626,7 +627,7 @@ class Campaign:
     rejected : Mapping[str, Rejected]
         Field -> points that the screening rejected; empty where there was no screening.
     drifts : DetectedDrift or None
-        Unstated drift of the attitude that the residuals show; None where they show none.
+        Drift of the attitude that the file does not specify but the residuals show; None where they show none.
     """
 
     spec: OrbitCalibrationSpec | MeasuredCalibrationSpec
@@ -716,7 +717,7 @@ class Campaign:
 
 @dataclass(frozen=True)
 class DetectedDrift:
-    """Unstated drift of the attitude during the passes that the residuals show.
+    """Drift of the attitude during the passes that the file does not specify but the residuals show.
 
     Attributes
     ----------
@@ -761,13 +762,15 @@ class Rejected:
     factors: Mapping[str, float]
 
     def after(self, first: Rejected) -> Rejected:
-        """Return the points rejected in two rounds, `first` and this one; the factors of the first are 1."""
+        """Return the points rejected in two rounds, `first` and this one, whose factors on the sigmas are those of this
+        one.
+        """
         points, checks = first.points + self.points, first.check_points + self.check_points
         return Rejected(first.entered, self.left, points, first.check_entered, self.check_left, checks, self.factors)
 
 
 def interior_names(lines: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the unknowns f, x, y of line cameras."""
+    """Return the names of the interior unknowns of line cameras: principal distance f, principal point x and y of each."""
     return tuple(f"{line} {name}" for line in lines for name in INTERIOR)
 
 

@@ -41,7 +41,7 @@ minute.
 
 
 def gauge_of(campaign: Campaign) -> Gauge:
-    """Return the gauge: the principal point of one line is held, see `GAUGE`.
+    """Return the gauge, which holds the principal point of one line at its laboratory value.
 
     Unknowns that the points determine less well than the prior stay near the laboratory's values, within the sigmas of
     launch and season.
@@ -54,7 +54,9 @@ def gauge_of(campaign: Campaign) -> Gauge:
 
 
 def _rates_of(campaign: Campaign) -> np.ndarray:
-    """Return the (3,) standard deviations of the attitude's rate in each pass, stated and detected, in rad/s."""
+    """Return the (3,) standard deviations of the attitude's rate in each pass, specified in the file and detected, in
+    rad/s.
+    """
     prior = campaign.spec.errors.star_tracker.drift if campaign.spec.errors.switched_on else None
     detected = (0.0, 0.0, 0.0) if campaign.drifts is None else campaign.drifts.rate
     return np.asarray(np.hypot(prior or (0.0, 0.0, 0.0), detected))
@@ -66,7 +68,7 @@ def _rate_priors(campaign: Campaign, passes: Sequence[FieldPass], common: Sequen
     Parameters
     ----------
     campaign : Campaign
-        Campaign with the stated or detected drift.
+        Campaign with the drift that is specified in the file or detected.
     passes : sequence of FieldPass
         Passes that are adjusted.
     common : sequence of Prior
@@ -85,7 +87,7 @@ def _rate_priors(campaign: Campaign, passes: Sequence[FieldPass], common: Sequen
 
 
 def calibrated_alone(campaign: Campaign, flight: FieldPass) -> Adjustment:
-    """Calibrate one field by itself, with paper 003's twelve unknowns less the gauge.
+    """Calibrate one field by itself, with paper 003's twelve unknowns without those that the gauge holds.
 
     A rate of the attitude is added where the attitude drifts.
 
@@ -113,15 +115,15 @@ def calibrated_alone(campaign: Campaign, flight: FieldPass) -> Adjustment:
 
 
 def with_detected_drift(campaign: Campaign, rates: tuple[Prior, ...] = ()) -> Campaign:
-    """Return the campaign, with an unstated drift of the attitude in its noise model if the residuals show one.
+    """Return the campaign with a drift of the attitude in its noise model, if the residuals show one.
 
-    The drift is a random walk, sized by its variance component, and a rate of each pass. The false-alarm rate of
-    either test is `FALSE_ALARM`.
+    Tested is a drift that the file does not specify. It is modelled as a random walk, sized by its variance component,
+    and a rate of each pass. The false-alarm rate of either test is `FALSE_ALARM`.
 
     Parameters
     ----------
     campaign : Campaign
-        Campaign with the stated noise.
+        Campaign with the noise that the file specifies.
     rates : tuple of Prior
         Priors of a rate that all passes share.
 
@@ -206,12 +208,12 @@ def simultaneous(
 
 
 LEAST_FIELDS = 4
-"""Least number of fields of a fit against latitude: the fit uses two degrees of freedom, and a single further one does
-not estimate the remainder.
+"""Smallest number of fields of a fit against latitude: the fit uses two degrees of freedom, and a single further one
+does not estimate the remainder.
 """
 _LEAST_FREEDOM = 3
-"""Least degrees of freedom of a fit against latitude from which rates during the passes are predicted; Student's
-variance needs three.
+"""Smallest number of degrees of freedom of a fit against latitude from which rates during the passes are predicted;
+Student's variance needs three.
 """
 _ONE_LATITUDE = np.radians(1.0)
 """Range of latitudes, in radians, below which fields count as lying at one latitude."""
@@ -225,7 +227,7 @@ class LatitudeFit:
     ----------
     axis : str
         Axis of the bias: roll, pitch or yaw.
-    latitude : (K,) ndarray
+    latitude : (K,) ndarray for K fields
         Latitudes of the fields, in radians.
     reference : float
         Latitude at which the sine vanishes, in radians.
@@ -240,7 +242,7 @@ class LatitudeFit:
     chi_square : float
         Chi-square of the fit with the biases' own covariance.
     degrees_of_freedom : int
-        K - 2.
+        Number of fields K minus 2.
     remainder : float
         Standard deviation of the scatter beyond the biases' own sigmas, in radians; 0 when these explain all of it.
     """
@@ -314,7 +316,7 @@ def _sine_rate(flight: FieldPass, reference: float) -> float:
 
 
 def fit_latitude(axis: str, latitude: np.ndarray, value: np.ndarray, covariance: np.ndarray) -> LatitudeFit:
-    """Fit biases (K,) with covariance (K, K) against latitudes (K,), all in radians."""
+    """Fit the biases (K,) of K fields, with covariance (K, K), against their latitudes (K,), all in radians."""
     reference = float(0.5 * (latitude.min() + latitude.max()))
     design = np.stack([np.sin(latitude - reference), np.ones_like(latitude)], axis=1)
     freedom = len(value) - 2

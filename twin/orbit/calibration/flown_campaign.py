@@ -68,7 +68,7 @@ _OFFSET = 9000.0
 km x 32 km.
 """
 _LEAST_CONTROL = 6
-"""Least number of control points of a field that must be matched in every line; twelve unknowns need three."""
+"""Smallest number of control points of a field that must be matched in every line; twelve unknowns need three."""
 _REMEDIES: Mapping[str, tuple[KeyPath, str]] = FrozenMap(
     {
         "span": (("span",), "a longer pass, or patches nearer to the field's middle"),
@@ -288,7 +288,7 @@ _DRIFT, _READING = 6, 7
 
 
 def _sample_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> FrozenMap[str, np.ndarray]:
-    """Draw the true (4,) d_alpha, d_beta, d_gamma and d_f of each line during one field, in radians and metres.
+    """Draw the true change of each line camera during one field: d_alpha, d_beta, d_gamma (rad) and d_f (m), (4,).
 
     The result is empty for cameras without drift. The draws of a line do not depend on the sigmas of the others.
 
@@ -309,7 +309,7 @@ def _sample_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> F
 def _sample_readings(
     spec: OrbitCalibrationSpec, drift: Mapping[str, np.ndarray], seed: np.random.SeedSequence
 ) -> FrozenMap[str, np.ndarray]:
-    """Draw the (4,) monitor reading of each line, in radians and metres; empty for no monitor.
+    """Draw the (4,) change of each line that the monitor measures, in radians and metres; empty without a monitor.
 
     Parameters
     ----------
@@ -345,7 +345,8 @@ _PICTURES = 5
 _TIES = 8
 """Random stream of a field's seed for the tie points of its strip; `_DRIFT` and `_READING` are the two before it."""
 _MARGIN = 6.0
-"""Least distance of a point from the edge of an image, in sigmas, so that its measured position cannot lie outside."""
+"""Smallest distance of a point from the edge of an image, in sigmas, so that its measured position cannot lie outside.
+"""
 
 
 def fly_fields(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance = silent) -> Campaign:

@@ -28,12 +28,13 @@ from twin.orbit.calibration.schemes import FieldErrors, laboratory_errors, schem
 from twin.orbit.flight.light_effects import NO_EFFECTS
 
 UNEXPECTED_SIGMAS = 4.0
-"""Difference of an unknown from its expected value, in expected sigmas, beyond which it is reported; with seventy
-unknowns, a false alarm occurs in 1 of 200 campaigns.
+"""Difference of an unknown from its expected value, in units of its expected standard deviation, beyond which it is
+reported; with seventy unknowns, a false alarm occurs in 1 of 200 campaigns.
 """
 UNDETECTED_SIGMAS = 3.0
-"""Error of an unknown, in its sigmas, by a drift that residuals show only in half of all cases, above which a file has
-to state whether there is a drift."""
+"""Error of an unknown, in units of its sigma, above which a file has to specify whether the attitude drifts: the error
+due to a drift that the residuals show in only half of all cases.
+"""
 _STEP_ALARM = 1e-4
 """False-alarm probability of all steps of a run together."""
 _TRIAL_TIME = 0.01
@@ -73,7 +74,7 @@ class LightRow:
     p_value: float
 
     def most(self, names: tuple[str, ...]) -> tuple[str, float]:
-        """Return the unknown of `names`, not held, that moves by the most of its sigmas, and by how many."""
+        """Return the unknown of `names`, not held by the gauge, with the largest change in sigmas, and that change."""
         size = {n: self.shift[n] / self.sigma[n] for n in names if self.sigma[n] > 0.0}
         worst = max(size, key=lambda n: abs(size[n]))
         return worst, size[worst]
@@ -100,7 +101,7 @@ class DatumRow:
     after : FieldErrors
         Mean of the fields' RMS errors in the right datum, each field with its own parameters.
     late : float
-        Delay of the line times, in seconds, in place of a shift.
+        Delay of the line times, in seconds, instead of a shift.
     sigma : Mapping[str, float]
         Standard deviation of each element of the interior orientation.
     warned : float or None
@@ -125,7 +126,7 @@ class DatumRow:
 
     @property
     def most_sigmas(self) -> tuple[str, float]:
-        """Element of the interior orientation that moves by the most of its sigmas, and by how many."""
+        """Element of the interior orientation with the largest change in units of its sigma, and that change in sigmas."""
         ratio = {n: abs(v) / self.sigma[n] for n, v in self.interior.items() if self.sigma[n] > 0.0}
         worst = max(ratio, key=lambda n: ratio[n])
         return worst, ratio[worst]
@@ -281,7 +282,7 @@ def unexpected_changes(campaign: Campaign, adjustment: Adjustment) -> tuple[Unex
 
 
 def _expected(campaign: Campaign) -> dict[str, tuple[float, float]]:
-    """Return the expected value and standard deviation of each unknown, by the priors of launch and orbit."""
+    """Return the expected value and standard deviation of each unknown, according to the priors of launch and orbit."""
     launch, errors = campaign.spec.launch, campaign.spec.errors
     inner = campaign.inner
     start = dict(zip(inner, np.ravel([campaign.laboratory[line].interior for line in campaign.lines]), strict=True))
@@ -361,14 +362,14 @@ class AttitudeDrift:
 
     @property
     def most(self) -> tuple[str, float]:
-        """Unknown that a drift moves by the most of its sigmas, and by how many; ("", 0) where rates are unknowns."""
+        """Unknown that a drift changes most in units of its sigma, and that change; ("", 0) where rates are unknowns."""
         if not self.sigmas_per_arcsec:
             return "", 0.0
         return max(self.sigmas_per_arcsec.items(), key=lambda item: item[1])
 
 
 def drift_warnings(campaign: Campaign, drift: AttitudeDrift) -> list[str]:
-    """Return warnings of a detected drift, or of a file that does not state a drift that would matter."""
+    """Return warnings of a detected drift, or of a file that does not specify a drift that would matter."""
     if drift.assumed is not None:
         rate = max(drift.assumed.rate) * drift.seconds / ARCSEC
         p_value = min(drift.course_p_value, 1.0 if drift.rate_p_value is None else drift.rate_p_value)
@@ -407,7 +408,7 @@ class ChipStep:
     place : float
         Position y of the joint in the focal plane, in metres.
     step : float
-        Estimated step of everything beyond the joint, in metres.
+        Estimated displacement of all pixels beyond the joint, in metres.
     sigma : float or None
         Standard deviation of the step, estimated together with all others, in metres; None where it is not observable.
     detectable : float or None

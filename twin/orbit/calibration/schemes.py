@@ -1,7 +1,7 @@
 """Errors at check points without ground control, by scheme of averaged parameters, and their dependence on the method.
 
 Schemes (paper 003, section 4.4): the parameters of several fields, each calibrated by itself, are averaged and tested
-on all fields by forward intersection, on one campaign and on campaigns repeated with all errors drawn anew. The gain of
+on all fields by forward intersection, on one campaign and on campaigns repeated with new random errors. The gain of
 averaging depends on how well the parameters repeat from field to field, which `repeatability` computes.
 
 Strips: passes are adjusted on tie points before their check points are intersected. Slow errors of the attitude over a
@@ -10,8 +10,8 @@ parameters as if they were exact would count that part twice and increase the er
 are used therefore includes the tie points of its pass, which separates the two.
 
 Monitoring: the gain of an on-board monitor where the cameras change from field to field (papers 001 and 003) is found
-from campaigns with the same draws and drifts of several sizes, adjusted as if nothing drifted and with the monitor's
-readings.
+from campaigns with the same random numbers and drifts of several sizes, adjusted as if nothing drifted and with the
+monitor's readings.
 
 Effects on the light that are corrected are left out of these campaigns, and the noise of attitude and orbit is treated
 as independent: both take most of the time and hardly change the errors at check points.
@@ -66,7 +66,7 @@ class FieldErrors:
 
     @classmethod
     def pooled(cls, errors: Iterable[CheckErrors]) -> FieldErrors:
-        """Return the RMS errors over all check points, so that a field weighs by the number of its points."""
+        """Return the RMS errors over all check points, so that each field is weighted by the number of its points."""
         rows = list(errors)
         count = [e.count for e in rows]
         plan, height = (np.average(np.square([getattr(e, what) for e in rows]), weights=count) for what in RMS)
@@ -128,13 +128,13 @@ _LEAST_SCHEMES = 3
 
 @dataclass(frozen=True, eq=False)
 class Repeats:
-    """Campaigns over the same fields with all errors drawn anew.
+    """Campaigns over the same fields with new random errors.
 
     Attributes
     ----------
     schemes : tuple of str
         Names of the schemes; in the last one each field uses its own parameters.
-    plan, height : (N, schemes, fields) ndarray
+    plan, height : (N, schemes, fields) ndarray for N campaigns
         RMS errors at check points, in metres.
     """
 
@@ -169,7 +169,7 @@ def evaluate_schemes(
         Campaign with its schemes and fields.
     alone : Mapping[str, Adjustment]
         Calibration of each field by itself, by field.
-    test : Callable[[FieldPass, Mapping[str, LineModel], ndarray], T]
+    test : callable
         Function of a field's pass, the cameras and the bias (3,). Cameras and bias are means of the scheme's fields,
         and the field's own in the last scheme.
     """
@@ -184,7 +184,15 @@ def evaluate_schemes(
 
 
 def scheme_errors(campaign: Campaign, alone: Mapping[str, Adjustment]) -> FrozenMap[str, FrozenMap[str, CheckErrors]]:
-    """Return the errors at check points, scheme -> field; arguments as in `evaluate_schemes`."""
+    """Return the errors at the check points of every field with every scheme: scheme -> field -> errors.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        Campaign with its schemes and fields.
+    alone : Mapping[str, Adjustment]
+        Calibration of each field by itself, by field.
+    """
     return evaluate_schemes(
         campaign, alone, lambda flight, cameras, bias: check_point_errors(campaign, flight, cameras, bias)
     )
@@ -205,7 +213,7 @@ def check_point_errors(
 
 
 def repeat_campaigns(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance) -> Repeats | None:
-    """Simulate and calibrate as many campaigns as the file asks for, and keep their errors; None for none.
+    """Simulate and calibrate as many campaigns as the file asks for, and return their errors; None for zero.
 
     Raises
     ------
@@ -233,7 +241,7 @@ def repeat_campaigns(setup: CalibrationSetup, seed: np.random.SeedSequence, adva
 def mean_parameters(
     campaign: Campaign, results: Sequence[Adjustment], names: Sequence[str]
 ) -> tuple[dict[str, LineModel], np.ndarray]:
-    """Return cameras and bias (3,) that are means of the parameters of these fields, each calibrated by itself."""
+    """Return the mean cameras and mean bias (3,) of these fields, each calibrated by itself."""
     cameras = {
         line: camera.with_interior(np.mean([r.cameras[line].interior for r in results], axis=0))
         for line, camera in campaign.laboratory.items()
@@ -252,9 +260,10 @@ class Repeatability:
     scatter : float
         Standard deviation over the fields.
     sigma : float
-        Standard deviation by the adjustments of single fields, root mean square; 0 where held.
+        Standard deviation that the adjustments of single fields predict, root mean square; 0 where the gauge holds it.
     p_value : float or None
-        Probability of a scatter at least as large if the parameter is the same in all fields; None where held.
+        Probability of a scatter at least as large if the parameter is the same in all fields; None where the gauge
+        holds it.
     """
 
     name: str
@@ -431,7 +440,7 @@ class DriftSize:
     Attributes
     ----------
     factor : float
-        Size relative to that of the file.
+        Standard deviations of the drift, divided by those of the file.
     without : Treatment
         Errors of the adjustment that assumes no drift.
     monitored : Treatment or None
@@ -503,7 +512,7 @@ def study_monitoring(setup: CalibrationSetup, seed: np.random.SeedSequence, adva
 def fly_with_drift(setup: CalibrationSetup, factor: float, seed: np.random.SeedSequence) -> Campaign:
     """Simulate the campaign with the file's drift times a factor, without correctable effects on the light.
 
-    All other draws are those without drift. The seed is not changed.
+    All other random numbers are those of the campaign without drift. The seed is not changed.
     """
     test = setup.test
     drift = {

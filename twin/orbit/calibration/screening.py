@@ -28,16 +28,19 @@ from twin.orbit.measured.pass_measurements import ImagePoints, listed
 _ROUNDS = 3
 """Largest number of rounds in which the sigmas of image points are rescaled."""
 _SETTLED = 1.05
-"""Factor on the sigmas of all lines together below which it is not applied, nor any below 1: errors that the three
-lines' matches with one template have in common do not show in residuals, because they move the adjusted point.
+"""Factor on the sigmas of all lines together below which no factor is applied; factors below 1 are never applied.
+Errors that the three lines' matches with one template have in common do not show in residuals, because they move the
+adjusted point.
 """
 _OWN_SIGMAS = 4.0
-"""Sigmas by which the variance of a line of a pass must exceed the others to get a separate factor; 3e-5 by chance. A
-variance from the median of n good points has a relative uncertainty of 1.44 / sqrt(n) (1 / ln 2 that of the root mean
-square).
+"""Sigmas by which the variance of a line of a pass must exceed the others to get a separate factor; by chance this
+happens with a probability of 3e-5. A variance from the median of n good points has a relative uncertainty of 1.44 /
+sqrt(n) (1 / ln 2 that of the root mean square).
 """
 _MEDIAN_SPREAD = 1.0 / np.log(2.0)
-"""Relative standard deviation of a variance from the median of one squared residual; see `_OWN_SIGMAS`."""
+"""Relative standard deviation of a variance from the median of one squared residual, times the square root of the
+number of residuals.
+"""
 _FALSE_ALARM = 1e-4
 """False-alarm probability of the test of check points, the same as for image points in the adjustment."""
 
@@ -47,14 +50,14 @@ _FAR_SCATTERS, _FAR_SIGMAS = 10.0, 20.0
 about their common misclosure, and sigmas of an image point. The nearest of 100 points in a strip of 60 km lies 1000
 sigmas away in the median."""
 _LEAST_OF_LINE = 8
-"""Least number of control points in a line for which wrong names are looked for."""
+"""Smallest number of control points in a line at which wrongly named points are searched for."""
 _SLOPE_POINTS = 500
 """Largest number of points from which the slope of the misclosures is computed."""
 _Accepted = dict[str, dict[str, np.ndarray]]
 
 
 def mislabelled_points(campaign: Campaign, flight: FieldPass) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Return which image points of a pass show another place than the ground point of their name.
+    """Return masks of the image points of a pass that do not show the ground point of their name.
 
     Errors of camera and platform move the image points of a line alike, slightly rotated and scaled: a straight line in
     the pixel through the medians of misclosures, a fit that tolerates up to half of the points being wrong.
@@ -91,7 +94,7 @@ def mislabelled_points(campaign: Campaign, flight: FieldPass) -> tuple[dict[str,
 
 
 def require_correct_names(campaign: Campaign) -> None:
-    """Raise an error if image points show other places than the ground points of their names.
+    """Raise an error if image points do not show the ground points of their names.
 
     Raises
     ------
@@ -120,7 +123,7 @@ def _without_mislabelled(campaign: Campaign) -> tuple[Campaign, dict[str, Reject
 
 
 def _with_light(campaign: Campaign, passes: tuple[FieldPass, ...]) -> Campaign:
-    """Return the campaign with other image points, from which effects on the light are taken out as before."""
+    """Return the campaign with the image points of `passes`, from which effects on the light are taken out as before."""
     removed = campaign.effects if campaign.spec.effects.corrected else NO_EFFECTS
     return replace(campaign, passes=passes).without_effects(removed)
 

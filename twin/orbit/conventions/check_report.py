@@ -1,6 +1,6 @@
-"""Report and result records of a check of conventions: confirmed, wrong or undetermined conventions of a pass.
+"""Report and result records of a check of conventions: each is confirmed, wrong or undetermined.
 
-The records define the quantities of check.json.
+A reading here is one interpretation of the files' numbers. The records define the quantities of check.json.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from twin.orbit.conventions.pass_readings import TESTED_CONVENTIONS, Changes, Fi
 from twin.orbit.flight.earth import Earth, east_north_up
 
 CheckedReading = tuple[Check, TriedReading]
-"""A check with one of its readings."""
+"""A check with one of the interpretations of the files that it tried."""
 PlacedReading = tuple[Check, Changes]
-"""A check with the changes of one of its readings."""
+"""A check with one interpretation of the files, given by its changes from the specified one."""
 
 
 def changes_text(changes: Changes) -> str:
-    """Return the conventions in which a reading differs from the stated one, for readers."""
+    """Return, as text, the conventions in which an interpretation of the files differs from the specified one."""
     if not changes:
         return "as stated"
     named = ((TESTED_CONVENTIONS[name], value) for name, value in changes)
@@ -32,7 +32,7 @@ def changes_text(changes: Changes) -> str:
 
 
 def _of_fit(get: Callable[[Fit], Any]) -> Callable[[CheckedReading], Any]:
-    """Return a function that gets a quantity of a reading's fit; None for an impossible reading."""
+    """Return a function that gets a quantity of an interpretation's fit to the points; None for an impossible one."""
     return lambda of: None if of[1].fit is None else get(of[1].fit)
 
 
@@ -79,7 +79,7 @@ CONVENTION: Record[tuple[ValueTest, ...]] = Record(
 
 
 def places_of(run: Check, changes: Changes) -> list[dict[str, Any]]:
-    """Return the first points of a reading on the ground, a row for each.
+    """Return where one interpretation of the files places the first points on the ground, one row per point.
 
     A row has longitude, latitude and the distance from the ground point, east and north in metres.
     """
@@ -113,7 +113,7 @@ PLACE: Record[PlacedReading] = Record(
 
 
 def _best(run: Check) -> dict[str, Any]:
-    """Return every convention of the best reading."""
+    """Return the value of every convention of the best interpretation of the files."""
     reading = changed(run.stated, run.best.changes)
     return {name: TESTED_CONVENTIONS[name].get(reading) for name in run.answers}
 
@@ -145,13 +145,13 @@ CHECK: Record[Check] = Record(
 OTHER_READING, NO_READING = 3, 4
 """Exit codes if another reading than the stated one explains the points, and if none does."""
 _LISTED = 12
-"""Number of readings in the table of the report."""
+"""Number of interpretations in the table of the report."""
 _NAMED = 6
 """Number of gross errors of a line that a warning names; check.json has all."""
 
 
 def check_report(run: Check) -> Report:
-    """Return the report of a check."""
+    """Return the report of a check of conventions: verdict, likeliest interpretations, tests and warnings."""
     code = {"confirmed": 0, "another": OTHER_READING, "none": NO_READING}[run.verdict]
     verdict, more = _verdict(run)
     return Report(
@@ -234,7 +234,7 @@ def _facts(run: Check) -> tuple[tuple[str, str], ...]:
 
 
 def _row(tried: TriedReading, run: Check) -> tuple[Cell, ...]:
-    """Return the table row of a reading."""
+    """Return the table row of one interpretation of the files."""
     if tried.fit is None:
         return changes_text(tried.changes), None, None, None, None, tried.why
     excess = run.excess(tried)
@@ -244,7 +244,7 @@ def _row(tried: TriedReading, run: Check) -> tuple[Cell, ...]:
 
 
 def _ranking(run: Check) -> Table:
-    """Return the table of the likeliest readings."""
+    """Return the table of the likeliest interpretations of the files."""
     stated, single = run.stated_fit, [tried for tried in run.tried if len(tried.changes) <= 1 and tried is not run.best]
     first = [run.best, *(tried for tried in run.tried if tried.changes in run.equally_likely)]
     first += [stated] if stated not in first else []

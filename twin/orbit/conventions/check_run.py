@@ -1,6 +1,6 @@
 """Search for the conventions of a pass that explain its ground points: ``python -m twin.orbit check``.
 
-A reading is one interpretation of the files' numbers under one set of conventions.
+Here a reading is one interpretation of the files' numbers, under one set of conventions.
 """
 
 from __future__ import annotations
@@ -44,17 +44,19 @@ if TYPE_CHECKING:
 
 Verdict = Literal["confirmed", "another", "none"]
 DECIDED = 20.0
-"""Difference of cost from which two readings are separated.
+"""Difference of cost (minus twice the log likelihood) from which two interpretations of the files are separated.
 
 One is then exp(-10) = 1/22 000 as likely as the other: a few hundred are tried, so that one in a hundred checks is
 wrong at most.
 """
 _FITS = 9.0
-"""Chi-square per degree of freedom up to which a reading explains the points: sigmas three times too small."""
+"""Chi-square per degree of freedom up to which an interpretation explains the points: it allows sigmas three times too
+small.
+"""
 _ROUGH_POINTS = 8
 """Number of points of each line in the first, rough comparison."""
 _CANDIDATES = 40
-"""Number of readings that are fitted after the rough comparison."""
+"""Number of interpretations that are fitted after the rough comparison."""
 _ROUNDS = 3
 """Number of search rounds; each adds two conventions that may be wrong."""
 _WRONG_SHARE = 1e-6
@@ -65,16 +67,16 @@ _MOST_WRONG = 0.3
 
 @dataclass(frozen=True, eq=False)
 class TriedReading:
-    """Reading that was tried, with its fit.
+    """Interpretation of the files that was tried, with its fit.
 
     Attributes
     ----------
     changes : Changes
-        Changes from the stated reading.
+        Changes from the interpretation that the test file specifies.
     fit : Fit or None
-        Fit to the points; None if they cannot have been imaged under this reading.
+        Fit to the points; None if they cannot have been imaged under this interpretation.
     why : str
-        Reason why the reading is impossible.
+        Reason why the interpretation is impossible.
     """
 
     changes: Changes
@@ -83,24 +85,26 @@ class TriedReading:
 
     @property
     def cost(self) -> float:
-        """Minus twice the log likelihood; infinite for an impossible reading."""
+        """Minus twice the log likelihood; infinite for an impossible interpretation."""
         return np.inf if self.fit is None else self.fit.cost
 
 
 @dataclass(frozen=True, eq=False)
 class ValueTest:
-    """Test of one value of a convention, with the others as in the best reading.
+    """Test of one value of a convention, with the others as in the best interpretation of the files.
 
     Attributes
     ----------
-    value : object
+    value : str, float, bool or tuple
         Value of the convention.
     stated, best : bool
-        True for the stated value, and for that of the best reading.
+        True for the specified value, and for that of the best interpretation.
     excess : float
-        Cost beyond that of the best reading, divided by the factor of the variances.
+        Cost (minus twice the log likelihood) beyond that of the best interpretation, divided by the factor of the
+        variances.
     moved : float or None
-        RMS displacement of the points from the best reading, metres; None if they have no position on the ground.
+        RMS displacement of the points from their positions under the best interpretation, metres; None if they have no
+        position on the ground.
     why : str
         Reason why the value is impossible; empty if it is not.
     """
@@ -129,16 +133,17 @@ class Check:
     readings : PassReadings
         Numbers of the files.
     stated : PassConventions
-        Stated reading.
-    tried : tuple of Tried
-        Readings with a fit, the likeliest first, then those that are impossible.
-    best : Tried
-        Reading with the fewest changes among those that explain the points as well as any.
+        Conventions that the test file specifies.
+    tried : tuple of TriedReading
+        Interpretations with a fit, the likeliest first, then those that are impossible.
+    best : TriedReading
+        Interpretation with the fewest changes among those that explain the points as well as any.
     verdict : Verdict
-        "confirmed" if the stated reading explains the points, "another" if another one does, or "none".
+        "confirmed" if the specified interpretation explains the points, "another" if another one does, or "none".
     factor : float
-        Factor by which the variances are too small: chi-square per degree of freedom of the best reading, at least 1.
-    answers : dict of str to tuple of Answer
+        Factor by which the variances are too small: chi-square per degree of freedom of the best interpretation, at
+        least 1.
+    answers : dict of str to tuple of ValueTest
         Tested values of each convention.
     first_points : dict of str to ndarray
         Rows of the ground points whose positions are listed, by line.
@@ -146,7 +151,7 @@ class Check:
         Ground positions of the first points of each line, ITRS, metres, by changes of one convention; a text says why
         there are none.
     count : int
-        Number of readings that were tried.
+        Number of interpretations that were tried.
     wrong : dict of str to tuple of str
         Names of points that were rejected as gross errors, by line.
     """
@@ -165,15 +170,15 @@ class Check:
     wrong: dict[str, tuple[str, ...]]
 
     def excess(self, tried: TriedReading) -> float:
-        """Return the cost of a reading beyond that of the best one, divided by the factor of the variances.
+        """Return the cost of an interpretation minus that of the best one, divided by the factor of the variances.
 
-        It is infinite for an impossible reading.
+        It is infinite for an impossible interpretation.
         """
         return (tried.cost - self.best.cost) / self.factor
 
     @property
     def equally_likely(self) -> tuple[Changes, ...]:
-        """Equally likely readings with no more changes than the best one, which the points do not separate."""
+        """Interpretations with no more changes than the best one that the points do not separate from it."""
         return tuple(
             tried.changes
             for tried in self.tried
@@ -182,12 +187,12 @@ class Check:
 
     @property
     def stated_fit(self) -> TriedReading:
-        """Stated reading with its fit."""
+        """Interpretation that the test file specifies, with its fit."""
         return next(tried for tried in self.tried if not tried.changes)
 
 
 def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> Check:
-    """Try the readings of a pass; nothing is traced or drawn at random.
+    """Try the interpretations of a pass's files; nothing is traced or drawn at random.
 
     Raises
     ------
@@ -223,7 +228,7 @@ def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Ad
 
 
 def _bench(setup: CheckSetup, readings: PassReadings, stated: PassConventions) -> PassBench:
-    """Return the bench on which readings are tried, with the image points reduced to the test's number."""
+    """Return the object that fits interpretations to the points, with the image points reduced to the test's number."""
     cameras = line_cameras(setup.camera)
     images = {}
     for name, raw in readings.images.items():
@@ -242,7 +247,7 @@ def _bench(setup: CheckSetup, readings: PassReadings, stated: PassConventions) -
 def _best_reading(
     bench: PassBench, stated: PassConventions, others: dict[str, tuple[Any, ...]]
 ) -> tuple[TriedReading, list[TriedReading], int]:
-    """Return the best reading, those that were fitted, and the number of those that were compared."""
+    """Return the best interpretation, those that were fitted, and the number of those that were compared."""
     start: Changes = ()
     fitted: dict[frozenset[str], TriedReading] = {}
     seen: set[frozenset[str]] = set()
@@ -280,7 +285,7 @@ def _rough(bench: PassBench, reading: PassConventions) -> float:
 
 
 def _tried(bench: PassBench, stated: PassConventions, changes: Changes) -> TriedReading:
-    """Fit a reading to the points."""
+    """Fit one interpretation of the files, the specified one with `changes`, to the points."""
     try:
         return TriedReading(changes, bench.fit(changed(stated, changes)))
     except ImpossibleError as error:
@@ -288,7 +293,7 @@ def _tried(bench: PassBench, stated: PassConventions, changes: Changes) -> Tried
 
 
 def _best(tried: Sequence[TriedReading]) -> TriedReading:
-    """Return the reading with the fewest changes among those that are as likely as any."""
+    """Return the interpretation with the fewest changes among those that are as likely as any."""
     least = min(tried, key=lambda reading: reading.cost)
     if least.fit is None:
         return next(reading for reading in tried if not reading.changes)
@@ -312,7 +317,7 @@ def _wrong(bench: PassBench, fit: Fit) -> dict[str, np.ndarray]:
 def _answers(
     bench: PassBench, stated: PassConventions, best: TriedReading, name: str, values: tuple[Any, ...], factor: float
 ) -> tuple[ValueTest, ...]:
-    """Test every value of a convention, with the others as in the best reading."""
+    """Test every value of a convention, with the others as in the best interpretation."""
     convention, reading = TESTED_CONVENTIONS[name], changed(stated, best.changes)
     stated_value, best_value = convention.get(stated), convention.get(reading)
     answers = []
@@ -334,7 +339,7 @@ def _answers(
 
 
 def _shown(others: dict[str, tuple[Any, ...]], best: TriedReading) -> list[Changes]:
-    """Return the readings whose ground positions are listed: stated, best, and those with one change."""
+    """Return the interpretations whose ground positions are listed: specified, best, and those with one change."""
     singles = [((name, value),) for name, values in others.items() for value in values]
     return list(dict.fromkeys([(), best.changes, *singles]))
 
@@ -350,12 +355,12 @@ def _first_places(
 
 
 def exported(run: Check) -> dict[str, str]:
-    """Return a folder of measurements in the project's own conventions, text by path.
+    """Return the files of a folder of measurements in the project's own conventions, path -> text.
 
     Raises
     ------
     InputError
-        The stated conventions were not confirmed.
+        The specified conventions were not confirmed.
     """
     if run.verdict != "confirmed":
         problem = "nothing is exported of a pass whose stated conventions are not confirmed"
@@ -364,7 +369,7 @@ def exported(run: Check) -> dict[str, str]:
 
 
 def measurements(run: Check) -> PassMeasurements:
-    """Return the pass in the project's own conventions, under the stated reading."""
+    """Return the pass in the project's own conventions, converted by the specified interpretation of its files."""
     readings, reading = run.readings, run.stated
     table = platform_table(readings.platform, reading.platform)
     times, images = {}, {}

@@ -1,10 +1,11 @@
-"""Files of a pass, their interpretation under any conventions, and the fit of a reading to ground points.
+"""Files of a pass, their interpretation under any conventions, and the fit of an interpretation to ground points.
 
 Every image point is followed down to the height of its ground point, and the difference of the two in plan is the
 residual. It may come from the image point, from the ground point, and from camera and platform, whose errors are within
-their stated uncertainty: a rotation and a shift of the platform and a shift of the times that all points share, a shift
-and a scale of each line. So the residuals have a covariance with large common parts. A wrong convention whose effect
-looks like one of these errors cannot be detected by the points; one with any other effect is detected at once.
+the uncertainty that the file specifies: a rotation and a shift of the platform and a shift of the times that all points
+share, a shift and a scale of each line. So the residuals have a covariance with large common parts. A wrong convention
+whose effect looks like one of these errors cannot be detected by the points; one with any other effect is detected at
+once.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ _LINES = (
 _AROUND = 120.0
 """Duration of orbit and attitude kept before and after the lines, in seconds: time scales differ by 70 s."""
 _LEAST_AROUND = 12
-"""Least number of readings kept before and after the lines."""
+"""Smallest number of readings kept before and after the lines."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +61,10 @@ class LineClock:
 
     Attributes
     ----------
-    line : (K,) ndarray
+    line : (K,) ndarray for K lines
         Numbers of lines, increasing.
     clock : Readings
-        K readings.
+        K readings of the clock, one for each line.
     """
 
     line: np.ndarray
@@ -72,7 +73,7 @@ class LineClock:
 
 @dataclass(frozen=True)
 class PassConventions:
-    """Conventions of a pass: one reading of its files.
+    """Conventions of a pass: one interpretation of its files.
 
     Attributes
     ----------
@@ -127,12 +128,12 @@ class PassReadings:
 
 
 def read_pass(spec: OrbitCheckSpec, camera: ThreeLineCameraSpec, folder: Path) -> tuple[PassReadings, PassConventions]:
-    """Read the files of a pass, with their stated conventions.
+    """Read the files of a pass, with the conventions that the test file specifies.
 
     Parameters
     ----------
     spec : OrbitCheckSpec
-        The files.
+        Paths of the files, and their conventions.
     camera : ThreeLineCameraSpec
         Payload with the lines.
     folder : Path
@@ -265,7 +266,7 @@ def _gcp_points(
 
 
 def _around(platform: PlatformReadings, lines: Mapping[str, LineClock]) -> PlatformReadings:
-    """Return the part of orbit and attitude that any reading of the line times can need."""
+    """Return the part of orbit and attitude that any interpretation of the line times can need."""
     ends = [(c.clock.day[k], c.clock.second[k]) for c in lines.values() for k in (0, -1)]
     day, second = min(ends)
     last = max((d - day) * 86400.0 + s - second for d, s in ends)
@@ -296,11 +297,11 @@ class TestedConvention:
     title : str
         Name for readers.
     get : callable
-        Function that returns its value in a reading.
+        Function that returns its value in an interpretation (`PassConventions`).
     put : callable
-        Function that returns a reading with another value.
+        Function that returns an interpretation with another value.
     values : callable
-        Function that returns its possible values, for a stated reading.
+        Function that returns its possible values, for the specified interpretation.
     text : callable
         Function that returns a value as text for readers.
     """
@@ -325,7 +326,7 @@ def _convention(title: str, key: str, values: tuple[Any, ...], text: Callable[[A
 
 
 def _turned(c: PassConventions) -> tuple[tuple[str, str, str], ...]:
-    """Return the body's axes as stated, and rotated by 180 degrees about each of them."""
+    """Return the body axes that the file specifies, and these axes rotated by 180 degrees about each of them."""
     a = c.platform.body_axes
     x, y, z = (_TURNED[v] for v in a)
     return a, (a[0], y, z), (x, a[1], z), (x, y, a[2])
@@ -373,12 +374,12 @@ TESTED_CONVENTIONS: Mapping[str, TestedConvention] = FrozenMap(
 
 
 def alternatives(stated: PassConventions, quaternions: bool) -> dict[str, tuple[Any, ...]]:
-    """Return the values of each convention other than the stated one; conventions that do not apply are left out.
+    """Return the values of each convention other than the specified one, without conventions that do not apply.
 
     Parameters
     ----------
     stated : PassConventions
-        Stated reading.
+        Specified interpretation of the files.
     quaternions : bool
         True if the attitude is quaternions, False if it is angles.
     """
@@ -393,7 +394,7 @@ def alternatives(stated: PassConventions, quaternions: bool) -> dict[str, tuple[
 
 
 Changes = tuple[tuple[str, Any], ...]
-"""Conventions with another value than the stated one."""
+"""Conventions whose value differs from the specified one: pairs of the convention's name and its value."""
 
 
 def singles_and_pairs(others: Mapping[str, tuple[Any, ...]], start: Changes = ()) -> Iterator[Changes]:
@@ -402,7 +403,7 @@ def singles_and_pairs(others: Mapping[str, tuple[Any, ...]], start: Changes = ()
     Parameters
     ----------
     others : mapping of str to tuple
-        Values of each convention other than the stated one.
+        Values of each convention other than the specified one.
     start : Changes
         Changes that all of them have.
     """
@@ -418,7 +419,7 @@ def singles_and_pairs(others: Mapping[str, tuple[Any, ...]], start: Changes = ()
 
 
 def changed(stated: PassConventions, changes: Changes) -> PassConventions:
-    """Return the reading with these changes."""
+    """Return the specified interpretation of the files with these changes."""
     for name, value in changes:
         stated = TESTED_CONVENTIONS[name].put(stated, value)
     return stated
@@ -431,12 +432,12 @@ _TICKS = 1000
 
 
 class ImpossibleError(ValueError):
-    """Error of a reading under which the points cannot have been imaged; the text says why."""
+    """Error of an interpretation under which the points cannot have been imaged; the text says why."""
 
 
 @dataclass(frozen=True, eq=False)
 class _PerturbedPlatform:
-    """Platform with a small rotation and shift for each of some times."""
+    """Platform with a small rotation and shift added at each of a number of times."""
 
     path: TabulatedTrajectory
     turn: np.ndarray | None = None
@@ -457,11 +458,11 @@ class _PerturbedPlatform:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Fit of a reading to the ground points.
+    """Fit of one interpretation of the files to the ground points.
 
     Attributes
     ----------
-    residual : (n, 2) ndarray
+    residual : (n, 2) ndarray for n image points
         Residuals east and north, metres.
     rms : float
         RMS of both together, metres.
@@ -491,7 +492,7 @@ class Fit:
 
 @dataclass(eq=False)
 class PassBench:
-    """Bench that tries readings on a pass.
+    """Files of a pass with its cameras, which tries interpretations (readings) of the files.
 
     Attributes
     ----------
@@ -515,7 +516,7 @@ class PassBench:
     _paths: dict[Conventions, TabulatedTrajectory | ImpossibleError] = field(default_factory=dict)
 
     def without(self, wrong: Mapping[str, np.ndarray]) -> PassBench:
-        """Return the bench without wrong image points, given as a mask (n,) for each line."""
+        """Return this object without the wrong image points, given as a mask (n,) for the n points of each line."""
         images = {name: raw.taken(~wrong[name]) for name, raw in self.readings.images.items()}
         remaining = {name: raw for name, raw in images.items() if len(raw.line)}
         return replace(self, readings=replace(self.readings, images=remaining), _paths=self._paths)
@@ -541,12 +542,12 @@ class PassBench:
             return ImpossibleError(error.issues[0].problem)
 
     def places(self, reading: PassConventions, most: int | None = None) -> dict[str, np.ndarray]:
-        """Return the ground positions of image points by line, ITRS, (n, 3), in metres.
+        """Return the ground positions of image points by line, ITRS, (n, 3) for n points, in metres.
 
         Parameters
         ----------
         reading : PassConventions
-            The reading.
+            Interpretation of the files.
         most : int or None
             Largest number of points of each line, spread over them; None for all.
 
@@ -562,7 +563,20 @@ class PassBench:
         return places
 
     def residuals(self, reading: PassConventions, most: int | None = None) -> np.ndarray:
-        """Return the residuals of all lines, east and north, (n, 2), in metres; arguments and errors as `places`."""
+        """Return the residuals of the image points of all lines, east and north, (n, 2) for n points, in metres.
+
+        Parameters
+        ----------
+        reading : PassConventions
+            Interpretation of the files.
+        most : int or None
+            Largest number of points of each line, spread over them; None for all.
+
+        Raises
+        ------
+        ImpossibleError
+            The points have no position on the ground.
+        """
         known, residuals = self.readings.ground.points.itrs, []
         for name, at in self.places(reading, most).items():
             point = self.readings.images[name].point
@@ -570,7 +584,7 @@ class PassBench:
         return np.concatenate(residuals)
 
     def fit(self, reading: PassConventions) -> Fit:
-        """Fit a reading to the ground points, or raise ImpossibleError."""
+        """Fit one interpretation of the files to the ground points, or raise ImpossibleError."""
         path, rows, common, noise, sizes = self.path(reading.platform), [], [], [], []
         size = self.uncertainty
         line_terms: list[np.ndarray] = []
@@ -667,14 +681,14 @@ class PassBench:
 def line_times(
     clock: LineClock, reading: PassConventions, epoch: str, line: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return middles of the exposures of lines and the time from one line to the next, in seconds, (n,) each.
+    """Return the middle of each line's exposure and the time to the next line, in seconds, (n,) each for n lines.
 
     Parameters
     ----------
     clock : LineClock
-        Readings at lines.
+        Clock readings at numbered lines.
     reading : PassConventions
-        The reading.
+        Interpretation of the files.
     epoch : str
         Zero of the times, UTC.
     line : (n,) ndarray
@@ -734,7 +748,7 @@ def _ground_noise(known: Any, point: np.ndarray, rise: np.ndarray) -> np.ndarray
 def _covariance(
     noise: list[np.ndarray], common: list[np.ndarray], line_terms: list[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the covariance of all residuals, and the part of it that they share, (2n, 2n) each, in m^2."""
+    """Return the covariance of all residuals of n points, and its part common to points, (2n, 2n) each, in m^2."""
     common_terms = np.concatenate(common).reshape(-1, common[0].shape[-1])
     shared = common_terms @ common_terms.T
     start = 0

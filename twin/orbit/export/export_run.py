@@ -4,7 +4,7 @@ The lines come from a simulated pass or a test in orbit. Camera and trajectory a
 one, as the user of the images knows them, or, on request, the true ones. An instrument's cameras can be those that its
 monitor has estimated in orbit. The scene of a DIMAP file has the rigorous model of that file.
 
-The quality of exported models comprises their errors on the ground by the uncertainty of camera and trajectory, the
+The quality of exported models comprises their errors on the ground due to the uncertainty of camera and trajectory, the
 correction of the polynomials by control points, and the difference of a product's own polynomials from its rigorous
 model.
 """
@@ -165,7 +165,7 @@ def read_control(path: Path, kind: Kind) -> ControlPoints:
 
 
 READS = ("orbit_simulate", "orbit_angle")
-"""Kinds of files that define a camera and its trajectory."""
+"""Kinds of test files from which an export can read a camera and its trajectory."""
 _PAYLOAD_HINT = "a payload has no orbit: the YAML file of a simulation or of a test of angles that names it"
 
 
@@ -303,14 +303,14 @@ class Export:
 
 
 def read_exportable(path: Path, seed: int | None = None, band: str | None = None) -> ExportSource | SceneSource:
-    """Read a source that has a camera and its trajectory: those of `read_source`, or the DIMAP file of a scene.
+    """Read a source of lines to export: a run folder or YAML file, or the DIMAP file of a scene.
 
     Parameters
     ----------
     path : Path
         Path of the file or run folder.
     seed : int, optional
-        Seed in place of the file's.
+        Seed instead of the file's.
     band : str, optional
         Band of a scene whose bands have different lines of sight.
 
@@ -330,7 +330,7 @@ def read_exportable(path: Path, seed: int | None = None, band: str | None = None
 
 
 def band_error(path: Path, band: str) -> InputError:
-    """Return the error for a band requested of a source without bands."""
+    """Return the error that reports a band requested from a source without bands."""
     return InputError(Issue("only the scene of a DIMAP file has bands", str(path), None, ("band",), band))
 
 
@@ -346,7 +346,7 @@ def read_source(path: Path, seed: int | None = None) -> ExportSource:
     path : Path
         Path of the file or run folder.
     seed : int, optional
-        Seed in place of the file's.
+        Seed instead of the file's.
 
     Raises
     ------

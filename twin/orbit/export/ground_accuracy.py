@@ -1,4 +1,4 @@
-"""Errors on the ground by errors of camera, orbit and attitude: covariances of points over a scene, CE90 and LE90.
+"""Errors on the ground due to errors of camera, orbit and attitude: covariances of points over a scene, CE90 and LE90.
 
 The rigorous sensor computes where pixels see the ground after each error is changed by a small step; these derivatives
 propagate the covariances to the ground. A point of one line has a height from another source. A point that several
@@ -7,8 +7,8 @@ attitude are those of the pass, which its lines share, and each line has its own
 
 `ground_sigma` propagates the uncertainty of a camera's change that was estimated in orbit. On the ground it is the
 error of the exported models, which rational polynomials state as ERR_BIAS and ERR_RAND. A line is corrected by the
-estimate; the derivatives by the four numbers of the change take the covariance of the estimate's error to the
-horizontal plane of each point.
+estimate; the derivatives with respect to the four numbers of the change take the covariance of the estimate's error to
+the horizontal plane of each point.
 """
 
 from __future__ import annotations
@@ -30,13 +30,14 @@ from twin.orbit.flight.sensor import OffsetPlatform, Sensor
 _GRID = (13, 13)
 """Lines and pixels of an image at which errors are computed; they are smooth."""
 _MOVED = 1.0
-"""Step of the derivatives by position, in metres."""
+"""Step of the derivatives with respect to position, in metres."""
 _TURNED = 1e-6
-"""Step of the derivatives by rotation, in radians: metres on the ground, over which it is linear to 1e-6."""
+"""Step of the derivatives with respect to rotation, in radians: metres on the ground, over which it is linear to 1e-6.
+"""
 _RAISED = 10.0
-"""Step of the derivatives by height, in metres."""
+"""Step of the derivatives with respect to height, in metres."""
 _EDGE = 0.5
-"""Half step of the derivatives by line and pixel, in pixels."""
+"""Half step of the derivatives with respect to line and pixel, in pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +72,7 @@ class CameraUncertainty:
         image: float = 0.0,
         height: float = 0.0,
     ) -> CameraUncertainty:
-        """Return independent errors, equal along and about all axes.
+        """Return the covariances of independent errors that are equal along, and about, all axes.
 
         Parameters
         ----------
@@ -80,7 +81,7 @@ class CameraUncertainty:
         attitude : float
             Standard deviation about each axis, in radians.
         interior : float
-            Standard deviation of line and pixel by the interior orientation, in pixels.
+            Standard deviation of line and pixel due to the interior orientation, in pixels.
         scale : float
             Relative standard deviation of the principal distance.
         image : float
@@ -98,7 +99,7 @@ class AccuracyMap:
 
     Attributes
     ----------
-    line, pixel : (N,) ndarray
+    line, pixel : (N,) ndarray for N grid points
         Image positions of the grid.
     longitude, latitude : (N,) ndarray
         Ground positions, in radians; NaN where a line of sight misses the Earth or fewer than two of several lines see
@@ -110,8 +111,8 @@ class AccuracyMap:
     random : (N, 3, 3) ndarray
         Covariance of the errors that are independent from point to point, those of measured image positions, in m^2.
     heights : (N, 3, 3) ndarray
-        Covariance by the heights that points of one line have from another source, which also move them in plan, in
-        m^2.
+        Covariance due to errors of the heights that points of one line have from another source, which also move them
+        in plan, in m^2.
     shape : tuple of int
         Shape of the grid.
     """
@@ -161,18 +162,18 @@ class AccuracyMap:
 
 @dataclass(frozen=True, eq=False)
 class _Derivatives:
-    """Derivatives of the ground position east and north, in metres, that pixels (N,) see at a height.
+    """Derivatives of the ground positions, east and north, in metres, that N pixels see at a height.
 
     Attributes
     ----------
     image : (N, 2, 2) ndarray
-        Derivatives by line and pixel.
+        Derivatives with respect to line and pixel, in m per pixel.
     platform : (N, 2, 6) ndarray
-        Derivatives by the errors of the platform.
+        Derivatives with respect to position (m/m) and rotation (m/rad) of the platform.
     interior : (N, 2, 3) ndarray
-        Derivatives by the errors of the interior orientation.
+        Derivatives with respect to line and pixel (m per pixel) and the relative principal distance (m).
     height : (N, 2) ndarray
-        Derivatives by the height.
+        Derivatives with respect to the height, in m/m.
     """
 
     image: Array
@@ -326,7 +327,7 @@ def _places(sensor: Sensor, line: Array, pixel: Array, height: float) -> tuple[A
 
 
 def _propagate(rows: Array, covariance: ArrayLike) -> Array:
-    """Return the (N, K, K) covariances propagated through derivatives (N, K, P)."""
+    """Return (N, K, K) covariances of K quantities at N points, propagated through derivatives (N, K, P) by P errors."""
     return np.asarray(rows @ np.asarray(covariance) @ np.swapaxes(rows, 1, 2))
 
 
@@ -374,7 +375,7 @@ _STEPS = (1e-7, 1e-7, 1e-7, 1e-6)
 while its coordinates are rounded to 1e-9 m.
 """
 _CHANGE_GRID = (3, 9)
-"""Lines and pixels of an image at which errors by a camera's change are computed; they are smooth along a line and
+"""Lines and pixels of an image at which errors due to a camera's change are computed; they are smooth along a line and
 hardly change along the track.
 """
 
@@ -386,7 +387,7 @@ class EstimatedChange:
     Attributes
     ----------
     values : (4,) ndarray
-        d_alpha, d_beta, d_gamma (rad) and d_f (m).
+        Rotations d_alpha, d_beta, d_gamma (rad) and change d_f of the principal distance (m).
     constant : (4, 4) ndarray
         Covariance of the part of their error that persists from image to image.
     random : (4, 4) ndarray
@@ -403,7 +404,7 @@ class EstimatedChange:
 
 @dataclass(frozen=True)
 class GroundSigma:
-    """Horizontal error on the ground of points of known height, by a camera's estimated change alone.
+    """Horizontal error on the ground of points of known height, due to the error of a camera's estimated change alone.
 
     Orbit and attitude do not contribute. Values are root mean squares over the image.
 
@@ -431,9 +432,10 @@ class GroundSigma:
 
 
 def ground_rows(sensor: Sensor, calibrated: CalibratedLine, values: Array, height: float) -> Array:
-    """Return the derivatives (N, 2, 4) of the ground position, east and north, by a camera's change.
+    """Return the derivatives of the ground position, east and north, with respect to the camera's change, (N, 2, 4).
 
-    They are in metres per rad, and per metre of principal distance, on a grid over the image.
+    For each of N points of a grid over the image: in metres per radian for d_alpha, d_beta and d_gamma, and in metres
+    per metre for the principal distance d_f.
 
     Parameters
     ----------
