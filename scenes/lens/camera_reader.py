@@ -268,7 +268,7 @@ def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) ->
 
 
 def _round_field(lens: Prescription) -> Prescription:
-    """Return the prescription with a round field in place of one whose corners are fully vignetted.
+    """Return the prescription with a round field instead of one whose corners are fully vignetted.
 
     Raises
     ------

@@ -342,7 +342,7 @@ def read_codev(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
     ----------
     path : str or Path
         Path of the file, in UTF-8, UTF-16 or ISO 8859-1.
-    glasses : Glasses
+    glasses : Mapping[str, callable]
         Glasses that its surfaces may name.
 
     Raises

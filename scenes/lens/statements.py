@@ -243,7 +243,7 @@ def index_of(source: Source, glasses: Glasses, name: str, wavelength: float, lin
     ----------
     source : Source
         The file.
-    glasses : Glasses
+    glasses : Mapping[str, callable]
         Known glasses.
     name : str
         Name of the glass in the file.

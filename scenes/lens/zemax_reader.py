@@ -114,7 +114,7 @@ def read_zemax(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
     ----------
     path : str or Path
         Path of the file, in UTF-16 of either order, UTF-8 or ISO 8859-1.
-    glasses : Glasses
+    glasses : Mapping[str, callable]
         Glasses that its surfaces may name.
 
     Raises

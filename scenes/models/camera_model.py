@@ -52,14 +52,14 @@ from scenes.yaml.errors import InputError, KeyPath, key_text
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 
 LARGEST_DIFFERENCE = 0.1
-"""Largest relative difference allowed between the traced and the stated focal length. The library's cameras need 0.5 %
-along the line and 8 % across it; a wrong sign or unit seldom causes less than a third.
+"""Largest relative difference allowed between the traced and the specified focal length. The library's cameras need 0.5
+% along the line and 8 % across it; a wrong sign or unit seldom causes less than a third.
 """
 
 LARGEST_PUPIL_DIFFERENCE = 0.4
-"""Largest relative difference allowed between the traced and the stated entrance pupil where the file states the stop's
-diameter as well. In off-axis cameras the pupil on the axis differs by up to some 10 % from that of the middle of the
-field; the smallest mistake, a radius in place of a diameter, is a factor of two.
+"""Largest relative difference allowed between the traced and the specified entrance pupil where the file states the
+stop's diameter as well. In off-axis cameras the pupil on the axis differs by up to some 10 % from that of the middle
+of the field; the smallest mistake, a radius instead of a diameter, is a factor of two.
 """
 
 SAME_PUPIL = 0.01
@@ -96,7 +96,7 @@ _NO_LIGHT = (AimError, BeamMissedError, ArithmeticError, np.linalg.LinAlgError, 
 
 
 def check_focal_length(spec: CameraSpec, traced: TracedFocalLengths, focal_lengths: FocalLengths) -> None:
-    """Raise InputError if the stated focal length differs from the traced one.
+    """Raise InputError if the specified focal length differs from the traced one.
 
     Agreement in one of the two directions is enough, since cameras with off-axis surfaces differ in them. A camera that
     is merely out of focus passes, because it can be refocused, unless a single wrong number explains the difference.
@@ -114,7 +114,7 @@ def check_focal_length(spec: CameraSpec, traced: TracedFocalLengths, focal_lengt
     ------
     InputError
         The two differ by more than ``LARGEST_DIFFERENCE``. The error names the number whose other sign or unit brings
-        the focal length to the stated one, where there is one.
+        the focal length to the specified one, where there is one.
     """
     stated, real = spec.focal_length, bool(np.all(traced.light > 0.0))
     in_place, in_focus = (_difference(np.abs(one), stated) <= LARGEST_DIFFERENCE for one in traced)
@@ -130,14 +130,14 @@ def check_focal_length(spec: CameraSpec, traced: TracedFocalLengths, focal_lengt
 
 
 def check_entrance_pupil(spec: CameraSpec, traced: float) -> None:
-    """Raise InputError if the stated entrance pupil differs from the traced diameter, in metres.
+    """Raise InputError if the specified entrance pupil differs from the traced diameter, in metres.
 
     Raises
     ------
     InputError
         The two differ by more than ``LARGEST_PUPIL_DIFFERENCE`` where the file states the stop's diameter. Without a
-        stated stop: they differ by more than ``SAME_PUPIL``, because other rays than those of the stated beam meet the
-        rim of the stop.
+        specified stop: they differ by more than ``SAME_PUPIL``, because other rays than those of the specified beam
+        meet the rim of the stop.
     """
     off = abs(traced / spec.entrance_pupil - 1.0)
     if spec.stop_diameter is None and off > SAME_PUPIL:
@@ -153,7 +153,7 @@ def check_entrance_pupil(spec: CameraSpec, traced: float) -> None:
 
 
 def _difference(traced: np.ndarray, stated: float) -> float:
-    """Return the relative difference from the stated focal length in the direction that is nearer to it."""
+    """Return the relative difference from the specified focal length in the direction that is nearer to it."""
     return float(np.min(np.abs(traced / stated - 1.0)))
 
 
@@ -294,7 +294,7 @@ def find_axis(
 ) -> tuple[CameraAxis, float]:
     """Return the axis of a camera and the radius of its stop, in metres.
 
-    The stop is as large as the file states. Without a stated diameter, rays along the axis that fill the diameter of
+    The stop is as large as the file states. Without a specified diameter, rays along the axis that fill the diameter of
     the entrance pupil before the first surface are traced to the stop, and the area that they enclose there is the
     stop's.
 
@@ -730,14 +730,14 @@ def derive_camera(spec: CameraSpec, backend: Backend, check_stated: bool = True)
     backend : Backend
         Backend that traces the rays.
     check_stated : bool
-        Whether the stated focal length is compared with the traced one; False while a file is made, whose focal length
-        follows from the trace.
+        Whether the specified focal length is compared with the traced one; False while a file is made, whose focal
+        length follows from the trace.
 
     Raises
     ------
     InputError
         The prescription does not bring the light of its field through the stop to the image, or its focal length
-        differs from the stated one.
+        differs from the specified one.
     """
     try:
         return _derived(spec, backend, check_stated)

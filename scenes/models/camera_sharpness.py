@@ -1,7 +1,7 @@
 """Sharpness of a camera as designed, from a few hundred rays, and the position of its best focal plane.
 
 Wavefront errors follow ``optics.waves.imaging``: rms over the stop about the sphere centred on the chief ray's image,
-piston and tilt removed, in waves of the camera's design wavelength. The best focal plane has the least mean square
+piston and tilt removed, in waves of the camera's design wavelength. The best focal plane has the smallest mean square
 error over the field.
 """
 
@@ -79,7 +79,7 @@ class FocalPlane:
 
 
 MIN_ILLUMINATED = 20
-"""Least number of the ``EVEN`` rays that must pass a field's edges; with fewer, two in a thousand, no error is
+"""Smallest number of the ``EVEN`` rays that must pass a field's edges; with fewer, two in a thousand, no error is
 computed.
 """
 
@@ -125,9 +125,9 @@ class FieldBeams:
     path : (F, 1 + N) ndarray
         Optical path from the incoming wavefront, in metres.
     exit_pupil : float
-        Distance from the stated image plane upstream to the exit pupil, in metres.
+        Distance from the specified image plane upstream to the exit pupil, in metres.
     room : (F,) ndarray
-        Distance from the last mirror along the chief ray to the stated image plane, in metres.
+        Distance from the last mirror along the chief ray to the specified image plane, in metres.
     illuminated : (F, N) ndarray of bool or None
         Rays that are not vignetted; None if none is.
     """
@@ -220,7 +220,7 @@ class FieldBeams:
         rings: int,
         cut: Cut | None = None,
     ) -> np.ndarray:
-        """Return the rms wavefront errors at many fields (F, 2) on the stated image plane, (F,), in waves.
+        """Return the rms wavefront errors at many fields (F, 2) on the specified image plane, (F,), in waves.
 
         Exceptions are those of ``trace``.
         """
@@ -239,7 +239,7 @@ class FieldBeams:
         return np.asarray(share / np.sum(share, axis=-1, keepdims=True))
 
     def _away(self, plane: FocalPlane) -> np.ndarray:
-        """Return the distance from the stated image plane along each ray to another plane, (F, 1 + N), in metres."""
+        """Return the distance from the specified image plane along each ray to another plane, (F, 1 + N), in metres."""
         point = np.array([0.0, 0.0, plane.z])
         normal = np.array([0.0, -np.sin(plane.tilt), np.cos(plane.tilt)])
         return np.asarray(((point - self.position) @ normal) / (self.direction @ normal))
@@ -268,7 +268,7 @@ class FieldBeams:
         return np.asarray(np.sqrt(squares @ self.nodes.share))
 
     def best_plane(self, tilt: bool = False) -> FocalPlane:
-        """Return the plane (shifted, and tilted about x if ``tilt`` is set) with the least mean square error."""
+        """Return the plane (shifted, and tilted about x if ``tilt`` is set) with the smallest mean square error."""
         start, root = FocalPlane.of(self.camera), np.sqrt(self.share / len(self.fields))
         middle = float(np.mean(self.position[:, 0, 1]))
 

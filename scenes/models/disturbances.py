@@ -173,7 +173,7 @@ class DisturbancePrior:
 
         Parameters
         ----------
-        rng : np.random.Generator
+        rng : Generator
             Generator of the random numbers.
         count : int
             Number of states.
@@ -579,7 +579,7 @@ def _first_impossible(cause: CauseSpec, known: Mapping[str, int]) -> int:
 
 
 def _least(matrix: np.ndarray) -> float:
-    """Return the least eigenvalue of a symmetric matrix; 0 for an empty one."""
+    """Return the smallest eigenvalue of a symmetric matrix; 0 for an empty one."""
     return float(np.linalg.eigvalsh(matrix)[0]) if len(matrix) else 0.0
 
 
@@ -615,7 +615,7 @@ def drawn_course(law: TimeLawSpec, seconds: Array, rng: np.random.Generator, cou
         Law of time of all courses. A jump has no effect here: its times are drawn per body.
     seconds : (T,) ndarray
         Increasing times, in seconds.
-    rng : np.random.Generator
+    rng : Generator
         Generator of the random numbers.
     count : int
         Number of courses.

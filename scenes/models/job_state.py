@@ -41,7 +41,8 @@ aluminium expands by 2 nm.
 ROUNDING = 1e-9
 """Residual of a field, in kelvin, below which it is zero."""
 LEAST_INSIDE = 0.5
-"""Least fraction of the body's volume that the nodes must cover; with less they belong to another body, frame or unit.
+"""Smallest fraction of the body's volume that the nodes must cover; with less they belong to another body, frame or
+unit.
 """
 SHOWN_OUTSIDE = 1e-3
 """Fraction of the body's volume outside the nodes above which a warning is given."""

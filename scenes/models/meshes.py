@@ -21,7 +21,7 @@ GRID = 24
 """Cells across a mirror: the mesh departs from the surface by less than a millimetre."""
 
 THICKNESS = 0.08
-"""Least thickness of a mirror behind its surface, as a fraction of its longer side."""
+"""Smallest thickness of a mirror behind its surface, as a fraction of its longer side."""
 
 BOARD = 0.010
 """Thickness of the focal plane's board, in metres; it stands behind the detectors."""

@@ -221,7 +221,7 @@ def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> instruments.Instrum
     ----------
     setup : MonitorDesignSetup
         The design.
-    beams : Layout
+    beams : tuple[Beam, ...]
         Beams, each of which becomes a channel at both ends of both lines: ``left`` and ``right``, ``left_2`` and
         ``right_2``.
     """
@@ -315,7 +315,7 @@ def changed_beam(setup: MonitorDesignSetup, beam: Beam, step: float, rng: np.ran
         Beam to change.
     step : float
         Standard deviation of the change of each number, relative to its range; numbers are reflected at the ends of it.
-    rng : np.random.Generator
+    rng : Generator
         Generator of the random numbers. About half of the numbers stay, so that changes of single ones are tried, too.
     """
     numbers = {}
@@ -366,7 +366,7 @@ class ImagingBeams:
 
     Attributes
     ----------
-    segments : Mapping[str, Sequence[np.ndarray]]
+    segments : Mapping[str, Sequence[ndarray]]
         Camera -> rays to both ends and the middle of the line, three of (RAYS, K, 2, 3), in the base frame, in metres.
     """
 
@@ -390,5 +390,6 @@ class ImagingBeams:
 
 
 def pupil_share(taken: np.ndarray) -> float:
-    """Return the largest blocked share of a camera's pupil along its line, from the mask of ``ImagingBeams.taken``."""
+    """Return the largest blocked fraction of a camera's pupil along its line, from the mask of ``ImagingBeams.taken``.
+    """
     return float(taken.mean(axis=-1).max())

@@ -1,8 +1,8 @@
 """Bodies that block light, and bodies that overlap: clearances of an instrument.
 
-Obstruction. A 180-deg prism stands in front of its camera, since its channel uses a part of the pupil; the share of the
-imaging beam that it blocks is reported, with the part of it that its channel uses. A monitor beam has to reach its area
-CCD whole: an instrument in which a body or the edge of a clear aperture vignettes one is refused.
+Obstruction. A 180-deg prism stands in front of its camera, since its channel uses a part of the pupil; the fraction of
+the imaging beam that it blocks is reported, with the part of it that its channel uses. A monitor beam has to reach its
+area CCD whole: an instrument in which a body or the edge of a clear aperture vignettes one is refused.
 
 Overlap. Prisms, mirrors and focal-plane boards are convex bodies. Two of them overlap where their Minkowski difference
 contains the origin; its depth is the distance by which one of them has to move. Parts of one camera are not compared
@@ -194,7 +194,7 @@ class Clearances:
     ----------
     paths : tuple[str, ...]
         Paths of the bodies.
-    corners : tuple[np.ndarray, ...]
+    corners : tuple[ndarray, ...]
         Corners of each body in its own frame, (P, 3), in metres.
     poses : tuple[Pose, ...]
         Nominal pose of each body.
@@ -393,7 +393,7 @@ class Obstruction:
     beam : str
         Name of the beam, such as ``forward/imaging`` or ``forward/left``.
     share : float
-        Blocked share of the beam's cross-section; for imaging the largest along the line.
+        Blocked fraction of the beam's cross-section; for imaging the largest along the line.
     used : float
         Part of ``share`` that the clear aperture of the prism's own channel uses; 0 for beams of other channels.
     """

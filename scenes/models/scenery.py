@@ -442,7 +442,7 @@ def measured_finishes(resolved: ResolvedJob) -> MeasuredFinishes | None:
 def _finish(
     base: Finish, spec: FinishSpec, kind: str, scatter: MeasuredScatter | None, coating: CoatingTable | None
 ) -> Finish:
-    """Return a built-in finish with measured values in place of its own."""
+    """Return a built-in finish with measured values instead of its own."""
     if kind == "black":
         assert scatter is not None
         return Finish(table=scatter.table, scattered_only=True)

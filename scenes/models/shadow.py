@@ -94,7 +94,8 @@ class Shadows:
     areas : (B, K) ndarray
         Area of each piece within the disk.
     known : Mapping[str, np.ndarray] or None
-        Name -> blocked share of the stop's area, (B,), where the pieces alone do not determine it; None where they do.
+        Name -> blocked fraction of the stop's area, (B,), where the pieces alone do not determine it; None where they
+        do.
     """
 
     pieces: np.ndarray
@@ -140,7 +141,7 @@ class Shadows:
         return replace(whole, known={**bodies, name: np.maximum(rest, 0.0)})
 
     def shares(self) -> dict[str, np.ndarray]:
-        """Return the share of the stop's area that each body blocks, (B,)."""
+        """Return the fraction of the stop's area that each body blocks, (B,)."""
         if self.known is not None:
             return dict(self.known)
         out: dict[str, np.ndarray] = {}

@@ -53,7 +53,7 @@ class ReadingsSpec(Spec):
 
     Attributes
     ----------
-    after : Name | None
+    after : str | None
         Last one of `moves` that had been made before this measurement; by default no move.
     """
 
@@ -70,29 +70,29 @@ class WavefrontReadingsSpec(ReadingsSpec):
 
     Attributes
     ----------
-    fields : Fields
-        Fields as shares of the half field, [along the line, along the track].
-    terms : tuple[Text, Text]
+    fields : tuple[tuple[float, float], ...]
+        Fields as fractions of the half field, [along the line, along the track].
+    terms : tuple[str, str]
         First and last Zernike term (Noll) that are used, `[Z4, Z11]`.
-    sigma : Sigma
+    sigma : float
         Standard deviation of the noise of each coefficient, rms, in metres.
-    common : Common
+    common : float
         Standard deviation of an error of each term that is the same at all fields, such as that of a reference surface,
         in metres.
-    focus : Focus
+    focus : float | 'free'
         Standard deviation of the position of the interferometer's focus along the light at each field, in metres;
         `free`, the default, if it is unknown.
-    zernikes : Reference | None
+    zernikes : str | None
         CSV file with the coefficients of every field.
-    maps : tuple[Reference, ...] | None
+    maps : tuple[str, ...] | None
         Files of wavefront maps, one for each field: Zygo .dat or .datx, CODE V INT, Zemax grid sag, FITS.
-    double_pass : Flag
+    double_pass : bool
         True if the light passed the camera twice, so that maps or coefficients show twice the error.
-    reference : Reference | None
+    reference : str | None
         Map or CSV file of the reference surface's error, which is subtracted; none by default.
-    orientation : Text
+    orientation : str
         Rotation or reflection that brings maps and coefficients to the stop's axes, in the words of `check`.
-    sign : Literal[1, -1]
+    sign : {1, -1}
         Sign convention of the file; -1 if an advanced wavefront is counted as negative.
     """
 
@@ -139,16 +139,16 @@ class FocusReadingsSpec(ReadingsSpec):
 
     Attributes
     ----------
-    fields : Fields | None
-        Fields as shares of the half field, [along the line, along the track].
-    values : Places | None
+    fields : tuple[tuple[float, float], ...] | None
+        Fields as fractions of the half field, [along the line, along the track].
+    values : tuple[float, ...] | None
         Position of best focus at each field, downstream of the line CCD, in metres.
-    sigma : Sigma
+    sigma : float
         Standard deviation of each position, in metres.
-    common : Common
+    common : float
         Standard deviation of an error that all positions have in common, in metres.
-    file : Reference | None
-        Result `focus.json` of a run of `twin.lab focus`, in place of fields and values.
+    file : str | None
+        Result `focus.json` of a run of `twin.lab focus`, instead of fields and values.
     """
 
     fields: Fields | None = None
@@ -174,15 +174,15 @@ class MtfReadingsSpec(ReadingsSpec):
 
     Attributes
     ----------
-    fields : Fields
-        Fields as shares of the half field, [along the line, along the track].
-    frequency : Number | None
+    fields : tuple[tuple[float, float], ...]
+        Fields as fractions of the half field, [along the line, along the track].
+    frequency : float | None
         Spatial frequency, in cycles per mm; by default the Nyquist frequency of the pixels.
-    along_line : tuple[Modulation, ...] | None
+    along_line : tuple[float, ...] | None
         MTF at each field for a pattern of lines perpendicular to the line CCD.
-    along_track : tuple[Modulation, ...] | None
+    along_track : tuple[float, ...] | None
         MTF at each field for a pattern of lines parallel to the line CCD.
-    sigma : Number
+    sigma : float
         Standard deviation of each MTF value.
     """
 
@@ -213,11 +213,11 @@ class DistortionReadingsSpec(ReadingsSpec):
 
     Attributes
     ----------
-    fields : tuple[FieldShare, ...] | None
-        Fields of the images as shares of half the line, for simulated data.
-    sigma : Sigma | None
+    fields : tuple[float, ...] | None
+        Fields of the images as fractions of half the line, for simulated data.
+    sigma : float | None
         Standard deviation of a position, in metres; by default that of the file.
-    file : Reference | None
+    file : str | None
         Result `distortion.json` of a run of `twin.lab distortion`.
     """
 
@@ -243,12 +243,12 @@ class SpotReadingsSpec(ReadingsSpec):
 
     Attributes
     ----------
-    sigma : Number
+    sigma : float
         Standard deviation of each coordinate, in pixels.
-    file : Reference | None
+    file : str | None
         Result `recovered.json` of a run of `twin.recover`, or a CSV file of the positions with the columns camera,
         channel, row_px, column_px.
-    state : Literal['before', 'after']
+    state : {'before', 'after'}
         Set of spots in `recovered.json` that is used: those recorded before or after the change.
     """
 
@@ -267,17 +267,17 @@ class SightReadingsSpec(ReadingsSpec):
 
     Attributes
     ----------
-    alpha, beta : Turn | None
+    alpha, beta : float | None
         Rotation of the line of sight about the camera's Y (alpha) or X (beta), in radians.
-    gamma : Turn | None
+    gamma : float | None
         Roll of the line about the line of sight, in radians.
-    principal_distance : Place | None
+    principal_distance : float | None
         Change of the principal distance, in metres.
-    sigma_alpha, sigma_beta, sigma_gamma : AngleSigma | None
+    sigma_alpha, sigma_beta, sigma_gamma : float | None
         Standard deviation of this angle, in radians; omitted for an angle that is not measured.
-    sigma_principal_distance : Sigma | None
+    sigma_principal_distance : float | None
         Standard deviation of the principal distance, in metres; omitted if it is not measured.
-    correlation : tuple[tuple[Number, ...], ...] | None
+    correlation : tuple[tuple[float, ...], ...] | None
         Correlation matrix of the measured quantities in this order; by default they are uncorrelated.
     """
 
@@ -322,11 +322,11 @@ class TemperatureReadingsSpec(ReadingsSpec):
 
     Attributes
     ----------
-    bodies : tuple[Text, ...]
+    bodies : tuple[str, ...]
         Paths or short names of the bodies.
-    values : tuple[Warmth, ...] | None
+    values : tuple[float, ...] | None
         Temperature difference of each body, in kelvin.
-    sigma : WarmthSigma
+    sigma : float
         Standard deviation of each temperature, in kelvin.
     common : float
         Standard deviation of an error that all temperatures have in common, in kelvin.
@@ -353,13 +353,13 @@ class PositionReadingsSpec(ReadingsSpec):
 
     Attributes
     ----------
-    bodies : tuple[Text, ...]
+    bodies : tuple[str, ...]
         Paths or short names of the bodies.
-    values : tuple[Place3, ...] | None
+    values : tuple[tuple[float, float, float], ...] | None
         Displacement of each body in the axes of the instrument's base, in metres.
-    sigma : Sigma
+    sigma : float
         Standard deviation of each coordinate, in metres.
-    frame : Literal['free', 'base']
+    frame : {'free', 'base'}
         Reference frame of the measuring machine: `base` for the instrument's base, or `free` for one with an unknown
         shift and rotation, which needs three bodies or more.
     """
@@ -393,21 +393,21 @@ class MeasurementsSpec(Spec):
 
     Attributes
     ----------
-    wavefronts : Named[WavefrontReadingsSpec]
+    wavefronts : Mapping[str, WavefrontReadingsSpec]
         Name -> wavefronts by an interferometer.
-    focus : Named[FocusReadingsSpec]
+    focus : Mapping[str, FocusReadingsSpec]
         Name -> positions of best focus by field.
-    mtf : Named[MtfReadingsSpec]
+    mtf : Mapping[str, MtfReadingsSpec]
         Name -> MTF at fields.
-    distortion : Named[DistortionReadingsSpec]
+    distortion : Mapping[str, DistortionReadingsSpec]
         Name -> image positions along the line at known angles.
-    spots : Named[SpotReadingsSpec]
+    spots : Mapping[str, SpotReadingsSpec]
         Name -> spots of the monitor.
-    sight : Named[SightReadingsSpec]
+    sight : Mapping[str, SightReadingsSpec]
         Name -> line of sight and principal distance.
-    temperatures : Named[TemperatureReadingsSpec]
+    temperatures : Mapping[str, TemperatureReadingsSpec]
         Name -> temperatures of bodies.
-    positions : Named[PositionReadingsSpec]
+    positions : Mapping[str, PositionReadingsSpec]
         Name -> positions of bodies.
     """
 
@@ -451,10 +451,10 @@ class ActuatorSpec(CompensatorSpec):
         Step of which the amount is a multiple, as with shims; by default any amount is possible.
     accuracy
         Standard deviation of a move that does not depend on its size.
-    move_error : Number
-        Standard deviation of a move as a share of its amount.
-    response : Number
-        Standard deviation of the error of the traced response to this actuator, as a share of the response.
+    move_error : float
+        Standard deviation of a move as a fraction of its amount.
+    response : float
+        Standard deviation of the error of the traced response to this actuator, as a fraction of the response.
     """
 
     move_error: Annotated[Number, Field(ge=0.0, le=1.0)] = 0.02
@@ -472,7 +472,7 @@ class MoveSpec(Spec):
 
     Attributes
     ----------
-    by : dict[Name, Amount]
+    by : dict[str, str | float]
         Actuator -> amount of its move.
     """
 
@@ -480,15 +480,15 @@ class MoveSpec(Spec):
 
 
 class SimulatedInstrumentSpec(Spec):
-    """Simulated instrument, which the program draws at random, measures and moves in place of a real one.
+    """Simulated instrument, which the program draws at random, measures and moves instead of a real one.
 
     Attributes
     ----------
-    law : Literal['normal', 'uniform']
+    law : {'normal', 'uniform'}
         Probability distribution of its motions, with the covariance of the prior.
-    prior : Ref | None
+    prior : str | None
         Disturbances file from which the instrument is drawn; by default that of the estimate.
-    seed : Seed
+    seed : int
         Seed of the instrument and of all measurement errors.
     """
 
@@ -502,28 +502,28 @@ class AsBuiltSpec(Spec):
 
     Attributes
     ----------
-    instrument : Ref
+    instrument : str
         Camera or instrument, by name or path, as in a job.
-    camera : Name | None
+    camera : str | None
         Name of the camera to which the estimate applies; may be omitted if the instrument has one camera.
-    prior : Ref
+    prior : str
         Disturbances file with the prior: the uncertainty of the state before any measurement.
     measurements : MeasurementsSpec
         Measurements by kind and name.
-    merits : Named[MeritSpec]
+    merits : Mapping[str, MeritSpec]
         Name -> requirement on the camera, as in a tolerance budget.
-    actuators : Named[ActuatorSpec]
+    actuators : Mapping[str, ActuatorSpec]
         Name -> actuator for the alignment.
-    moves : Named[MoveSpec]
+    moves : Mapping[str, MoveSpec]
         Name -> alignment move that was made, in the order of time.
     candidates : MeasurementsSpec
         Measurements that could be made next; the report compares their benefit.
-    draws : Whole
+    draws : int
         Number of states drawn from the posterior and traced for the merits.
-    seed : Seed
+    seed : int
         Seed of these draws.
     simulate : SimulatedInstrumentSpec | None
-        Simulated instrument in place of measured data; by default the data are measured.
+        Simulated instrument instead of measured data; by default the data are measured.
     """
 
     instrument: Ref

@@ -28,19 +28,19 @@ class LensSpec(Spec):
 
     Attributes
     ----------
-    front_radius : Length
+    front_radius : float
         Radius of curvature of the surface toward the mirrors, in metres.
-    front_conic : Number
+    front_conic : float
         Conic constant of the front surface.
-    back_radius : Length
+    back_radius : float
         Radius of curvature of the surface toward the focal plane, in metres.
-    thickness : PositiveLength
+    thickness : float
         Thickness on the axis, in metres.
-    glass : GlassName
+    glass : str
         Glass of the catalogue.
-    diameter : PositiveLength
+    diameter : float
         Clear aperture of both surfaces, in metres.
-    focal_distance : PositiveLength
+    focal_distance : float
         Distance from the back vertex to the focal plane, in metres.
     """
 
@@ -70,7 +70,7 @@ class AutocollimatorSpec(Spec):
 
     Attributes
     ----------
-    wavelength : Wavelength
+    wavelength : float
         Wavelength of the source, in metres.
     lens : LensSpec
         Lens of the collimator.
@@ -79,11 +79,11 @@ class AutocollimatorSpec(Spec):
     area_ccd : AreaCcdSpec
         Detector; its offset counts from the pinhole to the centre of the pixel grid along the system's Y (horizontal)
         and X (up), in metres.
-    window : Whole
+    window : int
         Side of the square region around the spot that is read out, in pixels.
-    distance : PositiveLength
+    distance : float
         Distance from the lens's front vertex to the turntable's centre, in metres.
-    frames : Frames
+    frames : int
         Number of frames in a reading.
     """
 
@@ -118,9 +118,9 @@ class MirrorsSpec(Spec):
 
     Attributes
     ----------
-    aperture : PositiveLength
+    aperture : float
         Diameter of each mirror, in metres; it limits the beam.
-    radius : PositiveLength
+    radius : float
         Distance of the mirrors' centres from the turntable's centre, in metres.
     """
 
@@ -133,7 +133,7 @@ class StandSpec(Spec):
 
     Attributes
     ----------
-    X, Y, Z : HalfAngle
+    X, Y, Z : float
         Half angle theta for rotations about this axis, in radians.
     """
 
@@ -147,11 +147,11 @@ class ProgrammeSpec(Spec):
 
     Attributes
     ----------
-    steps : Whole
+    steps : int
         Number of steps after the first reading at zero.
-    small, table, large : Step
+    small, table, large : float
         Step size, in radians: a smaller one, that of the main series (`table`) and a larger one.
-    narrow, wide : HalfAngle
+    narrow, wide : float
         Half angle theta between the mirrors, in radians, in the narrow or the wide arrangement.
     stands : StandSpec
         Half angle theta of each axis in the main series.
@@ -171,17 +171,17 @@ class BenchErrorsSpec(Spec):
 
     Attributes
     ----------
-    focal_length : ScaleSigma
+    focal_length : float
         Relative error of an autocollimator's focal length against its calibration.
-    ccd_rotation : AngleSigma
+    ccd_rotation : float
         Rotation of an area CCD in its focal plane, in radians.
-    reading : AngleSigma
+    reading : float
         Instability of an autocollimator about its X and Y from one reading to the next, in radians.
-    turntable_step : AngleSigma
+    turntable_step : float
         Error of each position of the turntable, in radians.
-    axis_tilt : AngleSigma
+    axis_tilt : float
         Tilt of each axis of the turntable toward the two others, in radians.
-    mirror_mount : AngleSigma
+    mirror_mount : float
         Mounting error of each mirror about its X and Y, in radians.
     """
 

@@ -111,26 +111,26 @@ class BaffleSpec(Spec):
 
     Attributes
     ----------
-    shape : Literal['plate', 'box', 'tube', 'ring']
+    shape : {'plate', 'box', 'tube', 'ring'}
         Shape of the part: plate (width x height), box (width x height x length, open at +z), tube (diameter, length,
         open at both ends) or ring (diameter, with a round hole).
     body : str
         Path of the body that carries the part.
-    position : Vector3
+    position : tuple[float, float, float]
         Position in that body's frame, in metres: the centre of a plate, of a ring, of a box's bottom or of a tube's
         lower end.
     rotate : tuple[float, float, float]
         Rotation vector in that body's frame, in radians. Without rotation, plates are perpendicular to z, and boxes and
         tubes extend along z.
-    width : Size | None
+    width : float | None
         Size along x, in metres, of a plate or a box.
-    height : Size | None
+    height : float | None
         Size along y, in metres, of a plate or a box.
-    length : Size | None
+    length : float | None
         Size along z, in metres, of a box or a tube.
-    diameter : Size | None
+    diameter : float | None
         Outer diameter of a tube or a ring, in metres.
-    hole : Size | None
+    hole : float | None
         Diameter of the hole of a ring, in metres.
     """
 
@@ -196,24 +196,24 @@ class SurfaceEdgeSpec(Spec):
 
     Attributes
     ----------
-    clear : Shape | None
+    clear : {'circle', 'rectangle', 'ellipse', 'ray', 'polygon'} | None
         Shape that transmits light inside and blocks it outside.
-    blocks : Shape | None
+    blocks : {'circle', 'rectangle', 'ellipse', 'ray', 'polygon'} | None
         Shape that blocks light inside.
-    centre : Vector2 | None
+    centre : tuple[float, float] | None
         Centre of the shape, in metres; of a ray the middle of its start. By default the surface's vertex.
-    radius : PositiveLength | None
+    radius : float | None
         Radius of a circle, in metres.
-    inner : PositiveLength | None
+    inner : float | None
         Radius of the hole in a circle, in metres; by default no hole.
-    half : Half | None
+    half : tuple[float, float] | None
         Half widths of a rectangle or an ellipse along x and y, in metres.
-    width : PositiveLength | None
+    width : float | None
         Width of a ray, a vane that extends without end along x before its rotation, in metres.
     turn : float | None
         Rotation of a rectangle, an ellipse or a ray about its centre, right-handed about the surface's z, in radians;
         zero by default.
-    corners : tuple[Vector2, ...] | None
+    corners : tuple[tuple[float, float], ...] | None
         Corners of a polygon in sequence, in metres.
     """
 

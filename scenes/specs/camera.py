@@ -42,14 +42,14 @@ class TdiSpec(Spec):
 
     Attributes
     ----------
-    stages : Whole
+    stages : int
         Number of TDI stages, i.e. lines over which the charge is collected.
-    phases : Whole
+    phases : int
         Number of clock phases per pixel. Between two phases the charge stands still while the image moves, which blurs
         it along the track by one step.
-    open_share : Number
-        Share of each step during which light is collected.
-    line_time : instruments.Exposure
+    open_share : float
+        Fraction of each step during which light is collected.
+    line_time : float
         Time from one line to the next, in seconds.
     rate_error : float
         Relative difference between the speeds of the image and of the charge; it blurs the image over all stages.
@@ -67,17 +67,17 @@ class BandSpec(Spec):
 
     Attributes
     ----------
-    offset : Length
+    offset : float
         Position along X' (flight direction) relative to the line's centre, in metres.
-    pixels : Whole
+    pixels : int
         Number of pixels along the line.
-    pitch : PixelPitch
+    pitch : float
         Pitch of the square pixels, in metres.
-    spectrum : Spectrum
+    spectrum : SpectrumSpec
         Relative signal by wavelength, or two wavelengths between which the light is evenly distributed.
-    detector : Ref
+    detector : str
         Data sheet of the detector, by name or path.
-    diffusion : Diffusion
+    diffusion : float
         Charge diffusion between pixels (crosstalk), rms, in metres.
     tdi : TdiSpec
         Time delay and integration; a single stage by default.
@@ -120,25 +120,25 @@ class BeamRangesSpec(Spec):
 
     Attributes
     ----------
-    pupil_x : Vector2 | None
+    pupil_x : tuple[float, float] | None
         Beam centre in the entrance pupil across the line, positive toward the central prism, in metres.
-    pupil_y : Vector2 | None
+    pupil_y : tuple[float, float] | None
         Beam centre in the entrance pupil along the line, positive toward the beam's end of the line, in metres.
-    width : Vector2 | None
+    width : tuple[float, float] | None
         Diameter of the return face, in metres. The prisms' widths exceed it by the same amount as at the start.
     field : tuple[float, float] | None
         Field angle of the area CCD from the visual axis, in radians.
-    prism_180_distance : Vector2 | None
+    prism_180_distance : tuple[float, float] | None
         Distance from the camera's origin to the 180-degree prism, in metres.
-    prism_0_distance : Vector2 | None
+    prism_0_distance : tuple[float, float] | None
         Distance from the return face to the rhomboid, in metres.
-    shift : Vector2 | None
+    shift : tuple[float, float] | None
         Beam displacement by the rhomboid, in metres.
-    spread_x : Vector2 | None
+    spread_x : tuple[float, float] | None
         Distance of the facet from the central prism's apex along the base's X, in metres.
-    spread_y : Vector2 | None
+    spread_y : tuple[float, float] | None
         Distance of the facet from the central prism's apex along the base's Y, in metres.
-    photons : PhotonRange | None
+    photons : tuple[float, float] | None
         Photons of a spot per frame; layouts whose spots would saturate their pixels are refused.
     """
 
@@ -167,7 +167,7 @@ class TransferChoiceSpec(Spec):
 
     Attributes
     ----------
-    material : instruments.MadeOf
+    material : str
         Glass of the prism, or material of the frame that carries the mirrors.
     kind : str | None
         Kind of reflector; by default the lateral-transfer prism.
@@ -187,7 +187,7 @@ class ShiftChoiceSpec(Spec):
 
     Attributes
     ----------
-    material : instruments.MadeOf
+    material : str
         Glass of the prism, or material of the frame that carries the mirrors.
     kind : str | None
         Kind of reflector; by default the rhomboid.
@@ -226,9 +226,9 @@ class MonitorGoalSpec(Spec):
     ----------
     angle : float | None
         Standard deviation of the change of the intersection angle, in radians; by default not a goal.
-    d_f : PositiveLength | None
+    d_f : float | None
         Standard deviation of the change of a principal distance, in metres; by default not a goal.
-    height : PositiveLength | None
+    height : float | None
         Standard deviation of the height of a ground point, in metres, which needs the instrument's altitude; by default
         not a goal.
     """
@@ -255,14 +255,14 @@ class MonitorLimitsSpec(Spec):
     Attributes
     ----------
     pupil_share : float | None
-        Largest share of a camera's imaging pupil that the monitor's prisms block, at the worst field of the line; no
+        Largest fraction of a camera's imaging pupil that the monitor's prisms block, at the worst field of the line; no
         limit by default.
     mass : float | None
         Largest mass of all prisms, or of the mirrors in their place, without the central prism, in kg; no limit by
         default.
-    spot_sigmas : Number
+    spot_sigmas : float
         Number of standard deviations of its position by which each spot stays within its area CCD.
-    ghost_paths : Whole | None
+    ghost_paths : int | None
         Number of paths per source for tracing ghosts of the layouts on the Pareto front. A layout whose ghosts have
         more than a thousandth of a spot's light is excluded. By default no ghosts are traced.
     """
@@ -278,20 +278,20 @@ class MonitorSearchSpec(Spec):
 
     Attributes
     ----------
-    beams : Whole
+    beams : int
         Number of beams drawn at random at the beginning.
-    layouts : Whole
+    layouts : int
         Largest number of combinations of beams that are compared.
-    rounds : Whole
+    rounds : int
         Number of rounds that change the beams of the best layouts and combine them again. The steps are halved after a
         round without an improvement.
-    changed : Whole
+    changed : int
         Number of beams that each round tries.
-    exact : Whole
+    exact : int
         Number of layouts that are modelled completely after the first draw and after each round.
-    refine : Whole
+    refine : int
         Largest number of steps by exact gradients that finally improve the best layout.
-    starts : Whole
+    starts : int
         Number of further searches from other random beams, without those of the instrument, as a test of whether they
         reach the same result.
     """
@@ -310,27 +310,27 @@ class MonitorDesignSpec(Spec):
 
     Attributes
     ----------
-    instrument : Ref
+    instrument : str
         Instrument to start from, by name or path: a pair with mirrored monitor channels.
-    name : Name
+    name : str
         Name of the new instrument.
-    description : Text
+    description : str
         Description of the new instrument for readers; the program does not use it.
-    disturbances : tuple[Ref, ...] | None
+    disturbances : tuple[str, ...] | None
         Files of disturbances, by name or path; by default the instrument's.
-    beams : Whole
+    beams : int
         Largest number of beams at each end of a line.
     vary : BeamRangesSpec
         Ranges in which each beam may vary.
-    prisms : Named[PrismChoiceSpec] | None
+    prisms : Mapping[str, PrismChoiceSpec] | None
         Name of your choice -> pair of prisms that a beam may have; by default those of the start.
-    area_ccds : Named[instruments.AreaCcdChoiceSpec] | None
+    area_ccds : Mapping[str, AreaCcdChoiceSpec] | None
         Name of your choice -> area CCD that all channels may have; by default that of the start.
-    central_material : instruments.GlassName | None
+    central_material : str | None
         Glass of the central prism; by default that of the start.
-    photons_per_frame : instruments.Photons | None
+    photons_per_frame : float | None
         Photons of every spot per frame; by default those of the start.
-    frames : instruments.Frames | None
+    frames : int | None
         Number of frames in a measurement; by default that of the start.
     goal : MonitorGoalSpec
         Standard deviations to be reached.
@@ -338,7 +338,7 @@ class MonitorDesignSpec(Spec):
         Limits that must not be exceeded.
     search : MonitorSearchSpec
         Effort of the search.
-    seed : Seed
+    seed : int
         Seed of all random numbers.
     """
 
@@ -370,26 +370,26 @@ class MirrorSpec(Spec):
 
     Attributes
     ----------
-    z : Length
+    z : float
         Position of the vertex on the parent axis, in metres; light enters toward +z.
-    decentre : Vector2 | None
+    decentre : tuple[float, float] | None
         Displacement of the vertex from the parent axis along x and y, in metres; zero by default.
-    rotate : Turn | None
+    rotate : tuple[float, float, float] | None
         Rotation vector of the surface about its vertex, in radians; zero by default.
-    radius : Radius
+    radius : float
         Vertex radius of curvature, in metres, positive if the centre of curvature lies toward +z; ``flat`` for a plane.
-    conic : Number
+    conic : float
         Conic constant k.
-    aspheric : AsphereTerms
+    aspheric : Mapping[str, float]
         Coefficients A4, A6, ... of the sag beyond the conic's, in 1/m^3, 1/m^5, ...; by default a pure conic.
-    sag : FrozenMap[str, SagTerm] | None
+    sag : Mapping[str, SagTerm] | None
         Kind of a further sag term -> its coefficients; none by default.
-    light : Light | None
+    light : {'refracts', 'passes'} | None
         `refracts` for a face of a lens, `passes` for a plane that only serves as the stop; by default a mirror.
-    index : Number | None
+    index : float | None
         Refractive index behind a face of a lens at the design wavelength; 1 where the light leaves the lens.
-    glass : LensGlass | None
-        Glass behind a face where light enters a lens, in place of `index`; its dispersion gives the index at every
+    glass : LensGlassSpec | None
+        Glass behind a face where light enters a lens, instead of `index`; its dispersion gives the index at every
         wavelength.
     edges : tuple[SurfaceEdgeSpec, ...] | None
         Edges that block light at this surface besides the stop; light must pass all of them. By default there are no
@@ -452,7 +452,7 @@ class ImageSpec(Spec):
 
     Attributes
     ----------
-    z : Length
+    z : float
         Position on the parent axis, in metres.
     tilt : float | None
         Rotation about the prescription's x, the direction of the line CCD, in radians; by default the plane is
@@ -468,9 +468,9 @@ class LineSpec(Spec):
 
     Attributes
     ----------
-    pixels : Whole
+    pixels : int
         Number of pixels along the line.
-    pitch : PixelPitch
+    pitch : float
         Pixel pitch, in metres.
     """
 
@@ -483,32 +483,32 @@ class CameraSpec(TitledSpec):
 
     Attributes
     ----------
-    focal_length : PositiveLength
+    focal_length : float
         Nominal focal length, in metres; the ray trace computes the exact one.
-    entrance_pupil : PositiveLength
+    entrance_pupil : float
         Diameter of the entrance pupil, in metres: of the axial beam before the first surface. Its rays define the size
         of the stop, unless ``stop_diameter`` states it.
-    field_bias : instruments.FieldPlace
+    field_bias : float
         Angle of the line CCD's centre from the parent axis, in the plane of symmetry, in radians.
     field : FieldSpec
         Half angles of the field of view about the field bias.
-    wavelength : Wavelength
+    wavelength : float
         Design wavelength, in metres.
-    stop : Name
+    stop : str
         Name of the surface that is the aperture stop.
-    stop_diameter : PositiveLength | None
+    stop_diameter : float | None
         Diameter of the stop, in metres, if it is known; ``entrance_pupil`` is then nominal.
-    mirrors : Named[MirrorSpec]
+    mirrors : Mapping[str, MirrorSpec]
         Name -> surface, in the order of the light: mirrors, and also faces of lenses and a separate stop.
     image : ImageSpec
         Focal plane.
     line : LineSpec
         Line CCD.
-    bands : Named[BandSpec]
+    bands : Mapping[str, BandSpec]
         Name of a spectral band -> its line CCD, for images of targets; none by default.
-    spectrum : Spectrum | None
+    spectrum : SpectrumSpec | None
         Light for polychromatic image quality; by default that of the panchromatic or first band.
-    medium : Medium | None
+    medium : {'vacuum', 'air'} | None
         Medium around the lenses at 20 C, to which the index of a glass refers: ``air``, as in prescriptions for use on
         the ground, or ``vacuum``, the default.
     edge_margin : float
@@ -630,7 +630,7 @@ class CameraSpec(TitledSpec):
 
     @property
     def light(self) -> SpectrumSpec | None:
-        """Light for polychromatic image quality, None for none.
+        """Light for polychromatic image quality, None if there is none.
 
         It is the camera's spectrum, else that of its panchromatic band, else that of its first band.
         """
@@ -699,27 +699,27 @@ class CameraDesignSpec(Spec):
 
     Attributes
     ----------
-    camera : Ref
+    camera : str
         Prescription to start from, by name or path.
-    name : Name
+    name : str
         Name of the new camera.
-    description : Text
+    description : str
         Description of the new camera for readers; the program does not use it.
-    vary : Named[tuple[Vary, ...]]
+    vary : Mapping[str, tuple[{'radius', 'conic', 'A4', 'A6', 'A8', 'z'}, ...]]
         Name of a mirror, or ``image`` -> list of its variables.
     envelope : float | None
         Largest extent along the parent axis over all mirrors and the image, relative to the start's; free by default.
-    clearance : Length
+    clearance : float
         Smallest distance, in the plane of symmetry, of every beam from the edge of every mirror and of the focal plane
         that it passes, in metres.
     anamorphism : float | None
         Largest relative difference of the focal length along the line from that across it; free by default.
-    steps : Whole
+    steps : int
         Number of steps in which the envelope is reduced from the start's to the goal's.
-    starts : Whole
+    starts : int
         Number of starting points: the camera itself with the envelope reduced in steps, the same at once, and others
         drawn at random about it. Each one leads to one local optimum.
-    seed : Seed
+    seed : int
         Seed of the random starting points.
     """
 

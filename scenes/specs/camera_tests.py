@@ -33,11 +33,11 @@ class CollimatorSpec(Spec):
 
     Attributes
     ----------
-    focal_length : PositiveLength
+    focal_length : float
         Focal length, in metres.
-    aperture : PositiveLength
+    aperture : float
         Diameter of the aperture, in metres.
-    wavefront : dict[Term, FigureTerm]
+    wavefront : dict[str, float]
         Zernike term (Noll) -> wavefront error over the aperture, in metres rms; by default there is no error.
     """
 
@@ -57,9 +57,9 @@ class CameraUnderTestSpec(Spec):
 
     Attributes
     ----------
-    camera : Ref
+    camera : str
         Prescription of the camera, or an instrument as built from it, by name or path.
-    as_built : Paths[PlainPerturbationSpec]
+    as_built : Mapping[str, PlainPerturbationSpec]
         Node (``M1``, ``M2`` ... or ``focal_plane``) -> deviation from the prescription, as in a job's `perturb`; mostly
         figure errors of mirrors.
     """
@@ -88,9 +88,9 @@ class EdgeSpec(Spec):
 
     Attributes
     ----------
-    angle : EdgeAngle
+    angle : float
         Angle between the edge and the pixel columns or rows, in radians.
-    region : Whole
+    region : int
         Side of the square region around the edge that is analysed, in pixels.
     """
 
@@ -103,15 +103,15 @@ class ScanSpec(Spec):
 
     Attributes
     ----------
-    reach : PositiveLength
+    reach : float
         Half range of the first scan, which goes from -reach to +reach, in metres.
-    step : PositiveLength
+    step : float
         Step of the first scan, in metres.
-    points : Whole
+    points : int
         Number of points of the second scan, centred on the peak of the first one; with fewer than seven an error of the
         first peak could not be corrected.
-    depth : Number
-        Half width of the second scan as a share of the defocus at which geometric blur removes all contrast at the
+    depth : float
+        Half width of the second scan as a fraction of the defocus at which geometric blur removes all contrast at the
         Nyquist frequency.
     """
 
@@ -126,15 +126,15 @@ class MountSpec(Spec):
 
     Attributes
     ----------
-    holes : tuple[Vector3, ...]
+    holes : tuple[tuple[float, float, float], ...]
         Positions of the screw holes in the assembly's frame O'-X'Y'Z', in metres.
-    tilt : Tilt
+    tilt : float
         Angle of the mounting surface's normal from Z', about Y', in radians.
-    clearance : PositiveLength
+    clearance : float
         Clearance of the screws in their holes, within which the assembly can slide, in metres.
-    thickness : PositiveLength
+    thickness : float
         Thickness of the shims before the alignment, in metres.
-    step : PositiveLength
+    step : float
         Resolution to which the workshop grinds a shim, in metres.
     """
 
@@ -150,11 +150,11 @@ class MissetSpec(Spec):
 
     Attributes
     ----------
-    rotate : AngleSigmas
+    rotate : tuple[float, float, float]
         Rotations about X', Y', Z' through the centre of the panchromatic line, in radians.
-    shift : LengthSigmas
+    shift : tuple[float, float, float]
         Shifts along X', Y', Z', in metres.
-    chips : LengthSigma
+    chips : float
         Height error of each line CCD relative to the assembly, which no shim can correct, in metres.
     """
 
@@ -168,19 +168,19 @@ class FocusTestSpec(CameraUnderTestSpec):
 
     Attributes
     ----------
-    name : Name
+    name : str
         Name of the test.
-    description : Text
+    description : str
         Description for readers; the program does not use it.
     collimator : CollimatorSpec
         Collimator in front of the camera.
     edge : EdgeSpec
         Target.
-    fields : tuple[Share, ...]
-        Fields along the line, as shares of half the line's length, -1 to 1.
-    white : Light
-        Signal of the bright side of the edge, as a share of the full well.
-    frames : Frames
+    fields : tuple[float, ...]
+        Fields along the line, as fractions of half the line's length, -1 to 1.
+    white : float
+        Signal of the bright side of the edge, as a fraction of the full well.
+    frames : int
         Number of frames averaged at each position of the target.
     scan : ScanSpec
         Scan of the target through focus.
@@ -188,11 +188,11 @@ class FocusTestSpec(CameraUnderTestSpec):
         Initial misalignment of the assembly.
     mount : MountSpec
         Mount of the assembly.
-    level : AngleSigma
+    level : float
         Standard deviation of the theodolite's reading of the line's level, in radians.
-    rounds : Whole
+    rounds : int
         Number of rounds of shimming.
-    seed : Seed
+    seed : int
         Seed of all random numbers.
     """
 
@@ -225,38 +225,38 @@ class DistortionTestSpec(CameraUnderTestSpec):
 
     Attributes
     ----------
-    name : Name
+    name : str
         Name of the test.
-    description : Text
+    description : str
         Description for readers; the program does not use it.
     collimator : CollimatorSpec
         Collimator in front of the camera.
-    turntable : Ref
+    turntable : str
         Turntable test with the dividing error and the calibration, by name or path.
-    pinhole : PositiveLength
+    pinhole : float
         Diameter of the pinhole target, in metres.
-    band : Name
+    band : str
         Band whose line CCD is measured.
-    points : Whole
+    points : int
         Number of points over the field.
-    reach : Number
-        Distance of the first and last point from the line's centre, as a share of half the line's length.
-    sets : Whole
+    reach : float
+        Distance of the first and last point from the line's centre, as a fraction of half the line's length.
+    sets : int
         Number of times that all points are measured.
-    light : Light
-        Signal of the brightest pixel, as a share of the full well.
-    frames : Frames
+    light : float
+        Signal of the brightest pixel, as a fraction of the full well.
+    frames : int
         Number of frames averaged at each point.
-    window : Whole
+    window : int
         Side of the square region around the spot, in pixels.
-    zero : AngleSigma
+    zero : float
         Standard deviation of aligning the line's centre to the collimator's axis at the middle angle of the turntable,
         in radians.
-    axis_tilt : AngleSigma
+    axis_tilt : float
         Standard deviation of the tilt of the turntable's axis against the camera's X, in radians.
-    setting : AngleSigma
+    setting : float
         Standard deviation with which the turntable stops at a required reading, in radians.
-    seed : Seed
+    seed : int
         Seed of all random numbers.
     """
 
@@ -287,9 +287,9 @@ class LineSpec(Spec):
 
     Attributes
     ----------
-    pitch : PositiveLength
+    pitch : float
         Pixel pitch, in metres.
-    middle : Number
+    middle : float
         Column of the line's centre, from which positions are counted; the centre of the first pixel is 0.
     """
 
@@ -302,9 +302,9 @@ class DistortionFiles(Spec):
 
     Attributes
     ----------
-    spots : Reference
+    spots : str
         CSV file of turntable readings and spot positions on the line.
-    zero : TableAngle
+    zero : float
         Approximate reading at which the line's centre is imaged, in radians; the fit estimates its error.
     line : LineSpec | None
         Pixels of the line, for a table whose positions are columns; omitted if they are lengths.
@@ -312,7 +312,7 @@ class DistortionFiles(Spec):
         True if turntable readings increase while positions on the line decrease.
     turntable : TurntableFiles | None
         Calibration of the turntable; without it the readings are used as they are.
-    angle_sigma : AngleSigma | None
+    angle_sigma : float | None
         Standard deviation of the angle error of each point without a calibration, in radians: independent from point to
         point and the same in all sets.
     """
@@ -336,11 +336,11 @@ class MeasuredDistortionSpec(TitledSpec):
 
     Attributes
     ----------
-    principal_distance : PositiveLength
+    principal_distance : float
         Approximate principal distance of the camera, in metres; it is used to evaluate the scatter between sets.
     measured : DistortionFiles
         Angles and spot positions.
-    seed : Seed
+    seed : int
         Seed, without effect: nothing in this evaluation is random.
     """
 
@@ -354,19 +354,19 @@ class NoiseSpec(Spec):
 
     Attributes
     ----------
-    gain_dn_per_e : Positive
+    gain_dn_per_e : float
         System gain, in grey values per electron.
-    dark_noise_e : NotNegative
+    dark_noise_e : float
         Read noise, in electrons rms.
-    dark_signal_e : NotNegative
+    dark_signal_e : float
         Dark signal of an exposure, in electrons.
-    offset_dn : NotNegative
+    offset_dn : float
         Black level, in grey values.
-    prnu : Number
+    prnu : float
         Photo response non-uniformity, relative rms.
-    dsnu_e : NotNegative
+    dsnu_e : float
         Dark signal non-uniformity, in electrons rms.
-    saturation_dn : Positive
+    saturation_dn : float
         Grey value above which the response is not linear.
     """
 
@@ -384,9 +384,9 @@ class LevelSpec(Spec):
 
     Attributes
     ----------
-    angle : Angle
+    angle : float
         Rotation of the line from its required direction, about Z', in radians.
-    sigma : AngleSigma
+    sigma : float
         Standard deviation of this angle, in radians.
     """
 
@@ -399,18 +399,18 @@ class FocusFiles(Spec):
 
     Attributes
     ----------
-    mtf : Reference | None
+    mtf : str | None
         CSV file of MTF values with their standard deviations; either this or `images` is required.
-    images : Reference | None
+    images : str | None
         CSV file that lists images of a slanted knife edge; either this or `mtf` is required.
-    moved : Literal['image', 'target', 'focal_plane']
+    moved : {'image', 'target', 'focal_plane'}
         Component to which the shifts refer, always along the light: ``image``, ``target`` or ``focal_plane`` (the CCD).
-    per_shift : Number | None
+    per_shift : float | None
         Image shift per target shift for ``target``, (f of the camera / f of the collimator)^2; a column `per shift` of
         the table overrides it.
-    frequency : Number
+    frequency : float
         Spatial frequency of the MTF that is measured in images, in cycles per pixel.
-    noise : dict[Name, NoiseSpec]
+    noise : dict[str, NoiseSpec]
         Name of a band -> noise of its detector, for images; for other bands the noise is estimated from the image.
     level : LevelSpec | None
         Level of the line; without it the rotation about Z' is not corrected.
@@ -445,14 +445,14 @@ class MeasuredFocusSpec(TitledSpec):
         Through-focus series.
     mount : MountSpec
         Mount of the assembly.
-    shims : tuple[PositiveLength, ...] | None
+    shims : tuple[float, ...] | None
         Present thickness of the shim at each hole, in metres; by default the `thickness` of `mount`.
-    vertex_error : LengthSigma
+    vertex_error : float
         Standard deviation of an error common to all vertices that the shape of the through-focus curve causes, in
         metres; the default holds for F/8 to F/10 and wavefront errors of 0.2 waves.
-    vertex_trend : LengthSigma
+    vertex_trend : float
         Standard deviation of the change of that error from the centre to the ends of the fields, in metres.
-    seed : Seed
+    seed : int
         Seed, without effect: nothing in this evaluation is random.
     """
 

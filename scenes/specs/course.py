@@ -97,9 +97,9 @@ class TemperatureCourse(Spec):
 
     Attributes
     ----------
-    change : tuple[TemperatureChange, ...] | None
+    change : tuple[float, ...] | None
         Temperature change at the body's origin at each time, in kelvin; zero by default.
-    gradient : tuple[TemperatureGradient, ...] | None
+    gradient : tuple[tuple[float, float, float], ...] | None
         Temperature gradient in the body's frame at each time, in K/m; zero by default.
     """
 
@@ -112,14 +112,14 @@ class MotionCourse(Spec):
 
     Attributes
     ----------
-    rotate : tuple[Rotation, ...] | None
+    rotate : tuple[tuple[float, float, float], ...] | None
         Rotation vector in the body's frame about the pivot at each time, in radians; the rotation precedes the shift.
         Zero by default.
-    shift : tuple[Shift, ...] | None
+    shift : tuple[tuple[float, float, float], ...] | None
         Shift in the body's frame at each time, in metres; zero by default.
-    scale : tuple[ScaleChange, ...] | None
+    scale : tuple[float, ...] | None
         Relative change of scale of the body and all it carries at each time; zero by default.
-    pivot : Name
+    pivot : str
         Name of the body's point that rotation and scale leave in place at all times.
     """
 
@@ -162,18 +162,18 @@ class CourseSpec(Spec):
 
     Attributes
     ----------
-    times : tuple[Moment, ...]
+    times : tuple[float, ...]
         Ascending times, in seconds. The instrument has no memory, so that only their order affects the images.
-    temperature : Paths[TemperatureCourse]
+    temperature : Mapping[str, TemperatureCourse]
         Node path -> temperature at each time.
-    motion : Paths[MotionCourse]
+    motion : Mapping[str, MotionCourse]
         Node path -> motion at each time.
-    table : Reference | None
-        CSV file with times, temperatures and motions, in place of these keys; a path relative to the job's file. Each
+    table : str | None
+        CSV file with times, temperatures and motions, instead of these keys; a path relative to the job's file. Each
         head has quantity and unit: `time [min]`, `base/forward/M2 shift z [um]`, `base/forward/M2 rotate x [arcsec]`,
         `base/forward scale [ppm]`, `base/forward temperature [K]`, `base/forward gradient x [mK/m]`. The key `motion`
         then holds only pivots.
-    detail : Moment | None
+    detail : float | None
         Time whose state is reported in full, like the single state of a job without a course, in seconds; by default
         the last one.
     """

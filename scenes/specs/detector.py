@@ -29,25 +29,25 @@ class DetectorSpec(TitledSpec):
 
     Attributes
     ----------
-    quantum_efficiency : Number
+    quantum_efficiency : float
         Electrons per photon at the wavelength of use.
-    system_gain_dn_per_e : Number
+    system_gain_dn_per_e : float
         System gain K of EMVA 1288, in DN per electron.
-    dark_noise_e : Number
+    dark_noise_e : float
         Temporal noise in the dark without dark current, in electrons rms.
-    dark_current_e_per_s : Number
+    dark_current_e_per_s : float
         Mean dark current of a pixel, in electrons per second.
-    full_well_e : Number
+    full_well_e : float
         Saturation capacity, in electrons.
-    prnu : Number
+    prnu : float
         Photo response non-uniformity, relative rms.
-    dsnu_e : Number
+    dsnu_e : float
         Dark signal non-uniformity, in electrons rms.
-    bit_depth : Whole
+    bit_depth : int
         Resolution of the analogue-to-digital converter, in bits; frames are stored with 16 bits.
-    offset_dn : Number
+    offset_dn : float
         Grey value of zero signal, in DN.
-    noise : Named[Number] | None
+    noise : Mapping[str, float] | None
         Name of a noise source beyond the model of EMVA 1288 -> its standard deviation, in electrons rms; none by
         default.
     """

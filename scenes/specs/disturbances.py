@@ -74,7 +74,7 @@ class TemperatureSigmaSpec(Spec):
     ----------
     change : float
         Standard deviation of the temperature at the body's origin, in kelvin.
-    gradient : GradientSigma
+    gradient : tuple[float, float, float]
         Standard deviation of each component of the temperature gradient in the body's frame, in K/m.
     """
 
@@ -100,22 +100,22 @@ class TimeLawSpec(Spec):
 
     Attributes
     ----------
-    kind : Literal['white', 'constant', 'jump'] | None
-        Law without parameter, in place of the other keys: `white`, independent at every time; `constant`; or `jump`, a
+    kind : {'white', 'constant', 'jump'} | None
+        Law without parameter, instead of the other keys: `white`, independent at every time; `constant`; or `jump`, a
         step at an unknown time.
-    drift : Span | None
+    drift : float | None
         Correlation time, in seconds: the correlation decays exponentially.
-    period : Span | None
+    period : float | None
         Period of an oscillation, in seconds.
-    trend : Span | None
+    trend : float | None
         Time in which a linear trend grows by its standard deviation, in seconds.
-    relaxation : Span | None
+    relaxation : float | None
         Time constant of the exponential approach to a new value, in seconds.
-    event : Moment | None
+    event : float | None
         Time of a step, in seconds.
-    jump : Span | None
+    jump : float | None
         Mean time between two jumps, in seconds; jumps below the detection threshold contribute to sigma.
-    since : Moment | None
+    since : float | None
         Time at which a trend or relaxation starts, in seconds; 0 by default.
     """
 
@@ -195,10 +195,10 @@ class CorrelationSpec(Spec):
     between : tuple[str, ...]
         Names of the components: `base/forward/M1 shift z`, `NODE rotate x`, `NODE scale`, `NODE figure Z5`, `NODE
         radius`, `NODE conic`, `NODE temperature`, `NODE gradient x`, `NODE index_gradient x`.
-    correlation : Correlation | None
+    correlation : float | None
         Correlation of any two of them.
-    matrix : tuple[tuple[Correlation, ...], ...] | None
-        Correlation matrix of the components, in place of one number.
+    matrix : tuple[tuple[float, ...], ...] | None
+        Correlation matrix of the components, instead of one number.
     """
 
     between: Annotated[tuple[Annotated[str, Field(strict=True)], ...], Field(min_length=2)]
@@ -336,17 +336,17 @@ class JointSpec(Spec):
 
     Attributes
     ----------
-    components : JointSigmas
+    components : dict[str, float]
         Name of a component -> standard deviation with its unit, or a plain number for `conic` and `index`. Names are
         those of `correlations`, and `NODE index`; after a shift, a rotation or a scale, `about PIVOT` selects a pivot
         other than the default, which is the body's centre if it has one, else its origin.
-    correlation : tuple[tuple[Correlation, ...], ...] | None
+    correlation : tuple[tuple[float, ...], ...] | None
         Correlation matrix with rows in the order of the components; by default they are independent.
-    correlation_file : Reference | None
-        CSV file with the matrix and the names of the components as heads, in place of `correlation`.
-    time : TimeLaw
+    correlation_file : str | None
+        CSV file with the matrix and the names of the components as heads, instead of `correlation`.
+    time : TimeLawSpec
         Time law of the components in a series of measurements.
-    reason : Reason
+    reason : str
         Source of the numbers.
     """
 
@@ -445,7 +445,7 @@ class CauseSpec(_CauseKeys):
 
     Attributes
     ----------
-    bodies : BodyPatterns
+    bodies : tuple[str, ...]
         Node paths, in which `*` stands for one part of a path or a piece of it (`base/*/M?` are all mirrors), and
         `<camera>` for the name of a camera (`base/<camera>`).
     shift
@@ -470,9 +470,9 @@ class CauseSpec(_CauseKeys):
         Correlation of the same component of any two of the bodies; by default they are independent.
     correlations : tuple[CorrelationSpec, ...]
         Correlations of single components.
-    time : TimeLaw
+    time : TimeLawSpec
         Time law in a series of measurements.
-    reason : Reason
+    reason : str
         Source of the numbers.
     """
 
@@ -525,14 +525,14 @@ class DisturbancesSpec(TitledSpec):
 
     Attributes
     ----------
-    sigmas : Number
+    sigmas : float
         Number of standard deviations that each value of the file represents; 3 for a list of 3-sigma values.
-    causes : Named[CauseSpec]
+    causes : Mapping[str, CauseSpec]
         Name -> cause of change.
     joint : JointSpec | None
         Named components of bodies with a joint distribution, such as the result of an estimate; besides the causes or
         in their place.
-    jump_false_alarm : Number | None
+    jump_false_alarm : float | None
         Probability that a jump is reported in a series without one, over all its times and all components whose time
         law is `jump`; 0.001 by default.
     """
@@ -598,12 +598,12 @@ class JobDisturbancesSpec(Spec):
 
     Attributes
     ----------
-    file : Ref | None
+    file : str | None
         Name of a file in scenes/library/disturbances, or the path of your file; `none` for no disturbances. By default
         the instrument's.
-    causes : Named[CauseChangeSpec]
+    causes : Mapping[str, CauseChangeSpec]
         Name -> change of a cause of the file, or an additional cause, with the file's number of standard deviations.
-    without : tuple[Name, ...]
+    without : tuple[str, ...]
         Names of the file's causes that are excluded.
     """
 
@@ -646,21 +646,21 @@ class ErrorBudgetSpec(Spec):
 
     Attributes
     ----------
-    description : Text
+    description : str
         Description for readers; the program does not use it.
-    instrument : Ref
+    instrument : str
         Instrument, by name or path.
-    photons_per_frame : Number
+    photons_per_frame : float
         Photons of a spot per frame; few, so that the centroid's noise is a line of the budget.
-    frames : Frames
+    frames : int
         Number of frames averaged in a measurement.
-    trials : Whole
+    trials : int
         Number of random states for each line.
-    all_together : Whole
+    all_together : int
         Number of random states with all causes at once.
-    angle_errors : AngleErrors
+    angle_errors : dict[str, dict[str, tuple[float, float]]]
         Prism (prism_180 or prism_0) -> face -> its manufacturing tilt about x and y, in radians.
-    disturbances : Ref
+    disturbances : str
         File of disturbances: one of scenes/library/disturbances or the path of your file. Each of its causes is a line.
     """
 

@@ -71,7 +71,7 @@ def read_for(command: str, file: Path, resolve: Callable[[Path], Given]) -> Give
         Command as the user types it, ``twin.lab focus``.
     file : Path
         File that the user passed to the command.
-    resolve : Callable[[Path], Given]
+    resolve : callable
         Function that reads the file and raises InputError.
 
     Raises

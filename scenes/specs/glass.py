@@ -44,21 +44,21 @@ class LensGlassSpec(Spec):
 
     Attributes
     ----------
-    name : Text
+    name : str
         Name of a glass in the catalogue (`N-BK7`, `N-SF11`, `S-FPL53`, `FCD1`, `H-K9L`, ...), or any name beside a
         formula.
-    formula : Whole | None
+    formula : int | None
         Number of the dispersion formula in AGF catalogues (1 Schott, 2 Sellmeier 1, ...); by default the catalogue's
         glass.
-    coefficients : tuple[Number, ...] | None
+    coefficients : tuple[float, ...] | None
         Coefficients of the formula for wavelengths in micrometres, in the order of the AGF catalogue; for Sellmeier B1,
         C1, B2, C2, B3, C3.
-    range : WavelengthRange | None
+    range : tuple[float, float] | None
         Shortest and longest wavelength at which the formula holds, in metres.
     expansion : float | None
         Linear thermal expansion, mean of -30 to 70 C, as in the ED line of AGF catalogues, in 1/K. By default that of
         the twin's material of the same name; if there is none, the lens cannot be heated.
-    thermal : tuple[Number, ...] | None
+    thermal : tuple[float, ...] | None
         Schott's constants D0, D1, D2, E0, E1 and Lambda_TK of dn/dT in the units of data sheets, as in the TD line of
         AGF catalogues. By default those of the catalogue; if there are none, the lens cannot be heated.
     """
@@ -103,7 +103,7 @@ class LensGlassSpec(Spec):
         ----------
         wavelength : float
             Wavelength, in metres.
-        medium : Medium
+        medium : {'vacuum', 'air'}
             Medium to which the index refers: ``air`` of 20 C and 1013 hPa, as manufacturers state it, or ``vacuum``.
 
         Raises
@@ -125,7 +125,7 @@ class LensGlassSpec(Spec):
         ----------
         wavelength : float
             Wavelength, in metres.
-        medium : Medium
+        medium : {'vacuum', 'air'}
             Medium to which the index refers, as in ``index``. The medium itself is not heated.
 
         Raises

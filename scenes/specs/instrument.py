@@ -166,16 +166,16 @@ class Prism180Spec(Spec):
 
     Attributes
     ----------
-    material : MadeOf
+    material : str
         Glass of the prism; for a kind without glass the material of its frame and mirrors.
-    distance : PositiveLength
+    distance : float
         Distance from the camera's origin to the window, along the line of sight, in metres.
-    width : PositiveLength
+    width : float
         Width of the clear apertures across the beam, in metres; somewhat more than the return face's diameter.
-    tilt : Tilt
+    tilt : tuple[float, float]
         Rotation about the prism's x and y and its null point, relative to faces perpendicular to the beam, in radians.
         It leaves the beam's direction unchanged and keeps the reflections from the faces off the area CCD.
-    angle_errors : FaceErrors
+    angle_errors : dict[str, tuple[float, float]]
         Name of a face -> its manufacturing tilt about the face's x and y, in radians. Faces: window, mirror, roof_a,
         roof_b; of the hollow kind mirror, roof_a, roof_b.
     kind : str | None
@@ -206,17 +206,17 @@ class Prism0Spec(Spec):
 
     Attributes
     ----------
-    material : MadeOf
+    material : str
         Glass of the prism; for a kind without glass the material of its frame and mirrors.
-    distance : PositiveLength
+    distance : float
         Distance from the return face to the prism's centre, along the beam, in metres.
-    shift : PositiveLength
+    shift : float
         Displacement of the beam, toward the central prism, in metres.
-    width : PositiveLength
+    width : float
         Width of the clear apertures across the beam, in metres.
-    tilt : Tilt
+    tilt : tuple[float, float]
         Rotation about the prism's x and y and its centre, relative to faces perpendicular to the beam, in radians.
-    angle_errors : FaceErrors
+    angle_errors : dict[str, tuple[float, float]]
         Name of a face -> its manufacturing tilt about the face's x and y, in radians. Faces: entry, mirror_a, mirror_b,
         exit; of the periscope mirror_a, mirror_b.
     kind : str | None
@@ -253,13 +253,13 @@ class CentralPrismSpec(Spec):
 
     Attributes
     ----------
-    position : Vector3
+    position : tuple[float, float, float]
         Position of the apex in the base frame, in metres.
-    material : GlassName
+    material : str
         Glass of the block.
-    spread : Spread
+    spread : tuple[float, float]
         Distance from the apex at which the beams meet their facets, along the base's X and Y, in metres.
-    height : PositiveLength
+    height : float
         Height of the block below the apex, in metres.
     """
 
@@ -283,9 +283,9 @@ class ReticleSpec(Spec):
 
     Attributes
     ----------
-    pinhole : PositiveLength
+    pinhole : float
         Diameter of the pinhole, in metres.
-    photons_per_frame : Photons
+    photons_per_frame : float
         Expected number of photons of a spot that reach the plane of the area CCD during one exposure.
     """
 
@@ -298,17 +298,17 @@ class AreaCcdSpec(Spec):
 
     Attributes
     ----------
-    detector : Ref
+    detector : str
         Data sheet of the detector, by name or path.
-    rows : AreaSide
+    rows : int
         Number of pixel rows.
-    columns : AreaSide
+    columns : int
         Number of pixel columns.
-    pitch : PixelPitch
+    pitch : float
         Pixel pitch, in metres.
-    offset : Vector2
+    offset : tuple[float, float]
         Position (X, Y) of the pixel grid's centre relative to the pinhole, in the focal plane, in metres.
-    exposure : Exposure
+    exposure : float
         Exposure of a frame, in seconds.
     """
 
@@ -327,13 +327,13 @@ class AreaCcdChoiceSpec(Spec):
 
     Attributes
     ----------
-    detector : Ref
+    detector : str
         Data sheet of the detector, by name or path.
-    pitch : PixelPitch
+    pitch : float
         Pixel pitch, in metres.
-    rows : AreaSide
+    rows : int
         Number of pixel rows.
-    columns : AreaSide
+    columns : int
         Number of pixel columns.
     """
 
@@ -348,7 +348,7 @@ class ReturnFaceSpec(Spec):
 
     Attributes
     ----------
-    aperture : PositiveLength
+    aperture : float
         Diameter of the mirror coating, in metres.
     """
 
@@ -362,16 +362,16 @@ class ChannelSpec(Spec):
 
     Attributes
     ----------
-    field : FieldPlace
+    field : float
         Field angle of the area CCD from the visual axis, positive at the +Y end of the line, in radians.
-    pupil_offset : Vector2
+    pupil_offset : tuple[float, float]
         Centre (X, Y) of the beam in the entrance pupil, in metres.
     return_face : ReturnFaceSpec | None
         Mirror that returns the beam and limits it; by default the monitor's.
-    spread : Spread | None
+    spread : tuple[float, float] | None
         Distance from the central prism's apex at which the beam meets its facet, along the base's X and Y, in metres;
         by default the central prism's.
-    photons_per_frame : Photons | None
+    photons_per_frame : float | None
         Photons of the spot per frame; by default those of the monitor's reticle.
     prism_180 : Prism180Spec | None
         Lateral-transfer prism; by default the monitor's.
@@ -414,18 +414,18 @@ class MountedCameraSpec(Spec):
 
     Attributes
     ----------
-    camera : Ref
+    camera : str
         Prescription of the camera, by name or path.
-    look : LookAngle
+    look : float
         Look angle: angle of the visual axis from the base's +Z about the base's Y, positive forward (toward +X), in
         radians.
-    position : Vector3
+    position : tuple[float, float, float]
         Position of the camera's origin in the base frame, in metres.
-    pupil_offset : Vector2 | None
+    pupil_offset : tuple[float, float] | None
         Centre (X, Y) of the sub-aperture in the entrance pupil of a plain pair of channels, at both ends of the line,
         in metres.
-    channels : Named[ChannelSpec] | None
-        Name -> channel, in place of a plain pair. The published formulas need a pair at opposite fields called left and
+    channels : Mapping[str, ChannelSpec] | None
+        Name -> channel, instead of a plain pair. The published formulas need a pair at opposite fields called left and
         right; other cameras are measured by the estimators that use all spots.
     """
 
@@ -457,15 +457,15 @@ class MaterialsSpec(Spec):
 
     Attributes
     ----------
-    base : MaterialName
+    base : str
         Material of the common structure.
-    camera : MaterialName
+    camera : str
         Material of each camera's structure and of the monitor's brackets.
-    mirror : MaterialName
+    mirror : str
         Material of all mirrors.
-    focal_plane : MaterialName
+    focal_plane : str
         Material of the carrier of the line CCD.
-    board : MaterialName
+    board : str
         Material of the boards at each end of the line that carry reticle and area CCD.
     """
 
@@ -481,7 +481,7 @@ class MonitorSpec(Spec):
 
     Attributes
     ----------
-    wavelength : Wavelength
+    wavelength : float
         Wavelength of the source, in metres.
     field : float
         Field angle of the area CCDs from the visual axis, left at +Y and right at -Y, in radians.
@@ -495,7 +495,7 @@ class MonitorSpec(Spec):
         Rhomboid of each channel.
     return_face : ReturnFaceSpec
         Mirror that returns the beam of each channel.
-    frames : Frames
+    frames : int
         Number of frames in a measurement.
     """
 
@@ -519,7 +519,7 @@ class InstrumentSpec(TitledSpec):
 
     Attributes
     ----------
-    cameras : Named[MountedCameraSpec]
+    cameras : Mapping[str, MountedCameraSpec]
         Name -> camera; the first one is the reference for the change of the intersection angle.
     central_prism : CentralPrismSpec | None
         Central prism, the common reference of the monitor; absent if there is no monitor.
@@ -529,13 +529,13 @@ class InstrumentSpec(TitledSpec):
         Temperature at which all parts have their nominal shape, in kelvin.
     materials : MaterialsSpec
         Materials of the parts.
-    baffles : Named[BaffleSpec]
+    baffles : Mapping[str, BaffleSpec]
         Name -> baffle; none by default.
     altitude : float | None
         Altitude of the orbit, in metres. It is needed to express changes of a pair's cameras as errors on the ground.
-    disturbances : Ref | None
+    disturbances : str | None
         Expected disturbances unless a job has its own: a file of scenes/library/disturbances or the path of your file.
-    as_built : AsBuilt | None
+    as_built : Mapping[str, PlainPerturbationSpec] | None
         Node -> deviation of the built body from the rest of this file, as in a job's `perturb`. A job's perturbation is
         added to it, and changes are counted from it.
     """
@@ -675,14 +675,14 @@ class AsBuiltInstrumentSpec(TitledSpec):
 
     Attributes
     ----------
-    design : Ref
+    design : str
         Instrument of the design: a name in scenes/library/instruments, or the path of your file. A camera, given as
         `{camera: NAME or FILE}` or by its name, is an instrument without a monitor.
-    as_built : AsBuilt
+    as_built : Mapping[str, PlainPerturbationSpec]
         Node -> deviation from the design, as in a job's `perturb`; the node is given by its path or the last parts of
         it. Or a list of texts such as `M2 shift z 20 um`. A job's perturbation is added to it, and changes are counted
         from it.
-    disturbances : Ref | None
+    disturbances : str | None
         Expected disturbances, or the uncertainty of the deviations: a file of scenes/library/disturbances or the path
         of your file; by default the design's.
     """

@@ -44,14 +44,14 @@ class TargetsSpec(Spec):
 
     Attributes
     ----------
-    angle : EdgeAngle
+    angle : float
         Angle of the knife edge to the pixel columns or rows, in radians.
-    region : Whole
+    region : int
         Side of the recorded images, in pixels.
-    white : White
-        Signal of a large bright area in each frame through an unobstructed pupil, as a share of the full well; bodies
-        in the beam reduce it.
-    frames : Frames | None
+    white : float
+        Signal of a large bright area in each frame through an unobstructed pupil, as a fraction of the full well;
+        bodies in the beam reduce it.
+    frames : int | None
         Number of frames; by default that of the spots.
     """
 
@@ -69,10 +69,10 @@ class PerturbationSpec(PlainPerturbationSpec):
 
     Attributes
     ----------
-    temperature : job_tables.TableTemperature | None
+    temperature : TableTemperatureSpec | None
         Temperature change: uniform as `2 K`, with a gradient, or a table of temperatures at nodes. It replaces the
         change that the body inherits from its carrier, even if it is `0 K`; by default the change is inherited.
-    deformation : job_tables.Deformation | None
+    deformation : DeformationSpec | None
         Table or mesh of displaced nodes; by default there is no deformation.
     """
 
@@ -118,9 +118,9 @@ class StraySpec(Spec):
 
     Attributes
     ----------
-    paths : Whole
+    paths : int
         Number of paths from every source.
-    finishes : job_tables.FinishesSpec | None
+    finishes : FinishesSpec | None
         Measured BSDFs and coatings of surfaces; by default the built-in finishes.
     """
 
@@ -145,14 +145,14 @@ class RenderSpec(Spec):
     stray : StraySpec | None
         Path tracing of ghosts and stray light: `true`, or a mapping with the number of paths; by default they are not
         traced.
-    quality : Flag
+    quality : bool
         True to compute wavefront errors, defocus and MTF on the line CCDs.
-    obstruction : Literal['traced', 'ignore']
+    obstruction : {'traced', 'ignore'}
         Treatment of prisms, baffles and other bodies in the cameras' beams: `traced`, they block light for image
         quality and targets; `ignore`, the pupils are unobstructed.
-    frames : Frames | None
+    frames : int | None
         Number of frames; by default that of the instrument's monitor.
-    seed : Seed
+    seed : int
         Seed of all random numbers of the job.
     """
 
@@ -225,15 +225,15 @@ class JobSpec(Spec):
 
     Attributes
     ----------
-    instrument : Ref
+    instrument : str
         Name of an instrument in scenes/library/instruments, or path of your file relative to the job's file. A camera,
         given as `{camera: NAME or FILE}` or by its name, is an instrument without a monitor.
-    perturb : Paths[PerturbationSpec]
+    perturb : Mapping[str, PerturbationSpec]
         Node -> perturbation; the node is given by its path or the last parts of it. Or a list of texts such as `M2
         shift z 20 um`. By default the instrument is in its nominal state.
     course : CourseSpec | None
         Temperatures and motions that change with time; by default there is a single state.
-    disturbances : JobDisturbances | None
+    disturbances : JobDisturbancesSpec | None
         Expected disturbances, on which the sigmas are based: a file, or changes of single causes of it. By default
         those of the instrument; `none` for sigmas of the noise alone.
     render : RenderSpec
@@ -280,7 +280,7 @@ class JobSpec(Spec):
 
 
 def _with_course(job: JobSpec) -> JobSpec:
-    """Return the job with the content of its course's table in place of the reference to it."""
+    """Return the job with the content of its course's table instead of the reference to it."""
     if job.course is None or job.course.table is None:
         return job
     path = job.course.file_at(("table",), job.course.table, Path(job.source.file).parent, "a CSV file")
@@ -332,7 +332,7 @@ def checked_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> JobSpec:
     Returns
     -------
     JobSpec
-        The job with the paths of nodes in place of their short names.
+        The job with the paths of nodes instead of their short names.
 
     Raises
     ------

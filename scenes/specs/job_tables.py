@@ -35,9 +35,9 @@ class TemperatureSpec(Spec):
 
     Attributes
     ----------
-    change : TemperatureChange
+    change : float
         Temperature change at the body's origin, in kelvin.
-    gradient : TemperatureGradient
+    gradient : tuple[float, float, float]
         Temperature gradient in the body's frame, in K/m.
     """
 
@@ -60,19 +60,19 @@ class TableTemperatureSpec(TemperatureSpec):
 
     Attributes
     ----------
-    table : Reference | None
+    table : str | None
         CSV file with the columns x, y, z and T (absolute, `T [degC]` or `T [K]`) or dT (`dT [K]`, changes from the
         instrument's temperature), or a mesh (.vtu, .vtk, .msh, .med) with temperatures at its nodes; a path relative to
         this file.
-    frame : Reference | None
+    frame : str | None
         Path of the body in whose nominal frame the nodes are given; by default the heated body.
-    values : Literal['change', 'K', 'degC'] | None
+    values : {'change', 'K', 'degC'} | None
         Meaning of a mesh's numbers: changes in kelvin (`change`) or absolute temperatures (`K`, `degC`).
-    unit : MeshUnit | None
+    unit : {'m', 'mm', 'um'} | None
         Unit of a mesh's coordinates, which its file does not contain.
-    field : Text | None
+    field : str | None
         Name of the temperatures in a mesh; needed if it has several scalar fields at its nodes.
-    sha256 : Checksum | None
+    sha256 : str | None
         Checksum of the table, filled in by the program when the table is read; a table with another checksum is
         refused.
     """
@@ -122,18 +122,18 @@ class DeformationSpec(Spec):
 
     Attributes
     ----------
-    table : Reference
+    table : str
         CSV file with the columns x, y, z, dx, dy and dz with their units, or a mesh (.vtu, .vtk, .msh, .med) with
         displacements at its nodes; a path relative to this file.
-    frame : Reference | None
+    frame : str | None
         Path of the body in whose nominal frame nodes and displacements are given; by default the deformed body.
-    terms : Whole
+    terms : int
         Highest Zernike term of the figure, by Noll's numbering; the residual is represented on a grid.
-    unit : MeshUnit | None
+    unit : {'m', 'mm', 'um'} | None
         Unit of a mesh, which its file does not contain.
-    field : Text | None
+    field : str | None
         Name of the displacements in a mesh; needed if it has several vector fields at its nodes.
-    sha256 : Checksum | None
+    sha256 : str | None
         Checksum of the table, filled in by the program when the table is read; a table with another checksum is
         refused.
     """
@@ -210,9 +210,9 @@ class FinishTableSpec(Spec):
 
     Attributes
     ----------
-    table : Reference
+    table : str
         Path of the table, relative to this file.
-    sha256 : Checksum | None
+    sha256 : str | None
         Checksum of the table, filled in by the program when the table is read; a table with another checksum is
         refused.
     """
@@ -229,12 +229,12 @@ class FinishSpec(Spec):
 
     Attributes
     ----------
-    bsdf : FinishTable | None
-        Tabular BSDF of the reflected light in Zemax's format (.bsdf), in place of the built-in scatter lobe. Its values
+    bsdf : FinishTableSpec | None
+        Tabular BSDF of the reflected light in Zemax's format (.bsdf), instead of the built-in scatter lobe. Its values
         are relative to the incident light, and the scattered share is part of the reflected light.
-    coating : FinishTable | None
+    coating : FinishTableSpec | None
         CSV file with the columns wavelength, angle, R and optionally T (or Rs and Rp, Ts and Tp).
-    reflectance : Share | None
+    reflectance : float | None
         Reflectance, specular and scattered together.
     """
 

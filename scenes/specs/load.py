@@ -1,4 +1,4 @@
-"""Resolution of references: names in the library of the twin, paths of a user's files, or mappings in place of a file.
+"""Resolution of references: names in the library of the twin, paths of a user's files, or mappings instead of a file.
 
 The library's folders are cameras, instruments, detectors, payloads, disturbances and budgets in scenes/library,
 scenes/lab (experiments on the ground) and scenes/orbit (in flight). The name of a file there is its file name without
@@ -132,7 +132,8 @@ def load_disturbances(reference: str | Path, owner: Spec | None = None, key: Key
 
 
 def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesSpec | None:
-    """Return the disturbances of a job: its own file or its instrument's, with the job's changes; None for none.
+    """Return the disturbances of a job: its own file or its instrument's, with the job's changes; None if there is
+    none.
 
     Raises
     ------

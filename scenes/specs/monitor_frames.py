@@ -46,13 +46,13 @@ class ChannelFramesSpec(Spec):
 
     Attributes
     ----------
-    before : Files
+    before : str | list[str]
         Image file, or list of files, of the nominal state.
-    after : tuple[Files, ...]
+    after : tuple[str | list[str], ...]
         Image file, or list of files, of the state to be measured; for a series one entry for each time.
-    offset : FirstPixel
+    offset : tuple[int, int]
         Row and column on the CCD of the frames' first pixel, for frames of a part of the CCD.
-    offset_after : FirstPixel | None
+    offset_after : tuple[int, int] | None
         Row and column of the first pixel of the frames after the change, if it differs from `offset`; required if these
         frames have another size.
     """
@@ -68,17 +68,17 @@ class GeometrySpec(Spec):
 
     Attributes
     ----------
-    principal_distance : PositiveLength
+    principal_distance : float
         Principal distance along the line, in metres.
-    separation : PositiveLength
+    separation : float
         Distance of the two area CCDs, in metres.
-    pitch : PixelPitch
+    pitch : float
         Pixel pitch of the area CCDs, in metres.
-    look : LookAngle
+    look : float
         Look angle: angle of the camera's line of sight about the base's Y, in radians.
-    field : FieldPlace
+    field : float
         Field angle of the area CCDs from the visual axis, in radians.
-    principal_distance_across : PositiveLength | None
+    principal_distance_across : float | None
         Plate scale across the line, in metres; by default the principal distance.
     """
 
@@ -95,35 +95,35 @@ class MeasurementSpec(Spec):
 
     Attributes
     ----------
-    instrument : Ref | None
+    instrument : str | None
         Name of an instrument in scenes/library/instruments, or path of your file. Its model predicts the spots' shape
         and their response to motions.
-    geometry : Named[GeometrySpec] | None
-        Camera -> geometry for the published formulas, in place of an instrument.
-    frames : Reference | Paths[ChannelFramesSpec]
+    geometry : Mapping[str, GeometrySpec] | None
+        Camera -> geometry for the published formulas, instead of an instrument.
+    frames : str | Mapping[str, ChannelFramesSpec]
         Folder with CAMERA_CHANNEL_before.tiff and CAMERA_CHANNEL_after.tiff (or .fits), a CSV table of files, or
         CAMERA/CHANNEL -> files.
-    times : tuple[Moment, ...] | None
+    times : tuple[float, ...] | None
         Time of each entry of `after`, for a series; by default a single state is measured.
-    disturbances : JobDisturbances | None
+    disturbances : JobDisturbancesSpec | None
         Expected disturbances, on which the sigmas are based, as in a job; by default the instrument's.
-    template : Literal['twin', 'measured']
+    template : {'twin', 'measured'}
         Source of the spots' calibrated shape: `twin` for the model, or `measured` for the frames before the change.
-    detector : Ref | None
+    detector : str | None
         Data sheet of the area CCDs, a name in the library or a path; by default the instrument's.
-    exposure : Exposure | None
+    exposure : float | None
         Exposure of a frame, in seconds; by default the instrument's.
-    photon_transfer : Literal['stated', 'measured']
+    photon_transfer : {'stated', 'measured'}
         Source of gain and noise of the CCDs: `stated` for the data sheet, or `measured` for the dark and flat frames.
-    dark : PerChannel | None
+    dark : str | list[str] | Mapping[str, str] | None
         Dark frames, for all channels or by channel; by default there are none.
-    flat : PerChannel | None
+    flat : str | list[str] | Mapping[str, str] | None
         Flat-field frames, for all channels or by channel; by default there are none.
-    bad_pixels : PerChannel | None
+    bad_pixels : str | list[str] | Mapping[str, str] | None
         Image in which bad pixels are not 0, for all channels or by channel; by default there is none.
-    corrections : Literal['automatic', 'none']
+    corrections : {'automatic', 'none'}
         Search of the frames for defects, which are then excluded or fitted: `automatic`, or `none`.
-    vibration : Literal['none', 'fitted']
+    vibration : {'none', 'fitted'}
         Smear by vibration during an exposure: `none`, or `fitted`.
     analysis : AnalysisSpec
         Analysis of the frames.

@@ -61,12 +61,12 @@ class RequirementSpec(Spec):
 
     Attributes
     ----------
-    quantity : Text
+    quantity : str
         Quantity as `GROUP KEY`: a camera with `d_alpha_arcsec`, `d_beta_arcsec`, `d_gamma_arcsec` or `d_f_um`;
         `intersection_angle change_arcsec`; `ground along_m`, `across_m` or `height_m`.
-    limit : Text
+    limit : str
         Largest absolute value of its change, with unit.
-    probability : Number
+    probability : float
         Probability with which the limit must be met at every time.
     """
 
@@ -125,21 +125,21 @@ class OperationSpec(Spec):
 
     Attributes
     ----------
-    instrument : Ref
+    instrument : str
         Instrument of the record: a name in scenes/library/instruments, or the path of your file.
-    disturbances : Ref
+    disturbances : str
         Expected disturbances over years with their time laws: a name in scenes/library/disturbances, or the path of
         your file.
-    events : dict[str, Causes]
+    events : dict[str, tuple[str, ...]]
         Event of the record -> causes of the disturbances file whose motions then change by a step with their standard
         deviations. An event without causes has no effect.
     coefficients : float
         Relative standard deviation of the computed thermal response of each body with a temperature sensor.
-    mission : Span
+    mission : float
         Duration of the mission, to which `jump_false_alarm` of the disturbances refers.
-    window : Whole
+    window : int
         Number of readings after a jump within which it is searched for.
-    horizon : Span
+    horizon : float
         Time span of a forecast.
     requirements : tuple[RequirementSpec, ...]
         Requirements; each quantity occurs once.
@@ -236,12 +236,12 @@ class ReadingColumnSpec(Spec):
 
     Attributes
     ----------
-    column : Heads
+    column : tuple[str, ...]
         Head of the column, or list of the heads of the components: three angles of an attitude, or the four numbers of
         its quaternion, the scalar last.
-    unit : Text
+    unit : str
         Unit of the numbers; `quaternion` for a quaternion.
-    sigma : Text
+    sigma : str
         Standard deviation of each number, with unit; for a quaternion that of the angle about each axis.
     """
 
@@ -258,26 +258,26 @@ class ReadingTableSpec(Spec):
     kind : str
         Content of a row: `temperature` of bodies, `attitude` of star trackers, `focus` of cameras; `monitor`,
         `calibration` or `angle` for a row that refers to a run folder; or `event`.
-    files : Reference
+    files : str
         Paths of the tables, relative to this file; `*` and `?` are wildcards.
-    form : Literal['csv', 'keywords']
+    form : {'csv', 'keywords'}
         Format: `csv` with the heads in the first row, or `keywords`, lines of `KEYWORD = TIME NUMBER` as in CCSDS
         messages.
-    time : Text
+    time : str
         Head of the column of times.
-    time_scale : TimeScale
+    time_scale : {'UTC', 'GPS', 'TAI', 'TT', 'GAL', 'QZS', 'BDT'}
         Time scale of the clock.
-    epoch : ClockReading | None
+    epoch : str | None
         Reading of that clock at 0, if the column has numbers instead of dates.
-    time_unit : Text
+    time_unit : str
         Unit of those numbers.
-    columns : Paths[ReadingColumnSpec]
+    columns : Mapping[str, ReadingColumnSpec]
         Body, star tracker or camera -> its columns, for kinds with numbers.
-    name : Text | None
+    name : str | None
         Head of the column with the event or the run folder, whose path is relative to the table.
-    detail : Text | None
+    detail : str | None
         Head of the column with details of an event.
-    events : Paths[Event]
+    events : Mapping[str, str]
         Name of an event in the table -> kind of event.
     """
 
@@ -342,7 +342,7 @@ class TelemetrySpec(Spec):
 
     Attributes
     ----------
-    instrument : Ref
+    instrument : str
         Instrument that sent the readings: a name in scenes/library/instruments, or the path of your file.
     readings : tuple[ReadingTableSpec, ...]
         Tables of readings.

@@ -41,26 +41,26 @@ class PlainPerturbationSpec(Spec):
 
     Attributes
     ----------
-    rotate : Rotation
+    rotate : tuple[float, float, float]
         Rotation vector in the body's frame, about the pivot, in radians; the rotation precedes the shift.
-    shift : Shift
+    shift : tuple[float, float, float]
         Shift in the body's frame, in metres.
-    pivot : Name
+    pivot : str
         Name of the body's point that rotation and scale leave in place.
-    figure : dict[Term, FigureTerm]
+    figure : dict[str, float]
         Zernike term, by Noll's numbering and normalisation -> surface error of a mirror or a face, in metres.
-    scale : ScaleChange
+    scale : float
         Relative change of scale of the body and all it carries.
-    radius : RadiusChange | None
+    radius : float | None
         Relative change of the vertex radius of curvature of a mirror or a face; zero by default.
-    conic : ConicChange | None
+    conic : float | None
         Change of the conic constant, a pure number; zero by default.
-    index : IndexChange | None
+    index : float | None
         Change of the refractive index of the lens that begins at this face, a pure number; zero by default.
-    abbe : AbbeChange | None
+    abbe : float | None
         Relative change of the Abbe number of the lens that begins at this face; its index at the d line is unchanged.
         Zero by default.
-    temperature : job_tables.PlainTemperature | None
+    temperature : TemperatureSpec | None
         Temperature change: uniform as `2 K`, or with a gradient. It replaces the change that the body inherits from its
         carrier, even if it is `0 K`; by default the change is inherited.
     """
@@ -186,7 +186,7 @@ def with_full_paths(
         Perturbations by path, or by the last parts of it.
     nodes : Mapping[str, NodeInfo]
         Node path -> allowed actions.
-    issue : Callable[[Problem, str], Issue]
+    issue : callable
         Function from a problem and a name to an issue.
 
     Raises

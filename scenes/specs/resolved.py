@@ -34,11 +34,11 @@ class ResolvedJob(Spec):
         The job with its defaults.
     instrument : InstrumentSpec
         Instrument to which `job.instrument` refers.
-    cameras : Paths[CameraSpec]
+    cameras : Mapping[str, CameraSpec]
         Reference in `instrument.cameras.<name>.camera` -> prescription.
     detector : DetectorSpec | None
         Data sheet of the monitor's area CCDs; None without a monitor.
-    line_detectors : Paths[DetectorSpec] | None
+    line_detectors : Mapping[str, DetectorSpec] | None
         Reference of a camera -> data sheet of the line CCD that images targets; None without targets.
     disturbances : DisturbancesSpec | None
         Disturbances on which the sigmas are based, with the job's changes; None for the noise alone.
@@ -341,7 +341,7 @@ class CameraTestSetup(ExperimentSetup[TestType], Generic[TestType]):
     ----------
     camera : CameraSpec
         Prescription and bands.
-    detectors : Paths[DetectorSpec]
+    detectors : Mapping[str, DetectorSpec]
         Reference of a band -> data sheet.
     """
 
@@ -464,13 +464,13 @@ class CameraSetup(Spec):
     ----------
     camera : CameraSpec
         Prescription of the camera.
-    mounted : Name | None
+    mounted : str | None
         Name of the camera in the instrument.
     instrument : InstrumentSpec | None
         Instrument that carries the camera; None for a camera alone.
-    cameras : Paths[CameraSpec]
+    cameras : Mapping[str, CameraSpec]
         Reference in the instrument -> prescription.
-    perturb : Paths[PerturbationSpec]
+    perturb : Mapping[str, PerturbationSpec]
         Perturbations of bodies of the instrument, as in a job; for a camera alone of its parts.
     """
 

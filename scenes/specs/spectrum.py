@@ -59,16 +59,16 @@ class SpectrumSpec(Spec):
 
     Attributes
     ----------
-    between : WavelengthRange | None
+    between : tuple[float, float] | None
         Shortest and longest wavelength of light that is evenly distributed between them, in metres.
-    wavelengths : tuple[Wavelength, ...] | None
+    wavelengths : tuple[float, ...] | None
         Wavelengths of spectral lines, ascending, in metres.
-    weights : tuple[Number, ...] | None
+    weights : tuple[float, ...] | None
         Relative signal of each line; by default all are equal.
-    table : Reference | None
+    table : str | None
         CSV file with the columns `wavelength` (with unit) and `response`; a path relative to this file. The response is
         linear between its rows and zero beyond them.
-    curve : tuple[tuple[Wavelength, Number], ...] | None
+    curve : tuple[tuple[float, float], ...] | None
         Content of the table, filled in by the program when it is read; the table's file is then not needed.
     black_body : float | None
         Temperature of a black body as the source for the band or the table, in kelvin; by default the photon flux is
@@ -150,7 +150,7 @@ class SpectrumSpec(Spec):
         """Return wavelengths and weights for means over the signal, by the Gauss rule of this spectrum.
 
         The mean of a function of the wavelength is exact if it is a polynomial of degree below 2 ``count``, for any
-        response. For lines, all of them are returned in place of a rule.
+        response. For lines, all of them are returned instead of a rule.
 
         Parameters
         ----------

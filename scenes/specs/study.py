@@ -46,7 +46,7 @@ class Sampler:
     ----------
     title : str
         Name for reports.
-    points : Callable[[int, int, np.random.Generator], np.ndarray]
+    points : callable
         Function from number of runs, number of independent factors and random generator to points of the unit cube,
         (runs, factors) in [0, 1]. A factor takes the value at which its distribution function equals the point's
         coordinate.
@@ -140,9 +140,9 @@ class NormalSpec(Spec):
 
     Attributes
     ----------
-    mean : Scalar
+    mean : str | float | int | bool
         Mean, with the unit of the base's value.
-    sigma : Scalar
+    sigma : str | float | int | bool
         Standard deviation, with unit.
     """
 
@@ -155,11 +155,11 @@ class TruncatedSpec(Spec):
 
     Attributes
     ----------
-    mean : Scalar
+    mean : str | float | int | bool
         Mean of the normal distribution before truncation, with unit.
-    sigma : Scalar
+    sigma : str | float | int | bool
         Standard deviation of the normal distribution before truncation, with unit.
-    limits : tuple[Scalar, Scalar]
+    limits : tuple[str | float | int | bool, str | float | int | bool]
         Smallest and largest value, with units.
     """
 
@@ -173,11 +173,11 @@ class TableSpec(Spec):
 
     Attributes
     ----------
-    file : Reference
+    file : str
         CSV file with names in its first line, relative to the study's file.
-    column : Text
+    column : str
         Name of the column.
-    values : tuple[Scalar, ...] | None
+    values : tuple[str | float | int | bool, ...] | None
         Values of the column, filled in by the program in a study's config.yaml, which then needs no other file.
     """
 
@@ -193,9 +193,9 @@ class ScaleSpec(Spec):
 
     Attributes
     ----------
-    key : Key
+    key : tuple[str | int, ...]
         Key path in the base's resolved config.yaml of the number or quantity that is scaled.
-    power : Number
+    power : float
         Exponent of the ratio; 2 for an area if the factor is a diameter.
     """
 
@@ -211,21 +211,21 @@ class FactorSpec(Spec):
 
     Attributes
     ----------
-    key : Key | None
+    key : tuple[str | int, ...] | None
         Key path in the base's resolved config.yaml: keys and list indices.
-    motion : Text | None
-        Motion below `perturb` of a job, such as `M2 shift z`, in place of its key.
-    keys : tuple[Key, ...] | None
+    motion : str | None
+        Motion below `perturb` of a job, such as `M2 shift z`, instead of its key.
+    keys : tuple[tuple[str | int, ...], ...] | None
         Several key paths that all get the same value.
     scales : tuple[ScaleSpec, ...]
         Values that scale with the factor. A factor without key and keys is the ratio itself, 1 for the unchanged base.
-    values : tuple[Scalar, ...] | None
+    values : tuple[str | float | int | bool, ...] | None
         List of values; designs other than a grid use each of them equally often.
-    range : tuple[Scalar, Scalar] | None
+    range : tuple[str | float | int | bool, str | float | int | bool] | None
         Smallest and largest value: evenly spaced in a grid, uniformly distributed in other designs.
-    count : Count | None
+    count : int | None
         Number of values of a range in a grid.
-    uniform : tuple[Scalar, Scalar] | None
+    uniform : tuple[str | float | int | bool, str | float | int | bool] | None
         Smallest and largest value of a uniform distribution.
     normal : NormalSpec | None
         Normal distribution.
@@ -412,9 +412,9 @@ class DesignSpec(Spec):
     kind : str
         Design: grid, every combination; latin_hypercube or sobol, evenly distributed over all factors; monte_carlo,
         independent random draws.
-    runs : Whole | None
+    runs : int | None
         Number of runs; a grid has as many as there are combinations.
-    seed : Seed
+    seed : int
         Seed of the draws, and of the noise of every run.
     """
 
@@ -446,7 +446,7 @@ class LimitsSpec(Spec):
 
     Attributes
     ----------
-    runs : Whole
+    runs : int
         Number of runs beyond which the study needs --yes.
     memory : str
         Memory of all processes together, with the unit MB or GB.
@@ -479,7 +479,7 @@ class BaseSpec(Spec):
     ----------
     command : str
         Command that runs it, such as `render` for `python -m twin.render`.
-    file : Reference
+    file : str
         File of the job or test, or the config.yaml of one of its runs, relative to the study's file; for lab and orbit
         also a name in the library.
     """
@@ -497,17 +497,17 @@ class ResponseSpec(Spec):
 
     Attributes
     ----------
-    key : Key
+    key : tuple[str | int, ...]
         Key path in the results: the JSON file of the run folder without .json, then its keys and list indices.
-    unit : Text | None
+    unit : str | None
         Unit of the number; by default read from the suffix of its key.
-    sigma : Key | None
+    sigma : tuple[str | int, ...] | None
         Key path of its total standard deviation, if the results have one; for readings of the monitor it covers noise
         and motions that the spots cannot separate.
-    noise : Key | None
+    noise : tuple[str | int, ...] | None
         Key path of its standard deviation by the noise of a run alone, which differs from run to run; for readings of
         the monitor the key that ends in ``_sigma_noise``.
-    minus : Key | None
+    minus : tuple[str | int, ...] | None
         Key path of a number that is subtracted, such as the true value, so that the response is an error.
     """
 
@@ -538,17 +538,17 @@ class ResponseSpec(Spec):
 
 
 class ThresholdSpec(Spec):
-    """Requirement on a response, in the response's unit. The report gives the share of runs that meet it.
+    """Requirement on a response, in the response's unit. The report gives the fraction of runs that meet it.
 
     Attributes
     ----------
-    response : Name
+    response : str
         Name of the response.
-    at_most : Number | None
+    at_most : float | None
         Largest value that meets the requirement.
-    at_least : Number | None
+    at_least : float | None
         Smallest value that meets the requirement.
-    magnitude : Flag
+    magnitude : bool
         True to judge the absolute value of the response.
     """
 
@@ -569,13 +569,13 @@ class ParetoSpec(Spec):
 
     Attributes
     ----------
-    x : Name
+    x : str
         Name of a factor or response.
-    y : Name
+    y : str
         Name of a factor or response.
-    best_x : Literal['min', 'max']
+    best_x : {'min', 'max'}
         Direction of improvement of x: `min` if smaller is better, `max` if larger is better.
-    best_y : Literal['min', 'max']
+    best_y : {'min', 'max'}
         Direction of improvement of y: `min` if smaller is better, `max` if larger is better.
     """
 
@@ -590,15 +590,15 @@ class StudyReportSpec(Spec):
 
     Attributes
     ----------
-    histograms : tuple[Name, ...] | None
+    histograms : tuple[str, ...] | None
         Responses with a histogram; by default all.
-    scatter : tuple[tuple[Name, Name], ...]
+    scatter : tuple[tuple[str, str], ...]
         Scatter plots: pairs of names of factors or responses, [along x, along y].
     pareto : tuple[ParetoSpec, ...]
         Pareto fronts.
-    sobol : Flag
+    sobol : bool
         True to estimate variance-based (Sobol) sensitivity indices.
-    thresholds : Named[ThresholdSpec]
+    thresholds : Mapping[str, ThresholdSpec]
         Name -> requirement on a response.
     """
 
@@ -626,13 +626,13 @@ class StudySpec(TitledSpec):
     ----------
     base : BaseSpec
         Job or test that is varied.
-    factors : Named[FactorSpec]
+    factors : Mapping[str, FactorSpec]
         Name -> factor.
     design : DesignSpec
         Design of experiments.
-    noise : Literal['own', 'shared']
+    noise : {'own', 'shared'}
         Noise of the runs: `own`, independent in every run, or `shared`, that of the base job's seed in all runs.
-    responses : Named[ResponseSpec]
+    responses : Mapping[str, ResponseSpec]
         Name -> number that is stored for each run.
     limits : LimitsSpec
         Limits on the resources of the study.

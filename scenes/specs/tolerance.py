@@ -59,9 +59,9 @@ class Varied(Spec):
 
     Attributes
     ----------
-    motion : Text
+    motion : str
         Motion of one body without an amount: `M2 shift z`, `M2 rotate x about centre`, `M1 radius`.
-    carrying : tuple[Text, ...]
+    carrying : tuple[str, ...]
         Further bodies that move rigidly with it, about the same point.
     """
 
@@ -124,29 +124,29 @@ class ToleranceSpec(Varied):
         `M2 figure Z7`, `base temperature`; `M1 figure` alone is a figure error of many terms.
     carrying
         Further bodies that move rigidly with the first.
-    limit : Amount
+    limit : str | float
         Largest deviation in either direction; for a figure error its rms over the clear aperture, about its mean.
-    law : Literal['normal', 'uniform', 'ends']
+    law : {'normal', 'uniform', 'ends'}
         Distribution: `normal` with the limit at `sigmas` standard deviations; `uniform` within the limit; `ends`, one
         of both ends.
-    sigmas : Number
+    sigmas : float
         Number of standard deviations of a normal distribution at the limit.
-    mean : Amount | None
+    mean : str | float | None
         Mean of the distribution, for a deviation that has been measured and is not corrected; zero by default.
-    measured : tuple[Amount, ...] | None
-        Measured deviations of such parts, each drawn equally often, in place of a distribution.
-    terms : tuple[Text, Text] | None
+    measured : tuple[str | float, ...] | None
+        Measured deviations of such parts, each drawn equally often, instead of a distribution.
+    terms : tuple[str, str] | None
         First and last Zernike term (Noll) of a figure error, `[Z5, Z36]`.
-    power : Number
+    power : float
         Exponent of a figure error's spectrum: the variance of its terms falls with this power of their radial order.
-    cost : Cost
-        Cost of the stated limit, in any unit.
-    exponent : Number
+    cost : float
+        Cost of the specified limit, in any unit.
+    exponent : float
         Exponent of the cost: it is proportional to the inverse limit to this power.
-    costs : tuple[tuple[Amount, Cost], ...] | None
-        Known costs of limits, `[[20 um, 1], [10 um, 3]]`, in place of cost and exponent; they are interpolated and
+    costs : tuple[tuple[str | float, float], ...] | None
+        Known costs of limits, `[[20 um, 1], [10 um, 3]]`, instead of cost and exponent; they are interpolated and
         extrapolated by a smooth curve in logarithms.
-    kept : Flag
+    kept : bool
         True if the allocation must not change this limit.
     """
 
@@ -212,7 +212,7 @@ class ToleranceSpec(Varied):
 
     @property
     def cost_points(self) -> tuple[tuple[float, float], ...]:
-        """Limits relative to the stated one with their costs, ascending, at least two."""
+        """Limits relative to the specified one with their costs, ascending, at least two."""
         if self.costs is None:
             return (1.0, self.cost), (2.0, self.cost * 2.0**-self.exponent)
         return tuple(sorted((amount_si(limit, self.parts[1]) / self.limit_si, cost) for limit, cost in self.costs))
@@ -252,11 +252,11 @@ class CompensatorSpec(Varied):
         Motion of the compensator: `focal_plane shift z`.
     carrying
         Further bodies that move rigidly with the first.
-    range : Amount
+    range : str | float
         Largest amount in either direction; zero disables the compensator.
-    step : Amount | None
+    step : str | float | None
         Step of which the amount is a multiple; by default any amount is possible.
-    accuracy : Amount | None
+    accuracy : str | float | None
         Standard deviation of a move; zero by default.
     """
 
@@ -292,7 +292,7 @@ class CompensatorSpec(Varied):
 
 FieldShare = Annotated[Number, Field(ge=-1.0, le=1.0)]
 NINE = tuple((x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0))
-"""Default fields of a merit: shares of the half field along the line and along the track."""
+"""Default fields of a merit: fractions of the half field along the line and along the track."""
 MERIT_UNITS: Mapping[str, Kind | None] = FrozenMap(
     {
         "wavefront": None,
@@ -312,7 +312,7 @@ MORE_IS_BETTER = ("mtf",)
 OF_MONITOR = ("monitor_angle", "monitor_focus")
 """Kinds of merits that concern the readings of a monitor."""
 POSTERIOR = "posterior"
-"""Estimator of a monitor's readings with the least variance."""
+"""Estimator of a monitor's readings with the smallest variance."""
 
 
 class MeritSpec(Spec):
@@ -324,29 +324,29 @@ class MeritSpec(Spec):
         Quantity: `wavefront`, rms wavefront error in waves of the design wavelength; `mtf` of the optics; `boresight`,
         rotation of the line of sight; `roll` of the line about the line of sight; `principal_distance`, its change;
         `distortion`, largest change of an image position along the line that these three do not explain; `chief_ray`,
-        largest rotation of a chief ray at the line CCD; `obstruction`, largest share of a field's beam, by area of the
-        stop, that bodies of the instrument block; `monitor_angle` and `monitor_focus`, standard deviation of the
+        largest rotation of a chief ray at the line CCD; `obstruction`, largest fraction of a field's beam, by area of
+        the stop, that bodies of the instrument block; `monitor_angle` and `monitor_focus`, standard deviation of the
         monitor's readings of a rotation and of `d_f` under the disturbances. The budget's `light` selects the light for
         wavefronts and MTFs.
-    fields : tuple[tuple[FieldShare, FieldShare], ...]
-        Fields for wavefront, mtf, chief_ray and obstruction, of which the worst one counts: shares of the half field,
-        [along the line, along the track].
-    frequency : Number | None
+    fields : tuple[tuple[float, float], ...]
+        Fields for wavefront, mtf, chief_ray and obstruction, of which the worst one counts: fractions of the half
+        field, [along the line, along the track].
+    frequency : float | None
         Spatial frequency of mtf, in cycles per mm; by default the Nyquist frequency of the pixels.
-    direction : Literal['line', 'track', 'worse']
+    direction : {'line', 'track', 'worse'}
         Direction of mtf: along the line, along the track, or the worse of both.
-    reading : Literal['angle', 'd_alpha', 'd_beta', 'd_gamma'] | None
+    reading : {'angle', 'd_alpha', 'd_beta', 'd_gamma'} | None
         Reading of monitor_angle: `angle` between the lines of sight of a pair, or `d_alpha`, `d_beta`, `d_gamma` of the
         camera; by default the angle of a pair, and the worst of these three for one camera.
-    estimator : Name
+    estimator : str
         Estimator of the monitor's readings.
-    at_most : Amount | None
+    at_most : str | float | None
         Largest value that passes, for all kinds but mtf; changes are judged by their absolute value.
-    at_least : Number | None
+    at_least : float | None
         Smallest value that passes, for mtf.
-    probability : Share
-        Required share of cameras that pass.
-    loss : Amount | None
+    probability : float
+        Required fraction of cameras that pass.
+    loss : str | float | None
         Loss of the merit that a single tolerance may cause, for the inverse sensitivity analysis; by default the margin
         between design and requirement over the square root of the number of tolerances.
     """
@@ -422,17 +422,17 @@ class MeritSpec(Spec):
 
 
 class AllocationSpec(Spec):
-    """Allocation of limits that achieve the yield at the least cost.
+    """Allocation of limits that achieve the yield at the smallest cost.
 
     Attributes
     ----------
-    target : Share
-        Yield: share of cameras that must pass all requirements.
-    grades : tuple[Number, ...]
+    target : float
+        Yield: fraction of cameras that must pass all requirements.
+    grades : tuple[float, ...]
         Preferred numbers: limits are rounded to these times powers of ten.
-    loosest : Number
+    loosest : float
         Largest factor by which a limit may increase.
-    tightest : Number
+    tightest : float
         Largest factor by which a limit may decrease.
     """
 
@@ -447,25 +447,25 @@ class ToleranceBudgetSpec(Spec):
 
     Attributes
     ----------
-    instrument : Ref
+    instrument : str
         Camera or instrument, by name or path, as in a job.
-    camera : Name | None
+    camera : str | None
         Name of the camera that is judged; may be omitted if the instrument has one camera.
-    disturbances : JobDisturbances | None
+    disturbances : JobDisturbancesSpec | None
         Disturbances between two measurements of the monitor, as in a job; by default those of the instrument.
-    tolerances : Named[ToleranceSpec]
+    tolerances : Mapping[str, ToleranceSpec]
         Name -> tolerance.
-    compensators : Named[CompensatorSpec]
+    compensators : Mapping[str, CompensatorSpec]
         Name -> adjustment of every camera, in this order; the adjustments minimise the mean square wavefront error over
         all fields of the merits.
-    merits : Named[MeritSpec]
+    merits : Mapping[str, MeritSpec]
         Name -> requirement.
-    light : Literal['spectrum', 'design'] | None
+    light : {'spectrum', 'design'} | None
         Light for wavefronts and MTFs: `spectrum` of the camera, or `design` for its design wavelength alone. By default
         the spectrum for a camera with lenses that has one, else the design wavelength.
-    samples : Whole
+    samples : int
         Number of cameras in the Monte Carlo run.
-    seed : Seed
+    seed : int
         Seed of all random numbers.
     allocation : AllocationSpec | None
         Allocation of new limits; by default the limits are not changed.
@@ -500,7 +500,7 @@ class ToleranceSetup(ExperimentSetup[ToleranceBudgetSpec]):
     ----------
     base : ResolvedJob
         Nominal job of the instrument.
-    draws : dict[str, Number]
+    draws : dict[str, float]
         Name of a varying number -> value in one camera, in units of its limit; missing numbers are zero.
     """
 

@@ -25,11 +25,11 @@ class GraduationSpec(Spec):
 
     Attributes
     ----------
-    rms : AngleSigma
+    rms : float
         Expected rms over the full circle, in radians.
-    first, last : Whole
+    first, last : int
         First or last harmonic; the shortest wavelength of the curve is 360 deg / last.
-    slope : Number
+    slope : float
         Exponent of the spectrum: the amplitude of harmonic k falls as k^-slope.
     """
 
@@ -52,11 +52,11 @@ class SubdivisionSpec(Spec):
 
     Attributes
     ----------
-    rms : AngleSigma
+    rms : float
         Expected rms, in radians.
-    lines : Whole
+    lines : int
         Number of signal periods in a full circle.
-    harmonics : tuple[Whole, ...]
+    harmonics : tuple[int, ...]
         Harmonics of the signal with this error; they are equal on average.
     """
 
@@ -82,15 +82,15 @@ class DividingErrorSpec(Spec):
 
     Attributes
     ----------
-    axis : AngleSigma
+    axis : float
         Wobble of the axis, first and second harmonic, in radians.
-    eccentricity : AngleSigma
+    eccentricity : float
         Eccentricity of the grating, first harmonic, in radians.
     graduation : GraduationSpec
         Errors of the grating's lines.
     subdivision : SubdivisionSpec
         Interpolation error within a period of the signal.
-    repeatability : AngleSigma
+    repeatability : float
         Standard deviation of a single reading, in radians.
     """
 
@@ -106,13 +106,13 @@ class ReferenceSpec(Spec):
 
     Attributes
     ----------
-    calibration : AngleSigma
+    calibration : float
         Standard uncertainty of the reference's certificate at each position, the same error in all repeats, in radians.
-    noise : AngleSigma
+    noise : float
         Standard deviation of a single reading of the autocollimator, in radians.
-    gross_error : AngleSigma
+    gross_error : float
         Size of a gross error (a shock, a draught), of either sign, in radians.
-    gross_probability : Number
+    gross_probability : float
         Probability of a gross error in a comparison.
     """
 
@@ -129,9 +129,9 @@ class HeldOutSpec(Spec):
 
     Attributes
     ----------
-    repeats : Whole
+    repeats : int
         Number of repeats of each angle.
-    spread : AngleSigma
+    spread : float
         Half range of a random offset of the turntable from the middle of a step, in radians, so that readings cover all
         phases of the grating's signal, as in use.
     """
@@ -145,11 +145,11 @@ class CalibrationPlanSpec(Spec):
 
     Attributes
     ----------
-    first, last, step : TableAngle
+    first, last, step : float
         First reading, last reading or step of the readings, in radians.
-    repeats : Whole
+    repeats : int
         Number of repeats of each comparison.
-    folds : Whole
+    folds : int
         Number of folds of the cross-validation.
     held_out : HeldOutSpec
         Held-out angles by which the fits are compared.
@@ -208,9 +208,9 @@ class TurntableTestSpec(TitledSpec):
         Reference standard.
     calibration : CalibrationPlanSpec
         Plan of the calibration.
-    camera_angle : TableAngle
+    camera_angle : float
         Reading of the turntable at the centre of the camera's field in the distortion test, in radians.
-    seed : Seed
+    seed : int
         Seed of all random numbers.
     """
 
@@ -239,14 +239,14 @@ class TurntableFiles(Spec):
 
     Attributes
     ----------
-    comparisons : Reference
+    comparisons : str
         CSV file of the calibrated readings.
-    held_out : Reference | None
+    held_out : str | None
         CSV file of readings between the calibrated ones, from a separate series, by which the fits are judged. Without
         it, cross-validation judges them and does not detect an error with a period below the step.
-    reference : AngleSigma
+    reference : float
         Standard uncertainty of the reference's certificate at each position, the same error in all repeats, in radians.
-    folds : Whole
+    folds : int
         Number of folds of the cross-validation.
     """
 
@@ -263,7 +263,7 @@ class MeasuredTurntableSpec(TitledSpec):
     ----------
     measured : TurntableFiles
         Comparisons of readings with a reference.
-    seed : Seed
+    seed : int
         Seed of the neural network's starting values.
     """
 

@@ -79,7 +79,7 @@ class Table:
         (N,) line number of each row in the file, counted from 1.
     heads : Mapping[str, str]
         Name of a column -> its head as written in the file.
-    columns : Mapping[str, np.ndarray]
+    columns : Mapping[str, ndarray]
         Name of a column -> (N,) numbers in SI units, or names; only for columns that the file has.
     """
 

@@ -74,7 +74,7 @@ def name_in(what: str, catalogue: Mapping[str, Any], look_up: Callable[[str], An
         Noun for the named thing, for the error message.
     catalogue : Mapping[str, Any]
         Catalogue, whose keys are the allowed names.
-    look_up : Callable[[str], Any]
+    look_up : callable
         Function from a name to an entry with a ``name``; raises KeyError for an unknown name.
     """
 
@@ -95,7 +95,7 @@ class OneOf:
 
     Attributes
     ----------
-    names : Callable[[], Iterable[str]]
+    names : callable
         Function that returns the names in the order in which a message lists them.
     """
 
@@ -193,7 +193,7 @@ Ref = Annotated[
     WrapValidator(_referred, json_schema_input_type=Reference | dict[str, Any]),
 ]
 """Reference to another specification: its name in the library (`gf7`), the path of its file relative to the file that
-refers to it, or the mapping itself. ``{camera: ...}`` in place of an instrument means the camera alone.
+refers to it, or the mapping itself. ``{camera: ...}`` instead of an instrument means the camera alone.
 `scenes.specs.load` reads the specification.
 """
 
@@ -330,9 +330,9 @@ class TitledSpec(Spec):
 
     Attributes
     ----------
-    name : Name
+    name : str
         Name of the file's content, which results and other files refer to.
-    description : Text
+    description : str
         Description for readers; the program does not use it. Empty by default.
     """
 

@@ -32,7 +32,7 @@ class Quantity:
 
     Attributes
     ----------
-    kind : units.Kind
+    kind : Kind
         Kind of the quantity.
     largest : str | None
         Largest absolute value, with unit; None for no limit.

@@ -1,6 +1,6 @@
 """Bundle adjustment of a block of line images with all sensors of its passes, as in a file of scenes/orbit.
 
-The block is simulated from stated laws: the errors of the orbit and attitude readings follow `truth` if it is given,
+The block is simulated from specified laws: the errors of the orbit and attitude readings follow `truth` if it is given,
 else `errors`; the adjustment always assumes `errors`.
 """
 
@@ -45,19 +45,19 @@ class LawSpec(Spec):
 
     Attributes
     ----------
-    law : LawKind
+    law : {'constant', 'rate', 'white', 'walk', 'slow', 'orbital', 'jitter'}
         Law: constant; rate, a linear growth from the middle of its validity; white, independent readings that a cubic
         spline interpolates; walk, a random walk that is zero in the middle; slow, a stationary process with the
         correlation time `time`; orbital, cosine and sine of the period `time`; jitter, an oscillation of `frequency`
         whose amplitude and phase have the correlation time `time`.
-    shared_by : Literal['pass', 'tracker', 'block']
+    shared_by : {'pass', 'tracker', 'block'}
         Validity of one random draw: each pass, all passes of a star tracker, or the whole block.
-    interval : Interval
+    interval : float
         Interval between independent readings of `white`, or between the estimated values of `walk`, of `slow` and of
         the amplitudes of `jitter`, in seconds.
-    time : Period | None
+    time : float | None
         Correlation time of `slow` and of the amplitudes of `jitter`, or period of `orbital`, in seconds.
-    frequency : Frequency | None
+    frequency : float | None
         Frequency of `jitter`, in hertz.
     """
 
@@ -84,7 +84,7 @@ class AttitudeLawSpec(LawSpec):
 
     Attributes
     ----------
-    sigma : AngleSigmas
+    sigma : tuple[float, float, float]
         Standard deviation about body X, Y and Z, in radians: of a constant, a reading or an amplitude; of jitter as a
         root mean square; of a rate per second; of the increment of a walk in a second.
     """
@@ -97,7 +97,7 @@ class OrbitLawSpec(LawSpec):
 
     Attributes
     ----------
-    sigma : Sigmas
+    sigma : tuple[float, float, float]
         Standard deviation along body X, Y and Z at the middle of the pass, in metres; its meaning by law is as for the
         attitude.
     """
@@ -110,9 +110,9 @@ class ReadingLawsSpec(Spec):
 
     Attributes
     ----------
-    attitude : Named[AttitudeLawSpec]
+    attitude : Mapping[str, AttitudeLawSpec]
         Name -> law of the star trackers including their mounting.
-    orbit : Named[OrbitLawSpec]
+    orbit : Mapping[str, OrbitLawSpec]
         Name -> law of the positions.
     """
 
@@ -131,7 +131,7 @@ class TrackerAngleSpec(Spec):
 
     Attributes
     ----------
-    between : tuple[Name, Name]
+    between : tuple[str, str]
         Names of the two star trackers.
     sigma : tuple[float, float, float]
         Standard deviation about body X, Y and Z, in radians.
@@ -146,15 +146,15 @@ class BlockPassSpec(Spec):
 
     Attributes
     ----------
-    epoch : UtcTime
+    epoch : str
         UTC at which the satellite is vertically above the place below.
-    longitude, latitude : Longitude | None
+    longitude, latitude : float | None
         Geodetic coordinate of this place, in radians; by default that of the area's centre.
-    direction : Literal['descending', 'ascending']
+    direction : {'descending', 'ascending'}
         Direction of flight: descending to the south, ascending to the north.
     roll : float
         Roll of the satellite about body X, in radians; positive looks to the left of the track, toward -Y.
-    tracker : Name
+    tracker : str
         Name of the star tracker that measures the attitude.
     """
 
@@ -171,13 +171,13 @@ class AreaSpec(Spec):
 
     Attributes
     ----------
-    longitude, latitude : Longitude
+    longitude, latitude : float
         Geodetic coordinate of the area's centre, in radians.
-    height : TerrainHeight
+    height : float
         Mean height of the ground above the ellipsoid, in metres.
-    relief : Relief
+    relief : float
         Half range of the heights, which are uniformly distributed about the mean, in metres.
-    east, north : FieldLength
+    east, north : float
         Size in this direction, in metres.
     """
 
@@ -194,19 +194,19 @@ class BlockPointsSpec(Spec):
 
     Attributes
     ----------
-    control : PointCount
+    control : int
         Number of control points, whose coordinates are known.
-    tie : PointCount
+    tie : int
         Number of tie points, whose coordinates are unknown.
-    check : Whole
+    check : int
         Number of tie points whose adjusted coordinates are compared with the truth.
-    image : Number
+    image : float
         Standard deviation of an image point in x and in y, in pixels.
     control_sigma : tuple[float, float]
         Standard deviations of control points, [each axis in plan, height], in metres.
-    gross : Number
-        Share of the tie points' image points with gross errors.
-    gross_size : Number
+    gross : float
+        Fraction of the tie points' image points with gross errors.
+    gross_size : float
         Size of the gross errors, in pixels.
     """
 
@@ -227,9 +227,9 @@ class LaserSpec(Spec):
 
     Attributes
     ----------
-    footprints : Whole
+    footprints : int
         Number of footprints in each pass, evenly spaced over the area; they are also observed in the images.
-    range : Positive
+    range : float
         Standard deviation of a range, in metres.
     pointing : float
         Standard deviation of the beam's direction about body X and Y, in radians.
@@ -248,7 +248,7 @@ class TerrainModelSpec(Spec):
 
     Attributes
     ----------
-    sigma : Positive
+    sigma : float
         Standard deviation of a height, independent from point to point, in metres.
     common : float
         Standard deviation of an error that all heights share, in metres.
@@ -293,9 +293,9 @@ class MonitorRecordSpec(Spec):
 
     Attributes
     ----------
-    record : Reference
+    record : str
         Folder of the record, or URL of its database.
-    plan : Reference | None
+    plan : str | None
         File of the plan of operation for the estimate; by default the plan stored in the record.
     """
 
@@ -314,21 +314,21 @@ class OrbitAdjustSpec(PayloadTestSpec):
 
     Attributes
     ----------
-    lines : tuple[Name, ...]
+    lines : tuple[str, ...]
         Lines of the camera that take part; each one gives a scene in each pass.
     earth : EarthSpec
         Earth rotation.
-    altitude : Altitude
+    altitude : float
         Altitude of the sun-synchronous orbit, in metres.
     span : float
         Half duration of the orbit data about each pass' epoch, in seconds.
-    line_time : LineTime
+    line_time : float
         Time from one image line to the next, in seconds.
     attitude : AttitudeSpec
         True attitude without the roll of the passes.
     area : AreaSpec
         Area in which the points lie.
-    passes : Named[BlockPassSpec]
+    passes : Mapping[str, BlockPassSpec]
         Name -> pass.
     points : BlockPointsSpec
         Points and their accuracies.
@@ -338,26 +338,26 @@ class OrbitAdjustSpec(PayloadTestSpec):
         Time laws of the true reading errors; by default those of `errors`.
     angles : tuple[TrackerAngleSpec, ...]
         Measured angles between star trackers.
-    changes : Named[CameraChangeSpec]
+    changes : Mapping[str, CameraChangeSpec]
         Line -> change of its camera since the calibration.
     monitor : MonitorReadingSpec | None
         Accuracy of an on-board monitor that measures these changes in each pass; by default there is no monitor.
     monitor_record : MonitorRecordSpec | None
-        Record of `twin.operate` with an estimate of these changes, in place of `monitor`; the true cameras are drawn
+        Record of `twin.operate` with an estimate of these changes, instead of `monitor`; the true cameras are drawn
         from the estimate.
     laser : LaserSpec | None
         Laser altimeter; by default there is none.
     terrain : TerrainModelSpec | None
         Terrain model; by default there is none.
-    without : tuple[Sensor, ...]
+    without : tuple[{'ties', 'control', 'monitor', 'laser', 'terrain', 'tracker_angles'}, ...]
         Sensors that the file has but the adjustment does not use.
-    robust : Flag
+    robust : bool
         True to detect gross errors.
-    components : tuple[Name, ...]
+    components : tuple[str, ...]
         Names of laws and groups of measurements whose variance components are estimated.
     datum : tuple[float, float, float]
         Common error of the control points to the east, north and up, unknown to the analysis, in metres.
-    seed : Seed
+    seed : int
         Seed of all random numbers.
     """
 
@@ -439,7 +439,7 @@ class CameraReadingSpec(Spec):
 
     Attributes
     ----------
-    angles : AngleErrors
+    angles : dict[str, dict[str, tuple[float, float]]]
         Rotations d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the line of sight), in radians.
     principal_distance : float
         Change d_f of the principal distance, in metres.
@@ -458,7 +458,7 @@ class MonitoredSpec(MonitorReadingSpec):
         Standard deviations of d_alpha, d_beta and d_gamma, in radians.
     principal_distance
         Standard deviation of d_f, in metres.
-    readings : Named[Named[CameraReadingSpec]]
+    readings : Mapping[str, Mapping[str, CameraReadingSpec]]
         Pass -> line -> reading.
     """
 
@@ -472,24 +472,24 @@ class MeasuredAdjustSpec(MeasuredTestSpec):
     ----------
     camera
         Payload as calibrated: a name in scenes/library/payloads, or the path of your file.
-    names : Literal['shared', 'own']
+    names : {'shared', 'own'}
         Meaning of point names: `shared`, one name in the tables of two passes is one point on the ground; `own`, a name
         is valid within its pass.
     errors : ReadingLawsSpec
         Time laws of the errors of orbit and attitude.
-    trackers : Named[Name]
+    trackers : Mapping[str, str]
         Pass -> star tracker that measured its attitude; by default "tracker".
-    changes : Named[CameraChangeSpec]
+    changes : Mapping[str, CameraChangeSpec]
         Line -> change of its camera since the calibration.
     monitor : MonitoredSpec | None
         Readings of these changes by an on-board monitor; by default there is no monitor.
     monitor_record : MonitorRecordSpec | None
-        Record of `twin.operate` with an estimate of these changes, in place of `monitor`.
-    without : tuple[Literal['ties', 'control', 'monitor'], ...]
+        Record of `twin.operate` with an estimate of these changes, instead of `monitor`.
+    without : tuple[{'ties', 'control', 'monitor'}, ...]
         Sensors that the data have but the adjustment does not use.
-    robust : Flag
+    robust : bool
         True to detect gross errors.
-    components : tuple[Name, ...]
+    components : tuple[str, ...]
         Names of laws and groups of measurements whose variance components are estimated.
     """
 

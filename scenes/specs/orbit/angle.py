@@ -63,11 +63,11 @@ class StripsSpec(Spec):
 
     Attributes
     ----------
-    points : Points
+    points : int
         Number of points on each strip, at least three.
-    first : Number
+    first : float
         Position of the first point on the line, in pixels.
-    last : Number
+    last : float
         Position of the last point on the line, in pixels.
     """
 
@@ -91,9 +91,9 @@ class TerrainSpec(Spec):
 
     Attributes
     ----------
-    height : TerrainHeight
+    height : float
         Mean height, in metres.
-    relief : Relief
+    relief : float
         Standard deviation of the heights about the mean, in metres.
     length : float
         Correlation length of the heights along the strip, exp(-(distance/length)^2/2), in metres.
@@ -109,13 +109,13 @@ class LightEffectsSpec(Spec):
 
     Attributes
     ----------
-    light_time : Flag
+    light_time : bool
         True to include the Earth's rotation during the light travel time.
-    aberration : Flag
+    aberration : bool
         True to include aberration by the satellite's velocity.
-    refraction : Flag
+    refraction : bool
         True to include refraction by the standard atmosphere.
-    wavelength : Wavelength
+    wavelength : float
         Vacuum wavelength for the refraction, in metres.
     """
 
@@ -130,7 +130,7 @@ class EffectsSpec(LightEffectsSpec):
 
     Attributes
     ----------
-    corrected : Flag
+    corrected : bool
         True if the analysis corrects the included effects by its models of them.
     """
 
@@ -142,11 +142,11 @@ class AngleErrorsSpec(Spec):
 
     Attributes
     ----------
-    station : GroundSigma
+    station : float
         Standard deviation of each coordinate of the measured orbit, in metres.
-    points : GroundSigma
+    points : float
         Standard deviation of each coordinate of a ground point, matching and aerial triangulation together, in metres.
-    datum : DatumShift
+    datum : tuple[float, float, float]
         Common shift of all ground points to the east, north and up, unknown to the analysis, in metres.
     """
 
@@ -163,10 +163,10 @@ class OrbitAngleSpec(PayloadTestSpec):
     camera
         Name in scenes/library/payloads or scenes/library/instruments, or path of such a file. The lines of a payload
         are ideal projections; those of an instrument are ray-traced, one for each of its cameras.
-    angles : Angles
+    angles : Mapping[str, tuple[str, str]] | None
         Name -> the two lines between which the angle lies; by default alpha [forward, nadir] and beta [nadir, backward]
         if the camera has these lines, or alpha between the lines of a camera with two.
-    perturb : Paths[Change]
+    perturb : Mapping[str, PlainPerturbationSpec]
         Change since the laboratory, unknown to the analysis: for a payload line -> rotation vector in body axes, for an
         instrument node path -> perturbation as in a job.
     earth : EarthSpec
@@ -175,7 +175,7 @@ class OrbitAngleSpec(PayloadTestSpec):
         True orbit.
     attitude : AttitudeSpec
         True attitude.
-    time : Moment
+    time : float
         Time of exposure from the orbit's epoch, in seconds.
     strips : StripsSpec
         Positions of the ground points on the lines.
@@ -185,9 +185,9 @@ class OrbitAngleSpec(PayloadTestSpec):
         Effects on the light path.
     errors : AngleErrorsSpec
         Measurement errors of the station and the ground points.
-    passes : Passes
+    passes : int
         Number of repetitions with new random errors, from which the scatter is computed.
-    seed : Seed
+    seed : int
         Seed of all random numbers.
     """
 

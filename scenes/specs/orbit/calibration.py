@@ -22,10 +22,10 @@ class CameraDriftSpec(Spec):
 
     Attributes
     ----------
-    angles : AngleSigmas
+    angles : tuple[float, float, float]
         Standard deviations of d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the line of sight),
         in radians.
-    principal_distance : LengthSigma
+    principal_distance : float
         Standard deviation of d_f, in metres.
     """
 
@@ -53,7 +53,7 @@ class StripSpec(Spec):
 
     Attributes
     ----------
-    ties : Whole
+    ties : int
         Number of simulated tie points; for images all measured ones are used.
     length : float
         Length along the track, around the field, of the strip with the tie points, in metres.
@@ -97,13 +97,13 @@ class FieldSpec(Spec):
 
     Attributes
     ----------
-    latitude, longitude : Latitude
+    latitude, longitude : float
         Geodetic coordinate of the field's centre, over which the satellite passes at the epoch, in radians.
-    epoch : UtcTime
+    epoch : str
         UTC of the pass.
-    height : TerrainHeight
+    height : float
         Mean height of the ground above the ellipsoid, in metres.
-    relief : Relief
+    relief : float
         Half range of the heights, which are uniformly distributed about the mean, in metres.
     """
 
@@ -119,13 +119,13 @@ class PointsSpec(Spec):
 
     Attributes
     ----------
-    control : Count
+    control : int
         Number of control points, which are used for the calibration.
-    check : Count
+    check : int
         Number of check points, which only test the calibration.
-    first, last : Number
+    first, last : float
         First or last pixel of the part of the nadir line on which the points lie, counted from 0.
-    length : FieldLength
+    length : float
         Length of the field along the track, in metres.
     """
 
@@ -149,7 +149,7 @@ class PatchPlaceSpec(Spec):
 
     Attributes
     ----------
-    pixel : Number
+    pixel : float
         Pixel of the nadir line that images the patch's centre.
     track : float
         Distance of the patch's centre from the field's centre along the flight, in metres.
@@ -160,13 +160,13 @@ class PatchPlaceSpec(Spec):
 
 
 class CalibrationImagesSpec(Spec):
-    """Patches of every field whose images are rendered and measured, in place of simulated image points.
+    """Patches of every field whose images are rendered and measured, instead of simulated image points.
 
     Attributes
     ----------
     patches : tuple[PatchPlaceSpec, ...]
         Positions of the patches of every field.
-    lines, pixels : Side
+    lines, pixels : int
         Size of every image in this direction, in pixels.
     ground : GroundSpec
         True ground. Its mean height is that of the field; a real terrain is another part of the model in each patch.
@@ -174,7 +174,7 @@ class CalibrationImagesSpec(Spec):
         Orthophoto and elevation model. Their errors are drawn for each patch; a shift is common to all.
     points : ImagePointsSpec
         Points of every patch. Their `control` and `height_sigma` are used as the accuracy of the reference.
-    oversampling : Whole
+    oversampling : int
         Number of ground samples along each side of a pixel.
     """
 
@@ -207,16 +207,16 @@ class CalibrationErrorsSpec(ErrorsSpec):
 
     Attributes
     ----------
-    season : AngleSigmas
+    season : tuple[float, float, float]
         Standard deviation of a further constant bias of each field about body X, Y, Z, in radians.
-    image : Number
+    image : float
         Standard deviation of an image point in x and in y, in pixels.
-    control : GroundSigma
+    control : float
         Standard deviation of each coordinate of a control point, in metres.
-    datum : DatumShift
+    datum : tuple[float, float, float]
         Common shift of the coordinates of all control points to the east, north and up, unknown to the analysis, in
         metres. Check points are in the correct datum.
-    switched_on : Flag
+    switched_on : bool
         False for exact image points, control points and orbit, and an attitude with its biases only.
     """
 
@@ -235,7 +235,7 @@ class LaunchSpec(Spec):
 
     Attributes
     ----------
-    bias : AngleSigmas
+    bias : tuple[float, float, float]
         Standard deviations of the angle between star trackers and cameras about body X, Y, Z, in radians; 0 if nothing
         is known of it.
     interior : float
@@ -279,36 +279,36 @@ class OrbitCalibrationSpec(TitledSpec):
 
     Attributes
     ----------
-    camera : Ref
+    camera : str
         Payload with lines forward, nadir and backward: a name in scenes/library/payloads, or the path of your file.
-    perturb : Named[InteriorChangeSpec]
+    perturb : Mapping[str, InteriorChangeSpec]
         Line -> true change of its interior orientation since the laboratory. The nadir line's principal point is the
         gauge and does not change: it cannot be separated from a rotation of the whole camera,
         `errors.star_tracker.bias`.
     earth : EarthSpec
         Earth rotation.
-    altitude : Altitude
+    altitude : float
         Altitude of the descending sun-synchronous orbit over each field, in metres.
     span : float
         Half duration of the orbit data about the field's centre, in seconds.
-    line_time : LineTime
+    line_time : float
         Time from one image line to the next, in seconds.
     attitude : AttitudeSpec
         True attitude.
-    fields : Named[FieldSpec]
+    fields : Mapping[str, FieldSpec]
         Name -> test field.
-    schemes : tuple[tuple[Name, ...], ...]
+    schemes : tuple[tuple[str, ...], ...]
         Schemes: each is a list of fields whose parameters are averaged. The program adds a scheme in which each field
         uses its own parameters.
     points : PointsSpec | None
         Simulated points of every field; omitted if images are measured.
     images : CalibrationImagesSpec | None
-        Rendered and measured images in place of simulated points.
+        Rendered and measured images instead of simulated points.
     effects : EffectsSpec
         Effects on the light path.
     errors : CalibrationErrorsSpec
         Measurement errors.
-    drift : CameraDrifts
+    drift : Mapping[str, CameraDriftSpec]
         Line -> change of its camera from field to field.
     monitor : MonitorReadingSpec | None
         Accuracy of an on-board monitor that measures these changes in each pass; by default there is no monitor.
@@ -318,10 +318,10 @@ class OrbitCalibrationSpec(TitledSpec):
         Prior of the change by the launch.
     limits : MapLimitsSpec
         Largest RMS errors for the verdict.
-    repeats : Repeats
+    repeats : int
         Number of further campaigns over the same fields with new random numbers, which show the scatter between
         campaigns.
-    seed : Seed
+    seed : int
         Seed of all random numbers.
     """
 

@@ -28,11 +28,11 @@ class JitterLineSpec(Spec):
 
     Attributes
     ----------
-    frequency : Frequency
+    frequency : float
         Frequency, in hertz.
-    amplitude : Amplitudes
+    amplitude : tuple[float, float, float]
         Amplitudes (half of peak to peak) about body X, Y and Z (roll, pitch, yaw), in radians.
-    phase : Phases | None
+    phase : tuple[float, float, float] | None
         Phases about the three axes, or one for all, in radians, for time from the orbit's epoch; random by default.
     """
 
@@ -46,9 +46,9 @@ class JitterBandSpec(Spec):
 
     Attributes
     ----------
-    first, last : Frequency
+    first, last : float
         Lower (first) or upper (last) end of the band, in hertz.
-    level : Levels
+    level : tuple[float, float, float]
         One-sided spectral density about body X, Y and Z, in rad^2/Hz; level x (last - first) is the variance.
     """
 
@@ -159,13 +159,13 @@ class PassingSpec(Spec):
 
     Attributes
     ----------
-    longitude, latitude : Longitude
+    longitude, latitude : float
         Geodetic coordinate of the place vertically below the satellite, in radians.
-    altitude : Altitude
+    altitude : float
         Altitude of the satellite above the ellipsoid there, in metres.
-    direction : Literal['descending', 'ascending']
+    direction : {'descending', 'ascending'}
         Direction of flight: descending to the south, ascending to the north.
-    inclination : Inclination | None
+    inclination : float | None
         Osculating inclination, in radians; by default that of a sun-synchronous orbit.
     """
 
@@ -181,19 +181,19 @@ class ElementsSpec(Spec):
 
     Attributes
     ----------
-    altitude : Altitude
+    altitude : float
         Semi-major axis minus the equatorial radius, in metres.
-    eccentricity : Number
+    eccentricity : float
         Eccentricity, at most 0.1.
-    inclination : Inclination | None
+    inclination : float | None
         Inclination, in radians; by default that of a sun-synchronous orbit.
-    node : Longitude | None
+    node : float | None
         Right ascension of the ascending node from the celestial intermediate origin, in radians.
     node_local_time : float | None
-        Local mean solar time of the descending node, 0 h to 24 h, in place of `node`, in seconds.
-    perigee : Longitude
+        Local mean solar time of the descending node, 0 h to 24 h, instead of `node`, in seconds.
+    perigee : float
         Argument of the perigee, in radians.
-    argument : Longitude
+    argument : float
         Argument of latitude (perigee + true anomaly) at the epoch, in radians.
     """
 
@@ -220,9 +220,9 @@ class StateSpec(Spec):
 
     Attributes
     ----------
-    position : Position
+    position : tuple[float, float, float]
         Position in the GCRS, in metres.
-    velocity : Velocity
+    velocity : tuple[float, float, float]
         Velocity in the GCRS, in m/s.
     """
 
@@ -235,9 +235,9 @@ class OrbitSpec(Spec):
 
     Attributes
     ----------
-    epoch : UtcTime
+    epoch : str
         UTC epoch, from which all times of the orbit are counted.
-    before, after : Span
+    before, after : float
         Duration of the orbit data before or after the epoch, in seconds.
     passing : PassingSpec | None
         Place over which the orbit passes at the epoch.
@@ -277,9 +277,9 @@ class AttitudeSpec(Spec):
 
     Attributes
     ----------
-    nadir : Literal['geodetic', 'geocentric']
+    nadir : {'geodetic', 'geocentric'}
         Direction of Z: along the ellipsoid's normal (geodetic) or to the Earth's centre (geocentric).
-    steering : Literal['none', 'yaw']
+    steering : {'none', 'yaw'}
         Direction of X: along the inertial velocity (none), or along the track on the rotating Earth (yaw), so that the
         image at nadir does not drift along the line.
     offset : tuple[float, float, float]
@@ -299,15 +299,15 @@ class GpsErrorsSpec(Spec):
 
     Attributes
     ----------
-    interval : Interval
+    interval : float
         Interval between fixes, in seconds.
-    noise : LengthSigmas
+    noise : tuple[float, float, float]
         Standard deviation of a fix, independent from fix to fix, in metres.
-    drift : LengthSigmas
+    drift : tuple[float, float, float]
         Standard deviation of a slowly varying error, in metres.
     correlation_time : float
         Correlation time of `drift`, at which its correlation has fallen to 1/e, in seconds.
-    velocity : SpeedSigmas
+    velocity : tuple[float, float, float]
         Standard deviation of a fix's velocity, independent from fix to fix, in m/s.
     """
 
@@ -325,9 +325,9 @@ class ThermalDriftSpec(Spec):
 
     Attributes
     ----------
-    amplitude : AngleErrors
+    amplitude : tuple[float, float, float]
         Rotation vector about body X, Y and Z, in radians; it is multiplied by sin(latitude - reference).
-    reference : Latitude
+    reference : float
         Geodetic latitude at which the change is zero, in radians.
     """
 
@@ -340,9 +340,9 @@ class SlowErrorsSpec(Spec):
 
     Attributes
     ----------
-    noise : AngleSigmas
+    noise : tuple[float, float, float]
         Standard deviation of a value about body X, Y and Z, in radians.
-    interval : Interval
+    interval : float
         Interval between the values, in seconds; it covers many readings.
     """
 
@@ -355,19 +355,19 @@ class StarTrackerErrorsSpec(Spec):
 
     Attributes
     ----------
-    interval : Interval
+    interval : float
         Interval between readings, in seconds.
-    noise : AngleSigmas
+    noise : tuple[float, float, float]
         Standard deviation of a reading, independent from reading to reading, in radians.
-    bias : AngleErrors
+    bias : tuple[float, float, float]
         Constant error, in radians.
     thermal : ThermalDriftSpec
         Error that depends on the latitude.
     slow : SlowErrorsSpec
         Error that changes within a pass.
-    drift : AngleSigmas
+    drift : tuple[float, float, float]
         Standard deviation of a constant rate in each pass, as the change in a second, in radians.
-    walk : AngleSigmas
+    walk : tuple[float, float, float]
         Standard deviation of the increment of a random walk in a second, in radians.
     """
 
@@ -400,7 +400,7 @@ class PayloadTestSpec(TitledSpec):
 
     Attributes
     ----------
-    camera : Ref
+    camera : str
         Payload: a name in scenes/library/payloads, or the path of your file.
     """
 

@@ -44,7 +44,7 @@ class SplineSpec(Spec):
     ----------
     interval : float
         Interval of the knots, in seconds.
-    sigma : AngleSigma
+    sigma : float
         Prior standard deviation of a coefficient, in radians.
     """
 
@@ -57,19 +57,19 @@ class JitterSearchSpec(Spec):
 
     Attributes
     ----------
-    lowest, highest : Frequency
+    lowest, highest : float
         Lowest or highest frequency of the search, in hertz.
-    axes : Axes
+    axes : tuple[{'roll', 'pitch', 'yaw'}, ...]
         Body axes about which jitter is searched.
-    false_alarm : Number
+    false_alarm : float
         Probability of reporting jitter if there is none, over all frequencies together.
-    trend : Whole
+    trend : int
         Degree of the polynomial in time that represents slow changes, for each line separately.
-    interior : Whole
+    interior : int
         Degree of the polynomial along each line that represents errors of its interior orientation.
-    height : TerrainHeight
+    height : float
         Height of tie points above the ellipsoid, in metres.
-    height_sigma : HeightSigma
+    height_sigma : float
         Standard deviation of that height, in metres.
     spline : SplineSpec | None
         Attitude as a spline; by default there is none.
@@ -101,24 +101,24 @@ class BandPointsSpec(Spec):
 
     Attributes
     ----------
-    count : Whole
+    count : int
         Number of points.
     duration : float
         Duration of the flight over the strip with the points, in seconds.
-    noise : PointNoise
+    noise : float
         Standard deviation of an image coordinate, independent from line to line, in pixels.
-    line_noise : dict[Name, PointNoise]
+    line_noise : dict[str, float]
         Line -> true standard deviation where it differs from `noise`, which the measurements state for all lines.
     rows : float | None
         Time of flight between the rows on which the points lie, in seconds; by default they lie anywhere.
     row_spread : float
         Standard deviation of a point's time about its row, in seconds.
-    height : TerrainHeight
+    height : float
         Mean height of the ground, in metres.
     relief : float
         Half range of the heights, which are uniformly distributed about the mean, in metres.
-    wrong : Number
-        Share of image points with gross errors of up to 20 pixels.
+    wrong : float
+        Fraction of image points with gross errors of up to 20 pixels.
     """
 
     count: Annotated[Whole, Field(ge=30, le=20_000)] = 1000
@@ -137,7 +137,7 @@ class OrbitJitterSpec(PayloadTestSpec):
 
     Attributes
     ----------
-    lines : SomeLines
+    lines : tuple[str, ...] | None
         Names of the lines that are used; by default all.
     earth : EarthSpec
         Earth rotation.
@@ -147,9 +147,9 @@ class OrbitJitterSpec(PayloadTestSpec):
         True attitude with its jitter.
     effects : LightEffectsSpec
         Effects on the light path between ground and camera.
-    line_time : LineTime
+    line_time : float
         Time from one image line to the next, in seconds.
-    time : Moment
+    time : float
         Time of the strip's middle from the orbit's epoch, in seconds.
     points : BandPointsSpec
         Points that are measured.
@@ -157,7 +157,7 @@ class OrbitJitterSpec(PayloadTestSpec):
         Errors of the satellite's orbit and attitude measurements.
     search : JitterSearchSpec
         Settings of the search.
-    seed : Seed
+    seed : int
         Seed of all random numbers.
     """
 

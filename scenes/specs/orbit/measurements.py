@@ -70,19 +70,19 @@ class OrbitFileSpec(Spec):
 
     Attributes
     ----------
-    file : Reference
+    file : str
         Path of the file.
-    satellite : Satellite | None
+    satellite : str | None
         Satellite, if the file has several.
-    frame : OrbitFrame | None
+    frame : {'ITRS', 'GCRS', 'EME2000', 'TEME'} | None
         Reference frame of positions and velocities; inertial ones need Earth orientation.
-    time_scale : TimeScale | None
+    time_scale : {'UTC', 'GPS', 'TAI', 'TT', 'GAL', 'QZS', 'BDT'} | None
         Time scale of the clock.
-    epoch : ClockReading | None
+    epoch : str | None
         Reading of that clock at 0 s, for tables with `time [s]`.
-    leap_seconds : Literal['counted', 'skipped'] | None
+    leap_seconds : {'counted', 'skipped'} | None
         Treatment of leap seconds since the epoch in `time [s]` of a UTC clock; required if there are any.
-    offset : ClockOffset
+    offset : float
         Time to be added to the times, in seconds.
     """
 
@@ -100,29 +100,29 @@ class AttitudeFileSpec(Spec):
 
     Attributes
     ----------
-    file : Reference
+    file : str
         Path of the file.
-    satellite : Satellite | None
+    satellite : str | None
         Satellite, if the file has several.
-    frame : TurnFrame | None
+    frame : {'ITRS', 'GCRS', 'EME2000', 'TEME', 'orbital'} | None
         Reference frame of the attitude; `orbital` has X forward, Z down, Y = Z x X.
-    time_scale : TimeScale | None
+    time_scale : {'UTC', 'GPS', 'TAI', 'TT', 'GAL', 'QZS', 'BDT'} | None
         Time scale of the clock.
-    epoch : ClockReading | None
+    epoch : str | None
         Reading of that clock at 0 s, for tables with `time [s]`.
-    leap_seconds : Literal['counted', 'skipped'] | None
+    leap_seconds : {'counted', 'skipped'} | None
         Treatment of leap seconds since the epoch in `time [s]` of a UTC clock; required if there are any.
-    offset : ClockOffset
+    offset : float
         Time to be added to the times, in seconds.
-    scalar : Literal['last', 'first'] | None
+    scalar : {'last', 'first'} | None
         Position of a quaternion's scalar part, the cosine of half the rotation angle.
-    turns : Literal['body_to_frame', 'frame_to_body'] | None
+    turns : {'body_to_frame', 'frame_to_body'} | None
         Sense of the quaternion: transformation of the components of a vector by v' = q v q*.
-    body_axes : BodyAxes
+    body_axes : tuple[str, str, str]
         Directions of the file's body x, y and z in flight, as [forward, right, down].
-    sequence : Sequence | None
+    sequence : {'xyz', 'xzy', 'yxz', 'yzx', 'zxy', 'zyx'} | None
         Sequence of roll about x, pitch about y, yaw about z: `xyz` means v_frame = Rx(roll) Ry(pitch) Rz(yaw) v_body.
-    nadir, steering : Literal['geodetic', 'geocentric'] | None
+    nadir, steering : {'geodetic', 'geocentric'} | None
         Definition of the orbital frame, as in `attitude` of a simulated pass.
     """
 
@@ -150,10 +150,10 @@ class PlatformFilesSpec(Spec):
         File of the orbit.
     attitude : AttitudeFileSpec
         File of the attitude.
-    earth_orientation : Reference | None
+    earth_orientation : str | None
         Table of the IERS (finals2000A, C04) or CSV, for inertial frames.
     earth : EarthSpec | None
-        Earth rotation parameters of one moment, in place of that table.
+        Earth rotation parameters of one moment, instead of that table.
     """
 
     orbit: OrbitFileSpec
@@ -199,9 +199,9 @@ class GroundFileSpec(_HeightsFileSpec):
         Reference surface of the heights: the ellipsoid, or the geoid of `geoid`.
     geoid
         Grid of geoid heights above the ellipsoid, GeoTIFF or GTX.
-    sigma : tuple[PointSigma, PointSigma] | None
+    sigma : tuple[float, float] | None
         Standard deviations [east and north, up] of points for which the file has none, in metres.
-    sigma_axes : Literal['xyz', 'enu']
+    sigma_axes : {'xyz', 'enu'}
         Axes of the three sigmas of a .gcp: Earth-fixed x, y, z as that program uses them, or east, north, up.
     """
 
@@ -222,7 +222,7 @@ class RasterFileSpec(_HeightsFileSpec):
         Reference surface of an elevation model: the ellipsoid, or the geoid of `geoid`.
     geoid
         Grid of geoid heights above the ellipsoid, GeoTIFF or GTX.
-    band : Whole
+    band : int
         Band of the file that is read, counted from 1.
     """
 
@@ -277,9 +277,9 @@ class QuaternionSpec(Spec):
 
     Attributes
     ----------
-    scalar : Literal['first', 'last']
+    scalar : {'first', 'last'}
         Position of the scalar part (the cosine of half the rotation angle) among the four.
-    turns : Literal['body_to_frame', 'frame_to_body']
+    turns : {'body_to_frame', 'frame_to_body'}
         Sense of the quaternion: v' = q v q* transforms the components of a vector from body axes to the frame, or from
         the frame to body axes.
     """
@@ -293,22 +293,22 @@ class ConventionsSpec(Spec):
 
     Attributes
     ----------
-    frame : Literal['itrs']
+    frame : 'itrs'
         Reference frame of positions, velocities and quaternions; velocities are relative to it. itrs is Earth-fixed
         (WGS 84, CGCS2000 and ITRF agree with it to some centimetres).
     quaternion : QuaternionSpec | None
         Order and sense of the quaternions in tables.
-    body_axes : BodyAxes | None
+    body_axes : tuple[str, str, str] | None
         Directions of the quaternions' body x, y and z in flight, as [forward, right, down].
-    time_scale : Literal['utc']
+    time_scale : 'utc'
         Time scale of the epochs of the passes. Times in tables are SI seconds from them.
-    line_moment : Literal['start', 'middle', 'end']
+    line_moment : {'start', 'middle', 'end'}
         Moment of a line's exposure to which its time refers.
-    centre : Literal['integer', 'half']
+    centre : {'integer', 'half'}
         Image coordinate of the centre of pixel (or line) n: n, or n + 0.5.
     first_pixel : int
         Number of the first pixel of a line.
-    first_pixel_sees : Literal['right', 'left']
+    first_pixel_sees : {'right', 'left'}
         Side of the track that the first pixel images.
     """
 
@@ -327,22 +327,22 @@ class PassFilesSpec(Spec):
 
     Attributes
     ----------
-    epoch : UtcTime
+    epoch : str
         Epoch of the times in all tables.
-    platform : Reference | PlatformFilesSpec | None
+    platform : str | PlatformFilesSpec | None
         Orbit and attitude in one table, or files of other formats (SP3, OEM, AEM ...) with the conventions that they do
         not contain; alternatively `orbit` and `attitude`.
-    orbit : Reference | None
+    orbit : str | None
         Table of time, x, y, z and optionally vx, vy, vz.
-    attitude : Reference | None
+    attitude : str | None
         Table of time, q1, q2, q3, q4.
-    lines : Reference
+    lines : str
         Exposure times of the lines of each line camera.
-    ground : Reference
+    ground : str
         Ground points with coordinates, sigmas and roles.
-    image_points : Reference
+    image_points : str
         Image coordinates of the ground points in the line cameras.
-    tie_points : Reference | None
+    tie_points : str | None
         Image coordinates of points without known coordinates; by default there are none.
     """
 
@@ -381,7 +381,7 @@ class OrbitDataSpec(Spec):
     ----------
     conventions : ConventionsSpec
         Conventions of all tables.
-    passes : Passes
+    passes : Mapping[str, PassFilesSpec]
         Name of the pass, or of the field over which it leads -> its tables.
     """
 
@@ -394,11 +394,11 @@ class OrbitReadingsSpec(Spec):
 
     Attributes
     ----------
-    noise : LengthSigmas
+    noise : tuple[float, float, float]
         Standard deviation of a reading, independent from reading to reading, in metres.
-    drift : LengthSigmas
+    drift : tuple[float, float, float]
         Standard deviation of an error common to the whole pass, in metres.
-    interval : Interval | None
+    interval : float | None
         Interval between independent readings, in seconds; by default the median interval of the table.
     """
 
@@ -412,16 +412,16 @@ class AttitudeReadingsSpec(Spec):
 
     Attributes
     ----------
-    noise : AngleSigmas
+    noise : tuple[float, float, float]
         Standard deviation of a reading, independent from reading to reading, in radians.
     slow : SlowErrorsSpec
         Errors that change within a pass.
-    drift : AngleSigmas | None
+    drift : tuple[float, float, float] | None
         Standard deviation of a constant rate in each pass, as the change in a second, in radians; zeros for no rate,
         and by default unknown.
-    walk : AngleSigmas
+    walk : tuple[float, float, float]
         Standard deviation of the increment of a random walk in a second, in radians.
-    interval : Interval | None
+    interval : float | None
         Interval between independent readings, in seconds; by default the median interval of the table.
     """
 
@@ -441,7 +441,7 @@ class ReadingErrorsSpec(Spec):
         Accuracy of the orbit.
     star_tracker : AttitudeReadingsSpec
         Accuracy of the attitude.
-    season : AngleSigmas
+    season : tuple[float, float, float]
         Standard deviation of the change of biases from pass to pass about body X, Y, Z, in radians; used for warnings
         only.
     """
@@ -477,12 +477,12 @@ class MeasuredTestSpec(FixedTestSpec):
     ----------
     camera
         Payload as calibrated in the laboratory: a name in scenes/library/payloads, or the path of your file.
-    data : Reference | None
+    data : str | None
         Folder with a ``data.yaml``, or the path of such a file; alternatively `conventions` and `passes` are given
         here.
     conventions : ConventionsSpec | None
         Conventions of all tables.
-    passes : Passes | None
+    passes : Mapping[str, PassFilesSpec] | None
         Name -> tables of a pass.
     effects : EffectsSpec
         Effects on the light path that the image points contain; `corrected` makes the analysis correct them.
@@ -510,17 +510,17 @@ class MeasuredCalibrationSpec(MeasuredTestSpec):
 
     Attributes
     ----------
-    schemes : tuple[tuple[Name, ...], ...]
+    schemes : tuple[tuple[str, ...], ...]
         Schemes: each is a list of passes whose parameters are averaged; the program adds a scheme in which each pass
         uses its own parameters.
     errors : ReadingErrorsSpec
         Accuracy of the readings of orbit and attitude.
-    screening : Literal['robust', 'none']
+    screening : {'robust', 'none'}
         Treatment of image points: `robust` weights with rejection of gross errors, or `none`.
-    ties : Literal['with_control', 'apart']
+    ties : {'with_control', 'apart'}
         Use of tie points: `with_control`, they calibrate together with the control points; `apart`, they only serve the
         strip adjustment.
-    strip : Flag
+    strip : bool
         True to adjust every pass on its tie points before check points are intersected.
     launch : LaunchSpec
         Prior of the change by the launch.
@@ -542,10 +542,10 @@ class MeasuredAngleSpec(MeasuredTestSpec):
 
     Attributes
     ----------
-    angles : Angles
+    angles : Mapping[str, tuple[str, str]] | None
         Name -> the two lines between which the angle lies; by default alpha [forward, nadir] and beta [nadir, backward]
         if the camera has these lines, or alpha between the lines of a camera with two.
-    time : Moment | None
+    time : float | None
         Time from the pass's epoch, in seconds; by default the middle of the image points of each line.
     errors : ReadingErrorsSpec
         Accuracy of the readings of orbit and attitude.
@@ -569,7 +569,7 @@ class MeasuredJitterSpec(MeasuredTestSpec):
 
     Attributes
     ----------
-    lines : SomeLines
+    lines : tuple[str, ...] | None
         Names of the lines that are used; by default all that have points.
     search : JitterSearchSpec
         Settings of the search.
@@ -584,14 +584,14 @@ class LineTimesFileSpec(Spec):
 
     Attributes
     ----------
-    file : Reference
+    file : str
         Path of a CSV file with columns `camera`, `line` and `time [s]` or `date_time`; or of the DIMAP file of a scene,
         for a camera of one line.
-    time_scale : TimeScale
+    time_scale : {'UTC', 'GPS', 'TAI', 'TT', 'GAL', 'QZS', 'BDT'}
         Time scale of the clock.
-    epoch : ClockReading | None
+    epoch : str | None
         Reading of that clock at 0 s, for tables with `time [s]`.
-    moment : Literal['start', 'middle', 'end']
+    moment : {'start', 'middle', 'end'}
         Moment of a line's exposure to which its time refers.
     """
 
@@ -606,15 +606,15 @@ class ImagePointsFileSpec(Spec):
 
     Attributes
     ----------
-    file : Reference
+    file : str
         Path of a CSV file with columns `point`, `camera`, `line`, `pixel`, `line_sigma`, `pixel_sigma` and optionally
         `correlation`; or of the .gcp of the Ames Stereo Pipeline with the ground points, whose images are named as the
         lines, `nadir.tif`.
-    centre : Literal['integer', 'half']
+    centre : {'integer', 'half'}
         Image coordinate of the centre of pixel (or line) n: n, or n + 0.5.
-    first_pixel : Whole
+    first_pixel : int
         Number of the first pixel of a line.
-    first_pixel_sees : Literal['right', 'left']
+    first_pixel_sees : {'right', 'left'}
         Side of the track that the first pixel images.
     """
 
@@ -629,13 +629,13 @@ class UncertaintySpec(Spec):
 
     Attributes
     ----------
-    attitude : AngleSigma
+    attitude : float
         Standard deviation of the measured attitude including the camera's mounting, about each axis, in radians.
-    position : PointSigma
+    position : float
         Standard deviation of the orbit along each axis, in metres.
-    interior : Number
+    interior : float
         Standard deviation of each line's position in the focal plane, along and across the line, in pixels.
-    scale : Number
+    scale : float
         Relative standard deviation of each line's principal distance.
     time : float
         Standard deviation of the line times relative to those of orbit and attitude, in seconds.
@@ -667,9 +667,9 @@ class OrbitCheckSpec(FixedTestSpec):
         Effects on the light path between ground and camera.
     uncertainty : UncertaintySpec
         Uncertainty of camera and platform.
-    points : Whole
+    points : int
         Largest number of points of each line that are used.
-    shown : Whole
+    shown : int
         Number of points whose computed position is shown for each combination of conventions.
     """
 
@@ -688,9 +688,9 @@ class ImageWindowSpec(Spec):
 
     Attributes
     ----------
-    row, column : Whole
+    row, column : int
         Row or column in the file of the window's first pixel, counted from 0.
-    rows, columns : Whole
+    rows, columns : int
         Size of the window in this direction, in pixels.
     """
 
@@ -705,13 +705,13 @@ class LineImageFileSpec(Spec):
 
     Attributes
     ----------
-    file : Reference
+    file : str
         Path of a TIFF; a georeference in it is not used.
-    band : Whole
+    band : int
         Band that is read, counted from 1.
-    first_line : Whole
+    first_line : int
         Number, in the table of times, of the image's first row.
-    first_pixel : Whole
+    first_pixel : int
         Pixel of the line, counted from 0, of the image's first column.
     first_pixel_sees : str
         Side of the track that the first column images: right or left.
@@ -740,13 +740,13 @@ class OrbitMatchSpec(FixedTestSpec):
         Files of orbit and attitude.
     lines : LineTimesFileSpec
         File of the exposure times of the lines.
-    images : Named[LineImageFileSpec]
+    images : Mapping[str, LineImageFileSpec]
         Line -> its image.
     orthophoto : RasterFileSpec
         Orthophoto of the ground.
     dem : RasterFileSpec
         Elevation model of the ground.
-    control_sigma : tuple[PointSigma, PointSigma]
+    control_sigma : tuple[float, float]
         Standard deviations of points of the orthophoto with their heights, [each axis in plan, height], in metres.
     effects : LightEffectsSpec
         Effects on the light path between ground and camera.

@@ -30,7 +30,7 @@ from scenes.yaml.units import ANGLE, LENGTH, MOMENT, Kind, parse_quantity
 _EVEN = 1e-6
 """Largest difference of time steps that count as equal, in seconds."""
 _WHOLE = 1e-9
-"""Tolerance, as a share of a step, for rounding a range to whole steps."""
+"""Tolerance, as a fraction of a step, for rounding a range to whole steps."""
 _KINDS: dict[str, Kind] = {"rotate": ANGLE, "shift": LENGTH}
 """Kind of a mechanism's motion -> kind of quantity of its steps."""
 _QUANTITIES: dict[str, Kind] = {"d_alpha": ANGLE, "d_beta": ANGLE, "d_gamma": ANGLE, "d_f": LENGTH, "defocus": LENGTH}
@@ -55,18 +55,18 @@ class MotionSpec(Spec):
 
     Attributes
     ----------
-    rotate : Rotation
+    rotate : tuple[float, float, float]
         Rotation vector in the body's frame about the pivot, in radians; the rotation precedes the shift.
-    shift : Shift
+    shift : tuple[float, float, float]
         Shift in the body's frame, in metres.
-    pivot : Name
+    pivot : str
         Name of the body's point that the rotation leaves in place.
-    begin : Moment
+    begin : float
         Start time, in seconds.
-    duration : Span
+    duration : float
         Duration of the linear growth to `rotate` and `shift`, in seconds; 0 for a step.
-    period : Interval | None
-        Period of an oscillation `rotate` x sin(2 pi (t - begin)/period) at all times, in place of `duration`, in
+    period : float | None
+        Period of an oscillation `rotate` x sin(2 pi (t - begin)/period) at all times, instead of `duration`, in
         seconds.
     """
 
@@ -86,7 +86,7 @@ class MotionSpec(Spec):
         return self
 
     def share(self, time: float) -> float:
-        """Return the share of `rotate` and `shift` at a time in seconds."""
+        """Return the fraction of `rotate` and `shift` at a time in seconds."""
         passed = time - self.begin
         if self.period is not None:
             return math.sin(2.0 * math.pi * passed / self.period)
@@ -107,15 +107,15 @@ class GroundSpec(Spec):
 
     Attributes
     ----------
-    points : Count
+    points : int
         Number of points at every time.
-    first, last : Number
+    first, last : float
         First or last pixel of the part of the second camera's line on which the points lie, counted from 0.
-    length : FieldLength
+    length : float
         Length of the area along the track, in metres.
-    height : TerrainHeight
+    height : float
         Mean height above the ellipsoid, in metres.
-    relief : Relief
+    relief : float
         Half range of the heights, which are uniformly distributed about the mean, in metres.
     """
 
@@ -139,11 +139,11 @@ class MonitorErrorsSpec(ErrorsSpec):
 
     Attributes
     ----------
-    image : Number
+    image : float
         Standard deviation of an image point along and across the line, in pixels.
-    monitor : Flag
+    monitor : bool
         True for noise in the monitor's frames; false for expected images without noise or rounding.
-    switched_on : Flag
+    switched_on : bool
         False for exact image points, orbit and attitude, and monitor frames without noise.
     """
 
@@ -160,24 +160,24 @@ class CorrectionSpec(Spec):
 
     Attributes
     ----------
-    camera : Name
+    camera : str
         Camera to which the quantity belongs.
-    quantity : Literal['d_alpha', 'd_beta', 'd_gamma', 'd_f', 'defocus']
+    quantity : {'d_alpha', 'd_beta', 'd_gamma', 'd_f', 'defocus'}
         Quantity: `d_alpha`, `d_beta`, `d_gamma`, `d_f`, or `defocus`, best focus minus line CCD.
-    mechanism : Text | None
+    mechanism : str | None
         Motion of a body that corrects the quantity, as text without amount: `forward/focal_plane shift z`. By default
         the line of sight is corrected in the image processing on the ground, and no body moves.
-    gain : Number
-        Share of the remaining error that one reading corrects.
-    delay : Whole
+    gain : float
+        Fraction of the remaining error that one reading corrects.
+    delay : int
         Number of readings until a command takes effect; 0 for immediately, before the images of that time.
-    step : Text | None
+    step : str | None
         Step of the mechanism, with unit; by default any amount is possible.
-    range : Text | None
+    range : str | None
         Range of the mechanism to either side of its initial position, with unit; unlimited by default.
-    dead_band : Text | None
+    dead_band : str | None
         Dead band: smaller remaining errors are not corrected; in the quantity's unit. Zero by default.
-    response : Number
+    response : float
         True response of the mechanism relative to the nominal one; the estimate does not know it.
     """
 
@@ -258,11 +258,11 @@ class ReadingsSpec(Spec):
 
     Attributes
     ----------
-    begin : Moment
+    begin : float
         Time of the first reading from the orbit's epoch, in seconds.
-    every : Interval
+    every : float
         Interval between readings, in seconds.
-    count : Whole
+    count : int
         Number of readings.
     """
 
@@ -281,9 +281,9 @@ class LoopImagesSpec(Spec):
 
     Attributes
     ----------
-    times : tuple[Moment, ...]
+    times : tuple[float, ...]
         Times of these readings from the orbit's epoch, in seconds.
-    side : Side
+    side : int
         Number of lines and of pixels of every image.
     ground : SceneGroundSpec
         True ground.
@@ -311,7 +311,7 @@ class MechanismsSpec(Spec):
     readings : ReadingsSpec | None
         Times of the readings, if the file has no course: the motions are then drawn from the disturbances and their
         time laws. With a course the spots are read at each of its times.
-    corrections : Named[CorrectionSpec]
+    corrections : Mapping[str, CorrectionSpec]
         Name -> correction by the readings.
     images : LoopImagesSpec | None
         Pairs of line images; by default there are none.
@@ -327,39 +327,39 @@ class OrbitMonitorSpec(TitledSpec):
 
     Attributes
     ----------
-    instrument : Ref
+    instrument : str
         Instrument with two or more cameras and their monitors: a name in scenes/library/instruments, or the path of
         your file.
-    cameras : tuple[Name, ...] | None
+    cameras : tuple[str, ...] | None
         Two cameras of the stereo pair; the rotation of the first is relative to the second. By default those of an
         instrument with two.
-    perturb : Paths[PlainPerturbationSpec]
+    perturb : Mapping[str, PlainPerturbationSpec]
         Node -> constant perturbation relative to the nominal instrument, as in a job.
     course : CourseSpec | None
         Evenly spaced times from the orbit's epoch, with temperatures. Tests with `mechanisms.readings` have no course.
-    motion : Paths[MotionSpec]
+    motion : Mapping[str, MotionSpec]
         Node -> true motion, unknown to the estimates.
-    reference : Moment | None
+    reference : float | None
         Time of the course at which the cameras were calibrated and the monitor's reference images were taken, in
         seconds.
-    disturbances : JobDisturbances | None
+    disturbances : JobDisturbancesSpec | None
         Expected disturbances with their time laws, as in a job, on which the monitor's values and their sigmas are
         based; by default the instrument's.
-    interval : Interval | None
+    interval : float | None
         Interval between measurements of the monitor, in seconds, a multiple of the course's step. The values are
         interpolated linearly between them and held constant before the first and after the last. With disturbances all
         measurements are also smoothed together.
-    intervals : tuple[Interval, ...] | None
+    intervals : tuple[float, ...] | None
         Intervals that are compared, in seconds; by default all that divide the course.
-    apply : tuple[Parameter, ...]
+    apply : tuple[{'d_alpha', 'd_beta', 'd_gamma', 'd_f'}, ...]
         Monitor values that correct the cameras.
     mechanisms : MechanismsSpec | None
-        Closed loop that acts on every reading, in place of `reference` and `interval`.
-    frames : Frames | None
+        Closed loop that acts on every reading, instead of `reference` and `interval`.
+    frames : int | None
         Number of frames of a measurement; by default that of the instrument's monitor.
     analysis : AnalysisSpec
         Analysis of the monitor's images.
-    repeats : Repeats
+    repeats : int
         Number of repetitions of a measurement with new noise, from which the scatter is computed.
     earth : EarthSpec
         Earth rotation.
@@ -367,13 +367,13 @@ class OrbitMonitorSpec(TitledSpec):
         True orbit; it must cover all times and one more minute at either end.
     attitude : AttitudeSpec
         True attitude.
-    line_time : LineTime
+    line_time : float
         Time from one image line to the next, in seconds.
     ground : GroundSpec
         Check points.
     errors : MonitorErrorsSpec
         Measurement errors.
-    seed : Seed
+    seed : int
         Seed of all random numbers.
     """
 

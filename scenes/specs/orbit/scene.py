@@ -74,20 +74,20 @@ class LineImageSpec(Spec):
 
     Attributes
     ----------
-    f_number : Number
+    f_number : float
         F-number of the lens, whose pupil is circular and uniformly illuminated.
-    transmission : Number
+    transmission : float
         Transmission of the lens, mean over the spectrum.
-    wavefront : dict[EvenTerm, TermSize]
+    wavefront : dict[str, float]
         Even Zernike term (Noll, unit rms) -> wavefront error, in metres.
-    obstruction : tuple[Outline, ...]
+    obstruction : tuple[tuple[tuple[float, float], ...], ...]
         Outlines of obstructions before the lens: convex polygons that do not overlap, corners (along the line, along
         the track) in units of the pupil's radius.
-    spectrum : WavelengthRange
+    spectrum : tuple[float, float]
         Shortest and longest wavelength, in metres; the light between them is the Sun's.
-    detector : Ref
+    detector : str
         Data sheet of the detector, by name or path.
-    diffusion : Diffusion
+    diffusion : float
         Charge diffusion between pixels, rms, in metres.
     tdi : TdiSpec
         Time delay and integration; its line time is replaced by that of the image.
@@ -116,19 +116,19 @@ class TerrainSpec(Spec):
 
     Attributes
     ----------
-    kind : Literal['real', 'fractal']
+    kind : {'real', 'fractal'}
         Source of the heights: `real`, the elevation model that comes with matplotlib (Jacksboro fault, Tennessee, 3 arc
         seconds), mirrored beyond its edges of 30 km x 32 km; `fractal`, random.
-    height : TerrainHeight
+    height : float
         Mean height, in metres.
     relief : float | None
         Rms of the heights about their mean, in metres; required for `fractal`, for `real` by default that of the model,
         121 m.
-    exponent : Number
+    exponent : float
         Exponent of a fractal's amplitude spectrum; a larger one is smoother.
-    post : Spacing
+    post : float
         Spacing of a fractal's posts, in metres; between them the terrain is a cubic spline.
-    longest : GroundLength
+    longest : float
         Longest wavelength of a fractal's relief, in metres.
     offset : tuple[float, float]
         Position of the patch's centre to the east and north of the real model's centre, in metres.
@@ -156,18 +156,18 @@ class TextureSpec(Spec):
 
     Attributes
     ----------
-    spacing : Spacing
+    spacing : float
         Spacing of the cells of reflectance, in metres; the reflectance is a cubic B-spline of them without finer
         detail.
-    mean : Number
+    mean : float
         Mean reflectance.
-    contrast : Number
+    contrast : float
         Rms of the reflectance relative to its mean.
-    parcels : Share
-        Share of the ground covered by fields of crops; the rest varies as a fractal.
-    parcel_size : GroundLength
+    parcels : float
+        Fraction of the ground covered by fields of crops; the rest varies as a fractal.
+    parcel_size : float
         Side of a field of crops of mean area, in metres.
-    roads : GroundLength
+    roads : float
         Distance between roads, in metres.
     """
 
@@ -184,15 +184,15 @@ class LightSpec(Spec):
 
     Attributes
     ----------
-    elevation : Elevation
+    elevation : float
         Elevation of the Sun, in radians.
     azimuth : float
         Azimuth of the Sun, from north over east, in radians.
-    transmission : Number
+    transmission : float
         Transmission of the atmosphere, down and up together.
-    sky : Share
-        Share of the illumination of level ground that is diffuse light of the sky.
-    path : Number
+    sky : float
+        Fraction of the illumination of level ground that is diffuse light of the sky.
+    path : float
         Path radiance: light scattered by the atmosphere into the camera, as an equivalent reflectance.
     """
 
@@ -226,11 +226,11 @@ class DemSpec(Spec):
 
     Attributes
     ----------
-    post : Spacing
+    post : float
         Spacing of the posts, in metres.
-    sigma : GroundSigma
+    sigma : float
         Standard deviation of a height, in metres.
-    correlation : GroundLength
+    correlation : float
         Correlation length of the height errors, in metres.
     """
 
@@ -244,21 +244,21 @@ class ControlSpec(Spec):
 
     Attributes
     ----------
-    spacing : Spacing
+    spacing : float
         Ground sample distance of the orthophoto, in metres.
-    mtf : Number
+    mtf : float
         MTF of the orthophoto at its Nyquist frequency.
-    noise : Number
+    noise : float
         Noise of the orthophoto, rms, in reflectance.
-    changed : Share
-        Share of the fields of crops that look different on the orthophoto's date.
+    changed : float
+        Fraction of the fields of crops that look different on the orthophoto's date.
     light : LightSpec
         Illumination on the orthophoto's date.
     shift : tuple[float, float]
         Constant error in plan, east and north, in metres.
-    sigma : GroundSigma
+    sigma : float
         Standard deviation of a smooth error in plan, each axis, in metres.
-    correlation : GroundLength
+    correlation : float
         Correlation length of the smooth error, in metres.
     dem : DemSpec
         Elevation model.
@@ -290,27 +290,27 @@ class ImagePointsSpec(Spec):
 
     Attributes
     ----------
-    control : Whole
+    control : int
         Number of control points: points of the orthophoto that are matched in every line.
-    check : Whole
+    check : int
         Number of further points of the orthophoto, which only test the result.
-    tie : Whole
+    tie : int
         Number of tie points: points of the nadir line's image that are matched in the others.
-    reach : Whole
+    reach : int
         Search radius about the predicted position, in pixels and lines.
-    template : Whole
+    template : int
         Side of a template, in pixels.
-    least_correlation : Number
+    least_correlation : float
         Smallest correlation of image and template after the fit.
-    largest_sigma : Number
+    largest_sigma : float
         Largest standard deviation of a matched position along its worst direction, in pixels.
-    height_sigma : GroundSigma
+    height_sigma : float
         Standard deviation of the reference heights, as their producer states it, in metres.
-    roughness : Number
+    roughness : float
         Rms of the displacement over a patch by attitude noise, in pixels; smaller differences between neighbours are
         consistent.
-    false_alarm : Number
-        Share of correct matches that the consensus test may reject.
+    false_alarm : float
+        Fraction of correct matches that the consensus test may reject.
     """
 
     control: Annotated[Whole, Field(ge=0, le=2000)] = 60
@@ -361,13 +361,13 @@ class PatchSpec(Spec):
 
     Attributes
     ----------
-    line : Name
+    line : str
         Name of this line.
-    pixel : Number
+    pixel : float
         Pixel of this line that images the patch's centre.
-    time : Moment
+    time : float
         Time at which it does, from the orbit's epoch, in seconds.
-    lines, pixels : Side
+    lines, pixels : int
         Size of every image in this direction, in pixels.
     """
 
@@ -385,9 +385,9 @@ class OrbitSimulateSpec(PayloadTestSpec):
     ----------
     camera
         Payload with a section `image`: a name in scenes/library/payloads, or the path of your file.
-    lines : tuple[Name, ...]
+    lines : tuple[str, ...]
         Names of the lines that are rendered.
-    perturb : Named[InteriorChangeSpec]
+    perturb : Mapping[str, InteriorChangeSpec]
         Line -> true change of its interior orientation since the laboratory.
     earth : EarthSpec
         Earth rotation.
@@ -397,7 +397,7 @@ class OrbitSimulateSpec(PayloadTestSpec):
         True attitude.
     effects : LightEffectsSpec
         Effects on the light path between ground and camera.
-    line_time : LineTime
+    line_time : float
         Time from one image line to the next, in seconds.
     patch : PatchSpec
         Position and size of the patch.
@@ -409,9 +409,9 @@ class OrbitSimulateSpec(PayloadTestSpec):
         Points that are measured in the images; by default there are none.
     errors : ErrorsSpec
         Errors of the satellite's orbit and attitude measurements.
-    oversampling : Whole
+    oversampling : int
         Number of ground samples along each side of a pixel.
-    seed : Seed
+    seed : int
         Seed of all random numbers.
     """
 

@@ -61,7 +61,7 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
         The payload; None for an instrument.
     instrument : InstrumentSpec | None
         The instrument; None for a payload.
-    cameras : Paths[CameraSpec]
+    cameras : Mapping[str, CameraSpec]
         Reference in `instrument.cameras.<name>.camera` -> prescription; empty for a payload.
     """
 
@@ -166,7 +166,7 @@ class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
 
     Attributes
     ----------
-    detectors : Paths[DetectorSpec]
+    detectors : Mapping[str, DetectorSpec]
         Data sheets of the camera's line CCDs, if images are rendered.
     """
 
@@ -214,13 +214,13 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
     ----------
     instrument : InstrumentSpec
         Cameras and monitors on their base.
-    cameras : Paths[CameraSpec]
+    cameras : Mapping[str, CameraSpec]
         Reference in the instrument -> prescription.
     detector : DetectorSpec
         Data sheet of the monitor's area CCDs.
     disturbances : DisturbancesSpec | None
-        Expected disturbances; None for none.
-    line_detectors : Paths[DetectorSpec] | None
+        Expected disturbances; None if there is none.
+    line_detectors : Mapping[str, DetectorSpec] | None
         Reference of a camera -> data sheet of its line CCD; None if no line images are rendered.
     """
 
@@ -273,7 +273,7 @@ class SimulateSetup(PayloadSetup[OrbitSimulateSpec]):
 
     Attributes
     ----------
-    detectors : Paths[DetectorSpec]
+    detectors : Mapping[str, DetectorSpec]
         Reference of an image section -> data sheet of a line CCD.
     """
 
@@ -344,7 +344,7 @@ class MeasuredPassesSetup(PayloadSetup[TestType], Generic[TestType]):
 
     Attributes
     ----------
-    data : measurements.OrbitDataSpec
+    data : OrbitDataSpec
         Passes with absolute paths.
     """
 
@@ -464,7 +464,7 @@ def without_sensors(setup: AnyAdjust, names: Sequence[str]) -> AnyAdjust:
 
     Parameters
     ----------
-    setup : AnyAdjust
+    setup : AdjustSetup | MeasuredAdjustSetup
         The block.
     names : Sequence[str]
         Names of the sensors.

@@ -35,15 +35,15 @@ class CcdSpec(Spec):
 
     Attributes
     ----------
-    first, last : Whole
+    first, last : int
         First or last pixel of the CCD, both inclusive.
     shift : tuple[float, float]
         Shift x (flight) and y (along the line) in the focal plane, in metres.
     rotate : float
         Rotation about the line of sight, from +x toward +y, about the CCD's centre, in radians.
-    psi_x : LookAngles | None
+    psi_x : tuple[float, ...] | None
         Coefficients of the forward look angle, in radians, radians per pixel, per pixel^2, ...
-    psi_y : LookAngles | None
+    psi_y : tuple[float, ...] | None
         Coefficients of the look angle to the right, in radians, radians per pixel, per pixel^2, ...
     """
 
@@ -75,25 +75,25 @@ class LineCameraSpec(Spec):
 
     Attributes
     ----------
-    look : LookAngle
+    look : float
         Look angle: angle of the camera's Z from the base's +Z about the base's Y, positive forward (toward +X), in
         radians.
-    rotate : Rotation
+    rotate : tuple[float, float, float]
         Misalignment: rotation vector in the camera's axes after the look angle, in radians.
-    position : Vector3
+    position : tuple[float, float, float]
         Position of the projection centre in the base frame, in metres.
-    principal_distance : PositiveLength
+    principal_distance : float
         Principal distance f, in metres.
-    principal_point : Vector2
+    principal_point : tuple[float, float]
         Principal point, where the camera's Z meets the focal plane: x (flight) and y (along the line) from the line's
         centre, in metres.
     k1 : float
         Radial distortion of third order, in 1/m^2.
     k2 : float
         Radial distortion of fifth order, in 1/m^4.
-    pixels : LongestLine | None
+    pixels : int | None
         Number of pixels; by default that of the payload.
-    pitch : PixelPitch | None
+    pitch : float | None
         Pixel pitch, in metres; by default that of the payload.
     image : LineImageSpec | None
         Image formation and recording; by default that of the payload.
@@ -131,11 +131,11 @@ class ThreeLineCameraSpec(TitledSpec):
 
     Attributes
     ----------
-    pixels : LongestLine
+    pixels : int
         Number of pixels of each line without an entry; pixel 0 is at the line's -y end.
-    pitch : PixelPitch
+    pitch : float
         Pixel pitch of each line without an entry, in metres.
-    lines : Named[LineCameraSpec]
+    lines : Mapping[str, LineCameraSpec]
         Name -> line camera; usually forward, nadir and backward, in the order in which they image a point on the
         ground, then others such as a high-resolution and a multispectral one.
     image : LineImageSpec | None
