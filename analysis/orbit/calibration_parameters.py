@@ -72,13 +72,13 @@ class NoiseTerm:
     kind : {'attitude', 'station'}
         Quantity that the noise acts on.
     sigma : float
-        Standard deviation of a reading, about each body axis in radians or along each axis in metres; for a random
-        walk, the standard deviation of its increment over one second.
+        Standard deviation of one attitude or position measurement, about each body axis in radians or along each axis
+        in metres; for a random walk, the standard deviation of its increment over one second.
     interval : float or None
         Interval between the readings, which a cubic spline interpolates, in seconds. None if every exposure has
         independent noise.
     walks : bool
-        True for a random walk, which is linear between its nodes at the interval.
+        True for a random walk, estimated at nodes `interval` seconds apart and linear between them.
     """
 
     group: str
@@ -95,8 +95,8 @@ class Noise:
     Attributes
     ----------
     image : float
-        Sigma of an image point in x and in y, independent, in metres; x is the image line times the pixel pitch. Rays
-        with a covariance of their own (`Rays.spread`) state it in units of this sigma squared.
+        Sigma of an image point in x and in y, independent, in metres; x is the image line times the pixel pitch. Where
+        rays have a covariance of their own (`Rays.spread`), it is in units of this sigma squared.
     attitude : float
         Sigma of an attitude reading about each body axis, in radians.
     station : float
@@ -202,8 +202,8 @@ class CalibrationField:
         Raises
         ------
         CalibrationError
-            Shapes do not match, values are not finite, a point is far from the ellipsoid, a ray shows a point that does
-            not exist, or fewer than two lines see a tie point.
+            Shapes do not match, values are not finite, a point is far from the ellipsoid, a ray refers to a ground
+            point that does not exist, or fewer than two lines see a tie point.
         """
         points = np.array(ground, np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or not np.all(np.isfinite(points)):
@@ -278,7 +278,8 @@ def _rough_height(points: Array) -> Array:
 def vertical(points: Array) -> Array:
     """Return the (m, 3) unit normals of the ellipsoid at points (m, 3), ITRS, in metres.
 
-    The error is h/a of the deflection of the radius, 1e-6 rad for heights below 2 km.
+    The normal is computed as if the point lay on the ellipsoid. For a point at height h above a semi-major axis a, the
+    error is h / a times the angle between normal and radius: 1e-6 rad for heights below 2 km.
     """
     normal = points / _SEMI_AXES**2
     return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
@@ -351,7 +352,8 @@ def monitor_priors(field: str, line: str, reading: ArrayLike, sigma: ArrayLike) 
     line : str
         Name of the line camera.
     reading : (4,) array_like
-        d_alpha, d_beta, d_gamma (radians) and d_f (metres) against the reference state.
+        Measured drift since the reference state: rotations d_alpha, d_beta, d_gamma of the camera about its Y, X and Z
+        axes (radians), and change d_f of its principal distance (metres).
     sigma : (4,) array_like
         Standard deviation of each; infinite for a component that the monitor does not measure.
 
@@ -378,11 +380,13 @@ class Parameters:
     start : (P,) ndarray
         Start values, in metres and radians.
     scale : (P,) ndarray
-        Change of each unknown that moves the image by about one metre: 1 for principal points, 1/f rad for angles,
-        range/f m for offsets; for f, the change that moves the ends of the line by one metre.
+        Change of each unknown that moves the image by about one metre: 1 m for principal points x and y, 1/f rad for
+        angles and (distance to the ground)/f m for orbit offsets, with f the principal distance in metres; for f
+        itself, the change that moves the ends of the line by one metre.
     columns : mapping of (str, str) to tuple of ndarray
-        For each (field, line), the indices of (f, x, y), (roll, pitch, yaw), (along, across, down), (d_alpha, d_beta,
-        d_gamma, d_f) and (the rates of roll, pitch, yaw); -1 for a fixed parameter.
+        For each (field, line), the indices of the unknowns: interior orientation (f, x, y), attitude bias (roll, pitch,
+        yaw), orbit offset (along, across, down), camera drift (d_alpha, d_beta, d_gamma, d_f) and bias rates (roll,
+        pitch, yaw); -1 for a fixed parameter.
     middles : mapping of str to float
         Mean time of the rays of each field, in seconds, where the bias drifts.
     """
@@ -555,31 +559,36 @@ without any calibration (paper 003: 100 m class). With a camera mounted askew by
 observable, but only to 400 px with sixty points of 0.3 px.
 """
 LOST = 3e3
-"""Ratio of a combination's image motion to the noise of a single image point above which the points do not determine
-it, whatever the start values say. Six points over the width of a field give 500 or less.
+"""Largest ratio of a combination's standard deviation, as image motion, to the noise of a single image point. Above it
+the combination counts as not determined by the points, whatever the sigmas of the start values. Six points over the
+width of a field give 500 or less.
 """
 WEAK = 3e-2
 """Strength below which an estimated combination is reported as weak."""
 _CLOSED = 10.0
-"""Factor on the sigma of an unknown's prior that makes the prior close the combinations with this unknown."""
+"""Factor on the sigma of an unknown's prior, within which the prior is taken to fix the combinations that contain this
+unknown.
+"""
 _SHOWN = 1e-2
-"""Smallest share of the largest motion with which an unknown is listed in a combination."""
+"""Smallest image motion of an unknown listed in a combination, as a fraction of the largest one in it."""
 _ANGLES = (*BIAS, *DRIFT[:3], "rate")
 
 
 @dataclass(frozen=True, eq=False)
 class Combination:
-    """Change of unknowns that moves (nearly) no image point.
+    """Linear combination of unknowns that can change together while (nearly) no image point moves.
 
     Attributes
     ----------
     names : tuple of str
         Unknowns that take part.
     change : (k,) ndarray
-        Change of each of them, in metres and radians, scaled so that the largest image motion caused by any single one
-        is 1 mm.
+        Change of each of the k unknowns in `names`, in metres and radians, scaled so that the largest image motion
+        caused by any single one is 1 mm.
     strength : float
-        Ratio of the standard deviations of the unknowns alone to that of the combination.
+        Standard deviation that the combination would have if the ground points were known, divided by its standard
+        deviation with unknown ground points: 0 for an undetermined combination, 1 for one that the elimination of the
+        points does not weaken.
     sigma : float
         Standard deviation of the combination from the data, as the image motion of the unknown that moves the image
         most, in metres.
@@ -597,15 +606,15 @@ class Combination:
 
 @dataclass(frozen=True)
 class Gauge:
-    """Rule that fixes open combinations.
+    """Rule that fixes combinations of unknowns that the ground points leave undetermined.
 
     Attributes
     ----------
     held : tuple of str
         Unknowns that are fixed at their start values, for example ("nadir x",).
     start : mapping of str to float, float or None
-        Sigmas of the start values, which act as observations of open combinations only: by name in metres or radians,
-        or one for all in metres of image motion. None: nothing fixes what the points leave open.
+        Sigmas of the start values, which act as observations of these undetermined combinations only: by name in metres
+        or radians, or one for all in metres of image motion. None: nothing fixes what the points leave open.
     """
 
     held: tuple[str, ...] = ()
@@ -620,7 +629,7 @@ class Gauge:
         return "; ".join(t for t in (held, start) if t) or "none"
 
     def sigmas(self, names: Sequence[str], scale: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the (P,) sigmas of the start values in SI units, and a (P,) mask of those that were specified.
+        """Return the sigmas of the P start values, in SI units, and a (P,) mask of those that were specified.
 
         Start values without a specified sigma have `WORST` metres of image motion.
 
@@ -662,9 +671,10 @@ class Freedom:
     Attributes
     ----------
     kept : (R,) ndarray of int
-        Indices of the unknowns that are estimated.
+        Indices of the R unknowns that are estimated, of P in all.
     rows : (k, P) ndarray
-        Observations by the start values: rows @ (unknowns - start) is zero with unit standard deviation.
+        Coefficients of k pseudo-observations that tie combinations to the start values: rows @ (unknowns - start) is
+        zero with unit standard deviation.
     opened : tuple of Combination
         Open combinations before the gauge.
     """
@@ -675,12 +685,14 @@ class Freedom:
 
 
 def null_vectors(reduced: Array, sigma: Array) -> Array:
-    """Return a (P, k) orthonormal basis of the open combinations, in units of `sigma`.
+    """Return an orthonormal basis of the combinations that the data leave undetermined, in units of `sigma`.
+
+    The basis has shape (P, k), for P unknowns and k undetermined combinations.
 
     Parameters
     ----------
     reduced : (P, P) ndarray
-        Reduced normal matrix with the a-priori sigmas of the measurements.
+        Normal matrix after elimination of the ground points, weighted with the a-priori sigmas of the measurements.
     sigma : (P,) ndarray
         Sigmas of the start values.
     """
@@ -691,7 +703,10 @@ def null_vectors(reduced: Array, sigma: Array) -> Array:
 
 
 def weak_vectors(reduced: Array, length: Array, scale: Array, basis: Array) -> Array:
-    """Return the (P, k) combinations within `basis` whose strength is below `WEAK`, in units of `scale`.
+    """Return the combinations of P unknowns within `basis` whose strength is below `WEAK`, (P, k), in units of `scale`.
+
+    The strength is the ratio of a combination's standard deviation with everything else known to that in the
+    adjustment.
 
     Parameters
     ----------
@@ -702,7 +717,7 @@ def weak_vectors(reduced: Array, length: Array, scale: Array, basis: Array) -> A
     scale : (P,) ndarray
         Units of the unknowns, SI.
     basis : (P, r) ndarray
-        Basis of what may be estimated, in units of `scale`.
+        Basis of the r estimable combinations, in units of `scale`.
     """
     unit = scale * np.where(length > 0, length, 1.0)
     squares = basis.T @ (unit[:, None] ** 2 * basis)
@@ -713,7 +728,7 @@ def weak_vectors(reduced: Array, length: Array, scale: Array, basis: Array) -> A
 def combinations(
     names: Sequence[str], scale: Array, vectors: Array, reduced: Array, length: Array
 ) -> tuple[Combination, ...]:
-    """Return the space spanned by vectors (P, k), in units of `scale`, as combinations of named unknowns.
+    """Return a space of combinations as k combinations of named unknowns, as sparse as possible.
 
     A combination lists the unknowns that take part with at least a hundredth of the largest motion. Each combination
     has an unknown that is in no other one.
@@ -821,12 +836,12 @@ def free_basis(
 
 
 def _in_scale(vectors: Array, sigma: Array, scale: Array) -> Array:
-    """Return combinations (P, k) in units of `sigma` (P,) as vectors in units of `scale` (P,)."""
+    """Convert k combinations of P unknowns, (P, k), from units of `sigma` (P,) to units of `scale` (P,)."""
     return np.asarray(vectors * (sigma / scale)[:, None])
 
 
 def solved(normal: Array, right: Array) -> Array:
-    """Solve a positive definite system after scaling its unknowns to unit diagonal."""
+    """Solve the positive definite linear system `normal` x = `right`, scaled to unit diagonal for accuracy."""
     size = 1.0 / np.sqrt(np.diag(normal))
     factor = cho_factor(size[:, None] * normal * size)
     wide = right.reshape(len(size), -1)
@@ -834,10 +849,10 @@ def solved(normal: Array, right: Array) -> Array:
 
 
 def echelon(vectors: Array) -> Array:
-    """Return the space of vectors (P, k) in reduced echelon form, each vector with a largest entry of 1.
+    """Return a basis, in reduced echelon form, of the space that k vectors of P unknowns span, largest entries 1.
 
-    Each of the (P, k) independent vectors has a pivot unknown that is in no other one. The pivots are the unknowns with
-    the largest part in the space, which does not depend on the vectors that span it.
+    Input and result have shape (P, k). Each vector of the basis has a pivot unknown whose entry is zero in all others.
+    The pivots are the unknowns with the largest part in the space, which does not depend on the vectors that span it.
     """
     if not vectors.shape[1]:
         return vectors

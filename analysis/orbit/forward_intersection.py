@@ -57,13 +57,16 @@ from analysis.orbit.three_line_model import LineModel, Partials, Rays, bias_rota
 _RHO = 2.0 - np.sqrt(3.0)
 """Absolute double root of the autoregression that describes the coefficients of the interpolating cubic spline."""
 _NEEDED = 4
-"""Number of neighbouring spline coefficients z that affect one moment; no segment is shorter."""
+"""Number of cubic B-spline coefficients that determine the interpolated value at one time; no series of coefficients is
+shorter.
+"""
 
 
 def reading_variance(time: Array, interval: float) -> Array:
-    """Return the (n,) variance of the interpolating spline at times (n,) for readings of unit variance.
+    """Return the variance of a cubic spline interpolated between independent readings of unit variance, at n times.
 
-    The variance is 1 at a reading and 0.76 halfway between two.
+    Readings lie at whole multiples of `interval`, in seconds. The variance, (n,), is 1 at a reading and 0.76 halfway
+    between two.
     """
     _, blend = spline_blend(time, interval)
     return np.asarray(np.einsum("ni,ij,nj->n", blend, _covariance(_NEEDED), blend))
@@ -79,9 +82,10 @@ def ray_covariance(noise: Noise, rays: Rays, by: Partials, *, shared: bool) -> A
     rays : Rays
         Image points, n of them.
     by : Partials
-        Derivatives of their misclosures.
+        Derivatives of the collinearity misclosures of these image points.
     shared : bool
-        True to include the noise that rays share, as for one point alone; False to leave out what `SharedNoise` models.
+        True to include attitude and station noise that neighbouring rays share, as is right for one point alone; False
+        to omit the part of it that is modelled by `SharedNoise`.
 
     Raises
     ------
@@ -105,7 +109,10 @@ def ray_covariance(noise: Noise, rays: Rays, by: Partials, *, shared: bool) -> A
 
 
 def spline_blend(time: Array, interval: float) -> tuple[NDArray[np.intp], Array]:
-    """Return the index (n,) of the first of the four cubic B-splines that act at each time, and their values (n, 4)."""
+    """Return the index of the first of the four cubic B-splines that are nonzero at each of n times, and their values.
+
+    The knots lie at whole multiples of `interval`, in seconds. Indices have shape (n,), values (n, 4).
+    """
     place = np.asarray(time, np.float64) / interval
     reading = np.floor(place)
     u = place - reading
@@ -122,7 +129,7 @@ def _covariance(count: int) -> Array:
 def spline_precision(count: int) -> sparse.csr_matrix:
     """Return the inverse of `_covariance` for four or more coefficients.
 
-    Its interior is the square of the (1 4 1) / 6 band matrix; two rows at each end differ.
+    Its interior is the square of the tridiagonal matrix with (1 4 1) / 6 in each row; two rows at each end differ.
     """
     bands = [np.full(count - abs(k), v / 36.0) for k, v in ((0, 18.0), (1, 8.0), (2, 1.0))]
     matrix = sparse.diags([bands[2], bands[1], bands[0], bands[1], bands[2]], [-2, -1, 0, 1, 2]).tolil()
@@ -141,12 +148,12 @@ another meaning.
 
 @dataclass(frozen=True, eq=False)
 class ThirdDifference:
-    """Quality of a series of k columns by its third differences.
+    """Noise level of k sampled quantities, from their third differences.
 
     Attributes
     ----------
     rms : (k,) ndarray
-        RMS of the third differences of each column, as in Table 2 of paper 003.
+        RMS of the third differences of each quantity, in its unit, as in Table 2 of paper 003.
     white_sigma : (k,) ndarray
         rms / sqrt(20), the standard deviation of one sample if the noise is white.
     """
@@ -248,7 +255,7 @@ def intersect(
     offset: ArrayLike = (0.0, 0.0, 0.0),
     count: int | None = None,
 ) -> Intersection:
-    """Intersect the points of one pass from the rays of all lines.
+    """Compute the ground points of one pass by least-squares intersection of the rays of all line cameras.
 
     Parameters
     ----------
@@ -327,7 +334,7 @@ def check_errors(intersected: Array, surveyed: ArrayLike) -> CheckErrors:
 def _start(
     rays: Mapping[str, Rays], cameras: Mapping[str, LineModel], rotation: Array, shift: Array, good: NDArray[np.bool_]
 ) -> Array:
-    """Return the points nearest to their rays, as straight lines in space."""
+    """Return the position of each ground point that is nearest to its rays, by least squares, ITRS, in metres."""
     normal, right = np.zeros((len(good), 3, 3)), np.zeros((len(good), 3))
     for line, row in rays.items():
         camera = cameras[line]
@@ -356,7 +363,7 @@ class CalibratedLine:
     Attributes
     ----------
     pixels : int
-        Number of pixels of the line; the centre of the first is 0.
+        Number of pixels of the line; pixel coordinates count from 0 at the centre of the first pixel.
     directions : (K, 3) ndarray
         Chebyshev coefficients over the line, from -0.5 to pixels - 0.5, of a vector along the look direction in the
         body's axes; its length does not matter.
@@ -375,7 +382,7 @@ class CalibratedLine:
     principal_distance: float
 
     def corrected(self, change: ArrayLike) -> CalibratedLine:
-        """Return the line after a change of the camera.
+        """Return the calibrated line after a rotation of the camera and a change of its principal distance.
 
         Parameters
         ----------
@@ -449,7 +456,7 @@ class StereoPoints:
 def intersect_pair(
     first: CalibratedLine, second: CalibratedLine, seen_first: Sightings, seen_second: Sightings
 ) -> StereoPoints:
-    """Return the points nearest to their two rays in angle: each ray's miss counts relative to its length.
+    """Intersect two lines' rays of the same points, minimising the angles by which the rays miss each point.
 
     Raises
     ------
@@ -468,7 +475,7 @@ def intersect_pair(
 def intersect_rays(
     first_origin: ArrayLike, first_direction: ArrayLike, second_origin: ArrayLike, second_direction: ArrayLike
 ) -> StereoPoints:
-    """Intersect pairs of rays in the points that are nearest to both, each distance relative to the ray's length.
+    """Intersect pairs of rays in the points at which the angles by which the two rays miss them are smallest.
 
     Parameters
     ----------
@@ -480,7 +487,8 @@ def intersect_rays(
     Returns
     -------
     StereoPoints
-        The points `ground` (n, 3), and `miss` (n,), the distance at which the two rays pass each other, in metres.
+        The n points `ground`, (n, 3), in metres, and `miss`, (n,), the distance at which the two rays of each point
+        pass each other, in metres.
 
     Raises
     ------
@@ -524,23 +532,23 @@ def intersect_rays(
 
 
 def between(times: ArrayLike, measured: ArrayLike, values: ArrayLike) -> Array:
-    """Interpolate changes (m, 4) linearly to times (T,), constant beyond the ends.
+    """Interpolate measured camera changes linearly in time, constant before the first and after the last measurement.
 
     Parameters
     ----------
     times : (T,) array_like
-        Times of the result, in seconds.
+        Times of the result, T of them, in seconds.
     measured : (m,) array_like
         Ascending times of the measured changes, in seconds.
     values : (m, 4) array_like
-        Measured changes.
+        Measured changes of the camera: d_alpha, d_beta, d_gamma (radians) and d_f (metres).
     """
     target, at, known = (np.asarray(v, np.float64) for v in (times, measured, values))
     return np.stack([np.interp(target, at, column) for column in known.T], axis=-1)
 
 
 _SHARE = 0.9
-"""Share of the errors within CE90 and LE90."""
+"""Fraction of the errors that lie within CE90 (horizontally) and LE90 (in height)."""
 _DIRECTIONS = 0.5 * np.pi * (np.arange(32) + 0.5) / 32
 """Angles of the midpoint rule over a quarter circle, accurate to 1e-12 of CE90 for any ratio of the axes."""
 _FARTHEST = 40.0
@@ -575,7 +583,9 @@ def level_axes(points: Array) -> Array:
 
 
 def linear_error(variance: ArrayLike, probability: float = _SHARE) -> Array:
-    """Return the half width of the zero-centred interval that holds a share of normal errors; LE90 for 0.9.
+    """Return the half width of the zero-centred interval that holds a given fraction of normally distributed errors.
+
+    For a probability of 0.9 it is LE90.
 
     Parameters
     ----------
@@ -609,16 +619,17 @@ def linear_error(variance: ArrayLike, probability: float = _SHARE) -> Array:
 
 
 def circular_error(covariance: ArrayLike, probability: float = _SHARE) -> Array:
-    """Return the radius of the zero-centred circle that holds a share of normal errors in the plane; CE90 for 0.9.
+    """Return the radius of the zero-centred circle that holds a given fraction of normal errors in the plane.
 
-    A circular covariance gives 2.146 sigma, a degenerate one (along a line) 1.645 sigma.
+    For a probability of 0.9 it is CE90: 2.146 sigma for a circular covariance, 1.645 sigma for a degenerate one (along
+    a line).
 
     Parameters
     ----------
     covariance : (..., 2, 2) array_like
         Covariance of the errors.
     probability : float
-        Share of the errors, between 0 and 1.
+        Fraction of the errors within the circle, between 0 and 1.
 
     Returns
     -------
@@ -653,7 +664,10 @@ def circular_error(covariance: ArrayLike, probability: float = _SHARE) -> Array:
 
 
 def circle_of_points(covariance: Array) -> float:
-    """Return CE90 of a point drawn from a set with horizontal covariances (m, 2, 2); see `circular_error`."""
+    """Return the radius, in metres, that holds 90 % of the horizontal errors of a whole set of points (CE90).
+
+    The errors are normal with covariances (m, 2, 2) of the m points, in m^2; every point counts alike.
+    """
     values = _axes(covariance, _SHARE)
 
     def missing(radius: float) -> float:
@@ -663,7 +677,10 @@ def circle_of_points(covariance: Array) -> float:
 
 
 def interval_of_points(variance: Array) -> float:
-    """Return LE90, in metres, of a point drawn from a set with height variances (m,), in m^2."""
+    """Return the half width, in metres, that holds 90 % of the height errors of a whole set of points (LE90).
+
+    The errors are normal with variances (m,) of the m points, in m^2; every point counts alike.
+    """
     sigma = np.sqrt(np.maximum(variance, 1e-300))
 
     def missing(size: float) -> float:
@@ -673,21 +690,27 @@ def interval_of_points(variance: Array) -> float:
 
 
 def predicted(points: Array, covariance: Array) -> Accuracy:
-    """Return CE90 and LE90 of points (m, 3) predicted by their covariances (m, 3, 3), ITRS."""
+    """Return the 90 % errors in plan and height (CE90, LE90) that the covariances of m points predict.
+
+    Points (m, 3) are in metres and covariances (m, 3, 3) in m^2, ITRS.
+    """
     axes = level_axes(points)
     level = axes @ covariance @ np.swapaxes(axes, 1, 2)
     return Accuracy(circle_of_points(level[:, :2, :2]), interval_of_points(level[:, 2, 2]), len(points))
 
 
 def realised(points: Array, error: Array) -> Accuracy:
-    """Return CE90 and LE90 of points (m, 3) as sample quantiles of their errors (m, 3), ITRS, in metres."""
+    """Return the 90 % errors in plan and height (CE90, LE90) of m points as sample quantiles of their actual errors.
+
+    Points and errors, both (m, 3), are in ITRS, in metres.
+    """
     level = np.einsum("nij,nj->ni", level_axes(points), error)
     plan, height = np.linalg.norm(level[:, :2], axis=1), np.abs(level[:, 2])
     return Accuracy(float(np.quantile(plan, _SHARE)), float(np.quantile(height, _SHARE)), len(points))
 
 
 def _axes(covariance: ArrayLike, share: float) -> Array:
-    """Return the (..., 2) variances along the axes of the error ellipses, the smaller first."""
+    """Return the (..., 2) variances along the principal axes of horizontal error ellipses, the smaller first."""
     if not 0.0 < share < 1.0:
         raise ValueError("a share lies between 0 and 1")
     values = np.linalg.eigvalsh(np.asarray(covariance, np.float64))
@@ -697,10 +720,11 @@ def _axes(covariance: ArrayLike, share: float) -> Array:
 
 
 def _within(radius: ArrayLike, variances: Array) -> Array:
-    """Return the share (...) of normal errors with variances (..., 2) along two axes that lie within radii (...).
+    """Return the fraction of two-dimensional normal errors, given by variances along two axes, within circles.
 
     In units of the axes the errors are isotropic: directions are uniform, and the length follows a Rayleigh
-    distribution. The circle becomes an ellipse with the radius R / sqrt(a cos^2 + b sin^2) in each direction.
+    distribution. In the direction with angle phi from the first axis, the circle of radius R becomes an ellipse of
+    radius R / sqrt(a cos^2 phi + b sin^2 phi), for variances a and b along the axes.
     """
     along = variances[..., :1] * np.sin(_DIRECTIONS) ** 2 + variances[..., 1:] * np.cos(_DIRECTIONS) ** 2
     square = np.asarray(radius, np.float64)[..., None] ** 2

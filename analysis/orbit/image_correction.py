@@ -67,11 +67,11 @@ class ImageCorrection:
     freedom: int
 
     def at(self, line: ArrayLike, sample: ArrayLike) -> Array:
-        """Return the (N, 2) correction of line and sample at predicted positions (N,), in pixels."""
+        """Return the correction of line and sample, in pixels, at N predicted image positions, as (N, 2)."""
         return np.asarray(self._basis(line, sample) @ self.coefficients.T)
 
     def covariance_at(self, line: ArrayLike, sample: ArrayLike) -> Array:
-        """Return the (N, 2, 2) covariance of the correction at predicted positions (N,), in pixels^2."""
+        """Return the covariance of the correction at N predicted positions, (N, 2, 2), in pixels^2."""
         rows = _rows(self._basis(line, sample))
         return np.asarray(rows @ self.covariance @ np.swapaxes(rows, 1, 2))
 
@@ -95,7 +95,7 @@ class ImageCorrection:
 
 
 def _basis(kind: Kind, middle: Array, size: Array, position: Array) -> Array:
-    """Return the (N, K) basis functions at positions (N, 2)."""
+    """Return the K basis functions of a correction (constant, and scaled line and sample) at N positions, (N, K)."""
     one = np.ones((len(position), 1))
     return one if kind == "shift" else np.concatenate([one, (position - middle) / size], axis=1)
 
@@ -177,7 +177,10 @@ def _require_spread(kind: Kind, position: Array, size: Array) -> None:
 
 
 def _solved(rows: Array, difference: Array, spread: Array) -> tuple[Array, Array]:
-    """Return the coefficients (2 K,) and their covariance from whitened equations."""
+    """Return the 2 K coefficients of a correction and their covariance, by generalised least squares.
+
+    K is the number of coefficients of each of line and sample.
+    """
     root = np.linalg.cholesky(spread)
     white = np.linalg.solve(root, rows).reshape(-1, rows.shape[2])
     right = np.linalg.solve(root, difference[..., None]).reshape(-1)
@@ -186,7 +189,7 @@ def _solved(rows: Array, difference: Array, spread: Array) -> tuple[Array, Array
 
 
 def _squares(residual: Array, variance: Array) -> Array:
-    """Return the (N,) squared residuals normalised by their covariances.
+    """Return the chi-square contribution of each of N points: its squared residual normalised by its covariance.
 
     The pseudo-inverse is used because a component that one point alone determines has no residual variance.
     """

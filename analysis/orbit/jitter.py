@@ -59,15 +59,18 @@ from analysis.statistics import robust_sigma
 OVERSAMPLING = 6
 """Frequencies per inverse of the observed time span; the highest of them then has at least 98 % of a line's power."""
 BLIND = 0.1
-"""Share of the best response of an axis below which a frequency is blind."""
+"""Response of the observations to an oscillation about an axis, as a fraction of the largest response at any frequency,
+below which a frequency counts as blind.
+"""
 _AT_ONCE = 2_000_000
-"""Number of products of moment pairs and frequencies that are computed in one block."""
+"""Number of (pair of observation times) x (frequency) products that are computed in one block, which limits the memory.
+"""
 _RANK = 1e-6
-"""Smallest singular value or eigenvalue, relative to the largest, of a combination that counts as determined: lines
-that move alike move the ground.
+"""Smallest singular value or eigenvalue, relative to the largest, of a combination of unknowns that counts as
+determined. An equal motion of all lines cannot be told from a displacement of the ground points.
 """
 _NEVER = 1e-280
-"""Smallest probability and variance factor, which keeps logarithms and roots finite."""
+"""Lower bound of computed probabilities and variance factors, which keeps logarithms and roots finite."""
 _LEAST_ROWS = 30
 """Smallest number of degrees of freedom of a spectrum or of an estimated variance factor."""
 _REWEIGHTED = 3
@@ -82,21 +85,23 @@ class JitterError(MeasurementError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Whitened observations of an attitude.
+    """Observations of attitude differences between exposure times, whitened to unit noise variance.
 
     Attributes
     ----------
     value : (R,) ndarray
-        Observed values, whose noise has unit variance if the covariances used for whitening are right.
+        R observed values, such as image disparities divided by their sigma; their noise has unit variance if the
+        covariances used for whitening are right.
     group : (R,) ndarray of int
         Number of the ground point of each observation, from 0 on, in ascending order.
     time : (G, J) ndarray
-        Times that the observations of a group compare, in seconds.
+        The J times at which each of G ground points was observed, in seconds.
     weight : (R, J, A) ndarray
-        Derivative of each observation with respect to the attitude about each axis at each time, per radian; zero where
-        a group has fewer times.
+        Derivative of each observation with respect to the attitude angle about each of A axes at each time, per radian;
+        zero where a group has fewer times.
     nuisance : (R, P) ndarray
-        Columns of the nuisance parameters, of any rank.
+        Derivatives of the observations with respect to P nuisance parameters, such as heights of the points; their rank
+        may be lower than P.
     mix : (R, K, W) ndarray
         Mixing matrix by which the W unit errors of each of K kinds in a group make up the noise of an observation. The
         variance of each kind, such as the coordinates of one line or the heights known beforehand, may be wrong by a
@@ -126,19 +131,19 @@ class Observations:
         Parameters
         ----------
         value : (R,) array_like
-            Observed values.
+            R observed values, whitened to unit noise variance.
         group : (R,) array_like of int
             Number of the ground point of each observation, ascending.
         time : (G, J) array_like
-            Times that the observations of a group compare, in seconds.
+            The J times at which each of G ground points was observed, in seconds.
         weight : (R, J, A) array_like
-            Derivatives with respect to the attitude, per radian.
+            Derivatives of the observations with respect to the attitude angles about A axes at these times, per radian.
         nuisance : (R, P) array_like
-            Columns of the nuisance parameters.
+            Derivatives of the observations with respect to P nuisance parameters.
         kind : (R,) array_like of int, optional
             Kind of each observation, from 0 on, where errors are independent; all alike by default.
         mix : (R, K, W) array_like, optional
-            Mixing matrix instead of `kind`.
+            Instead of `kind`, the matrix by which W unit errors of each of K kinds make up the noise of an observation.
 
         Raises
         ------
@@ -166,12 +171,12 @@ class Observations:
 
     @property
     def axes(self) -> int:
-        """Number of attitude axes."""
+        """Number of body axes, A, about which the attitude is analysed."""
         return self.weight.shape[2]
 
     @cached_property
     def ends(self) -> tuple[float, float]:
-        """First and last moment, seconds."""
+        """Earliest and latest observation time, in seconds."""
         moments = self.time[self.group][np.any(self.weight != 0.0, axis=2)]
         return (float(moments.min()), float(moments.max())) if len(moments) else (0.0, 0.0)
 
@@ -182,12 +187,12 @@ class Observations:
 
     @property
     def middle(self) -> float:
-        """Reference time of the phases within this module, in seconds."""
+        """Middle of the observation times, in seconds, from which phases of oscillations count within this module."""
         return 0.5 * (self.ends[0] + self.ends[1])
 
     @cached_property
     def known(self) -> Array:
-        """Orthonormal basis (R, K) of the nuisance columns."""
+        """Orthonormal basis of the space that the nuisance derivatives of the R observations span, (R, rank)."""
         if not self.nuisance.shape[1]:
             return np.zeros((len(self.value), 0))
         size = np.linalg.norm(self.nuisance, axis=0)
@@ -196,29 +201,38 @@ class Observations:
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom beside the nuisance parameters."""
+        """Number of observations minus the number of independent nuisance parameters."""
         return len(self.value) - self.known.shape[1]
 
     def rest(self, columns: Array) -> Array:
-        """Return the part of columns (R, ...) that the nuisance parameters do not explain."""
+        """Return the part of vectors of R observations, (R, ...), that the nuisance parameters cannot explain.
+
+        It is the projection orthogonal to the nuisance derivatives.
+        """
         return np.asarray(columns - np.tensordot(self.known, np.tensordot(self.known.T, columns, 1), 1))
 
     def waves(self, frequency: ArrayLike) -> Array:
-        """Return the (R, F, 2 A) responses of the observations to unit sines and cosines about all axes, per radian."""
+        """Return the responses of the observations to attitude oscillations (sine and cosine) of given frequencies.
+
+        The result has shape (R, F, 2 A) for R observations, F frequencies in hertz and A axes; it is the value of an
+        observation per radian of amplitude.
+        """
         f = np.atleast_1d(np.asarray(frequency, np.float64))
         angle = 2.0 * np.pi * (self.time[:, :, None] - self.middle) * f
         both = np.stack([np.sin(angle), np.cos(angle)], axis=-1)[self.group]
         return np.einsum("rjfk,rja->rfka", both, self.weight).reshape(len(self.value), len(f), 2 * self.axes)
 
     def taken(self, keep: ArrayLike) -> Observations:
-        """Return the observations that a mask selects."""
+        """Return the observations that a boolean mask (R,) selects."""
         where = np.asarray(keep)
         some, group = np.unique(self.group[where], return_inverse=True)
         value, weight, nuisance = self.value[where], self.weight[where], self.nuisance[where]
         return Observations(value, group, self.time[some], weight, nuisance, self.mix[where])
 
     def factors(self) -> Array:
-        """Return the estimated variance factor of each kind of errors, (K,), from the residuals beside the nuisance.
+        """Return the estimated factor on the variance of each of K kinds of errors, (K,).
+
+        The estimate uses the residuals after fitting the nuisance parameters.
 
         Combinations of the kinds that have fewer than 30 degrees of freedom, such as the difference of two lines that
         are only seen against each other, keep their a-priori ratio.
@@ -234,7 +248,7 @@ class Observations:
         return estimate
 
     def _factors(self) -> Array:
-        """Return the variance factors for the present weights, one iteration of `factors`."""
+        """Return the variance factors (K,) of one iteration of `factors`, relative to the present whitening."""
         left, known, mix = (self._of_groups(v) for v in (self.rest(self.value)[:, None], self.known, self.mix))
         by_kind = [mix[:, :, k] for k in range(mix.shape[2])]
         spread = [m @ m.swapaxes(1, 2) for m in by_kind]
@@ -257,7 +271,7 @@ class Observations:
         return np.asarray(np.maximum(1.0 + (axes * inverse) @ axes.T @ (square - normal.sum(axis=1)), _LEAST_FACTOR))
 
     def rewhitened(self, factors: ArrayLike) -> Observations:
-        """Return the observations whitened with the variance of each kind of errors scaled by its factor (K,)."""
+        """Return the observations whitened with the variance of each of K kinds of errors times its factor (K,)."""
         scaled = self.mix * np.sqrt(np.maximum(np.asarray(factors, np.float64), _NEVER))[:, None]
         mix = self._of_groups(scaled.reshape(len(scaled), -1))
         spread = mix @ mix.swapaxes(1, 2)
@@ -279,13 +293,16 @@ class Observations:
         return _within(self.group, len(self.time))
 
     def _of_groups(self, columns: Array) -> Array:
-        """Return columns (R, ...) by group and number within it, (G, M, ...); zero where a group has fewer."""
+        """Return vectors of R observations arranged by ground point, (G, M, ...), padded with zeros.
+
+        G is the number of ground points and M the largest number of observations of one point.
+        """
         out = np.zeros((len(self.time), int(self._row.max(initial=0)) + 1, *columns.shape[1:]))
         out[self.group, self._row] = columns
         return out
 
     def beside(self, columns: Array) -> Observations:
-        """Return the observations with additional columns (R, P) of nuisance parameters."""
+        """Return the observations with P more nuisance parameters, given by their derivatives (R, P)."""
         return replace(self, nuisance=np.concatenate([self.nuisance, columns], axis=1))
 
 
@@ -295,7 +312,7 @@ def _within(group: NDArray[np.intp], count: int) -> NDArray[np.intp]:
 
 
 def _unmixed(group: NDArray[np.intp], count: int, kind: NDArray[np.intp]) -> Array:
-    """Return `Observations.mix` of observations with independent errors of kinds (R,)."""
+    """Return the mixing matrix (`Observations.mix`) of R observations with independent errors, each of one kind."""
     row = _within(group, count)
     out = np.zeros((len(kind), int(kind.max(initial=0)) + 1, int(row.max(initial=0)) + 1))
     out[np.arange(len(kind)), kind, row] = 1.0
@@ -309,24 +326,26 @@ def _powers(time: Array, degree: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Periodogram:
-    """Power over frequency, with its significance.
+    """Power of attitude oscillations as a function of frequency, with its significance.
 
     Attributes
     ----------
     frequency : (F,) ndarray
         Evenly spaced frequencies, in hertz.
     power : (F,) ndarray
-        Reduction of the sum of squares by an oscillation.
+        Reduction of the weighted sum of squares by fitting an oscillation of this frequency about all axes.
     amplitude : (F, A) ndarray
-        Fitted amplitude about each axis, in radians.
+        Fitted amplitude about each of A axes, in radians.
     sigma : (F, A) ndarray
         Standard deviation of an amplitude's components for unit noise variance, in radians.
     response : (F, A) ndarray
-        Response relative to a single observation of the oscillation; 2 for two observations in opposite phase.
+        RMS response of the observations relative to an observation of the attitude at one time; 2 if each observation
+        compares two times of opposite phase.
     blind : (F,) ndarray of bool
         True for frequencies excluded from the search.
     turning : float
-        Integral over the searched frequencies of the plane's rotation rate; see the module.
+        Integral over the searched frequencies of the rate at which the plane of sine and cosine rotates; it enters the
+        false-alarm bound of the module.
     segments : int
         Number of contiguous intervals of searched frequencies.
     total : float
@@ -348,11 +367,11 @@ class Periodogram:
 
     @property
     def order(self) -> int:
-        """Degrees of freedom of an oscillation's amplitudes."""
+        """Number of amplitudes of one oscillation: sine and cosine about each axis."""
         return 2 * self.amplitude.shape[1]
 
     def chance(self, power: ArrayLike) -> Array:
-        """Return the largest probability that noise alone reaches a power at any searched frequency.
+        """Return an upper bound of the probability that noise alone reaches a power at any searched frequency.
 
         The variance of the noise is unknown.
         """
@@ -373,7 +392,7 @@ class Periodogram:
         return int(np.argmax(np.where(self.blind, -1.0, self.power)))
 
     def intervals(self) -> list[tuple[float, float]]:
-        """Return the first and the last frequency of every blind interval."""
+        """Return the first and the last frequency, in hertz, of every interval excluded from the search as blind."""
         edge = np.flatnonzero(np.diff(np.concatenate([[0], self.blind.astype(int), [0]])))
         return [(float(self.frequency[a]), float(self.frequency[b - 1])) for a, b in edge.reshape(-1, 2)]
 
@@ -437,16 +456,16 @@ def periodogram(observations: Observations, lowest: float, highest: float) -> Pe
 
 @dataclass(frozen=True, eq=False)
 class _Products:
-    """Sums over the observations from which those of the waves of any frequency follow.
+    """Precomputed sums over the observations, from which scalar products of waves of any frequency follow quickly.
 
     Attributes
     ----------
     time : (G, J) ndarray
-        Times from the middle, in seconds.
+        The J observation times of each of G ground points, from the middle of all times, in seconds.
     columns : (G J, A C) ndarray
-        Products of the observations' weights with the value and the nuisance basis.
+        Products of the attitude derivatives with the observed value and the nuisance basis, C vectors in all.
     pairs : (G J J, A A) ndarray
-        Products of the weights with one another.
+        Products of the attitude derivatives at two times of one point.
     axes : int
         Number of axes, A.
     """
@@ -479,7 +498,10 @@ class _Products:
         return max(_AT_ONCE // len(self.pairs), 1)
 
     def at(self, frequency: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the products of waves and their slopes at frequencies (F,), orthogonal to the nuisance columns.
+        """Return the scalar products of waves and of their derivatives with respect to frequency, at F frequencies.
+
+        Frequencies are in hertz. Waves are the observations' responses to unit sines and cosines, made orthogonal to
+        the nuisance parameters.
 
         Returns
         -------
@@ -533,7 +555,8 @@ loses at most 3 % of its power by either.
 _WIDEST = 2**18
 """Largest number of resolution elements that are transformed."""
 _REGULAR = 1e-4
-"""Regularisation added to all axes, as a share of the best determined combination: axes that move alike stay bounded.
+"""Regularisation of the amplitudes about all axes, as a fraction of the weight of the best determined combination of
+axes. It keeps amplitudes finite where observations cannot separate two axes.
 """
 
 
@@ -543,7 +566,7 @@ def farthest(observations: Observations, highest: float) -> float:
 
 
 def peaks(observations: Observations, lowest: float, highest: float) -> tuple[Array, Array]:
-    """Return frequencies (K,), in hertz, and approximate powers (K,) of all maxima, the highest first.
+    """Return frequencies, in hertz, and approximate powers of the K maxima of the periodogram, the highest first.
 
     Parameters
     ----------
@@ -597,35 +620,42 @@ def peaks(observations: Observations, lowest: float, highest: float) -> tuple[Ar
 MOST_LINES = 20
 """Largest number of lines that a search detects."""
 _FAR = 5.0
-"""Robust standard deviations beyond which an observation counts as wrong: one in two million good ones is lost."""
+"""Robust standard deviations beyond which an observation is excluded as wrong; of normally distributed observations it
+excludes one in two million.
+"""
 _ROUNDS = 40
 """Largest number of iterations of a fit or of an exclusion."""
 _ARRIVED = 1e-10
-"""Largest change of a frequency at convergence, in resolution elements."""
+"""Largest change of a frequency at convergence, in resolution elements (the inverse of the observed time span)."""
 _ASTRAY = 1.0
-"""Largest change of a frequency from the highest power, in resolution elements: a fit that moves farther has not found
-the cause of that power.
+"""Largest change of a frequency from the highest power, in resolution elements (the inverse of the observed time span);
+a fit that moves farther has converged to another line.
 """
 _CELL = 1.0
-"""Resolution elements to each side of a fitted line in which no other is sought."""
+"""Half width of the interval around a fitted line in which no other line is sought, in resolution elements (the inverse
+of the observed time span).
+"""
 _MOST_ALIASES = 24
-"""Largest number of frequencies that are fitted in place of a line, those of the highest power."""
+"""Largest number of alias frequencies that are tried instead of a detected line's frequency, those of highest power
+first.
+"""
 _ALIKE = 0.8
-"""Smallest share of a line's power that an alias has, by the approximation that selects it."""
+"""Smallest approximate power of a candidate alias, as a fraction of the power of the line."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lines:
     """Detected oscillations, fitted together.
 
-    theta(t) = sum over lines of sine sin(2 pi f (t - origin)) + cosine cos(2 pi f (t - origin)).
+    The attitude angle about each axis at time t is the sum over the lines of sine * sin(2 pi f (t - origin)) + cosine *
+    cos(2 pi f (t - origin)), f being the frequency of a line.
 
     Attributes
     ----------
     frequency : (K,) ndarray
-        Frequencies, in hertz.
+        Frequencies of the K lines, in hertz.
     sine, cosine : (K, A) ndarray
-        Amplitudes of the sine and the cosine about each axis, in radians.
+        Amplitudes of the sine and the cosine about each of A axes, in radians.
     covariance : (K (1 + 2 A), K (1 + 2 A)) ndarray
         Covariance of frequency, sine and cosine of the first line, then of the next, with the noise variance estimated
         from the observations.
@@ -647,24 +677,28 @@ class Lines:
 
     @property
     def amplitude(self) -> Array:
-        """Amplitude of each line about each axis, (K, A), in radians."""
+        """Amplitudes of the K lines about each of A axes, (K, A), in radians: the root of sine^2 + cosine^2."""
         return np.hypot(self.sine, self.cosine)
 
     @property
     def phase(self) -> Array:
-        """Phase p (K, A) of amplitude sin(2 pi f t + p) with t from the epoch, in radians, 0 to 2 pi."""
+        """Phase p of each of K lines about each of A axes, (K, A), in radians, 0 to 2 pi.
+
+        The angle is amplitude * sin(2 pi f t + p), with the frequency f in hertz and the time t in seconds from the
+        epoch.
+        """
         at = np.arctan2(self.cosine, self.sine) - 2.0 * np.pi * self.frequency[:, None] * self.origin
         return np.asarray(np.mod(at, 2.0 * np.pi))
 
     @property
     def frequency_sigma(self) -> Array:
-        """Standard deviation (K,) of the frequencies, in hertz."""
+        """Standard deviations of the frequencies of the K lines, in hertz."""
         width = 1 + 2 * self.sine.shape[1]
         return np.asarray(np.sqrt(np.diag(self.covariance)[::width]))
 
     @property
     def amplitude_sigma(self) -> Array:
-        """Standard deviation (K, A) of the amplitudes, in radians: that of the component along the amplitude."""
+        """Standard deviations of the amplitudes of K lines about A axes, (K, A), in radians."""
         axes = self.sine.shape[1]
         out = np.zeros_like(self.sine)
         for k in range(len(self.frequency)):
@@ -677,7 +711,10 @@ class Lines:
         return out
 
     def design(self, seconds: ArrayLike) -> Array:
-        """Return the (T, A, K (1 + 2 A)) derivatives of the attitude at times (T,) by the fitted parameters."""
+        """Return the derivatives of the attitude at T times with respect to frequency, sine and cosine of each line.
+
+        The result has shape (T, A, K (1 + 2 A)) for A axes and K lines, in the order of `covariance`.
+        """
         t = np.asarray(seconds, np.float64) - self.origin
         axes, width = self.sine.shape[1], 1 + 2 * self.sine.shape[1]
         out = np.zeros((len(t), axes, width * len(self.frequency)))
@@ -692,7 +729,10 @@ class Lines:
         return out
 
     def course(self, seconds: ArrayLike) -> tuple[Array, Array]:
-        """Return the attitude (T, A), in radians, at times (T,), and its covariance (T, A, A)."""
+        """Return the attitude angles of all lines together at T times, about A axes, and their covariance.
+
+        Angles are (T, A) in radians, covariances (T, A, A) in rad^2, times in seconds.
+        """
         t = np.asarray(seconds, np.float64) - self.origin
         angle = 2.0 * np.pi * t[:, None] * self.frequency
         value = np.sin(angle) @ self.sine + np.cos(angle) @ self.cosine
@@ -715,7 +755,7 @@ class JitterSearch:
     used : (R,) ndarray of bool
         False for observations excluded as wrong.
     factors : (K,) ndarray
-        Variance factor of each kind of errors.
+        Estimated factor on the a-priori variance of each of K kinds of errors.
     threshold : float
         Power of ``after`` that noise alone exceeds with the specified probability.
     beyond : float
@@ -732,9 +772,9 @@ class JitterSearch:
 
     @property
     def detectable(self) -> Array:
-        """Smallest detectable amplitude (F, A) about one axis alone, in radians; inf where blind.
+        """Smallest detectable amplitude at each of F frequencies about each of A axes alone, (F, A), in radians.
 
-        It is the amplitude that reaches the threshold without noise.
+        It is the amplitude whose power without noise equals the threshold; infinite at blind frequencies.
         """
         least = np.sqrt(self.threshold) * self.before.sigma
         return np.where(self.before.blind[:, None], np.inf, least)
@@ -903,11 +943,11 @@ def _unaliased(
     kept : Observations
         Observations that are used.
     lines : Lines or None
-        Lines detected before; None for none.
+        Lines detected before, or None if this is the first.
     fitted : Lines
         These lines and the last one.
     reach : tuple of float
-        Lowest and highest frequency of aliases, in hertz.
+        Lowest and highest frequency in which aliases are searched, in hertz.
     false_alarm : float
         Likelihood ratio to the best frequency above which a frequency is an alias.
     """
@@ -936,7 +976,7 @@ def _unaliased(
 
 
 def _left(observations: Observations, lines: Lines) -> float:
-    """Return the sum of squared residuals of the observations beside lines and nuisance."""
+    """Return the sum of squared residuals of the observations after fitting nuisance parameters and lines."""
     residual = observations.rest(observations.value - _predicted(observations, lines))
     return float(residual @ residual)
 
@@ -1031,14 +1071,14 @@ def _fitted(observations: Observations, frequency: Array, chance: Array) -> Line
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """Attitude over time as a cubic spline, with the covariance of its coefficients.
+    """Attitude angles as functions of time (cubic splines), with the covariance of their coefficients.
 
     Attributes
     ----------
     knots : (K + 4,) ndarray
         Knots of the spline, in seconds.
     coefficients : (K, A) ndarray
-        Coefficients about each axis, in radians.
+        Coefficients of the K B-splines about each of A axes, in radians.
     covariance : (K A, K A) ndarray
         Covariance of the coefficients: all axes of the first B-spline, then of the next, in rad^2.
     """
@@ -1048,11 +1088,14 @@ class Course:
     covariance: Array
 
     def basis(self, seconds: ArrayLike) -> Array:
-        """Return the (T, K) values of the B-splines at times (T,) within the knots."""
+        """Return the values of the K B-splines at T times within the knots, in seconds, as (T, K)."""
         return np.asarray(BSpline.design_matrix(np.asarray(seconds, np.float64), self.knots, 3).toarray())
 
     def at(self, seconds: ArrayLike) -> tuple[Array, Array]:
-        """Return the attitude (T, A), in radians, at times (T,), and its covariance (T, A, A)."""
+        """Return the attitude angles about A axes at T times, and their covariance.
+
+        Angles are (T, A) in radians, covariances (T, A, A) in rad^2, times in seconds.
+        """
         by = self.basis(seconds)
         axes = self.coefficients.shape[1]
         spread = self.covariance.reshape(by.shape[1], axes, by.shape[1], axes)

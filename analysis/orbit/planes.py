@@ -54,13 +54,16 @@ from analysis.arrays import ARCSEC, Array, MeasurementError
 Method = Literal["printed", "corrected", "tls"]
 METHODS: tuple[Method, ...] = get_args(Method)
 _LEAST_SPREAD = 10.0
-"""Smallest spread of the points across their line of sight, in sigmas, that fixes the rotation of the plane about it.
+"""Smallest spread of the points across their line of sight, in sigmas, that determines the rotation of the plane about
+the line of sight.
 """
 # Eq. 5 counts as nearly vertical if its bias exceeds `_BIAS` sigmas, or if noise makes up more than `_ATTENUATION` of
 # its normal matrix.
 _BIAS, _ATTENUATION = 0.1, 0.01
 _SINGULAR = 1e15
-"""Largest condition number of a normal matrix of float64 sums whose smallest eigenvalue still has a correct digit."""
+"""Largest condition number of a normal matrix in float64 whose smallest eigenvalue still has a correct digit; a worse
+one counts as singular.
+"""
 
 
 class PlaneError(MeasurementError, ValueError):
@@ -153,7 +156,7 @@ class Strip:
 
 @dataclass(frozen=True, eq=False)
 class PlaneFit:
-    """Plane through the station.
+    """Plane through a station, fitted to the ground points of one CCD line.
 
     Attributes
     ----------
@@ -166,7 +169,8 @@ class PlaneFit:
     normal : (3,) ndarray
         Unit normal, z component negative (or zero) like the paper's (a0, a1, -1).
     point_gain : (n, 3, 3) ndarray
-        Derivative of the normal with respect to each point, 1/m, to first order of the residuals.
+        Derivative of the unit normal with respect to the coordinates of each of n points, 1/m, to first order of the
+        residuals.
     residual : (n,) ndarray
         Distance of the points from the plane along the normal, in metres.
     chi_square : float
@@ -175,7 +179,8 @@ class PlaneFit:
         Condition number of the normal matrix: that of eq. 5, or for tls that of the rotations about the two directions
         in the plane.
     attenuation : float
-        Noise share of eq. 5's normal matrix in its weakest direction, by which the slope there shrinks; 0 for tls.
+        Fraction of the smallest eigenvalue of eq. 5's normal matrix that is due to noise, by which the slope in that
+        direction is too small; 0 for tls.
     bias : (3,) ndarray
         Estimated error of the normal caused by the attenuation, in radians; zero for tls.
     """
@@ -203,24 +208,33 @@ class PlaneFit:
 
     @property
     def station_gain(self) -> Array:
-        """Derivative (3, 3) of the normal with respect to the station, 1/m: minus that of all points moved together."""
+        """Derivative (3, 3) of the unit normal with respect to the station's coordinates, 1/m.
+
+        It is minus the derivative for a common shift of all points.
+        """
         return np.asarray(-self.point_gain.sum(axis=0))
 
     @property
     def point_covariance(self) -> Array:
-        """Covariance (3, 3) of the normal from the points' errors alone, in rad^2; independent between strips."""
+        """Covariance (3, 3) of the unit normal due to the points' errors alone, in rad^2.
+
+        This part is independent between strips.
+        """
         gain = self.point_gain
         return np.asarray(np.einsum("nij,njk,nlk->il", gain, self.strip.covariance, gain))
 
     @property
     def covariance(self) -> Array:
-        """Covariance (3, 3) of the normal from points and station, in rad^2, of rank two."""
+        """Covariance (3, 3) of the unit normal due to errors of points and station, in rad^2, of rank two."""
         gain = self.station_gain
         return np.asarray(self.point_covariance + gain @ self.station.covariance @ gain.T)
 
     @property
     def coefficients(self) -> tuple[float, float, float]:
-        """Coefficients a0, a1, a2 of z = a0 x + a1 y + a2, a2 by eq. 1; PlaneError for an exactly vertical plane."""
+        """Coefficients a0, a1, a2 (a2 in metres) of the plane's equation z = a0 x + a1 y + a2.
+
+        PlaneError is raised for an exactly vertical plane.
+        """
         if self.normal[2] == 0.0:
             raise PlaneError("plane: it is vertical in this frame and has no form z = a0 x + a1 y + a2")
         a0, a1 = (float(v) for v in -self.normal[:2] / self.normal[2])
@@ -229,7 +243,7 @@ class PlaneFit:
 
     @property
     def near_vertical(self) -> bool:
-        """True if the steepness of the plane in its frame biases the explicit form; never for tls."""
+        """True if the plane is so steep in its frame that the form z = a0 x + a1 y + a2 is biased; never for tls."""
         shift = float(np.linalg.norm(self.bias))
         along = self.bias / shift if shift > 0 else self.bias
         sigma = float(np.sqrt(along @ self.covariance @ along))
@@ -237,7 +251,10 @@ class PlaneFit:
 
 
 def fit_plane(station: Station, strip: Strip, method: Method = "tls") -> PlaneFit:
-    """Fit a plane through the station to the strip's points; see the module for the methods.
+    """Fit a plane through the station to the ground points of one CCD line.
+
+    The methods are total least squares (tls) and z = a0 x + a1 y + a2 by the paper's eq. 5, with the printed or the
+    corrected sign.
 
     Raises
     ------
@@ -382,14 +399,14 @@ class _DistanceNoise:
         return cls(own, float(normal @ station.covariance @ normal))
 
     def weighted(self, rows: Array) -> Array:
-        """Return the inverse covariance times rows (n,) or (n, k), by the Sherman-Morrison formula."""
+        """Return the inverse covariance of the n distances times a vector (n,) or matrix (n, k)."""
         weight = 1.0 / self.own
         scaled = (rows.T * weight).T
         ratio = self.shared / (1.0 + self.shared * weight.sum())
         return np.asarray(scaled - ratio * np.multiply.outer(weight, scaled.sum(axis=0)))
 
     def white(self, rows: Array) -> Array:
-        """Return the symmetric root of the inverse covariance times rows (n, k), which have independent unit errors."""
+        """Return a matrix (n, k) whitened by the symmetric root of the inverse covariance of the n distances."""
         unit = self.own**-0.5
         total = float(unit @ unit)
         scaled = rows * unit[:, None]
@@ -422,7 +439,7 @@ def _check_points(arm: Array, strip: Strip) -> None:
 
 
 def _covariances(noise: ArrayLike, count: int, owner: str, definite: bool) -> Array:
-    """Return (count, 3, 3) covariances from sigmas or covariances."""
+    """Return validated covariances of `count` points, (count, 3, 3), in m^2, from sigmas in metres or covariances."""
     values = np.asarray(noise, np.float64)
     if values.ndim == 0 or values.shape == (count,):
         if not np.all(np.isfinite(values)) or np.any(values < 0) or (definite and np.any(values == 0)):
@@ -443,7 +460,7 @@ def _covariances(noise: ArrayLike, count: int, owner: str, definite: bool) -> Ar
 
 
 _FOLDED = 3.0
-"""Angle, in sigmas, below which an angle, which cannot be negative, is no longer normally distributed."""
+"""Ratio of an unsigned angle to its sigma below which its distribution is cut off at zero and no longer normal."""
 
 
 class AngleError(MeasurementError, ValueError):
@@ -463,7 +480,7 @@ class PlaneAngles:
     covariance : (m, m) ndarray
         Covariance from points and station, in rad^2.
     gradient : (m, k, 3) ndarray
-        Derivative of each angle with respect to the unit normals of the planes.
+        Derivative of each of the m angles, in radians, with respect to the unit normals of the k planes.
     folded : (m,) ndarray of bool
         True for an angle below three sigmas; its sigma is unreliable, because the angle cannot be negative.
     """
@@ -531,7 +548,10 @@ def _common_station(planes: Sequence[PlaneFit]) -> Station:
 
 
 def _propagated(gradient: Array, planes: Sequence[PlaneFit], station: Station) -> Array:
-    """Return the (m, m) covariance of quantities with the derivatives `gradient` (m, k, 3) by the planes' normals."""
+    """Return the covariance of m quantities from their derivatives with respect to the unit normals of k planes.
+
+    Derivatives `gradient` are (m, k, 3), the covariance (m, m).
+    """
     points = np.array([plane.point_covariance for plane in planes])
     shared = np.einsum("mki,kij->mj", gradient, np.array([plane.station_gain for plane in planes]))
     from_points = np.einsum("mki,kij,lkj->ml", gradient, points, gradient)
@@ -644,7 +664,10 @@ class LineFrame:
 
     @property
     def forward(self) -> Array:
-        """Unit vector side x central, which points ahead if the tangents rise to the right of the track."""
+        """Unit vector perpendicular to line of sight and CCD line, the vector product side x central.
+
+        It points ahead if the tangents rise to the right of the track.
+        """
         return np.asarray(np.cross(self.side, self.central))
 
 
@@ -699,7 +722,7 @@ def line_frame(plane: PlaneFit, tangent: ArrayLike, bend: float = 0.0) -> LineFr
 
 
 def _off_plane(plane: PlaneFit, arm: Array, interior: Array, bend: float) -> tuple[float, float]:
-    """Return the angle of the central ray out of the plane of a bent line, in radians, and its additional variance."""
+    """Return the angle by which a bent line's central ray leaves the fitted plane, in radians, and its variance."""
     distance = np.linalg.norm(arm, axis=1)
     spread = np.sqrt(np.einsum("i,nij,j->n", plane.normal, plane.strip.covariance, plane.normal)) / distance
     columns = np.column_stack([np.cos(interior), np.sin(interior), (interior / np.abs(interior).max()) ** 2])
@@ -734,7 +757,7 @@ class AlongTrackAngles:
 
 
 def along_track_angle(central_a: ArrayLike, side_a: ArrayLike, central_b: ArrayLike, side_b: ArrayLike) -> float:
-    """Return the rotation, in radians, about the mean direction of two lines between their central rays.
+    """Return the signed angle, in radians, between the central rays of two lines, about their mean direction.
 
     It takes the second line's central ray to the first's: positive where the first looks ahead of the second, with the
     lines' directions pointing to the right of the track.
@@ -853,11 +876,11 @@ class Sensitivity:
     axis : {'x', 'y', 'z'}
         Axis of the displacement.
     amount : (k,) ndarray
-        Displacements, in metres.
+        The k displacements, in metres.
     change : (m, k) ndarray
-        Change of the angles by recomputation, in radians.
+        Change of each of the m angles for each displacement, by repeating the fit, in radians.
     slope : (m,) ndarray
-        Linear derivatives at zero, in rad/m.
+        Derivative of each angle with respect to the displacement, at zero displacement, in rad/m.
     """
 
     angles: tuple[str, ...]
@@ -868,7 +891,7 @@ class Sensitivity:
     slope: Array
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what is moved, the axis, and the linear response to 10 m in arcseconds."""
+        """Return a dictionary: what is moved, the axis, and the linear change of each angle for 10 m, in arcseconds."""
         answers = {
             f"{name}_arcsec_per_10m": float(s) * 10.0 / ARCSEC + 0.0
             for name, s in zip(self.angles, self.slope, strict=True)

@@ -35,15 +35,17 @@ ratio has coefficients, and the others stay small."""
 _DAMPING = (0.0, 1e-8, 1e-6, 1e-4, 1e-2, 1.0)
 """Strengths of the regularisation of the denominators; the last one almost leaves polynomials."""
 _STEP = 1e-6
-"""Step of a numerical derivative on the ground, relative to the half extent of the ground."""
+"""Step of a numerical derivative with respect to ground coordinates, relative to the half extent of the fitted area."""
 _ARRIVED = 1e-9
-"""Newton step on the ground, relative to its half extent, below which the iteration has converged."""
+"""Newton step of ground coordinates, relative to the half extent of the fitted area, below which the iteration has
+converged.
+"""
 _MOST_STEPS = 30
-"""Largest number of Newton steps to the ground."""
+"""Largest number of Newton steps from image to ground coordinates."""
 _COEFFICIENTS = 50844
-"""Number of the TIFF tag RPCCoefficientTag."""
+"""Code of the TIFF tag RPCCoefficientTag, which holds the rational polynomials."""
 _UNSTATED = -1.0
-"""Value of ERR_BIAS and ERR_RAND in that tag if they are not known, metres."""
+"""Value of ERR_BIAS and ERR_RAND in RPCCoefficientTag that marks them as unknown."""
 _WIDEST = 90.0
 """Extent in longitude from which the ground counts as lying on a pole or the 180th meridian, degrees."""
 
@@ -57,7 +59,7 @@ class RationalPolynomial:
     offset : (5,) ndarray
         Offsets of line, sample, latitude, longitude (degrees) and height (metres).
     scale : (5,) ndarray
-        Scales of the same.
+        Scales of line, sample, latitude, longitude (degrees) and height (metres).
     line_numerator, line_denominator, sample_numerator, sample_denominator : (20,) ndarray
         Coefficients in the order of RPC00B.
     error_px : tuple of float
@@ -69,8 +71,8 @@ class RationalPolynomial:
         ERR_BIAS, in metres: rms error of each horizontal axis on the ground that does not vary with time and is common
         to points and images (GDAL's RFC 22; 68 % in STDI-0002); None if unknown.
     random_m : float or None
-        ERR_RAND, in metres: rms error of each horizontal axis that varies with time, another one in every image or
-        point.
+        ERR_RAND, in metres: rms error of each horizontal axis that varies with time, independent between images or
+        points; None if unknown.
     """
 
     offset: Array
@@ -260,8 +262,8 @@ def _best(
 ) -> tuple[tuple[Array, Array], float, float]:
     """Return numerator and denominator of one image coordinate, and its largest and rms error at the check points.
 
-    A jittering attitude is not a cubic: coefficients that follow the jitter at the fitted points err between them. The
-    strength of regularisation with the smallest rms error at the check points is therefore chosen.
+    Attitude jitter is not described by cubics: coefficients that follow it at the fitted points are wrong between them.
+    The strength of regularisation with the smallest rms error at the check points is therefore chosen.
     """
     (basis, fitted), (others, checked) = sides
     candidates: list[tuple[float, float, tuple[Array, Array]]] = []
@@ -282,8 +284,8 @@ def _best(
 def _ratio(basis: Array, value: Array, damping: float) -> tuple[Array, Array]:
     """Return numerator (20,) and denominator (20,), whose first coefficient is 1, of the ratio that fits values (N,).
 
-    The ratio itself is fitted by least squares: the weights follow from the previous denominator. `damping` regularises
-    the coefficients of the denominator.
+    The ratio is fitted by iterated linear least squares, weighted with the inverse of the previous denominator.
+    `damping` regularises the coefficients of the denominator.
     """
     weight = np.ones(len(value))
     damped = np.concatenate([np.zeros(TERMS), np.full(TERMS - 1, damping * np.sqrt(len(value)))])

@@ -36,8 +36,9 @@ _STATION = ("station x", "station y", "station z")
 _GROSS = 0.0175
 """Largest plausible change of a look angle from the laboratory's, in radians: 1 deg."""
 _RANK = 1e-9
-"""Smallest singular value, relative to the largest, of independent unit-length columns. Partials in float64 are
-accurate to 1e-15; three good strips and a station that only they determine stay above 5e-3.
+"""Smallest singular value, relative to the largest, of a Jacobian with columns of unit length that counts as having
+full rank. Partials in float64 are accurate to 1e-15; with three strips of well-distributed points and an unknown
+station the ratio stays above 5e-3.
 """
 _CONVERGED = 1e-6
 """Largest step of a converged iteration, in sigmas; the rounding of the misclosures is 1e-9 sigma."""
@@ -49,7 +50,7 @@ class ResectionError(MeasurementError, ValueError):
     Attributes
     ----------
     null_vectors : (k, P) ndarray
-        Combinations of the unknowns that move no image point.
+        The k linear combinations of the P unknowns that can change without moving an image point.
     """
 
     def __init__(self, message: str, null_vectors: Array | None = None) -> None:
@@ -143,7 +144,7 @@ class Resection:
     station : (3,) ndarray
         Adjusted station, in metres.
     names : tuple of str
-        Estimated unknowns.
+        Names of the P estimated unknowns.
     covariance : (P, P) ndarray
         Covariance of the unknowns in their order, in rad^2, and m^2 for the station.
     residual : mapping of str to (n, 2) ndarray
@@ -259,7 +260,7 @@ def resect(
         station_rows[:, -3:] = prior
 
     def system() -> tuple[Array, Array, dict[str, Array]]:
-        """Return partials and misclosures of the points and of the station's prior, and the plain residuals."""
+        """Return whitened partials and misclosures of points and station prior, and the residuals of each line."""
         design, miss, plain = _system(position, attitude, looks, lines, names)
         return np.vstack([design, station_rows]), np.concatenate([miss, prior @ (position - station.position)]), plain
 
@@ -306,7 +307,10 @@ def resect(
 def _system(
     station: Array, attitude: Array, looks: Mapping[str, float], lines: Mapping[str, ObservedLine], names: list[str]
 ) -> tuple[Array, Array, dict[str, Array]]:
-    """Return whitened partials (M, P), whitened misclosures (M,), and the plain residuals of each line."""
+    """Return the Jacobian and misclosures of the image points, both whitened, and the residuals of each line.
+
+    The Jacobian is (M, P) for M equations and P unknowns. Residuals are tangents, not whitened.
+    """
     rows, misses, plain = [], [], {}
     for name, line in lines.items():
         tilt = _pitched(looks[name])
@@ -344,7 +348,7 @@ def _pitched(look: float) -> Array:
 
 
 def _start(station: Station, lines: Mapping[str, ObservedLine], zero: str) -> tuple[Array, dict[str, float]]:
-    """Return the attitude from the reference line's directions (or another's) and look angles from mean directions."""
+    """Return start values: the attitude from the points of one line, and look angles from mean directions."""
     spread = {name: float(np.ptp(line.tangent[:, 1])) for name, line in lines.items()}
     base = zero if spread[zero] > 0 else max(spread, key=lambda name: spread[name])
     if spread[base] <= 0:

@@ -133,11 +133,11 @@ class LineModel:
         return cls(rotation, interior_values, centre, float(k1), float(k2), half_length=float(half_length))
 
     def with_interior(self, interior: ArrayLike) -> LineModel:
-        """Return the camera with another interior orientation f, x0, y0."""
+        """Return the camera with its interior orientation replaced: f, x0, y0 in metres."""
         return replace(self, interior=np.array(interior, np.float64))
 
     def drifted(self, drift: ArrayLike) -> LineModel:
-        """Return the camera with a drift (4,), d_alpha, d_beta, d_gamma, d_f against the reference state.
+        """Return the camera after a drift from its reference state: d_alpha, d_beta, d_gamma (radians), d_f (metres).
 
         The drift replaces an earlier one.
 
@@ -158,11 +158,11 @@ class LineModel:
 
     @property
     def principal_distance(self) -> Array:
-        """Principal distance of the drifted camera, metres."""
+        """Principal distance of the drifted camera, f + d_f, in metres."""
         return np.asarray(self.interior[0] + self.drift[3])
 
     def directions(self, image: Array) -> Array:
-        """Return the (n, 3) unit vectors in the body frame of the rays of image points (n, 2)."""
+        """Return the unit vectors toward the scene, in the body frame, (n, 3), of n image points."""
         at = image - self.interior[1:]
         square = np.sum(at**2, axis=1)
         at = at * (1.0 + square * (self.k1 + self.k2 * square))[:, None]
@@ -170,7 +170,7 @@ class LineModel:
         return np.asarray(look / np.linalg.norm(look, axis=1, keepdims=True))
 
     def seen(self, body: Array, image: Array) -> Seen:
-        """Return misclosures and derivatives of image points for ground points in the body frame.
+        """Return collinearity misclosures of image points, with derivatives, for ground points in the body frame.
 
         Parameters
         ----------
@@ -223,16 +223,16 @@ class LineModel:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Misclosures of image points and their derivatives.
+    """Collinearity misclosures of image points, with derivatives with respect to ground points and camera drift.
 
     Attributes
     ----------
     miss : (n, 2) ndarray
         Misclosures, in metres in the image, as from `misclosure`.
     by_body : (n, 2, 3) ndarray
-        Derivatives with respect to the ground point in the body frame.
+        Derivatives of the misclosures with respect to the ground point in the body frame, dimensionless.
     by_drift : (n, 2, 4) ndarray
-        Derivatives with respect to d_alpha, d_beta, d_gamma, d_f.
+        Derivatives of the misclosures with respect to d_alpha, d_beta, d_gamma (m/rad) and d_f (dimensionless).
     """
 
     miss: Array
@@ -331,7 +331,7 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Partials:
-    """Derivatives of `misclosure`.
+    """Derivatives of the collinearity misclosures (metres in the image) of n image points.
 
     Attributes
     ----------
@@ -361,7 +361,7 @@ def bias_rotation(bias: ArrayLike) -> Array:
 
 
 def _rotation_slopes(bias: Array) -> list[Array]:
-    """Return the derivatives of `bias_rotation` with respect to roll, pitch and yaw."""
+    """Return the derivatives of the bias rotation matrix with respect to roll, pitch and yaw, 1/rad."""
     turns = [_axis_rotation(axis, angle) for axis, angle in enumerate(bias)]
     out = []
     for axis, angle in enumerate(bias):
@@ -403,7 +403,7 @@ def misclosure(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset
 
 
 def partials(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: Array) -> Partials:
-    """Return the derivatives of `misclosure` in closed form.
+    """Return the analytic derivatives of the collinearity misclosures with respect to all parameters.
 
     Parameters
     ----------
