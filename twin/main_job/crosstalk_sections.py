@@ -1,4 +1,4 @@
-"""Report sections on elementary motions: spot shifts, readings of all estimators, factors of the printed formulas."""
+"""Report sections on elementary motions: spot shifts, estimates by all estimators, factors of printed formulas."""
 
 from __future__ import annotations
 
@@ -31,9 +31,14 @@ from twin.main_job.result_sections import IN_PAGE, figure
 from twin.monitor.crosstalk import PRINTED, CameraCrosstalk
 
 WRONG = 0.1
-"""Relative error above which a reading is marked as wrong, if it also exceeds the limit by ``UNOBSERVED``."""
+"""Relative error of an estimate above which it is marked as wrong, if the error also exceeds the limit by
+``UNOBSERVED``.
+"""
 UNOBSERVED = 0.01
-"""Share of the run's noise below which an error is not marked: a hundred units of the motion would not be noticed."""
+"""Smallest error that is marked, relative to the noise sigma of the run, per unit of motion.
+
+Below it, even a hundred units of the motion would cause an error no larger than the noise.
+"""
 
 
 def motion_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
@@ -60,7 +65,7 @@ _TYPESET = (*SYMBOLS.items(), (" um", " µm"), ("[um]", "[µm]"), ('"', " arcsec
 
 
 def _pretty(parts: list[str], labels: set[str], keep: bool = False) -> str:
-    """Typeset a statement for reports; the motion's label at its start is removed unless ``keep`` is set."""
+    """Typeset the name of a motion for reports; its label at the start is removed unless ``keep`` is set."""
     known = len(parts) > 1 and parts[0] in labels
     text = parts[1] if known and not keep else ": ".join(parts)
     for plain_text, typeset in _TYPESET:
@@ -71,7 +76,7 @@ def _pretty(parts: list[str], labels: set[str], keep: bool = False) -> str:
 
 
 def _motions(run: RenderRun) -> Table:
-    """Return the table with spot shifts, true change and reading of every estimator per unit of each motion."""
+    """Return the table with spot shifts, true change and estimate by every estimator, per unit of each motion."""
     pitch = 1e6 * run.experiment.path.pitch
     coordinates = list(
         dict.fromkeys(coordinate for table in run.crosstalk.values() for coordinate in table.coordinates)
@@ -93,7 +98,7 @@ def _motions(run: RenderRun) -> Table:
 
 
 def crosstalk_section(run: RenderRun) -> Section:
-    """Return the section that compares true changes and readings per unit of motion, a table for each camera."""
+    """Return the section that compares true and estimated changes per unit of motion, a table for each camera."""
     about = (
         "Per unit of motion: the true change of the camera (bold) and the reading of every estimator, to first order. "
         f"Underlined: wrong by more than {round(100 * WRONG)} % of the truth and by more than a hundredth of this "
@@ -150,7 +155,7 @@ def _columns(run: RenderRun, table: CameraCrosstalk, parameter: int) -> list[tup
 
 
 def _short(label: str) -> str:
-    """Return a motion's label without its body, which heads the group of rows."""
+    """Return a motion's label without the body's name, which the table shows above the motions of that body."""
     for word in ("figure ", "along ", "about "):
         if word in label:
             return (word + label.partition(word)[2]).removeprefix("figure ")
@@ -158,12 +163,12 @@ def _short(label: str) -> str:
 
 
 def is_wrong(reading: float, true: float, floor: float = SAME) -> bool:
-    """Return True if a reading differs from the truth by more than ``WRONG`` of it and more than ``floor``."""
+    """Return True if an estimate differs from the true value by more than ``WRONG`` of it and more than ``floor``."""
     return abs(reading - true) > max(WRONG * abs(true), floor)
 
 
 def formula_section(run: RenderRun) -> Section:
-    """Return the section with the factors of the printed formulas, two columns per camera, and their explanation."""
+    """Return the section with the factors of the published formulas, two columns per camera, and their explanation."""
     about = (
         "Each printed formula is evaluated with the traced spot shifts of the motion for which it was derived. A "
         "factor of 1 means that the formula is correct."

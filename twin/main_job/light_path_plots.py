@@ -68,13 +68,13 @@ def _channel(beam: Beam) -> str:
 
 
 def _colours(instrument: Instrument) -> dict[str, str]:
-    """Return channel name -> colour, identical in all cameras."""
+    """Return channel name -> colour; channels of the same name have the same colour in all cameras."""
     names = dict.fromkeys(channel.name for channel in instrument.channels)
     return {name: _CHANNEL_COLOURS[i % len(_CHANNEL_COLOURS)] for i, name in enumerate(names)}
 
 
 def _seen(instrument: Instrument, camera: str) -> list[Channel]:
-    """Return the channels that the side view shows: those at +Y, which hide those at -Y, or all if none is at +Y."""
+    """Return the channels that the side view shows: those at +Y, which cover those at -Y, or all if none is at +Y."""
     channels = [c for c in instrument.channels if c.camera == camera]
     return [c for c in channels if c.ccd[1] > 0.0] or channels
 
@@ -170,14 +170,14 @@ def _focal_plane(axes: Axes, paths: LightPaths, camera: str) -> None:
 
 
 def _widest(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return x and z of the ends of that one of a disk's two diameters that is longer in the side view."""
+    """Return x and z, in metres, of the ends of the one of a disk's two diameters that is longer in the side view."""
     pairs = ends.reshape(2, 2, 3)[..., [0, 2]]
     best = int(np.argmax(np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=-1)))
     return pairs[best, :, 0], pairs[best, :, 1]
 
 
 def _section(model: CameraModel, mirror: str) -> np.ndarray:
-    """Return points of a mirror in its plane of symmetry, (25, 3) array in the mirror's frame, metres."""
+    """Return points on a mirror's surface in its plane of symmetry, (25, 3) array in the mirror's frame, metres."""
     _, _, low, high = model.apertures[mirror].bounds
     y = np.linspace(low, high, 25)
     return np.stack([np.zeros_like(y), y, model.surfaces[mirror].sag(np.zeros_like(y), y)], axis=-1)
@@ -252,7 +252,7 @@ def footprints_svg(instrument: Instrument, paths: LightPaths) -> str:
 
 
 def _style(colour: str, filled: bool) -> dict[str, Any]:
-    """Return the line style of a footprint: filled at +Y, outlined at -Y, since both ends may coincide."""
+    """Return the line style of a footprint: filled at +Y, outlined at -Y, since the two footprints may coincide."""
     return {"fc": colour, "ec": colour, "alpha": 0.5} if filled else {"fill": False, "ec": colour, "lw": 1.4}
 
 

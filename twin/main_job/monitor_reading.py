@@ -78,25 +78,25 @@ class MonitorReading:
 
     @property
     def judged(self) -> str:
-        """Estimator of the verdict: `posterior` where the prior's disturbances change any reading, else `model`."""
+        """Name of the estimator that the verdict uses: `posterior` if the prior changes any estimate, else `model`."""
         return preferred_estimator(name for name in self.estimators if self.table.of(name))
 
     @cached_property
     def table(self) -> ReadingTable:
-        """All readings, beside the truth where it is known."""
+        """Table of the changes estimated by all estimators, beside the true changes where these are known."""
         return reading_table(self.recovery, self.cameras, self.truth, self.ground, self.disturbances).at(0)
 
     @cached_property
     def gains(self) -> dict[str, np.ndarray]:
-        """Gain of each estimator here: (4 x cameras, 2 x spots) parameters (rad, m) per pixel of shift."""
+        """Estimator -> gain matrix, (4 x cameras, 2 x spots): camera parameters (rad or m) per pixel of spot shift."""
         return estimator_gains(self.cameras, self.disturbances, self.recovery.shift_covariance[0])
 
     @cached_property
     def doubts(self) -> tuple[str, ...]:
         """Reasons why sigma does not hold for this measurement, as sentences without full stops.
 
-        They are spots that differ from their calibration, readings that are not linear and cannot be relinearised, and
-        shifts that contradict the prior.
+        They are spots whose shape differs from their calibration, estimates that are not linear in the motions and
+        cannot be relinearised, and spot shifts that contradict the prior.
         """
         texts = list(self.earlier_doubts)
         evidence = self.recovery.evidence
@@ -119,7 +119,7 @@ class MonitorReading:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Readings that were relinearised because they are not linear, as sentences without full stops."""
+        """Notes on estimates that were relinearised about the estimated state, as sentences without full stops."""
         return tuple(
             f"the motions read by the {self.estimators[name].title} are too large for a linear estimate "
             f"({self._error_text(name)} against the retraced state): its readings are Gauss-Newton iterates"
@@ -136,7 +136,10 @@ class MonitorReading:
         return unobserved_texts(prior, noise, self._quantities, self.gains[self.judged])
 
     def _error_text(self, name: str) -> str:
-        """Return the quantity whose linear reading departs most from the retraced state, and by how much, as text."""
+        """Return the quantity whose linear estimate differs most from a ray trace of the estimated state, as text.
+
+        The text also gives the size of the difference.
+        """
         index, size = self.recovery.curvature[name].worst()
         if not math.isfinite(size):
             return "light is lost"
@@ -148,14 +151,14 @@ class MonitorReading:
 
     @property
     def sigma_holds(self) -> bool:
-        """True if there are no doubts."""
+        """True if there is no reason to doubt the sigmas, i.e. ``doubts`` is empty."""
         return not self.doubts
 
     @cached_property
     def from_statement(self) -> dict[str, dict[str, float | None]]:
-        """Group -> key -> share of the posterior's variance that remains without image noise and so rests on the prior.
+        """Group -> key -> share of the posterior's variance due to the prior alone, which remains without image noise.
 
-        None for a quantity that no motion of the prior changes. Empty without a prior and without noise.
+        The share is None for a quantity that no motion of the prior changes. Empty without a prior and without noise.
         """
         prior, noise = self.disturbances, self.recovery.shift_covariance[0]
         if prior is None or not np.any(noise):
@@ -184,7 +187,7 @@ class MonitorReading:
         return consistency(recovery.shift[0], recovery.shift_covariance[0], self.disturbances, candidates, rate)
 
     def any_motions(self, prior: Disturbances) -> dict[str, np.ndarray]:
-        """Return the response of all spots to the motions of each body, in the prior or not.
+        """Return the response of all spots to the motions of each body, including bodies that the prior holds fixed.
 
         Parameters
         ----------
@@ -194,7 +197,7 @@ class MonitorReading:
         Returns
         -------
         dict of str to (2 C, M) ndarray
-            Body -> spot shifts, in pixels per table unit of each of its motions.
+            Body -> spot shifts of C channels, in pixels per table unit of each of the body's M motions.
         """
         columns: dict[tuple[str, str, int], np.ndarray] = {}
         for name, table in self.crosstalk.items():
@@ -207,16 +210,16 @@ class MonitorReading:
         return {b: np.stack([c for (body, _, _), c in columns.items() if body == b], axis=1) for b in bodies}
 
     def worst_of(self, shifts: np.ndarray, covariance: np.ndarray) -> tuple[int, Consistency] | None:
-        """Return the state of a series whose shifts agree least with the prior, and its consistency.
+        """Return the state of a series whose spot shifts agree least with the prior, and its chi-square test.
 
         The limit is that of the largest value of all times, at the same false-alarm rate. None without a prior.
 
         Parameters
         ----------
         shifts : (T, 2 C) ndarray
-            Spot shifts at each time, in pixels.
+            Spot shifts of C channels at T times, in pixels.
         covariance : (T, 2 C, 2 C) ndarray
-            Covariance of the shifts, in px^2.
+            Covariance of the shifts at each time, in px^2.
         """
         prior, false_alarm = self.disturbances, FALSE_ALARM / len(shifts)
         if prior is None:
@@ -227,7 +230,7 @@ class MonitorReading:
 
     @property
     def checks(self) -> Iterator[SelfCheck]:
-        """Checks of the spot fits, of the prior and of the linearity of the readings."""
+        """Checks of the spot fits, of the spot shifts against the prior, and of the linearity of the estimates."""
         evidence = self.recovery.evidence
         if evidence is not None:
             yield from _fits("spots before", evidence.before)
@@ -269,7 +272,7 @@ class MonitorReading:
         }
 
     def _retraced(self, name: str) -> dict[str, Any]:
-        """Return the comparison of an estimator's readings with the trace of the state that they describe."""
+        """Return the comparison of an estimator's linear estimates with a ray trace of the estimated state."""
         curvature = self.recovery.curvature[name]
         worst, size = curvature.worst()
         quantity = self._quantities[worst]
@@ -363,12 +366,12 @@ def prior_check(name: str, test: Consistency) -> SelfCheck:
 
 
 def worst_checks(readings: Iterable[MonitorReading]) -> tuple[SelfCheck, ...]:
-    """Return the worst check of each name among several readings.
+    """Return, for each name of a check, the one with the worst result among several measurements.
 
     Parameters
     ----------
     readings : Iterable[MonitorReading]
-        Readings of several states or times.
+        Measurements of several states or times.
     """
     out: dict[str, SelfCheck] = {}
     for check in (check for reading in readings for check in reading.checks):
@@ -380,7 +383,7 @@ def worst_checks(readings: Iterable[MonitorReading]) -> tuple[SelfCheck, ...]:
 SHARE_DECIMALS, OFF_DECIMALS = 3, 1
 """Decimals of shares, and of linearity errors in sigmas: rounding errors seldom change numbers rounded so."""
 READING_DECIMALS = 6
-"""Decimals of a reading in files, counted in units of its sigma."""
+"""Decimals of an estimated change in files, counted in units of its sigma."""
 _TEST_KEYS: Mapping[str, Callable[[Consistency], Any]] = {
     "chi_square": lambda test: _to_digits(test.chi_square),
     "chi_square_sigma_noise": lambda test: test.sigma_noise,
@@ -391,11 +394,11 @@ _TEST_KEYS: Mapping[str, Callable[[Consistency], Any]] = {
     "chance_sigma_noise": lambda test: test.chance_sigma_noise,
     "agrees": lambda test: test.agrees,
 }
-"""Key in files -> number of the test against the prior."""
+"""Key in files -> function that takes its number from the chi-square test against the prior."""
 _SIGMA_DIGITS = 8
 """Significant digits of a sigma and of a chi-square in files."""
 _SIGMAS = ("_sigma", "_sigma_noise", "_rms_m")
-"""Endings of the keys that hold sigmas."""
+"""Endings of the keys in files whose values are standard deviations."""
 
 
 def _to_digits(value: float) -> float:

@@ -100,7 +100,7 @@ def _quality_rows(name: str, camera: CameraQuality, quality: ImageQuality) -> li
 
 
 def _every_field(quality: ImageQuality) -> Table:
-    """Return the table with all digits at every field, including those that the report leaves out."""
+    """Return the table of image quality with all digits at every field, including those that the report leaves out."""
     places = {quality.fields.index(field): place for place, field in PLACES.items()}
     rows: list[list[Cell]] = []
     for name, camera in quality.cameras.items():
@@ -214,7 +214,7 @@ def _mtf_table(targets: TargetRun, kinds: list[str]) -> Table:
 
 
 def _mtf_rows(name: str, camera: CameraTargets) -> list[list[Cell]]:
-    """Return table rows with all digits of a camera's MTF readings."""
+    """Return table rows with the MTF measured in each of a camera's targets, with all digits."""
     rows: list[list[Cell]] = []
     for place, targets in camera.places.items():
         for direction in DIRECTIONS:
@@ -321,7 +321,10 @@ def stray_section(run: RenderRun) -> Section | None:
 
 
 def _surface_list(surfaces: list[str]) -> str:
-    """Return surfaces in order, without the ``base/<camera>/monitor/<channel>/`` that all paths of prisms share."""
+    """Return the names of surfaces in order, without the prefix that all paths through prisms share.
+
+    The prefix is ``base/<camera>/monitor/<channel>/``.
+    """
     prisms = [step for step in surfaces if "/monitor/" in step]
     common = "/".join(prisms[0].split("/")[:4]) + "/" if prisms else ""
     return " \N{RIGHTWARDS ARROW} ".join(step.removeprefix(common) for step in surfaces)
@@ -370,11 +373,11 @@ def finish_section(run: RenderRun) -> Section | None:
 
 
 NAMED = 1e-10
-"""Amplitude, in metres RMS, below which the report's table omits a Zernike term."""
+"""Smallest amplitude of a Zernike term that the report's table shows, in metres RMS."""
 
 
 def _flat(numbers: Mapping[str, Any], *keys: str) -> list[Cell]:
-    """Return the numbers under some keys as table cells; a vector gives one cell for each axis."""
+    """Return the numbers stored under some keys as table cells; a vector gives one cell for each axis."""
     values = [numbers[key] for key in keys]
     return [number for value in values for number in (value if isinstance(value, list) else [value])]
 

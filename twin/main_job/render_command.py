@@ -32,7 +32,7 @@ _DASH = "\N{EM DASH}"
 NUMBER = 7
 """Width of most numbers in the terminal's table, in characters."""
 _WIDE = 90
-"""Terminal width, in characters, from which the table also has the noise's part of sigma."""
+"""Smallest terminal width, in characters, at which the table also shows the part of sigma due to noise."""
 
 _ALONG = dict(zip(DIRECTIONS, ("along line", "along track"), strict=True))
 """Direction of the MTF -> its name in the terminal."""
@@ -68,7 +68,7 @@ def run_render(resolved: ResolvedJob, session: Session, frames: int | None, seed
 
 
 def _numbers(run: JobRun) -> dict[str, Any]:
-    """Return what ``--json`` prints: contents of the files with the main results, by their kind."""
+    """Return the data that ``--json`` prints: kind of file (truth, recovered, ...) -> contents of that JSON file."""
     parts = {"truth": run.truth_dict()}
     if isinstance(run, RenderRun):
         parts["recovered"] = recovered_numbers(run)
@@ -164,7 +164,10 @@ def _changes(run: JobRun) -> Table:
 
 
 def _table(run: RenderRun, wide: bool) -> Table:
-    """Return the table of every estimator's readings beside the truth, with sigma and error of the judged estimator."""
+    """Return the table of the changes by every estimator beside the truth, with sigma and error.
+
+    Sigma and error are those of the estimator that the verdict uses.
+    """
     title = f"{run.resolved.instrument.name}: recovered from the images ({run.frames} frames, seed {run.seed})"
     if run.series is not None:
         title += f"\nat {moment(float(run.series.times[run.series.shown]))} of the course"

@@ -1,4 +1,4 @@
-"""Files of a run with its numbers and images, and the tables of nodes and finishes that its job names.
+"""Files of a run with its numbers and images, and the tables of nodes and surface finishes that its job names.
 
 The run folder keeps a copy of each such table, so that its config.yaml repeats the run without the originals.
 """
@@ -32,7 +32,7 @@ from twin.uncertainty.uncertainty_numbers import LIMITS
 
 
 def irradiance_file(run: RenderRun) -> bytes:
-    """Return the contents of irradiance.nc."""
+    """Return the contents of irradiance.nc (NetCDF): the expected images before and after, in photons per pixel."""
     return netcdf(irradiance(run))
 
 
@@ -66,7 +66,7 @@ def write_results(run: JobRun, folder: RunFolder) -> None:
 
 
 def _write_monitor(run: RenderRun, folder: RunFolder) -> None:
-    """Write the frames, readings and tables of a run's monitor."""
+    """Write the frames, the estimated changes and the tables of a run's monitor."""
     crosstalk = {name: table.to_dict() for name, table in run.crosstalk.items()}
     for kind, data in (("recovered", recovered_numbers(run)), ("crosstalk", crosstalk)):
         _write_numbers(folder, kind, data)
@@ -97,7 +97,7 @@ def _spot_facts(run: RenderRun, channel: Channel, note: str) -> FrameFacts:
 
 
 def _write_series(run: RenderRun, series: TimeSeries, folder: RunFolder) -> None:
-    """Write a course: numbers, expected images, and for each channel the first frame of every time as one page."""
+    """Write a time series: numbers, expected images, and for each channel a file with the first frame of every time."""
     _write_numbers(folder, "course", series.to_dict())
     for i, channel in enumerate(run.experiment.path.channels):
         times = tuple(float(time) for time in series.times)
@@ -121,7 +121,7 @@ _WAVELENGTH = {"units": "m", "standard_name": "radiation_wavelength", "long_name
 
 
 def irradiance(run: RenderRun) -> GridData:
-    """Return expected photons before and after, (state, channel, row, column), and traced stray light apart."""
+    """Return expected photons per pixel before and after, (state, channel, row, column), and stray light separately."""
     photons = np.stack([run.photons_before, run.photons_after])
     states = ("state", ["before", "after"], {"long_name": "before the disturbance or after it"})
     images = _images(run, "state", states, photons)
@@ -134,7 +134,10 @@ def irradiance(run: RenderRun) -> GridData:
 
 
 def _images(run: RenderRun, first: str, coordinate: Gridded, photons: np.ndarray) -> GridData:
-    """Return expected images (N, C, rows, columns) as grid data with the coordinate of their first axis."""
+    """Return expected images (N, C, rows, columns) as grid data, for N states or times and C channels.
+
+    The coordinate of the first axis is attached.
+    """
     path = run.experiment.path
     return GridData(
         {
@@ -177,13 +180,13 @@ def table_names(job: JobSpec) -> Mapping[tuple[str, str], str]:
 
 
 def finish_tables(job: JobSpec) -> Mapping[tuple[str, str], FinishTableSpec]:
-    """Return (kind of surface, measured quantity) -> table of a finish, for a job's stray light."""
+    """Return (kind of surface, measured quantity) -> table of a surface finish (scatter, coating) for stray light."""
     stray = job.render.stray
     return FrozenMap({} if stray is None or stray.finishes is None else stray.finishes.tables)
 
 
 def finish_names(job: JobSpec) -> Mapping[tuple[str, str], str]:
-    """Return (kind of surface, measured quantity) -> name of the table of a finish in the run folder."""
+    """Return (kind of surface, measured quantity) -> file name of its table of a surface finish in the run folder."""
     tables = finish_tables(job).items()
     return FrozenMap(
         {(kind, what): f"finish/{kind}_{what}{PurePath(t.table).suffix.lower()}" for (kind, what), t in tables}
@@ -262,7 +265,7 @@ HEATED_BODY: Record[HeatedBody] = Record(
 
 
 def table_numbers(run: JobRun) -> dict[str, dict[str, Any]]:
-    """Return the contents of deformation.json and temperature.json, by kind, of a job that has such tables."""
+    """Return the contents of deformation.json and temperature.json, by kind; empty for a job without node tables."""
     names = table_names(run.resolved.job)
     numbers_by_kind = {
         "deformation": {path: DEFORMATION(face) for path, face in run.deformed.items()},

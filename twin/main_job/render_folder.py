@@ -122,7 +122,7 @@ _PICTURES = {
     "picture_prisms.png": "The central prism and its surroundings",
     "picture_focal_plane.png": "The detectors of the first camera",
 }
-"""Captions of the rendered pictures."""
+"""File name of each rendered picture -> its caption."""
 _JPEG_QUALITY = 88
 AGAIN = (
     "The config.yaml of the run folder is complete, with all references resolved; with the same versions of the "
@@ -209,7 +209,7 @@ ARROWS = " Arrows: lines of sight."
 
 
 def _instrument(side: str, pictures: Sequence[Path], viewer: Markup, monitored: bool) -> Section:
-    """Return the section with the 3-D view, the drawing shown where it is not available, and rendered pictures."""
+    """Return the section with the 3-D view, the side view for browsers without it, and rendered pictures."""
     drawing = '<figure id="fallback"><div class="card">{}</div><figcaption>{}</figcaption></figure>'
     markup = viewer + Markup(drawing).format(Markup(side), f"{SIDE}{BEAMS if monitored else ''}{ARROWS}")
     if pictures:
@@ -251,7 +251,7 @@ if TYPE_CHECKING:
     from twin.uncertainty.monitor_limits import MonitorLimits
 
 LIMITS = "limits"
-"""Name of the figure of what limits the readings."""
+"""Name of the figure that shows what limits the accuracy of the estimated changes."""
 SUMMARY, SCENE, IRRADIANCE = "summary", "scene", "irradiance"
 """Drawings that are files of bytes, not figures of the report: summary.png, scene.glb, irradiance.nc."""
 APART = (SUMMARY, SCENE, IRRADIANCE)
@@ -262,7 +262,7 @@ FILES = {IRRADIANCE: "irradiance.nc", SCENE: "scene.glb", SUMMARY: "summary.png"
 
 
 def begin_drawing(beside: SecondProcess, instrument: Instrument, backend: Backend, state: State) -> None:
-    """Start drawing in the second process what is known before the measurement, unless it has started already.
+    """Start drawing in the second process what does not depend on the measurement, unless it has started already.
 
     Parameters
     ----------
@@ -280,9 +280,9 @@ def begin_drawing(beside: SecondProcess, instrument: Instrument, backend: Backen
 
 
 def instrument_drawings(instrument: Instrument, backend: Backend, state: State) -> dict[str, Callable[[], Any]]:
-    """Return drawing functions of an instrument and its light in a state, by name, the longest first.
+    """Return name -> function that draws an instrument and its light in a state; the slowest come first.
 
-    They give <svg> elements, and the bytes of scene.glb.
+    The functions return <svg> elements, and the bytes of scene.glb.
     """
     paths = trace_light_paths(instrument, backend, state)
     return _attempts(
@@ -295,7 +295,7 @@ def instrument_drawings(instrument: Instrument, backend: Backend, state: State) 
 
 
 def drawings(run: JobRun) -> dict[str, Callable[[], Any]]:
-    """Return drawing functions of a run's results, by name; values computed on demand are computed now."""
+    """Return name -> function that draws a results figure of a run; what the figures need is computed now."""
     targets = run.targets
     out = _of_monitor(run) if isinstance(run, RenderRun) else {}
     if targets is not None:
@@ -309,7 +309,7 @@ def drawings(run: JobRun) -> dict[str, Callable[[], Any]]:
 
 
 def limits_drawing(limits: MonitorLimits | None) -> dict[str, Callable[[], Any]]:
-    """Return the drawing function of what limits the readings, by name; empty without a prior."""
+    """Return name -> function that draws what limits the estimated changes; empty without a prior."""
     if limits is None:
         return {}
     return _attempts({LIMITS: _drawing("twin.uncertainty.uncertainty_report:limits_svg", limits)})
@@ -320,7 +320,7 @@ def _attempts(drawing: Mapping[str, Callable[[], Any]]) -> dict[str, Callable[[]
 
 
 def _of_monitor(run: RenderRun) -> dict[str, Callable[[], Any]]:
-    """Return drawing functions of the monitor's images and readings, by name."""
+    """Return name -> function that draws a figure of the monitor's images or estimated changes."""
     out: dict[str, Callable[[], Any]] = {"motions": _drawing("spot_plots:motion_map_svg", run)}
     out |= {f"spots {name}": _drawing("spot_plots:spots_svg", run, name) for name in run.experiment.instrument.cameras}
     out[IRRADIANCE] = _drawing("render_files:irradiance_file", run)
@@ -336,12 +336,15 @@ def _of_monitor(run: RenderRun) -> dict[str, Callable[[], Any]]:
 
 
 def _drawing(function: str, *given: Any) -> Callable[[], Any]:
-    """Return a drawing by the function ``module:name``, which the drawing process imports (this takes a second)."""
+    """Return a call of the function ``module:name``, which is imported only by the process that draws.
+
+    The import takes a second.
+    """
     return partial(Named(function if "." in function else f"{__package__}.{function}"), *given)
 
 
 def _attempt(name: str, draw: Callable[[], Any]) -> Any:
-    """Return a drawing, or Undrawn with the reason: a failed drawing must not cost the computed results."""
+    """Return a drawing, or an `Undrawn` with the reason: a failed drawing must not cost the computed results."""
     try:
         return draw()
     except Exception as error:

@@ -1,4 +1,4 @@
-"""The main job: perturb, render, detect, recover, compare."""
+"""The main job: perturb the instrument, render and expose images, estimate the changes, compare with the truth."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ STAGES = (
 )
 
 COURSE = "times of the course"
-"""Progress label of a long part: the times of a course."""
+"""Progress label of a long part: the times of a time series."""
 
 STRAY = "trace ghosts and stray light"
 """Progress label of a long part: stray light."""
@@ -65,7 +65,7 @@ QUALITY = "image quality"
 """Progress label of a long part: image quality."""
 
 _FREE_PUPILS = "obstruction: ignore: image quality and targets do not include obstruction by bodies in the beams"
-"""Warning of a job that ignores obstructions."""
+"""Warning of a job that ignores obstructions of the pupils in image quality and targets."""
 
 MIN_LIGHT = 0.5
 """Share of the nominal light on a CCD below which the user is warned: vignetting, or a spot that leaves the CCD."""
@@ -84,10 +84,10 @@ def render_job(
     experiment: MonitorExperiment | None = None,
     placed: Callable[[Instrument, Backend, State], object] | None = None,
 ) -> JobRun:
-    """Run a job. Most of a course's results describe the single time ``course.detail``.
+    """Run a job: perturb the instrument, render and expose the images, estimate the changes and compare with the truth.
 
-    An instrument with a monitor gives a `RenderRun`. One without is perturbed and traced, and the images of its cameras
-    are evaluated.
+    For a time series, most of the results describe the single time ``course.detail``. An instrument with a monitor
+    gives a `RenderRun`. One without is perturbed and traced, and the images of its cameras are evaluated.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def render_job(
         Seed of all noise; overrides the job's.
     advance : Advance
         Called when each of STAGES and QUALITY begins and ends, and for the long parts COURSE, STRAY and TARGETS with
-        the number of times, paths or places done and their total.
+        the number of times, paths or target positions done and their total.
     experiment : MonitorExperiment or None
         The job's instrument if it has been built already; results are the same.
     placed : callable or None
@@ -209,7 +209,7 @@ def render_job(
 
 
 def require_one_state(resolved: ResolvedJob) -> None:
-    """Refuse what requires a monitor in a job of an instrument without one.
+    """Raise InputError if a job of an instrument without a monitor asks for what requires one.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def require_one_state(resolved: ResolvedJob) -> None:
     Raises
     ------
     InputError
-        The job has a course, stray light or disturbances.
+        The job has a time series, stray light or disturbances.
     """
     job = resolved.job
     for asked, key, what in (
@@ -376,7 +376,7 @@ def _stray_warnings(experiment: MonitorExperiment, stray: StrayPair) -> Iterator
 
 @contextmanager
 def _lost_by_motions(resolved: ResolvedJob, *errors: type[Exception]) -> Iterator[None]:
-    """Raise InputError at the key ``perturb`` for errors that motions cause."""
+    """Raise InputError at the key ``perturb`` where the motions cause one of the given errors (a context manager)."""
     try:
         yield
     except errors as error:

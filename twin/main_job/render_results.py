@@ -37,7 +37,7 @@ PROGRAM = "twin.render"
 
 @dataclass(frozen=True, eq=False)
 class StrayPair:
-    """Stray light of the nominal and the perturbed instrument, obstruction by prisms, and measured finishes."""
+    """Stray light of the nominal and the perturbed instrument, obstruction by prisms, and measured surface finishes."""
 
     before: StrayLight
     after: StrayLight
@@ -135,12 +135,12 @@ class JobRun:
 @shows("experiment", "seed", "before [DN]", "after [DN]")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RenderRun(JobRun):
-    """Result of a job of an instrument with a monitor, with the monitor's frames and readings.
+    """Result of a job of an instrument with a monitor, with the monitor's frames and estimated changes.
 
     Attributes
     ----------
     photons_before, photons_after : (C, rows, columns) ndarray
-        Expected photons per pixel and frame, stray light included.
+        Expected photons per pixel and frame on the CCDs of C channels, stray light included.
     before, after : (C, frames, rows, columns) ndarray of uint16
         Grey values, DN.
     recovery : Recovery
@@ -148,7 +148,8 @@ class RenderRun(JobRun):
     crosstalk : Mapping[str, CameraCrosstalk]
         Camera -> response to elementary motions.
     series : TimeSeries or None
-        All times of the job's course, None if it has none; the other attributes then describe the time that it shows.
+        All times of the job's time series, None if it has none; the other attributes then describe the time that it
+        shows.
     stray : StrayPair or None
         Ghosts and stray light, None if not asked for.
     """
@@ -168,7 +169,7 @@ class RenderRun(JobRun):
 
     @cached_property
     def reading(self) -> MonitorReading:
-        """Reading of the monitor, beside the truth."""
+        """Changes estimated from the monitor's images, beside the true changes."""
         experiment = self.experiment
         smoothed = None if self.series is None else self.series.smoothed
         return MonitorReading(
@@ -187,36 +188,36 @@ class RenderRun(JobRun):
 
     @property
     def estimators(self) -> dict[str, Estimator]:
-        """Estimators of the reading."""
+        """Estimators in the results, by name."""
         return self.reading.estimators
 
     @property
     def judged(self) -> str:
-        """Name of the estimator that the report judges."""
+        """Name of the estimator that the verdict of the report uses."""
         return self.reading.judged
 
     @property
     def gains(self) -> dict[str, np.ndarray]:
-        """Gain of each estimator of the reading."""
+        """Estimator -> gain matrix, (4 x cameras, 2 x spots): camera parameters (rad or m) per pixel of spot shift."""
         return self.reading.gains
 
     @property
     def sigma_holds(self) -> bool:
-        """True if no measurement contradicts the sigmas, at any time of a course."""
+        """True if no measurement contradicts the sigmas, at any time of a time series."""
         return self.reading.sigma_holds if self.series is None else bool(np.all(self.series.sigma_holds))
 
     @cached_property
     def worst_of_course(self) -> tuple[int, Consistency] | None:
-        """Index of the time of a course whose shifts agree least with the prior, and its consistency.
+        """Index of the time of a series whose spot shifts agree least with the prior, and its chi-square test.
 
-        None without a course or a prior; see `MonitorReading.worst_of`.
+        None without a time series or a prior. The limit is that of the largest value of all times.
         """
         series = self.series
         return None if series is None else self.reading.worst_of(series.shift, series.shift_covariance)
 
     @cached_property
     def limits(self) -> MonitorLimits | None:
-        """Analysis of what limits the readings; None without a prior.
+        """Analysis of what limits the accuracy of the estimated changes; None without a prior.
 
         It depends on the instrument and its light, not on these images, and is the same for every seed.
         """
@@ -226,7 +227,7 @@ class RenderRun(JobRun):
 
     @property
     def checks(self) -> tuple[SelfCheck, ...]:
-        """Checks of images and readings, and of the energy balance of stray light."""
+        """Checks of images and estimated changes, and of the energy balance of stray light."""
         out = [*self.experiment.path.checked.self_checks(), *self.reading.checks]
         if self.worst_of_course is not None:
             out.append(

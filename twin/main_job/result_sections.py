@@ -1,4 +1,4 @@
-"""Report sections on set-up, result, time course, spots and residuals of the main job."""
+"""Report sections on set-up, result, time series, spots and residuals of the main job."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from twin.monitor.reading_table import Reading, ReadingTable
 from twin.monitor.time_series import TimeSeries
 
 IN_PAGE = ""
-"""File name of artefacts that appear in the page only."""
+"""Empty file name, for artefacts that appear only in the report page."""
 _GROUND_TITLE = "Errors of ground points if the changes of the cameras are ignored"
 _ANGLE_TITLE = "Angle between the cameras"
 
@@ -54,7 +54,7 @@ def figure(
 
 
 def shown_time(run: JobRun) -> str:
-    """Return ``, at 12 min``, the time of a course that a run shows in full; empty without a course."""
+    """Return the time of a time series that a run shows in full, as ``, at 12 min``; empty for a single state."""
     if not isinstance(run, RenderRun):
         return ""
     return "" if run.series is None else f", at {moment(float(run.series.times[run.series.shown]))}"
@@ -63,8 +63,8 @@ def shown_time(run: JobRun) -> str:
 def result_tables(run: JobRun) -> tuple[Table, ...]:
     """Return the tables of recovered and true changes.
 
-    A course has the errors over all its times first, then the time that is shown; without a monitor there are only true
-    changes.
+    For a time series, the errors over all its times come first, then the time that is shown; without a monitor there
+    are only true changes.
     """
     if not isinstance(run, RenderRun):
         return (_change_table(run),)
@@ -100,7 +100,7 @@ def _change_table(run: JobRun) -> Table:
 
 
 def part_title(run: RenderRun, reading: Reading, nominal: bool = True) -> str:
-    """Return the heading of a reading's group: a camera, the angle between two, or points on the ground.
+    """Return the heading of a group of changes: a camera, the angle between two, or points on the ground.
 
     The angle's heading has its nominal value if ``nominal`` is set.
     """
@@ -217,7 +217,10 @@ def _range(values: np.ndarray, places: int) -> str:
 
 
 def _worst(run: RenderRun, series: TimeSeries) -> str:
-    """Return a sentence with the largest error of the judged estimator in alpha: camera, size, time, true change."""
+    """Return a sentence with the largest error in alpha of the estimator that the verdict uses.
+
+    It names the camera, the size, the time and the true change.
+    """
     candidates = [row for row in series.readings.of(run.judged) if row.parameter.key == "d_alpha_arcsec"]
     worst = max(candidates, key=lambda row: float(np.max(np.abs(row.error))))
     k = int(np.argmax(np.abs(worst.error)))
@@ -230,12 +233,12 @@ def _worst(run: RenderRun, series: TimeSeries) -> str:
 
 
 def course_sections(run: RenderRun, drawn: Mapping[str, str], shown: Table) -> tuple[Section, ...]:
-    """Return the sections with figures of a course and with the time that the other sections show.
+    """Return the sections with figures of a time series and with the time that the other sections show.
 
     Parameters
     ----------
     run : RenderRun
-        Run with a course.
+        Run with a time series.
     drawn : Mapping[str, str]
         Name -> <svg> element of its figures.
     shown : Table
@@ -285,7 +288,7 @@ def course_sections(run: RenderRun, drawn: Mapping[str, str], shown: Table) -> t
 
 
 def _every_time(run: RenderRun) -> Table:
-    """Return the table of every reading at every time, with all digits."""
+    """Return the table of every estimated change at every time, with all digits."""
     assert run.series is not None
     rows: list[list[Cell]] = []
     for rows_of_change in run.series.readings.by_change():
@@ -350,9 +353,9 @@ def _with_sigma(value: float, sigma: float, sign: bool = False) -> str:
 
 
 def residual_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
-    """Return the section with residuals of all estimators and the part of them that the crosstalk table explains.
+    """Return the section with the errors of all estimators and the part of them that the crosstalk table explains.
 
-    The unexplained part of the judged estimator's residual is compared with the noise alone.
+    The unexplained part of the error of the estimator that the verdict uses is compared with the noise alone.
     """
     title = run.estimators[run.judged].title
     rows: list[list[Cell]] = []
@@ -468,7 +471,7 @@ def _all(values: list[float]) -> str:
 
 
 def _fields(degrees: list[float]) -> str:
-    """Return distinct field angles, as text: ``±1.22``, or ``±1.22, 1.25`` where only one end has the second."""
+    """Return distinct field angles, in degrees, as text: ``±1.22``, or ``±1.22, 1.25`` if one end has the second."""
     ends: dict[str, set[bool]] = {}
     for field in degrees:
         ends.setdefault(plain(abs(field)), set()).add(field > 0.0)
@@ -503,7 +506,7 @@ def _prior_table(run: JobRun) -> Table:
     full: list[list[Cell]] = []
 
     def listed(name: str, when: str, why: str) -> list[Component]:
-        """Add the components of a cause to the table with all digits, and return them."""
+        """Add the motions due to one cause to the table with all digits, and return them."""
         components = [c for c in prior.components if c.cause == name]
         full.extend(
             [name, c.body, c.what, c.sigma / c.unit_size, unit_for_reports(c.unit), when, why] for c in components
@@ -548,7 +551,10 @@ def _prior_table(run: JobRun) -> Table:
 
 
 def done_table(run: JobRun) -> Table:
-    """Return the table of what the job does to each body at the time shown, without the bodies that it carries."""
+    """Return the table of the motions and temperatures that the job gives to each body at the time shown.
+
+    Bodies that only move because another body carries them are omitted.
+    """
     job = run.resolved.job
     shown = _shown(run)
     motions, fields = motions_of(job, shown), job.fields(shown)
@@ -575,12 +581,12 @@ def done_table(run: JobRun) -> Table:
 
 
 def _shown(run: JobRun) -> int | None:
-    """Return the index of the time of a course that is shown; None without one."""
+    """Return the index of the time of a time series that is shown; None for a single state."""
     return run.series.shown if isinstance(run, RenderRun) and run.series is not None else None
 
 
 def _heated(run: JobRun) -> int:
-    """Return the number of bodies at another temperature than nominal, faces of prisms not counted."""
+    """Return the number of bodies whose temperature is not nominal, faces of prisms not counted."""
     job = run.resolved.job
     time = _shown(run)
     fields = run.experiment.thermal.fields(run.experiment.fields(job, time))

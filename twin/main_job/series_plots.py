@@ -1,4 +1,4 @@
-"""Figures of a course: temperatures, true changes and the readings of every estimator over time."""
+"""Figures of a time series: temperatures, true changes and the changes by every estimator over time."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ COLOURS = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.ORANGE, svg.SKY, svg.PURPLE, 
 STYLES = ("-", "--", ":")
 """Line styles: the first for the first nodes, the others for nodes whose colour is already in use."""
 _BESIDE = 0.12
-"""Distance between the marks of two estimators at one time, as a share of the time step."""
+"""Horizontal distance between the markers of two estimators at the same time, as a share of the time step."""
 UNITS = ((2.0 * 86400.0, 86400.0, "d"), (6.0 * 3600.0, 3600.0, "h"), (180.0, 60.0, "min"), (0.0, 1.0, "s"))
-"""Time units: shortest course, in seconds, that is drawn in the unit; the unit in seconds; its name."""
+"""Time units: shortest duration of a series, in seconds, drawn in the unit; the unit in seconds; its name."""
 
 
 def time_unit(times: np.ndarray) -> tuple[float, str]:
-    """Return a unit that suits a course's length, in seconds, and its name.
+    """Return a unit that suits a time series' duration, in seconds, and its name.
 
     Parameters
     ----------
     times : (T,) ndarray
-        Times of the course, in seconds, ascending.
+        The T times of the series, in seconds, ascending.
     """
     span = float(times[-1] - times[0])
     return next((size, unit) for least, size, unit in UNITS if span >= least)
 
 
 def _time_axis(series: TimeSeries) -> tuple[np.ndarray, str]:
-    """Return the times of a course in a unit that suits its length, and the axis label."""
+    """Return the times of a series in a unit that suits its duration, and the axis label."""
     size, unit = time_unit(series.times)
     return series.times / size, f"time [{unit}]"
 
 
 def temperatures_svg(series: TimeSeries) -> str:
-    """Draw the temperatures and motions of a course that the job prescribes.
+    """Draw the temperatures and motions over time that the job prescribes.
 
     Panels show the change at the origin and the gradient along each axis of every node, and below them rotation and
     shift.
@@ -95,12 +95,12 @@ def temperatures_svg(series: TimeSeries) -> str:
 
 
 def parameters_svg(series: TimeSeries, names: dict[str, str]) -> str:
-    """Draw true parameters as lines and readings as marks, camera by camera, and the angle between two cameras.
+    """Draw true parameters as lines and estimates as markers, camera by camera, and the angle between two cameras.
 
     Parameters
     ----------
     series : TimeSeries
-        Course to draw.
+        Time series to draw.
     names : dict of str to str
         Estimator -> its title.
     """
@@ -109,14 +109,14 @@ def parameters_svg(series: TimeSeries, names: dict[str, str]) -> str:
 
 
 def smoothed_svg(series: TimeSeries) -> str:
-    """Draw errors of the smoothed changes with their total sigma, at the times of the course and between them.
+    """Draw errors of the smoothed changes with their total sigma, at the times of the series and between them.
 
-    The band narrows at each measurement and widens between two. Errors are known at the times of the course only.
+    The band of sigma narrows at each measurement and widens between two. Errors are known at the measured times only.
 
     Parameters
     ----------
     series : TimeSeries
-        Course with smoothed changes.
+        Time series with smoothed changes.
     """
     smoothed = series.smoothed
     assert smoothed is not None
@@ -142,7 +142,10 @@ def smoothed_svg(series: TimeSeries) -> str:
 def _changes_svg(
     series: TimeSeries, name: str, height: float, panel: Callable[[Axes, list[Reading]], None], ground: bool = False
 ) -> str:
-    """Draw a panel for each change: cameras side by side, below them their angle and, with ``ground``, the height."""
+    """Draw a panel for each change: cameras side by side, below them the angle between them.
+
+    With ``ground``, the height of points on the ground follows.
+    """
     with svg.look(name):
         groups: dict[str, list[list[Reading]]] = {}
         for same in series.readings.by_change():

@@ -32,7 +32,7 @@ _LEAST_CORE = 7.0
 
 
 def mean_images(run: RenderRun) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean frame of every channel before and after, in DN, each (C, rows, columns)."""
+    """Return the mean frame of every channel before and after, in DN, each (C, rows, columns) for C channels."""
     return mean_of(run.before), mean_of(run.after)
 
 
@@ -61,7 +61,7 @@ def core_window(before: np.ndarray, after: np.ndarray, radius: float) -> tuple[f
 
 
 def airy_radius(run: RenderRun) -> float:
-    """Return the radius of the first dark ring that the return face's aperture gives, in pixels."""
+    """Return the radius, in pixels, of the first dark ring of diffraction at the return face of the prism."""
     path = run.experiment.path
     camera = next(iter(run.experiment.instrument.cameras.values()))
     focal = float(camera.first_order.principal_distance[0])
@@ -154,14 +154,14 @@ def marks(names: Iterable[str]) -> dict[str, tuple[str, str]]:
     Parameters
     ----------
     names : Iterable[str]
-        Estimators in a figure; the mark of an estimator does not depend on the others.
+        Estimators in a figure; the marker of an estimator does not depend on the others.
     """
     all_marks = dict(zip(ESTIMATORS, cycle(_MARKS), strict=False))
     return {name: all_marks[name] for name in names}
 
 
 def residuals_svg(run: RenderRun) -> str:
-    """Draw the residuals of all estimators in sigma, a panel for each camera, the angle and the ground."""
+    """Draw the errors of all estimators in sigmas, a panel for each camera, the angle and the ground."""
     names = {name: estimator.title for name, estimator in run.estimators.items()}
     panels: dict[str, dict[str, dict[str, float | None]]] = {}
     for same in run.reading.table.by_change():
@@ -212,17 +212,17 @@ def _panel(axes: Axes, title: str, panel: dict[str, dict[str, float | None]], na
 
 
 ROW = 0.168
-"""Height of a row, in inches."""
+"""Height of a row of the motion map, in inches."""
 _DECADES = 3
 """Number of decades in the logarithmic part of the colour scale, below the largest number."""
 _MOST_LEVEL = 4
-"""Largest number of column names that fit side by side."""
+"""Largest number of column names that fit horizontally side by side."""
 _STRONG = 0.55
-"""Depth of a colour from which the number in it is white."""
+"""Depth of a cell's colour, from 0 to 1, above which the number in it is written in white."""
 
 
 def motion_map_svg(run: RenderRun) -> str:
-    """Draw the spot shifts, in micrometres per unit of motion: a row for each motion, a panel for each camera."""
+    """Draw the spot shifts, in micrometres per unit of motion: one line per motion, one panel per camera."""
     pitch = 1e6 * run.experiment.path.pitch
     tables = list(run.crosstalk.items())
     largest = max(float(np.abs(table.spot_shift).max()) for _, table in tables) * pitch
@@ -266,9 +266,9 @@ WIDTH, DPI = 14.0, 100
 NOTE, LONGEST_NOTE = 0.85, 150
 """Height of a note's line, in rows of the table, and number of characters that fit in the width."""
 FIRST = 0.22
-"""Right edge of the column of true values, as a share of the width."""
+"""Right edge of the column of true values, as a share of the picture's width."""
 REACH = 2.2
-"""Half-width of the pictures around both centres, in Airy radii."""
+"""Half-width of the spot images, beyond the two spot centres, in Airy radii."""
 
 
 def summary_png(run: RenderRun) -> bytes:
@@ -314,7 +314,7 @@ def _drawn_summary(run: RenderRun) -> Figure:
 
 
 def _notes(run: RenderRun) -> list[str]:
-    """Return the lines below the table: the basis of sigma, and the meaning of the marks."""
+    """Return the lines below the table: what sigma includes, and the meaning of the signs in the table."""
     limit = f" {sentence(limited(run))}" if limited(run) else ""
     texts = f"{assumed(run.reading)}.", f"± is one σ; ● within {FAR:g} σ of the truth, ▲ beyond.{limit}"
     return [line for text in texts for line in wrap(text, LONGEST_NOTE)]

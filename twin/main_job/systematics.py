@@ -1,4 +1,4 @@
-"""Systematic errors of the estimators by the crosstalk table, and the basis, consistency and limits of the sigmas."""
+"""Systematic errors of the estimators from crosstalk tables, and what the sigmas include, and what limits them."""
 
 from __future__ import annotations
 
@@ -27,30 +27,30 @@ from twin.monitor.time_series import SmoothedCourse
 from twin.uncertainty.monitor_limits import short_text, unit_text
 
 _FAMILY = 4
-"""Number of first motions of a crosstalk table that form the family which the estimators of paper 001 assume."""
+"""Number of the first motions of a crosstalk table that the estimators of paper 001 assume to be the only ones."""
 SHOWN = 1e-3
 """Smallest amount of a motion, in its table unit, that is reported."""
 
 
 HEAT = "temperatures (expansion, bending, change of index)"
-"""Name of the effects of temperatures; a table of motions of single bodies holds only the motions that they carry."""
+"""Name of the effects of temperatures, which have no motion of their own in a crosstalk table."""
 
 
 @dataclass(frozen=True, eq=False)
 class Systematics:
-    """Systematic errors of one camera's readings that the crosstalk tables predict from a run's motions.
+    """Systematic errors of one camera's estimates that the crosstalk tables predict from a run's motions.
 
     Attributes
     ----------
     bias : dict of str to (P,) ndarray
-        Estimator -> reading minus truth, to first order, of every reading of the camera, in its unit.
+        Estimator -> estimate minus truth, to first order, of each of the camera's P changes, in its unit.
     outside : tuple of str
-        Motions of this camera outside the family, as text with amounts.
+        Motions of this camera that the estimators of paper 001 do not assume, as text with amounts.
     parts : dict of str to (P,) ndarray
-        Motion, as text with its amount -> its contribution to the judged estimator's bias; motions of other cameras are
-        included where that estimator uses all spots together.
+        Motion, as text with its amount -> its contribution to the bias of the estimator that the verdict uses; motions
+        of other cameras are included where that estimator uses all spots together.
     uncovered : tuple of str
-        Bodies and effects that were perturbed but are in no row of the table.
+        Bodies and effects that were perturbed but are not in the crosstalk table.
     """
 
     bias: dict[str, np.ndarray]
@@ -60,7 +60,7 @@ class Systematics:
 
 
 def systematics(run: RenderRun, camera: str) -> Systematics:
-    """Sum the crosstalk tables over the motions of a run."""
+    """Return the systematic errors of a camera's estimates: the crosstalk per unit times the motions of a run."""
     amounts = {
         name: np.array([_amount(run, motion) for motion in table.motions]) for name, table in run.crosstalk.items()
     }
@@ -77,7 +77,7 @@ def systematics(run: RenderRun, camera: str) -> Systematics:
 
 
 def _parts(run: RenderRun, camera: str, amounts: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the error that each motion contributes, for motions outside the judged estimator's model."""
+    """Return motion -> error that it causes, for motions that the estimator of the verdict does not model."""
     names = list(run.crosstalk)
     k = names.index(camera)
     gain = rows_of(run.reading.cameras[camera]) @ run.gains[run.judged][4 * k : 4 * k + 4]
@@ -107,7 +107,10 @@ def _motion_text(motion: ElementaryMotion, amount: float) -> str:
 
 
 def _amount(run: RenderRun, elementary: ElementaryMotion) -> float:
-    """Return the amount of an elementary motion in the run's state, in table units, to first order in the pivots."""
+    """Return the amount of an elementary motion in the run's state, in table units.
+
+    Different pivots of rotation are accounted for to first order.
+    """
     motion = run.state.get(elementary.body)
     if motion is None:
         return 0.0
@@ -119,14 +122,14 @@ def _amount(run: RenderRun, elementary: ElementaryMotion) -> float:
 
 
 def _shift_at(run: RenderRun, body: str, motion: Motion, pivot: str) -> np.ndarray:
-    """Return the shift, in metres, that with another pivot gives the same motion to first order."""
+    """Return the shift, in metres, that describes the same motion about a different pivot, to first order."""
     pivots = next(b for b in run.experiment.instrument.assembly.tree.bodies if b.path == body).pivots
     arm = np.array(pivots[motion.pivot]) - np.array(pivots[pivot])
     return np.asarray(np.array(motion.shift) - np.cross(motion.rotate, arm) - motion.scale * arm)
 
 
 def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str, ...]:
-    """Return the bodies that moved, affect this camera and have no row in the table."""
+    """Return the bodies that moved and affect this camera, but are not in the crosstalk table."""
     camera_body = f"{BASE}/{camera}"
     bodies = {motion.body for motion in table.motions}
     uncovered = []
@@ -155,26 +158,27 @@ def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str
 
 
 def joined(names: Sequence[str]) -> str:
-    """Return ``a; b; c`` without repetitions."""
+    """Return names as ``a; b; c``, each only once."""
     return "; ".join(dict.fromkeys(names))
 
 
 UNNOTICED_SIGMAS = 4.0
-"""Error of a reading, in sigmas, from which a warning says that the spots do not show it.
+"""Smallest error of an estimate, in sigmas, for which a warning says that the spots do not show it.
 
 A motion drawn from the prior itself causes as much in one of 20 000 runs.
 """
 
 
 def unobserved_perturbations(run: RenderRun) -> tuple[str, ...]:
-    """Return a warning for each perturbed body that falsifies readings without showing in the spots.
+    """Return a warning for each perturbed body that falsifies estimates without moving the spots noticeably.
 
-    The effect of that body's perturbation alone on spots and cameras is traced and compared with the reading of it.
+    The effect of that body's perturbation alone on spots and cameras is traced and compared with the estimate from
+    these spots.
 
     Parameters
     ----------
     run : RenderRun
-        Run of a state, or of a course, whose shown time is used.
+        Run of a state, or of a time series, whose shown time is used.
     """
     job, noise = run.resolved.job, run.recovery.shift_covariance[0]
     shown = None if run.series is None else run.series.shown
@@ -218,7 +222,7 @@ def unobserved_perturbations(run: RenderRun) -> tuple[str, ...]:
 
 
 def _sigmas(rows: np.ndarray, prior: Disturbances | None, noise: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """Return (Q,) sigmas of the readings by an estimator."""
+    """Return the (Q,) standard deviations of the estimates of Q quantities, due to noise and the prior."""
     if prior is not None:
         return split(rows, prior, noise, gain).sigma
     return np.sqrt(np.einsum("qd,de,qe->q", rows @ gain, noise, rows @ gain))
@@ -227,11 +231,11 @@ def _sigmas(rows: np.ndarray, prior: Disturbances | None, noise: np.ndarray, gai
 _NOISE_ALONE = "There is no prior on disturbances: σ contains the noise of the images only"
 """Sentence, without a full stop, for runs without a prior."""
 NOISE = "the noise of the images"
-"""Name of the part of the variance that more frames lower."""
+"""Name of the part of the variance that more frames reduce: the noise of the images."""
 
 
 def assumed(reading: MonitorReading) -> str:
-    """Return the basis of the sigmas and whether the shifts agree with it, as a sentence without a full stop."""
+    """Return what the sigmas include and whether the spot shifts agree with it, as a sentence without a full stop."""
     prior, test = reading.disturbances, reading.consistency
     if prior is None or test is None:
         return _NOISE_ALONE
@@ -244,7 +248,7 @@ def assumed(reading: MonitorReading) -> str:
 
 
 def _prior_share_text(reading: MonitorReading) -> str:
-    """Return how much of the posterior's variances rests on the prior, from the least to the largest share, as text."""
+    """Return the range of the shares of the posterior's variances that are due to the prior, as text."""
     shares = [share for group in reading.from_statement.values() for share in group.values() if share is not None]
     if not shares:
         return ""
@@ -253,9 +257,9 @@ def _prior_share_text(reading: MonitorReading) -> str:
 
 
 def contradiction(run: RenderRun) -> tuple[str, ...]:
-    """Return a warning where the shifts of a course contradict the prior at the worst of its times.
+    """Return a warning where the spot shifts of a time series contradict the prior at the worst of its times.
 
-    For a single state this is among the doubts of its reading.
+    For a single state this is among the doubts of its `MonitorReading`.
     """
     if run.worst_of_course is None or run.series is None:
         return ()
@@ -265,21 +269,21 @@ def contradiction(run: RenderRun) -> tuple[str, ...]:
 
 
 def doubted(run: RenderRun) -> tuple[str, ...]:
-    """Return warnings of spots unlike their calibration and of nonlinear readings, for a course at its worst time."""
+    """Return warnings of spots unlike their calibration and of nonlinear estimates, for a series at its worst time."""
     if run.series is None:
         return (*run.reading.doubts, *run.reading.notes)
     return run.series.doubts(["/".join(channel) for channel in run.reading.channels])
 
 
 def course_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
-    """Return sentences on the agreement of all measurements of a course with the prior and its time laws.
+    """Return sentences on the agreement of all measurements of a time series with the prior and its time laws.
 
     Parameters
     ----------
     together : SmoothedCourse
-        Smoothed course.
+        Smoothed time series.
     times : (T,) ndarray
-        Times of its measurements, in seconds.
+        The T times of its measurements, in seconds.
     """
     return " ".join((_series_agrees(together, times), *_jump_sentences(together)))
 
@@ -314,7 +318,9 @@ def _series_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
 
 
 def combination(reading: MonitorReading, group: str, key: str) -> np.ndarray:
-    """Return the row that forms a change from all cameras' parameters, (4 x cameras,), its unit per SI, to first order.
+    """Return the factors that form a change from all cameras' parameters, to first order, and its unit in SI.
+
+    The factors are a (4 x cameras,) array.
 
     Parameters
     ----------
@@ -337,7 +343,7 @@ def limits(reading: MonitorReading, change: Reading) -> tuple[str, float]:
     reading : MonitorReading
         Reading of the instrument, with a prior.
     change : Reading
-        The change, as the judged estimator reads it.
+        The change, as estimated by the estimator that the verdict uses.
     """
     prior = reading.disturbances
     assert prior is not None

@@ -35,11 +35,11 @@ from twin.targets.target_measurement import NYQUIST, BarReading, CameraTargets, 
 COLOURS = {"before": BLUE, "after": VERMILION}
 MARKS = {"before": "o", "after": "D"}
 BAND = 2.0
-"""Half-width of the band about zero, in sigma."""
+"""Half-width of the uncertainty band about zero in the panels of MTF differences, in sigmas."""
 _LEAST_SPAN = 4.0
-"""Smallest half-height of the panels of differences, in thousandths."""
+"""Smallest half-height of the panels of MTF differences, in thousandths."""
 EVERY = 2
-"""Step between the frequencies that have a dot."""
+"""Number of spatial frequencies from one marker of the measured MTF to the next."""
 _IMAGE_NAMES = {
     "knife_edge_along": "knife edge, along line,\nmiddle 40 px",
     "knife_edge_track": "knife edge, along track,\nmiddle 40 px",
@@ -53,13 +53,13 @@ _IMAGE_NAMES = {
 Other targets have their own names; uniform fields are not shown.
 """
 _CROPS = {"knife_edge_along": 40, "knife_edge_track": 40, "pinhole": 24}
-"""Side of the part that is shown, in pixels; images without an entry are shown whole."""
+"""Target -> side of the part of its image that is shown, in pixels; images without an entry are shown whole."""
 STRETCH = 100.0
 """The pinhole's stretch is linear up to this fraction (1/STRETCH) of the peak."""
 
 
 def curves_svg(name: str, camera: CameraTargets) -> str:
-    """Draw measured and true MTF, a row for each direction and a column for each place."""
+    """Draw measured and true MTF, a row for each direction and a column for each position in the field."""
     with look(f"mtf-{name}"):
         figure = new_figure(8.4)
         heights = (3.0, 1.2) * len(DIRECTIONS)
@@ -138,7 +138,7 @@ def _norm(target: str, image: np.ndarray) -> Normalize:
 
 
 def images_svg(name: str, camera: CameraTargets) -> str:
-    """Draw mean images, a row for each target, with before and after side by side for each place."""
+    """Draw mean images, a row for each target, with before and after side by side for each position in the field."""
     columns = [(place, when) for place in camera.places for when in COLOURS]
     names = [name for name in next(iter(camera.places.values())).before.frames if name in {*_IMAGE_NAMES, *TARGETS}]
     with look(f"targets-{name}"):
@@ -165,7 +165,7 @@ _RIM = np.exp(2j * np.pi * np.arange(181) / 180)
 
 
 def pupils_svg(quality: ImageQuality) -> str:
-    """Draw pupils, a row per camera and a column per place: nominal shadows filled, perturbed ones outlined."""
+    """Draw pupils, a row per camera and a column per field position: nominal shadows filled, perturbed outlined."""
     where = {place: quality.fields.index(field) for place, field in PLACES.items()}
     with look("pupils"):
         figure = new_figure(0.6 + 2.9 * len(quality.cameras))
@@ -202,7 +202,11 @@ _PIXELS = 220
 
 
 def deformation_svg(faces: Mapping[str, NodalDeformation]) -> str:
-    """Draw maps of the change of sag at the nodes, a row for each body: change, after Zernike terms, after the grid."""
+    """Draw maps of the change of sag at the nodes, three for each body.
+
+    They show the change itself, the rest after the Zernike terms are subtracted, and the rest after the interpolating
+    grid is subtracted as well.
+    """
     with look("deformation"):
         figure = new_figure(3.3 * len(faces))
         rows = figure.subplots(len(faces), 3, squeeze=False)

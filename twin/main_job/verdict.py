@@ -1,4 +1,4 @@
-"""Verdict of a run in sentences computed from its numbers, and warnings of readings that mislead."""
+"""Verdict of a run in sentences computed from its numbers, and warnings of estimates that mislead."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ from twin.monitor.reading_table import Reading
 from twin.monitor.time_series import TimeSeries
 
 FALSE_ALARM = 1e-3
-"""Probability that noise and disturbances of the prior cause any warning of a misreading in a run."""
+"""Probability that noise and disturbances of the prior alone cause any warning of a wrong estimate in a run."""
 _EXPLAINED = 0.2
-"""Largest unexplained share of an error that counts as explained to first order."""
+"""Share of an error up to which it may stay unexplained by the first-order crosstalk and still counts as explained."""
 _SOFTER = 0.05
-"""Relative loss of MTF at Nyquist from which it is reported."""
+"""Smallest relative loss of MTF at Nyquist that is reported."""
 MOST_FRAMES = 10_000
 """Largest number of frames that is recommended."""
 _DIMMED = 0.5
-"""Share of its nominal light below which a spot counts as dimmed, the limit of the warning about it."""
+"""Share of its nominal light below which a spot is reported as dimmed."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Verdict of a run in at most two sentences, the text that follows, and all warnings, those of misreadings last."""
+    """Verdict of a run in at most two sentences, the text that follows, and all warnings, wrong estimates last."""
 
     verdict: str
     more: tuple[str, ...]
@@ -57,12 +57,15 @@ class Judgement:
 
 
 def readings(run: RenderRun, estimator: str) -> tuple[Reading, ...]:
-    """Return all readings of an estimator: cameras, angle and ground errors; over a course, RMS values."""
+    """Return all changes by an estimator: cameras, angle and ground errors; over a time series, RMS values."""
     return run.series.readings.rms.of(estimator) if run.series else run.reading.table.of(estimator)
 
 
 def judge(run: JobRun) -> Judgement:
-    """Judge a run by its readings, sigmas, truth and crosstalk; without a monitor by the truth and the images."""
+    """Return the verdict of a run from its estimates, sigmas, truth and crosstalk.
+
+    Without a monitor, the verdict is based on the true changes and the images.
+    """
     if not isinstance(run, RenderRun):
         return Judgement(*answer(*_changed(run)), run.warnings)
     rows = readings(run, run.judged)
@@ -121,7 +124,7 @@ def _changed(run: JobRun) -> tuple[str, str]:
 
 
 def recovered_numbers(run: RenderRun) -> dict[str, Any]:
-    """Return the contents of recovered.json: readings, verdict and warnings."""
+    """Return the contents of recovered.json: estimated changes, verdict and warnings."""
     judgement = judge(run)
     return {**stated(run.recovered_dict()), "verdict": judgement.verdict, "warnings": list(judgement.warnings)}
 
@@ -175,7 +178,7 @@ def _nothing(run: RenderRun, rows: tuple[Reading, ...], wrong: list[Reading]) ->
 
 
 def _chance(ratio: float, count: int) -> float:
-    """Return the probability that the largest of ``count`` normal numbers is as far out."""
+    """Return the probability that the largest of ``count`` standard normal numbers exceeds ``ratio`` in magnitude."""
     return float(-np.expm1(count * np.log1p(-2.0 * ndtr(-abs(ratio)))))
 
 
@@ -184,7 +187,7 @@ def _are(what: list[Reading]) -> str:
 
 
 def _changes(rows: tuple[Reading, ...]) -> list[Reading]:
-    """Return the readings without the errors on the ground, which follow from them."""
+    """Return the changes without the errors on the ground, which follow from them."""
     return [r for r in rows if r.group != GROUND_GROUP]
 
 
@@ -228,7 +231,10 @@ def _needed(run: RenderRun, clearest: Reading) -> str:
 
 
 def limited(run: RenderRun) -> str:
-    """Return the body that limits the angle of a pair, or else the worst reading; empty without a prior."""
+    """Return the body that limits the accuracy of a pair's angle, or else of the worst change, as text.
+
+    Empty without a prior.
+    """
     if _noise_only(run):
         return ""
     rows = readings(run, run.judged)
@@ -264,16 +270,16 @@ def _score(rows: tuple[Reading, ...], wrong: list[Reading], suffix: str = "") ->
 
 
 def _misread_reason(run: RenderRun) -> str:
-    """Return why an estimator misreads a motion, as text."""
+    """Return why an estimator gives wrong changes for a motion, as text."""
     if run.estimators[run.judged].stated:
         return "larger than the prior expects"
     return f"outside the family of the {_title(run)}"
 
 
 def _cause(run: RenderRun, worst: Reading, count: int) -> str:
-    """Return the cause of an error, as far as the crosstalk table explains it, and where to look.
+    """Return the cause of an error, as far as the crosstalk table explains it, and where to look, as text.
 
-    ``count`` is the number of all readings.
+    ``count`` is the number of all estimated changes.
     """
     cameras = list(run.crosstalk)
     biases = {name: systematics(run, name) for name in cameras}
@@ -314,7 +320,7 @@ def _cause(run: RenderRun, worst: Reading, count: int) -> str:
 
 
 NAMED = 4
-"""Largest number of motions that a sentence names."""
+"""Largest number of motions that a sentence of the verdict names."""
 
 
 def _largest(parts: Mapping[str, float]) -> str:
@@ -344,7 +350,7 @@ def _series_verdict(
 
 
 def _contradicted_course(run: RenderRun) -> str:
-    """Return the lead of the verdict for a course that contradicts its prior; empty where it does not.
+    """Return the first sentence of the verdict for a time series that contradicts its prior; else empty.
 
     It has the largest error of the filtered and smoothed changes.
     """
@@ -362,7 +368,7 @@ def _contradicted_course(run: RenderRun) -> str:
 
 
 def _lost_light(run: RenderRun) -> str:
-    """Return a sentence on spots that lost more than half of their light in the state shown."""
+    """Return a sentence on spots that lost more than half of their light in the state shown; empty if none did."""
     share = run.photons_after.sum(axis=(1, 2)) / run.photons_before.sum(axis=(1, 2))
     lost = [(c.key, s) for c, s in zip(run.experiment.path.channels, share, strict=True) if s < _DIMMED]
     if not lost:
@@ -372,7 +378,10 @@ def _lost_light(run: RenderRun) -> str:
 
 
 def sharpness_lost(quality: ImageQuality) -> tuple[float, str, str]:
-    """Return the largest relative loss of MTF at Nyquist on the lines, its place, and the values before and after."""
+    """Return the largest relative loss of MTF at Nyquist on the line CCDs.
+
+    Its position and the values before and after are returned as two texts.
+    """
     losses = [
         (1.0 - float(mtf[1, k] / mtf[0, k]), name, direction, field, float(mtf[0, k]), float(mtf[1, k]))
         for name, camera in quality.cameras.items()
@@ -388,7 +397,7 @@ def sharpness_lost(quality: ImageQuality) -> tuple[float, str, str]:
 
 
 def _blurred(run: RenderRun) -> str:
-    """Return a sentence on the loss of sharpness in the cameras' images, where it matters."""
+    """Return a sentence on the loss of MTF in the cameras' images; empty if it is below the reported limit."""
     if run.quality is None:
         return ""
     share, where, change = sharpness_lost(run.quality)
@@ -396,12 +405,12 @@ def _blurred(run: RenderRun) -> str:
 
 
 def alarm_limit(count: int) -> float:
-    """Return the sigmas that any of ``count`` normal errors exceeds with at most FALSE_ALARM probability."""
+    """Return the limit, in sigmas, that any of ``count`` normal errors exceeds with at most FALSE_ALARM probability."""
     return -float(ndtri(0.5 * FALSE_ALARM / count))
 
 
 def _beyond_prior(run: RenderRun, rows: tuple[Reading, ...], warned: tuple[str, ...]) -> tuple[str, ...]:
-    """Return a warning where readings are wrong beyond chance because the job moves more than its prior expects.
+    """Return a warning where estimates are wrong beyond chance because the job moves more than its prior expects.
 
     In a real measurement this would go unnoticed. Bodies that have a warning already are omitted.
     """
@@ -424,7 +433,7 @@ def _beyond_prior(run: RenderRun, rows: tuple[Reading, ...], warned: tuple[str, 
 
 
 def _misreadings(run: RenderRun) -> tuple[str, ...]:
-    """Return a warning for every reading that is wrong by more than its change, and by more than chance allows."""
+    """Return a warning for every estimate that is wrong by more than its change, and by more than chance allows."""
     changes: dict[tuple[str, str], list[Reading]] = {}
     for reading in (one for estimator in run.estimators for one in readings(run, estimator)):
         changes.setdefault((reading.group, reading.parameter.key), []).append(reading)

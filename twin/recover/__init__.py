@@ -1,1 +1,1 @@
-"""Measured frames of a monitor through the analysis of the main job: the command ``python -m twin.recover``."""
+"""Analysis of measured frames of a monitor as in the main job: the command ``python -m twin.recover``."""

@@ -38,7 +38,7 @@ from twin.framework.frame_store import mean_of, release_memory
 from twin.recover.measured_frames import ChannelFrames, StateFrames, cannot_measure
 
 _MOST_GROWTH = 4.0
-"""Factor by which missing pixels may increase sigma before a spot counts as lost."""
+"""Factor by which missing pixels may increase the position's sigma before a spot counts as lost."""
 _REMEDIES = (
     ("(saturation", "frames with less light or a shorter exposure"),
     (
@@ -63,7 +63,7 @@ class SpotResult:
     frames : StateFrames
         Frames as recorded.
     mean : (H, W) ndarray
-        Mean image that was measured, DN.
+        Mean image that was measured, H rows and W columns, DN.
     used : (H, W) ndarray of bool
         Pixels that were used.
     residual : (H, W) ndarray or None
@@ -71,7 +71,7 @@ class SpotResult:
     findings : tuple of Finding
         Artefacts of the frames and how each was treated.
     cost : float
-        Relative increase of the position's sigma by the artefacts.
+        Relative increase of the position's sigma due to the artefacts.
     core : tuple of (float, int) or None
         Reduced chi-square of the spot's core, and its number of pixels; None where no shape was fitted.
     fits : bool
@@ -92,7 +92,7 @@ class SpotResult:
 
     @property
     def clean(self) -> bool:
-        """True if nothing was corrected."""
+        """True if no artefact of the frames had to be corrected."""
         return not any(finding.corrects for finding in self.findings)
 
 
@@ -124,7 +124,7 @@ class ChannelResult:
 
 
 def remedy(reason: str) -> str:
-    """Return what to do where a spot cannot be measured for a reason."""
+    """Return advice on what to do about a spot that cannot be measured, chosen by the reason."""
     return next((remedy for word, remedy in _REMEDIES if word in reason), "other frames of this channel")
 
 
@@ -181,7 +181,7 @@ class ChannelMeasurement:
         return self._templates[state.shape]
 
     def search(self) -> list[Issue]:
-        """Compare frames with each other and images with the shape of the spot; return the issues of refused frames."""
+        """Compare frames with each other and images with the spot's shape; return issues that forbid a measurement."""
         issues: list[Issue] = []
         try:
             self._show_level()
@@ -209,7 +209,13 @@ class ChannelMeasurement:
         return issues
 
     def _show_level(self) -> None:
-        """Lower the detector's dark level where a level was subtracted from the frames. Raises FramesError."""
+        """Lower the detector's dark level where a level was subtracted from the frames.
+
+        Raises
+        ------
+        FramesError
+            A level was subtracted from the frames but not from the dark frames.
+        """
         channel = self.channel
         below = max(
             subtracted_level(state.frames, channel.raw_noise, state.bad_part(channel.bad), release_memory)
@@ -347,7 +353,7 @@ class ChannelMeasurement:
         return self._on_ccd(widened(positions, np.array(self._widened[-1:])), state)
 
     def _widening(self, number: int) -> float:
-        """Return the factor of a spot's sigma by the fit of its core; 1 where no shape was fitted."""
+        """Return the factor that increases a spot's sigma for a poor fit of its core; 1 if no shape was fitted."""
         examined, first = self._examined[number], self._examined[0] if self._learnt else None
         if examined is None or (self._learnt and number == 0):
             return 1.0
@@ -363,7 +369,7 @@ class ChannelMeasurement:
         return FittedSpot(positions, counts, jitter, others, smear, state.offset)
 
     def shift_covariance(self, number: int) -> np.ndarray:
-        """Return the (1, 2, 2) noise covariance of after - before, in px^2.
+        """Return the (1, 2, 2) noise covariance of the spot's shift from before to after, in px^2.
 
         Parameters
         ----------
@@ -377,11 +383,11 @@ class ChannelMeasurement:
         return spread + self._doubt(number)
 
     def _doubt(self, number: int) -> np.ndarray:
-        """Return the (2, 2) covariance, in px^2, of a centroid's error by a reflection in the frames before.
+        """Return the (2, 2) covariance, in px^2, of a centroid's error due to a reflection in the frames before.
 
-        Such a centroid knows no shape. The reflection is in the image before, and is added to the image after only with
-        the accuracy of the learnt shape. The difference between the shift and that of the shape itself is counted as an
-        error.
+        Such a centroid uses no shape of the spot. The reflection is in the image before, and is added to the image
+        after only with the accuracy of the learnt shape. The difference between the centroid's shift and that of a fit
+        of the shape is counted as an error.
         """
         first, second = self._examined[0], self._examined[number]
         if not self._learnt or first is None or second is None or not np.any(second.fit.others[:, 2] < 0.0):
@@ -410,7 +416,7 @@ class ChannelMeasurement:
         return self._centroid(screened.mean[None], screened.frames, self.channel.noise, state)
 
     def _repaired(self, examined: Examined, state: StateFrames) -> tuple[SpotPositions, float]:
-        """Return positions by a centroid that uses no shape, and the relative increase of sigma by corrections."""
+        """Return positions by a centroid that uses no shape, and the relative increase of sigma due to corrections."""
         screened, noise, template = examined.screened, self.channel.noise, self._template(state)
 
         def measure(image: np.ndarray, own: NoiseModel) -> SpotPositions:
@@ -436,10 +442,10 @@ class ChannelMeasurement:
         return replace(positions, row=row, column=column, gain_maps=gain, light_dn=light)
 
     def _core_excess(self, number: int, fit: ScreenedFit) -> float:
-        """Return the factor by which the variance in a spot's core exceeds the specified one, where frames are noisier.
+        """Return the factor by which the variance in a spot's core exceeds the specified one, for noisy frames.
 
-        It is taken from differences of frames in the core, but is at most that beside the spot: in the light, flicker
-        and movement add to the differences.
+        It is computed from differences of frames in the core, but is at most that beside the spot: in the light,
+        flicker and movement add to the differences.
         """
         ratio = self._noise_ratios[number]
         if ratio is None or ratio <= 1.0:

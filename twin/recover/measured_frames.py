@@ -133,7 +133,7 @@ def _not_ascending(channel: ChannelFrames) -> int:
 Shape = tuple[int, int]
 
 _MOST_GREY = 2.0**32
-"""Largest magnitude of a grey value: that of a converter of 32 bits, more than any has."""
+"""Largest magnitude of a grey value, in DN: that of a 32-bit converter, more than any camera has."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +145,7 @@ class StateFrames:
     files : tuple of str
         Paths of the files.
     frames : (N, H, W) ndarray
-        Grey values as recorded, DN.
+        Grey values of N frames of H rows and W columns as recorded, DN.
     offset : (int, int)
         Row and column of the CCD at which the frames begin.
     key : KeyPath
@@ -253,9 +253,15 @@ def read_measurement(
 
 
 def _require_memory(test: MeasurementSpec) -> None:
-    """Check that the frames kept in memory and the maps of every state fit, by the header of one file per state.
+    """Check that the frames kept in memory and the maps of every state fit into memory.
 
-    Files that cannot be read are skipped here and reported when they are read. Raises InputError.
+    Sizes are taken from the header of one file per state. Files that cannot be read are skipped here and reported when
+    they are read.
+
+    Raises
+    ------
+    InputError
+        Memory does not suffice.
     """
     assert not isinstance(test.frames, str)
     if test.times is None:
@@ -331,7 +337,7 @@ def _state(test: Spec, files: tuple[str, ...], offset: Shape, key: KeyPath) -> S
 
 
 def _stacked(test: Spec, files: tuple[str, ...], key: KeyPath) -> np.ndarray:
-    """Return frames of all files in order, (N, H, W), in an unnamed temporary file where they are many."""
+    """Return N frames of all files in order, (N, H, W), in an unnamed temporary file if they are many."""
     images = [_opened(test, file, key) for file in files]
     stack: np.ndarray | None = None
     count = unreleased = 0
@@ -371,7 +377,7 @@ def _opened(test: Spec, file: str, key: KeyPath) -> ImageFile:
 
 
 def _pages(test: Spec, file: str, image: ImageFile, key: KeyPath) -> Iterator[np.ndarray]:
-    """Yield the frames of a file, and check that a converter could give their grey values."""
+    """Yield the frames of a file, and check that their grey values are in the range of a converter."""
     largest = 0.0
     with _readable(test, file, key):
         for page in image.pages():
@@ -384,7 +390,7 @@ def _pages(test: Spec, file: str, image: ImageFile, key: KeyPath) -> Iterator[np
 
 @contextmanager
 def _readable(test: Spec, file: str, key: KeyPath) -> Iterator[None]:
-    """Raise errors of a file as InputError at its key in the measurement."""
+    """Raise errors of reading a file as InputError at its key in the measurement (a context manager)."""
     try:
         yield
     except ImageError as error:
@@ -406,7 +412,13 @@ def _check_place(test: Spec, state: StateFrames, ccd: Shape) -> None:
 
 
 def _check_part(test: Spec, state: StateFrames, known: bool, others: str, key: str) -> None:
-    """Check that the part of the CCD that the frames of a state show is specified. Raises InputError."""
+    """Check that the file of the measurement says which part of the CCD the frames of a state show.
+
+    Raises
+    ------
+    InputError
+        The part is not specified.
+    """
     if not known:
         text = f"{state.files[0]}: frames of {state.shape[0]} x {state.shape[1]} pixels are not of the size of {others}"
         remedy = f"{key}: [ROW, COLUMN] of the CCD at which they begin, and one size for all frames of a series"
@@ -414,7 +426,13 @@ def _check_part(test: Spec, state: StateFrames, known: bool, others: str, key: s
 
 
 def _check_values(test: Spec, state: StateFrames, detector: DetectorSpec) -> None:
-    """Check that the converter can give the grey values of frames of integers. Raises InputError."""
+    """Check that the grey values of integer frames are in the range of the detector's converter.
+
+    Raises
+    ------
+    InputError
+        A grey value is out of range.
+    """
     largest, bits, different = 0, 0, False
     for frame in state.frames:
         values = frame[np.isfinite(frame)]

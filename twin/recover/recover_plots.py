@@ -22,7 +22,7 @@ LIMIT = 5.0
 
 
 def _panels(run: RecoverRun, camera: str) -> list[tuple[str, list[tuple[str, SpotResult, np.ndarray]]]]:
-    """Return each channel with its state before and its last state after, and the spot centres on the CCD."""
+    """Return, for each channel, the states before and last after, with the spot centres on the CCD, in pixels."""
     out = []
     for i, result in enumerate(run.channels):
         name, channel = result.channel.name.split("/")
@@ -36,7 +36,7 @@ def _panels(run: RecoverRun, camera: str) -> list[tuple[str, list[tuple[str, Spo
 
 
 def _extent(spot: SpotResult) -> tuple[float, float, float, float]:
-    """Return the extent of an image on the CCD, as Matplotlib's ``extent``."""
+    """Return the region of the CCD that a spot's image shows, in pixels, as Matplotlib's ``extent``."""
     (row, column), (height, width) = spot.frames.offset, spot.mean.shape
     return column - 0.5, column + width - 0.5, row + height - 0.5, row - 0.5
 
@@ -105,7 +105,7 @@ def _bar(figure: Figure, shown: Any, grid: Any, label: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """One change over time.
+    """One change over time, as the figure of a series draws it.
 
     Attributes
     ----------
@@ -114,9 +114,10 @@ class Line:
     name : str
         Name of the change with its unit.
     marks : (3, T) ndarray
-        Times in seconds, values and standard deviations, estimated from each time alone.
+        For each of T measured times: time in seconds, value and standard deviation, estimated from that time alone.
     band : (3, F) ndarray or None
-        Times, values and standard deviations from all times together, also between them; None without a prior.
+        For F times at and between the measured ones: time, value and standard deviation, estimated from all times
+        together; None without a prior.
     """
 
     camera: str

@@ -27,7 +27,10 @@ def _name(run: RecoverRun) -> str:
 
 
 def _corrected(run: RecoverRun) -> tuple[int, int, SpotResult | None, str]:
-    """Return the number of corrected sets of frames, the number of all, the most costly one and its name."""
+    """Return the number of corrected sets of frames, the number of all, and the one that lost most accuracy.
+
+    The last two values are that spot, or None, and its name.
+    """
     all_frames = [
         (result.channel.name, state_name(run.times, k), spot)
         for result in run.channels
@@ -41,7 +44,7 @@ def _corrected(run: RecoverRun) -> tuple[int, int, SpotResult | None, str]:
 
 
 def _verdict(run: RecoverRun) -> tuple[str, tuple[str, ...]]:
-    """Return the verdict and the sentences that follow it."""
+    """Return the verdict of the measurement and the sentences that follow it."""
     reading = run.last
     found = reading.table.of(reading.judged)
     title = reading.estimators[reading.judged].title
@@ -84,7 +87,7 @@ def _verdict(run: RecoverRun) -> tuple[str, tuple[str, ...]]:
 
 
 def recover_report(run: RecoverRun) -> Report:
-    """Return the report of the command."""
+    """Return the report of ``python -m twin.recover``."""
     reading = run.last
     verdict, more = _verdict(run)
     facts = [
@@ -124,7 +127,7 @@ def _frames_text(run: RecoverRun) -> str:
 
 
 def _summary(run: RecoverRun) -> Table:
-    """Return the table of every estimator's readings, with sigma of the judged estimator."""
+    """Return the table of the changes by every estimator, with the sigma of the one that the verdict uses."""
     reading = run.last
     heads = ["camera", "change", *(one.title for one in reading.estimators.values()), "σ", "σ of noise", "in σ"]
     rows: list[list[Cell]] = []
@@ -201,7 +204,7 @@ def _of(run: RecoverRun, camera: str) -> list[ChannelResult]:
 
 
 def _estimators(run: RecoverRun) -> Section:
-    """Return the section with all readings and their sigmas."""
+    """Return the section with the changes by all estimators and their sigmas."""
     reading = run.last
     heads = ["camera", "change", "unit"]
     for estimator in reading.estimators.values():

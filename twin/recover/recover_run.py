@@ -55,7 +55,7 @@ class RecoverRun:
     setup : MeasurementSetup
         Measurement.
     readings : tuple of MonitorReading
-        Reading of each state after.
+        Estimated changes of each state after.
     channels : tuple of ChannelResult
         Results of the channels, in the order of the spots.
     pitch : float
@@ -80,12 +80,15 @@ class RecoverRun:
 
     @property
     def last(self) -> MonitorReading:
-        """Reading of the latest state."""
+        """Estimated changes of the latest state."""
         return self.readings[-1]
 
     @cached_property
     def worst(self) -> tuple[int, Consistency] | None:
-        """Index of the state whose shifts agree least with the prior, and its consistency; None without a prior."""
+        """Index of the state whose spot shifts agree least with the prior, and its chi-square test.
+
+        None without a prior.
+        """
         recoveries = [reading.recovery for reading in self.readings]
         if len(recoveries) == 1:
             return None if self.last.consistency is None else (0, self.last.consistency)
@@ -96,7 +99,7 @@ class RecoverRun:
 
     @property
     def all_warnings(self) -> tuple[str, ...]:
-        """Warnings of the measurement, and of contradictions of the prior."""
+        """Warnings of the measurement, and of spot shifts that contradict the prior."""
         worst, when, rate = self.worst, "", f"{FALSE_ALARM:g}"
         if worst is None:
             return self.warnings
@@ -124,7 +127,7 @@ class _Calibrated:
 
     @property
     def motions(self) -> Mapping[str, MotionModel] | None:
-        """Estimator -> motions by which it reads; None without a model of the instrument."""
+        """Estimator -> motions of bodies that it estimates; None without a model of the instrument."""
         return None if self.experiment is None else self.experiment.motion_models
 
     def crosstalk(self, recovery: Recovery) -> Mapping[str, CameraCrosstalk]:
@@ -271,7 +274,7 @@ def _measured(
 def _recover_clean(
     setup: MeasurementSetup, bench: _Calibrated, calibration: MonitorCalibration, channels: Sequence[ChannelFrames]
 ) -> tuple[list[Recovery], SmoothedCourse | None]:
-    """Recover clean states in the way, and in the portions, of the main job."""
+    """Estimate the changes from frames without artefacts, with the same computation and batches as the main job."""
     states, count = len(channels[0].after), len(channels[0].after[0].frames)
     centroid = setup.test.analysis.centroid
 
@@ -301,7 +304,7 @@ def _recover_clean(
 def _recover_corrected(
     setup: MeasurementSetup, bench: _Calibrated, measurements: Sequence[ChannelMeasurement]
 ) -> tuple[list[Recovery], SmoothedCourse | None]:
-    """Recover states whose spots were measured channel by channel."""
+    """Estimate the changes of states whose spots were measured channel by channel because of artefacts."""
     calibration = bench.calibration
     if calibration is None:
         template = measurements[0].shape
@@ -331,7 +334,7 @@ def _smoother(setup: MeasurementSetup, bench: _Calibrated) -> CourseSmoother | N
 
 
 def _joint_noise(parts_of_spots: Sequence[NoiseParts]) -> NoiseParts:
-    """Return the joint noise of spots on different CCDs."""
+    """Return the joint noise of spots on different CCDs, whose noise is independent."""
     return NoiseParts(
         np.concatenate([parts.temporal for parts in parts_of_spots]),
         np.concatenate([parts.pattern for parts in parts_of_spots]),
@@ -339,7 +342,7 @@ def _joint_noise(parts_of_spots: Sequence[NoiseParts]) -> NoiseParts:
 
 
 def _joint_positions(positions: Sequence[SpotPositions]) -> SpotPositions:
-    """Return all spots together, without their maps, which may differ in size."""
+    """Return the positions of all spots in one object, without the images' maps, which may differ in size."""
     names = ["row", "column", "temporal_covariance", "fixed_covariance", "flux", "background", "converged"]
     names.append("reduced_chi_square")
     values: dict[str, Any] = {
@@ -349,7 +352,7 @@ def _joint_positions(positions: Sequence[SpotPositions]) -> SpotPositions:
 
 
 def _spot_issues(setup: MeasurementSetup, channels: Sequence[ChannelFrames], error: SpotError) -> list[Issue]:
-    """Return issues of spots that are numbered state by state."""
+    """Return the issues of spots that cannot be measured; the error numbers its spots state by state."""
     issues = []
     for number, reason in error.reasons.items():
         channel = channels[number % len(channels)]
@@ -361,7 +364,7 @@ def _spot_issues(setup: MeasurementSetup, channels: Sequence[ChannelFrames], err
 
 
 def state_name(times: Sequence[float] | None, number: int) -> str:
-    """Return the name of a state for readers; in a series it has the time.
+    """Return the name of a state as shown to the user; in a series it has the time.
 
     Parameters
     ----------
@@ -397,7 +400,7 @@ def _worst(
 
 
 def _reading_warnings(readings: Sequence[MonitorReading], times: Sequence[float] | None) -> tuple[str, ...]:
-    """Return doubts and notes of the readings that the frames gave no warning of; for a series the first of each."""
+    """Return doubts and notes of the estimates that the frames gave no warning of; for a series the first of each."""
     texts: dict[str, list[str]] = {}
     for k, reading in enumerate(readings):
         for text in (*reading.doubts, *reading.notes):

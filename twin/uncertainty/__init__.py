@@ -1,1 +1,1 @@
-"""Accuracy limits of a monitor's readings, for ``python -m twin.uncertainty`` and the main job."""
+"""Accuracy limits of the changes estimated by a monitor, for ``python -m twin.uncertainty`` and the main job."""

@@ -35,7 +35,7 @@ LEVELS = (0.68, 0.95)
 HALF_WIDTHS = tuple(float(np.sqrt(2.0 * gammaincinv(0.5, level))) for level in LEVELS)
 """Half-widths of the intervals, in standard deviations of a normal error."""
 FALSE = 1e-2
-"""Probability that any of all counts is outside its limits although every sigma is right."""
+"""Probability that any count of covered intervals is outside its limits although every sigma is right."""
 CHUNK, _PIXELS = 32, 10_000_000
 """Numbers of states, and of pixels of their images, that are rendered at once (2 GB); results do not depend on them."""
 STATES = "random states"
@@ -88,15 +88,15 @@ class Coverage:
         return len(self.truth)
 
     def rms(self, estimator: str) -> np.ndarray:
-        """Return the (Q,) RMS errors."""
+        """Return the (Q,) RMS errors of the Q quantities over all measured states."""
         return np.asarray(np.sqrt(np.mean(self.errors[estimator] ** 2, axis=0)))
 
     def ratio(self, estimator: str) -> np.ndarray:
-        """Return the (Q,) RMS of error over sigma; 1 where the sigmas are right."""
+        """Return, for each of the Q quantities, the (Q,) RMS of error over sigma; 1 where the sigmas are right."""
         return np.asarray(np.sqrt(np.mean((self.errors[estimator] / self.sigmas[estimator]) ** 2, axis=0)))
 
     def held(self, estimator: str, level: int) -> np.ndarray:
-        """Return the (Q,) number of states whose interval contains the truth.
+        """Return, for each of the Q quantities, the (Q,) number of states whose interval contains the truth.
 
         Parameters
         ----------
@@ -110,11 +110,11 @@ class Coverage:
 
     @property
     def counts(self) -> int:
-        """Number of counts of coverage."""
+        """Number of counts of covered intervals: estimators times confidence levels times quantities."""
         return len(self.errors) * len(self.quantities) * len(LEVELS)
 
     def limits(self, estimator: str, level: int) -> np.ndarray:
-        """Return the (2, Q) smallest and largest counts that agree with the expected coverage.
+        """Return the (2, Q) smallest and largest counts that agree with the expected coverage of the Q quantities.
 
         The probability that any count is outside by chance is ``FALSE`` for all counts together.
 
@@ -132,14 +132,14 @@ class Coverage:
 
     @property
     def alarm_limit(self) -> int:
-        """Largest number of alarms that agrees with their false-alarm rate, at a probability of ``FALSE``."""
+        """Largest number of chi-square alarms that agrees with the false-alarm rate, at a probability of ``FALSE``."""
         from scipy.stats import binom
 
         return int(binom.ppf(1.0 - FALSE, self.measured, FALSE_ALARM))
 
     @property
     def sigma_holds(self) -> bool:
-        """True if no count is outside its limits and sigma is doubted in no state."""
+        """True if no count of covered intervals is outside its limits and sigma is doubted in no state."""
         return not self.outliers and self.alarms <= self.alarm_limit and not self.doubted
 
     @property
@@ -165,7 +165,7 @@ def run_states(
 ) -> Coverage:
     """Draw, render, expose and recover random states.
 
-    Every state has its detectors and its nominal measurement.
+    Every state has its own detectors and its own nominal measurement.
 
     Parameters
     ----------
@@ -252,10 +252,10 @@ def run_states(
 def _exposed(
     experiment: MonitorExperiment, photons: np.ndarray, frames: int, seed: int, numbers: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return frames of the nominal state and of numbered states, each (S, C, frames, rows, columns).
+    """Return frames of the nominal state and of S states, each (S, C, frames, rows, columns) for C channels.
 
-    Each pair has detectors of its own: with one detector for all, the effect of its pattern on the nominal spots would
-    be the same error in all states.
+    Each pair of states has its own detectors: with one detector for all, the effect of its pixel pattern on the nominal
+    spots would be the same error in all states.
     """
     detector, channels = experiment.detector, len(experiment.path.channels)
     before = np.empty((*photons.shape[:2], frames, *photons.shape[2:]), np.uint16)
@@ -276,10 +276,10 @@ def _exposed(
 def _chances(
     recovery: Recovery, experiment: MonitorExperiment, quantities: tuple[Quantity, ...]
 ) -> dict[str, np.ndarray]:
-    """Return estimator -> (levels, N, Q) probability that an interval contains the truth, given the shifts.
+    """Return estimator -> probability that an interval contains the truth, given the spot shifts.
 
-    Errors of the posterior are independent of the shifts; relative to it, a reading is off by (gain - posterior's gain)
-    times the shifts.
+    Each is a (levels, N, Q) array for N states and Q quantities. Errors of the posterior are independent of the shifts;
+    relative to the posterior, an estimate is off by (its gain - posterior's gain) times the shifts.
     """
     prior, noise = experiment.disturbances, recovery.shift_covariance
     assert prior is not None
@@ -309,7 +309,7 @@ _SPREAD = "prior on disturbances"
 
 @dataclass(frozen=True, eq=False)
 class UncertaintyRun:
-    """Result of the command.
+    """Result of ``python -m twin.uncertainty``.
 
     Attributes
     ----------
@@ -338,7 +338,7 @@ class UncertaintyRun:
 def run_uncertainty(
     resolved: ResolvedJob, backend: Backend, seed: int = 0, advance: Advance = silent, states: int = 0
 ) -> UncertaintyRun:
-    """Analyse what limits the readings of a job's instrument; the job's perturbation is ignored.
+    """Analyse what limits the estimated changes of a job's instrument; the job's perturbation is ignored.
 
     Parameters
     ----------

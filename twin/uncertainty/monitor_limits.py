@@ -1,4 +1,4 @@
-"""Limits of a monitor's readings under a prior on disturbances, and the benefit of further measurements."""
+"""Limits of the changes estimated by a monitor under a prior on disturbances, and the benefit of more measurements."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ from twin.monitor.observation import LOST, ObservationOptions, observe
 from twin.monitor.truth import half_fields
 
 BEST = "posterior"
-"""Estimator of the least variance: only another measurement reduces the error that it leaves."""
+"""Name of the estimator of the smallest variance; only a further measurement reduces the error that it leaves."""
 LINES = 10
-"""Number of motions that are listed; the others are summed."""
+"""Number of motions that are listed for each quantity; the others are summed."""
 FIELD = 0.1 * ARCSEC
-"""Standard deviation, in radians, with which a test field fixes a direction of a camera.
+"""Standard deviation, in radians, of a direction of a camera that is calibrated with a test field.
 
 It is a quarter of a metre on the ground from 500 km, the result of control points of that accuracy.
 """
@@ -62,7 +62,7 @@ _PIXELS = 1 << 21
 
 @dataclass(frozen=True, eq=False)
 class Remedy:
-    """Further measurement that would improve the readings.
+    """Further measurement that would reduce the errors of the estimated changes.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Remedy:
     what : str
         Description.
     sigma : (Q,) ndarray
-        Standard deviations of the posterior that it would leave.
+        Standard deviations of the Q quantities by the posterior that it would leave.
     """
 
     name: str
@@ -81,7 +81,7 @@ class Remedy:
 
 @dataclass(frozen=True, eq=False)
 class MonitorLimits:
-    """Analysis of what limits an instrument's readings.
+    """Analysis of what limits the accuracy of the changes that an instrument's monitor estimates.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class MonitorLimits:
     quantities : tuple of Quantity
         The Q quantities.
     noise : (D, D) ndarray
-        Noise covariance of the spot shifts, px^2.
+        Noise covariance of the D coordinates of spot shifts, px^2.
     frames : int
         Number of frames of each state.
     splits : Mapping[str, Split]
@@ -120,7 +120,7 @@ class MonitorLimits:
 
     @cached_property
     def rows(self) -> np.ndarray:
-        """Rows that form the quantities from the cameras' parameters, (Q, 4 K)."""
+        """Derivatives of the Q quantities with respect to the four parameters of each of K cameras, (Q, 4 K)."""
         return np.stack([quantity.row for quantity in self.quantities])
 
     def lines(self, estimator: str, quantity: int) -> list[tuple[str, float]]:
@@ -140,18 +140,24 @@ class MonitorLimits:
 
     @cached_property
     def _by_label(self) -> Mapping[str, dict[str, np.ndarray]]:
-        """Estimator, or empty for before a measurement -> label -> (Q,) contribution to the variances."""
+        """Estimator -> motion's label -> (Q,) contribution to the variances of the Q quantities.
+
+        The empty name stands for the variances before a measurement.
+        """
         shares = {"": self.splits[BEST].before, **{name: split.after for name, split in self.splits.items()}}
         return {name: Split.by(share, self.stated.labels) for name, share in shares.items()}
 
     @cached_property
     def gain(self) -> np.ndarray:
-        """Gain of the posterior, (4 K, D)."""
+        """Gain of the posterior, (4 K, D), for K cameras and D coordinates of spot shifts.
+
+        It gives the four parameters of each camera, in rad or m, per pixel of spot shift.
+        """
         return self.stated.best_gain(self.noise)
 
     @cached_property
     def elasticities(self) -> tuple[Elasticity, ...]:
-        """Sensitivity of every quantity's sigma to each number of the prior."""
+        """Sensitivity of every quantity's sigma to each number of the prior, relative change per relative change."""
         return elasticities(self.rows, self.stated, self.noise, self.gain)
 
     @cached_property
@@ -161,7 +167,7 @@ class MonitorLimits:
 
     @cached_property
     def from_statement(self) -> np.ndarray:
-        """Shares of the posterior's variances that remain without image noise and so rest on the prior, (Q,)."""
+        """Shares of the Q posterior variances that would remain without image noise, due to the prior alone, (Q,)."""
         with_noise, noise_free = (
             limits.posterior_sigma(self.rows, self.stated, noise) for noise in (self.noise, 0.0 * self.noise)
         )
@@ -169,7 +175,10 @@ class MonitorLimits:
 
     @cached_property
     def sigma_if_known(self) -> Mapping[str, np.ndarray]:
-        """Label -> (Q,) sigmas if that motion were known, for the motions listed first under the posterior."""
+        """Motion's label -> (Q,) sigmas of the Q quantities if that motion were known.
+
+        The motions are those listed first under the posterior.
+        """
         names = {name for q in range(len(self.quantities)) for name, _ in self.lines(BEST, q)[:LINES]}
         # keep the order of the prior, since a set has none
         labels = [label for label in dict.fromkeys(self.stated.labels) if label in names]
@@ -178,7 +187,7 @@ class MonitorLimits:
 
 
 def expected_covariance(experiment: MonitorExperiment, frames: int) -> np.ndarray:
-    """Return the expected noise covariance (D, D), px^2, of the shifts between two measurements.
+    """Return the expected noise covariance (D, D), px^2, of the D coordinates of spot shifts between two measurements.
 
     No noise is drawn. The pattern of the pixels' response cancels where a spot stays on its pixels. It is therefore
     computed for some states of the prior and averaged; where their spots leave the CCDs, no such state is used.
@@ -213,14 +222,14 @@ def expected_covariance(experiment: MonitorExperiment, frames: int) -> np.ndarra
 def find_limits(
     experiment: MonitorExperiment, noise: np.ndarray, frames: int, second_monitor: bool = False
 ) -> MonitorLimits | None:
-    """Return what limits the readings of all quantities that the prior changes; None if it changes no camera.
+    """Return what limits the accuracy of all quantities that the prior changes; None if it changes no camera.
 
     Parameters
     ----------
     experiment : MonitorExperiment
         Instrument.
     noise : (D, D) ndarray
-        Noise covariance of the shifts, px^2.
+        Noise covariance of the D coordinates of spot shifts, px^2.
     frames : int
         Number of frames of each state.
     second_monitor : bool
@@ -282,12 +291,15 @@ def _left(rows: np.ndarray, prior: Disturbances, noise: np.ndarray) -> np.ndarra
 
 
 def _own(prior: Disturbances) -> list[bool]:
-    """Return for each motion True if a second monitor has its own such body: prisms, not cameras or central prism."""
+    """Return, for each motion, True if its body is one that a second monitor has as well: prisms.
+
+    Cameras and the central prism are shared by both monitors.
+    """
     return ["/monitor/" in body for body in prior.bodies]
 
 
 def _second_monitor(experiment: MonitorExperiment) -> Disturbances:
-    """Return the disturbances of a second monitor for the same motions, mirrored to the other side of every pupil."""
+    """Return the disturbances of a second monitor, mirrored to the other side of every pupil, for the same motions."""
     resolved = experiment.resolved
     mirrored = {name: mounted.mirrored for name, mounted in resolved.instrument.cameras.items()}
     instrument = resolved.instrument.model_copy(update={"cameras": mirrored})
@@ -322,7 +334,7 @@ def short_text(quantity: Quantity) -> str:
 
 
 def unit_text(quantity: Quantity) -> str:
-    """Return the unit of a quantity."""
+    """Return the unit of a quantity as text, such as arcsec or um."""
     return quantity.parameter.unit
 
 
@@ -336,11 +348,11 @@ def unobserved_texts(
     prior : Disturbances
         Prior on the disturbances.
     noise : (D, D) ndarray
-        Noise covariance of the shifts, px^2.
+        Noise covariance of the D coordinates of spot shifts, px^2.
     quantities : Sequence[Quantity]
-        The Q quantities.
+        The quantities.
     gain : (4 K, D) ndarray
-        Gain of the judged estimator.
+        Gain of the estimator of the verdict: four parameters of each of K cameras per pixel of shift.
     """
     rows = np.stack([quantity.row for quantity in quantities])
     out = []
@@ -354,12 +366,12 @@ def unobserved_texts(
 
 
 def body_text(body: str) -> str:
-    """Return the name of a body, or of its motion, without the base."""
+    """Return the name of a body, or of its motion, without the prefix ``base``."""
     return body.removeprefix(f"{BASE}/")
 
 
 def part_of(body: str) -> str:
-    """Return the kind of a body, for all cameras alike: ``M2``, ``prism_180``, ``camera``, ``central_prism``."""
+    """Return the kind of a body, the same in all cameras: ``M2``, ``prism_180``, ``camera``, ``central_prism``."""
     below = body.split("/")[1:]
     if not below:
         return "base"
@@ -393,6 +405,6 @@ def combination_text(limits: MonitorLimits, number: int, most: int = 4) -> str:
 
 
 def _moved(combination: LeastObservable) -> str:
-    """Return how far a combination moves the spots, and their noise, as text."""
+    """Return how far a combination of motions moves the spots, in comparison with their noise, as text."""
     moved, noise = float(abs(combination.spots).max()), float(combination.noise.max())
     return f"{moved:.1g} px (noise {noise:.1g} px)"

@@ -1,4 +1,4 @@
-"""Records of the contents of uncertainty.json."""
+"""Contents of uncertainty.json: which numbers of the analysis are written, and under which keys."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from twin.uncertainty.coverage import FALSE, Coverage, UncertaintyRun
 from twin.uncertainty.monitor_limits import BEST, LINES, MonitorLimits, Remedy
 
 SEEN = 8
-"""Number of motions that are listed for a combination."""
+"""Largest number of motions that are listed for a least observable combination."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Limited:
-    """Limits of one quantity before the measurement, or after it by an estimator."""
+    """Limits of one quantity before the measurement, or after it by an estimator, for the JSON file."""
 
     limits: MonitorLimits
     q: int
@@ -170,7 +170,7 @@ LIMITS: Record[MonitorLimits] = Record(
 
 @dataclass(frozen=True, eq=False)
 class _Counted:
-    """Errors of one quantity by one estimator in random states."""
+    """Errors of one quantity by one estimator in random states, for the JSON file."""
 
     coverage: Coverage
     q: int
@@ -251,7 +251,7 @@ def _by_quantity(
 
 
 def uncertainty_numbers(run: UncertaintyRun) -> dict[str, Any]:
-    """Return the contents of uncertainty.json: those of the main job, and ``states`` with the random states.
+    """Return the contents of uncertainty.json: the limits as in the main job, and ``states`` with the random states.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Report of what limits a monitor's readings, with its figure, and the section on it in the main job's report."""
+"""Report of what limits the accuracy of a monitor, with its figure, and the section on it in the main job's report."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FEW = 3
-"""Number of motions listed for each quantity in a report with another main subject."""
+"""Number of motions listed for each quantity in a report of the main job."""
 RARE = 1e-3
-"""Probability that a spot leaves its CCD below which it is not reported."""
+"""Probability that a spot leaves its CCD below which the report does not mention it."""
 
 
 def limits_section(
     limits: MonitorLimits | None, lines: int = FEW, folded: int = 3, figure: str | None = None
 ) -> Section:
-    """Return the section on what limits the readings, with figure and tables.
+    """Return the section on what limits the accuracy of the estimated changes, with figure and tables.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def limits_section(
 
 
 def uncertainty_report(run: UncertaintyRun) -> Report:
-    """Return the report of the command."""
+    """Return the report of ``python -m twin.uncertainty``."""
     limits, coverage = run.limits, run.coverage
     sections = [limits_section(limits, LINES, 0), _prior_section(limits), _before(limits)]
     if coverage is not None:
@@ -165,7 +165,7 @@ def _loss_text(limits: MonitorLimits) -> str:
 
 
 def _sigmas(limits: MonitorLimits) -> Table:
-    """Return the table of standard deviations before and after the measurement."""
+    """Return the table of every quantity's standard deviation before and after the measurement."""
     heads = ("quantity", "before", *limits.splits, "noise part")
     rows: list[Sequence[Cell]] = []
     for q, quantity in enumerate(limits.quantities):
@@ -180,7 +180,7 @@ def _sigmas(limits: MonitorLimits) -> Table:
 
 
 def _ledger(limits: MonitorLimits, lines: int) -> Table:
-    """Return the table of the posterior's variance by motions."""
+    """Return the table of each motion's contribution to the posterior's variances."""
     split = limits.splits[BEST]
     rows: list[Sequence[Cell]] = []
     for q, quantity in enumerate(limits.quantities):
@@ -213,7 +213,10 @@ def _ledger(limits: MonitorLimits, lines: int) -> Table:
 
 
 def _before(limits: MonitorLimits) -> Section:
-    """Return the section on the variance by motions before a measurement, and after it by the other estimators."""
+    """Return the section on each motion's contribution to the variances other than the posterior's.
+
+    They are those before a measurement, and after it by the other estimators.
+    """
     rows: list[Sequence[Cell]] = []
     for q, quantity in enumerate(limits.quantities):
         for name in ("", *(name for name in limits.splits if name != BEST)):
@@ -285,7 +288,7 @@ def _prior_section(limits: MonitorLimits) -> Section:
 
 
 def _remedies(limits: MonitorLimits) -> Table:
-    """Return the table of what further measurements would leave."""
+    """Return the table of the standard deviations that would remain after further measurements."""
     heads = ["quantity", "before", "now", *(remedy.what for remedy in limits.remedies)]
     rows: list[Sequence[Cell]] = []
     for q, quantity in enumerate(limits.quantities):
@@ -308,7 +311,7 @@ def _remedies(limits: MonitorLimits) -> Table:
 
 
 def _least_observable(limits: MonitorLimits) -> Table:
-    """Return the table of the least observable combinations of motions."""
+    """Return the table of the combinations of motions that the spots observe least, for each quantity."""
     rows = [(quantity_text(q), combination_text(limits, k)) for k, q in enumerate(limits.quantities)]
     caption = (
         "The most probable motions that change a quantity by the standard deviation of the posterior. The largest, in "
@@ -326,7 +329,7 @@ def _coverage_text(coverage: Coverage) -> str:
 
 
 def _states(coverage: Coverage) -> Section:
-    """Return the section on the random states."""
+    """Return the section on errors and coverage in the random states."""
     n, unmeasured = coverage.measured, coverage.drawn - coverage.measured
     rows: list[Sequence[Cell]] = []
     for k, quantity in enumerate(coverage.quantities):
@@ -371,12 +374,12 @@ def _states(coverage: Coverage) -> Section:
 
 
 PALETTE = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.ORANGE, svg.PURPLE, svg.SKY, svg.YELLOW)
-"""Colours of the bodies with the largest shares; the others are grey."""
+"""Colours of the bodies that cause the largest shares of the variance; the others are grey."""
 MARKS = "os^vDP*X"
 
 
 def limits_svg(limits: MonitorLimits) -> str:
-    """Draw what the measurement removes and what remains.
+    """Draw how much the measurement reduces the standard deviations, and which bodies cause the remaining variance.
 
     Left: standard deviation of every quantity by each estimator, over that before the measurement. Right: the variance
     that the posterior leaves, by bodies.
@@ -408,7 +411,7 @@ def _figure(limits: MonitorLimits) -> Figure:
 
 
 def _reduced(axes: Axes, limits: MonitorLimits) -> None:
-    """Draw the ratios of standard deviations, with both values in their units for the posterior."""
+    """Draw the ratios of standard deviations after and before, with both values in their units for the posterior."""
     y = np.arange(len(limits.quantities))
     before = limits.splits[BEST].sigma_before
     for k, (name, split) in enumerate(limits.splits.items()):
