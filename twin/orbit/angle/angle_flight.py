@@ -137,7 +137,7 @@ kilometre and more.
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """Measured station and ground points, with the laboratory's interior of each line; one Cartesian frame, in metres.
+    """Measured station and ground points, with the laboratory's interior of each line; one Cartesian frame, metres.
 
     Attributes
     ----------

@@ -114,8 +114,7 @@ class FrameRow:
 
 @dataclass(frozen=True, eq=False)
 class EffectRow:
-    """Error of the angles between planes (total least squares, tls) due to an effect on the light or a common shift of
-    the points, in radians.
+    """Error of the angles due to an effect on the light or a common shift of the points, in radians.
 
     Attributes
     ----------
@@ -473,9 +472,7 @@ def estimate_angles(measurement: Measurement) -> Estimate:
 
 
 def frame_rows(flight: AnglePass, common: Measurement) -> tuple[FrameRow, ...]:
-    """Estimate the angles by every plane-fitting method in every coordinate frame, from a measurement of
-    `reduce_to_station`.
-    """
+    """Estimate the angles by every plane-fitting method in every frame, from a measurement of `reduce_to_station`."""
     places = {
         "Earth-fixed": (np.eye(3), np.zeros(3)),
         "local level": (flight.local, flight.middle_point),
@@ -502,7 +499,7 @@ def frame_rows(flight: AnglePass, common: Measurement) -> tuple[FrameRow, ...]:
 
 
 def effect_rows(flight: AnglePass) -> tuple[EffectRow, ...]:
-    """Compute the errors of the angles due to each effect on the light alone and due to all three, on the true points.
+    """Compute the errors of the angles due to each effect on the light and due to all three, on the true points.
 
     Where the file has a shift of the datum, the error due to it comes last.
     """

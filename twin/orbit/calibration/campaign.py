@@ -762,15 +762,13 @@ class Rejected:
     factors: Mapping[str, float]
 
     def after(self, first: Rejected) -> Rejected:
-        """Return the points rejected in two rounds, `first` and this one, whose factors on the sigmas are those of this
-        one.
-        """
+        """Return the points rejected in two rounds, `first` and this one, with the factors on sigmas of this one."""
         points, checks = first.points + self.points, first.check_points + self.check_points
         return Rejected(first.entered, self.left, points, first.check_entered, self.check_left, checks, self.factors)
 
 
 def interior_names(lines: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the interior unknowns of line cameras: principal distance f, principal point x and y of each."""
+    """Return the names of the interior unknowns: principal distance f and principal point x, y of each line."""
     return tuple(f"{line} {name}" for line in lines for name in INTERIOR)
 
 

@@ -234,9 +234,7 @@ FOLDER = "models"
 
 
 def _names(line: ExportedLine) -> dict[str, str]:
-    """Return the paths in the run folder of a line's files: its image support data (ISD), and image and RPC where there
-    are any.
-    """
+    """Return the paths in the run folder of a line's files: support data (ISD), and image and RPC where there are any."""
     stem = f"{FOLDER}/{line.window.name}"
     names = {"isd": f"{stem}.json"}
     if line.window.frame is not None:

@@ -327,7 +327,7 @@ def _places(sensor: Sensor, line: Array, pixel: Array, height: float) -> tuple[A
 
 
 def _propagate(rows: Array, covariance: ArrayLike) -> Array:
-    """Return (N, K, K) covariances of K quantities at N points, propagated through derivatives (N, K, P) by P errors."""
+    """Return (N, K, K) covariances of K quantities at N points, through derivatives (N, K, P) with respect to P errors."""
     return np.asarray(rows @ np.asarray(covariance) @ np.swapaxes(rows, 1, 2))
 
 
@@ -404,7 +404,7 @@ class EstimatedChange:
 
 @dataclass(frozen=True)
 class GroundSigma:
-    """Horizontal error on the ground of points of known height, due to the error of a camera's estimated change alone.
+    """Horizontal error of ground points of known height, due to the error of a camera's estimated change alone.
 
     Orbit and attitude do not contribute. Values are root mean squares over the image.
 

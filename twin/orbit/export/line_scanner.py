@@ -51,7 +51,7 @@ class EffectiveCamera:
 
     Attributes
     ----------
-    seconds : (N,) ndarray
+    seconds : (N,) ndarray for N nodes
         Evenly spaced times of the nodes, of the trajectory.
     station : (N, 3) ndarray
         Projection centre, ITRS, in metres.
@@ -66,10 +66,11 @@ class EffectiveCamera:
     pixels : int
         Number of pixels of the line.
     along : (4,) ndarray
-        Coefficients of the real y by powers of the ideal one, both in millimetres.
-    across : (4,) ndarray
-        Coefficients, by powers of the ideal y, of what is added to the ideal x of a point on the line to make it 0, in
+        Coefficients of the powers 0 to 3 of the ideal position y along the line that give the real y, both in
         millimetres.
+    across : (4,) ndarray
+        Coefficients of the powers 0 to 3 of the ideal y that give what is added to the ideal x of a point on the line
+        to make it 0, in millimetres.
     """
 
     seconds: Array
@@ -83,7 +84,7 @@ class EffectiveCamera:
     across: Array
 
     def looks(self, pixel: Array) -> Array:
-        """Return the unit directions (K, 3) of positions (K,) on the line, in camera axes."""
+        """Return the (K, 3) unit directions of K positions on the line, in camera axes."""
         real = 1e3 * self.pitch * (np.asarray(pixel) - 0.5 * (self.pixels - 1))
         ideal = real.copy()
         slope = self.along[1:] * np.arange(1.0, len(self.along))
@@ -202,7 +203,7 @@ def _effective_camera(sensor: Sensor, pitch: float, height: float, epoch: str) -
     Raises
     ------
     ValueError
-        See `line_scanner`.
+        A line of sight misses the Earth, or the trajectory is too rough for `_MOST` nodes.
     """
     count = _FEWEST
     while True:
@@ -228,7 +229,7 @@ def _ephemeris_time(epoch: str) -> tuple[int, float]:
 
 
 def _nodes(sensor: Sensor, count: int, epoch: str) -> Array:
-    """Return the times of nodes (N,), in seconds of the trajectory, evenly spaced at whole ticks of ephemeris time."""
+    """Return the (N,) times of N nodes, in seconds of the trajectory, evenly spaced at whole ticks of ephemeris time."""
     ends = sensor.time(np.array([-0.5, sensor.lines - 0.5]))
     step = max(np.ceil((ends[1] - ends[0]) / count / _TICK), 1.0) * _TICK
     fraction = _ephemeris_time(epoch)[1]
@@ -283,7 +284,7 @@ def _fit_camera(sensor: Sensor, pitch: float, height: float, seconds: Array) -> 
 
 
 def _directions(sensor: Sensor, seconds: Array, pixel: Array, height: float) -> tuple[Array, Array]:
-    """Return stations (N, 3), and unit directions (N, K, 3) to the ground that pixels (K,) see at a height, ITRS."""
+    """Return stations (N, 3) at N times, and unit directions (N, K, 3) to what K pixels see at a height, ITRS."""
     count = len(seconds)
     step = float(seconds[1] - seconds[0])
     trajectory = _AtNodes(sensor, seconds)
@@ -300,7 +301,7 @@ def _directions(sensor: Sensor, seconds: Array, pixel: Array, height: float) -> 
 
 
 def _lagrange(times: Array, values: Array, at: Array) -> Array:
-    """Interpolate values (N, K) at evenly spaced nodes to times (M,), as the community sensor model does.
+    """Interpolate K quantities (N, K) at N evenly spaced nodes to M times, as the community sensor model does.
 
     It uses eight nodes, and fewer near the ends.
     """
@@ -320,12 +321,12 @@ def _lagrange(times: Array, values: Array, at: Array) -> Array:
 
 
 def _quaternions(rotation: Rotation) -> Array:
-    """Return continuous quaternions (N, 4), x, y, z, w, of the rotations from the ITRS to the camera."""
+    """Return continuous quaternions (N, 4), x, y, z, w, of the rotations from the ITRS to the camera at N nodes."""
     return continuous_quaternions(rotation.inv().as_quat(canonical=False))
 
 
 def _smooth(camera: EffectiveCamera) -> bool:
-    """Return True if every other node predicts those between to `_FOLLOWED` pixels.
+    """Return True if every second node predicts the nodes between them to `_FOLLOWED` pixels.
 
     The interpolation between all nodes is then more accurate still.
     """
@@ -342,7 +343,7 @@ def _smooth(camera: EffectiveCamera) -> bool:
 _FOLLOWED = 0.01
 """Largest interpolation error between nodes, in pixels."""
 _NEAREST = 2e5
-"""Least height of a satellite, in metres, at which a shift of the station is converted to an angle."""
+"""Smallest height of a satellite, in metres, at which a shift of the station is converted to an angle."""
 
 
 def _error(sensor: Sensor, camera: EffectiveCamera, height: float, window: tuple[int, int]) -> ModelError:
@@ -477,7 +478,9 @@ def _rotation_record(number: int, nodes: list[float], quaternion: Array, rate: A
 
 
 def _angular_velocity(camera: EffectiveCamera) -> Array:
-    """Return the angular velocity (N, 3) of the camera's axes against the Earth-fixed ones, in the latter, in rad/s."""
+    """Return the (N, 3) angular velocity of the camera's axes relative to the Earth-fixed ones, in the latter, in
+    rad/s.
+    """
     step = camera.seconds[1] - camera.seconds[0]
     rate = (camera.rotation[1:] * camera.rotation[:-1].inv()).as_rotvec() / step
     return np.concatenate([rate[:1], 0.5 * (rate[1:] + rate[:-1]), rate[-1:]])

@@ -71,7 +71,7 @@ def with_quality(run: Export, uncertainty: CameraUncertainty | None, points: Con
 
 
 def _with_errors(line: ExportedLine, accuracy: AccuracyMap, is_controlled: bool) -> ExportedLine:
-    """Return a line whose models state its errors.
+    """Return a line whose models contain its errors on the ground (ERR_BIAS and ERR_RAND).
 
     Polynomials corrected by control points keep the errors of the correction.
     """
@@ -288,7 +288,7 @@ def polynomial_files(run: PolynomialExport) -> dict[str, bytes]:
 
 
 def polynomial_report(run: PolynomialExport) -> Report:
-    """Return the report of the correction."""
+    """Return the report of polynomials corrected by control points: correction, residuals and remaining errors."""
     quality = Quality(control=FrozenMap({run.source.name: run.control}))
     verdict, more = answer(*quality_answers(quality))
     before, after = run.source.polynomial, run.control.after

@@ -63,12 +63,12 @@ def sensor_polynomial(
 
 
 def axis_sigma(covariance: Array) -> float:
-    """Return the root mean square error of a horizontal axis, metres, as ERR_BIAS and ERR_RAND state it.
+    """Return the root mean square error of a horizontal axis, metres, as ERR_BIAS and ERR_RAND define it.
 
     Parameters
     ----------
-    covariance : Array
-        (N, 2, 2) to the east and to the north over an image, m^2.
+    covariance : (N, 2, 2) ndarray
+        Covariances of errors to the east and to the north at N points of an image, m^2.
     """
     return float(np.sqrt(0.5 * np.mean(np.trace(covariance, axis1=-2, axis2=-1))))
 
@@ -82,7 +82,7 @@ def _image_to_ground(
     *,
     at_ends: bool,
 ) -> Array:
-    """Return line, sample, latitude, longitude (degrees) and height (metres) over an image, (N, 5).
+    """Return line, sample, latitude, longitude (degrees) and height (metres) at N points over an image, (N, 5).
 
     Image coordinates count from the window's first pixel.
     """
@@ -255,7 +255,7 @@ def polynomial_correction(
     ----------
     polynomial : RationalPolynomial
         Polynomials of the image.
-    itrs : (N, 3) ndarray
+    itrs : (N, 3) ndarray for N points
         Ground points, in metres.
     ground_covariance : (N, 3, 3) ndarray
         Covariances of the ground points in ITRS axes, in m^2.
@@ -271,7 +271,7 @@ def polynomial_correction(
     Raises
     ------
     ValueError
-        See `analysis.orbit.image_correction.image_correction`.
+        The points do not determine the correction.
     """
     longitude, latitude, height = Earth().geodetic(itrs)
     slope = image_slope(polynomial, latitude, longitude, height) @ east_north_up(longitude, latitude)
@@ -281,9 +281,9 @@ def polynomial_correction(
 
 
 def image_slope(polynomial: RationalPolynomial, latitude: Array, longitude: Array, height: Array) -> Array:
-    """Return the derivatives (N, 2, 3) of line and sample by metres east, north and up, at positions (N,).
+    """Return the derivatives of line and sample, in pixels per metre of a step east, north and up, (N, 2, 3).
 
-    Latitudes and longitudes are in radians, heights in metres.
+    They are computed at N positions; latitudes and longitudes are in radians, heights in metres.
     """
     meridian, normal = curvature_radii(latitude)
     moves = (
@@ -363,5 +363,5 @@ def _on_the_ground(polynomial: RationalPolynomial, correction: ImageCorrection) 
 
 
 def residual_sigma(correction: ImageCorrection) -> Array:
-    """Return the (N, 2) standard deviations of the residuals of line and sample, in pixels."""
+    """Return the standard deviations of the residuals of line and sample at N points, (N, 2), in pixels."""
     return np.sqrt(np.maximum(np.einsum("nii->ni", correction.variance), 0.0))

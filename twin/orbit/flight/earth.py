@@ -109,17 +109,20 @@ class EarthRotation:
     polar: np.ndarray
 
     def celestial(self, seconds: Any) -> np.ndarray:
-        """Return the rotation GCRS -> CIRS, the frame of the pole and origin of date; (...) -> (..., 3, 3)."""
+        """Return the rotation GCRS -> CIRS, the frame of the pole and origin of date; shape (..., 3, 3) for times
+        (...).
+        """
         x, y, s = np.moveaxis(self.pole(np.asarray(seconds, dtype=np.float64)), -1, 0)
         return np.asarray(erfa.c2ixys(x, y, s))
 
     def matrix(self, seconds: Any) -> np.ndarray:
-        """Return the rotation GCRS -> ITRS: x_itrs = matrix @ x_gcrs; (...) -> (..., 3, 3)."""
+        """Return the rotation GCRS -> ITRS: x_itrs = matrix @ x_gcrs; (..., 3, 3) for times (...)."""
         t = np.asarray(seconds, dtype=np.float64)
         return np.asarray(erfa.c2tcio(self.celestial(t), self.angle + RATE * t, self.polar))
 
     def rate(self, seconds: Any) -> np.ndarray:
-        """Return the angular velocity of the ITRS relative to the GCRS in ITRS axes, in rad/s; (...) -> (..., 3).
+        """Return the angular velocity of the ITRS relative to the GCRS in ITRS axes, in rad/s, (..., 3) for times
+        (...).
 
         The motion of the pole (some 1e-11 rad/s) is part of it, so that velocities are the exact derivatives of
         positions.
@@ -180,7 +183,9 @@ def east_north_up(lon: Any, lat: Any) -> np.ndarray:
 
 
 def curvature_radii(lat: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ellipsoid's radii of curvature along the meridian (M) and across it (N), in metres; (...) -> (...)."""
+    """Return the ellipsoid's radii of curvature along the meridian (M) and across it (N), in metres, at latitudes
+    (...).
+    """
     square = 1.0 - _E2 * np.sin(lat) ** 2
     return EQUATORIAL_RADIUS * (1.0 - _E2) / square**1.5, EQUATORIAL_RADIUS / np.sqrt(square)
 
@@ -282,7 +287,7 @@ class Earth:
         """Return the first points at which descending rays reach a geodetic height.
 
         The surface of equal height is not an ellipsoid; the intersection is found by Newton steps on the geodetic
-        height along the ray, starting at the ellipsoid with both axes longer by the height.
+        height along the ray, starting at the ellipsoid whose semi-axes are both enlarged by the height.
 
         Parameters
         ----------
@@ -317,10 +322,10 @@ class Earth:
 
 
 def _nearer_root(o: np.ndarray, d: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Return the distance (...) along the rays to the ellipsoid with axes longer by h.
+    """Return the distances (...) along rays from origins o in directions d to the ellipsoid enlarged by a height h.
 
-    It is NaN where a ray misses clearly, and that of the nearest point where it misses by less than the two surfaces
-    can differ.
+    Both semi-axes are enlarged by h, in metres. The distance is NaN where a ray misses clearly, and that of the nearest
+    point where it misses by less than the two surfaces can differ.
     """
     axes = EQUATORIAL_RADIUS * np.array([1.0, 1.0, 1.0 - FLATTENING]) + h[..., None]
     p, q = o / axes, d / axes

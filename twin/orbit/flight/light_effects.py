@@ -55,7 +55,7 @@ class LightEffects:
     light_time : bool
         Include the rotation of the Earth during the light time.
     aberration : bool
-        Include the aberration by the satellite's inertial velocity.
+        Include the aberration due to the satellite's inertial velocity.
     refraction : bool
         Include refraction in the standard atmosphere.
     wavelength : float
@@ -146,12 +146,12 @@ def standard_refractivity(wavelength: float) -> float:
 
 
 def refractive_shift(zenith: np.ndarray, height: np.ndarray, radius: np.ndarray, wavelength: float) -> np.ndarray:
-    """Return the shift by refraction of the ground point of a look from space, toward the satellite's nadir.
+    """Return the shift, due to refraction, of the ground point of a look from space, toward the satellite's nadir.
 
-    In a spherically layered atmosphere n r sin z = p is constant along the ray (Bouguer's invariant; Noerdlinger, ISPRS
-    J. 54, 360 (1999)), and in space p belongs to the straight line. The angle at the Earth's centre between satellite
-    and point is the integral of p dr/(r sqrt(n^2 r^2 - p^2)), so the ray arrives nearer to the nadir than the straight
-    line by
+    In a spherically layered atmosphere p = n r sin z, with refractive index n, distance r from the Earth's centre and
+    zenith angle z, is constant along the ray (Bouguer's invariant; Noerdlinger, ISPRS J. 54, 360 (1999)), and in space
+    p belongs to the straight line. The angle at the Earth's centre between satellite and point is the integral of p
+    dr/(r sqrt(n^2 r^2 - p^2)), so the ray arrives nearer to the nadir than the straight line by
 
         r0 integral_{r0}^{inf} (p/r) [1/sqrt(r^2 - p^2) - 1/sqrt(n^2 r^2 - p^2)] dr  ~  tan z sec^2 z integral (n-1) dh.
 
@@ -227,8 +227,8 @@ def refracted(point: np.ndarray, station: np.ndarray, earth: Earth, wavelength: 
 def unrefracted(point: np.ndarray, station: np.ndarray, earth: Earth, wavelength: float) -> np.ndarray:
     """Return the points that straight looks would reach if refracted looks meet `point`.
 
-    The inverse of `refracted`, by fixed-point steps; each makes the error smaller by the shift over the distance, 3e-6
-    at 500 km.
+    This is the inverse of `refracted`, by fixed-point steps; each reduces the error by a factor of shift over distance,
+    3e-6 at 500 km.
     """
     straight = point
     for _ in range(_FIXED_POINT_STEPS):

@@ -48,7 +48,7 @@ class LineTimes:
 
     Attributes
     ----------
-    line : (K,) ndarray
+    line : (K,) ndarray for K lines
         Image coordinates of lines, increasing; the middle of the first line is 0.
     time : (K,) ndarray
         Middle of the exposure, seconds of the trajectory, increasing.
@@ -94,7 +94,7 @@ class LineTimes:
         return float((self.time[-1] - self.time[0]) / (self.line[-1] - self.line[0]))
 
     def at(self, line: ArrayLike) -> np.ndarray:
-        """Return the times of lines (...), in seconds; beyond the ends by the slope there."""
+        """Return the times of lines (...), in seconds, extrapolated linearly beyond the table's ends."""
         x = np.asarray(line, dtype=np.float64)
         k = np.clip(np.searchsorted(self.line, x, side="right") - 1, 0, len(self.line) - 2)
         slope = (self.time[k + 1] - self.time[k]) / (self.line[k + 1] - self.line[k])
@@ -171,7 +171,7 @@ class LinePiece:
     first, last : int
         First and last pixel of the CCD, counted over the line.
     directions : (K, 3) ndarray
-        Chebyshev coefficients of the looks over the CCD's pixels; see `LineCamera`.
+        K Chebyshev coefficients, over the CCD's pixels, of a vector along the look, body frame.
     """
 
     first: int
@@ -193,12 +193,12 @@ class LineCamera:
     pixels : int
         Number of pixels.
     directions : (K, 3) ndarray
-        Chebyshev coefficients over the line of a vector along the look, body frame; its length does not matter.
+        K Chebyshev coefficients over the line of a vector along the look, body frame; its length does not matter.
     origins : (J, 3) ndarray
-        Chebyshev coefficients over the line of a point on the ray, body frame, metres.
+        J Chebyshev coefficients over the line of a point on the ray, body frame, metres.
     pieces : tuple of LinePiece
-        CCDs of a line of several, from its first pixel on; their looks replace `directions`, which then are those of a
-        line without offsets.
+        CCDs of a line that consists of several, from its first pixel on; their looks replace `directions`, which then
+        are those of a line without offsets.
     """
 
     name: str
@@ -208,12 +208,12 @@ class LineCamera:
     pieces: tuple[LinePiece, ...] = ()
 
     def turned(self, rotation: np.ndarray) -> LineCamera:
-        """Return the line with its looks rotated in body axes, look @ rotation, (3, 3)."""
+        """Return the line with its looks rotated in body axes by a (3, 3) matrix: new look = look @ rotation."""
         pieces = tuple(replace(piece, directions=piece.directions @ rotation) for piece in self.pieces)
         return replace(self, directions=self.directions @ rotation, pieces=pieces)
 
     def look(self, pixel: np.ndarray) -> np.ndarray:
-        """Return unit directions toward the scene, body frame: pixels (N,) -> (N, 3).
+        """Return unit directions toward the scene, body frame: (N, 3) for N pixels.
 
         Raises
         ------
@@ -224,7 +224,7 @@ class LineCamera:
         return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
 
     def look_and_slope(self, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return `look` and its derivative by the pixel, in radians per pixel, both (N, 3).
+        """Return the looks of N pixels and their derivatives with respect to the pixel, in rad per pixel, both (N, 3).
 
         The derivative is perpendicular to the look.
         """
@@ -234,7 +234,7 @@ class LineCamera:
         return look, (change - look * np.sum(look * change, axis=-1, keepdims=True)) / length
 
     def relative_illumination(self, pixel: np.ndarray) -> np.ndarray:
-        """Return the irradiance on pixels (N,) relative to the line's middle, (N,), for ground of uniform radiance.
+        """Return the irradiance on N pixels relative to the line's middle, (N,), for ground of uniform radiance.
 
         The entrance pupil is foreshortened by cos w at the field angle w, and a pixel sees the solid angle of its angle
         along the line times its angle across, pitch x cos w / f. The product is cos^4 w for a projection without
@@ -250,7 +250,7 @@ class LineCamera:
         return np.asarray((look[1:] @ look[0]) ** 2 * rate[1:] / rate[0])
 
     def origin(self, pixel: np.ndarray) -> np.ndarray:
-        """Return points on the rays, body frame: pixels (N,) -> (N, 3), in metres.
+        """Return points on the rays, body frame: (N, 3) for N pixels, in metres.
 
         Raises
         ------
@@ -260,7 +260,7 @@ class LineCamera:
         return self._series(self.origins, self._checked(pixel))
 
     def _vector(self, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return a vector along the look and its derivative by the pixel, both (N, 3)."""
+        """Return a vector along the look of N pixels and its derivative with respect to the pixel, both (N, 3)."""
         pixels = self._checked(pixel)
         change = self._series(chebyshev.chebder(self.directions), pixels) * (2.0 / self.pixels)
         vector = self._series(self.directions, pixels)
@@ -369,7 +369,7 @@ def pixel_positions(line: LineCameraSpec, pixel: np.ndarray, pixels: int, pitch:
 def _ccd_positions(
     line: LineCameraSpec, ccd: CcdSpec | None, pixel: np.ndarray, pixels: int, pitch: float
 ) -> np.ndarray:
-    """Return positions of pixels of one CCD, or of a straight line if `ccd` is None; see `pixel_positions`."""
+    """Return x and y, in metres, of pixels of one CCD, or of a straight line if `ccd` is None, (N, 2) for N pixels."""
     straight = (pixel - 0.5 * (pixels - 1)) * pitch
     if ccd is None:
         return np.stack([np.zeros_like(straight), straight], axis=-1)
@@ -452,9 +452,9 @@ def dihedral_angle(
 ) -> float:
     """Return the angle between the planes of two lines, in radians, 0 to pi/2.
 
-    A line's plane is the one through the station that its looks depart from least (total least squares over the whole
-    line, or over `pixels`, each (N,)). Ground points of the strips give this angle (paper 000, eqs. 1 to 7).
-    It differs from `look_angle` when the lines are not parallel.
+    A line's plane is the one through the station from which its looks deviate least (total least squares over the whole
+    line, or over `pixels`, each (N,)). Ground points of the strips give this angle (paper 000, eqs. 1 to 7). It differs
+    from `look_angle` when the lines are not parallel.
     """
     angle = _angle(*(line_normal(camera, pixel) for camera, pixel in zip((a, b), pixels, strict=True)))
     return min(angle, np.pi - angle)
@@ -462,7 +462,7 @@ def dihedral_angle(
 
 @dataclass(frozen=True, eq=False)
 class LineAngles:
-    """Angles between pairs of lines, radians, by the angle's name.
+    """Angles between pairs of lines, name of the angle -> radians.
 
     Attributes
     ----------
@@ -480,7 +480,7 @@ class LineAngles:
 
     @property
     def look(self) -> dict[str, float]:
-        """Angles between the lines of sight of the lines' centres; see `look_angle`."""
+        """Angles between the lines of sight of the lines' centres, name of the angle -> radians, 0 to pi."""
         return {name: look_angle(self.cameras[a], self.cameras[b]) for name, (a, b) in self.pairs.items()}
 
     @property
@@ -490,7 +490,7 @@ class LineAngles:
 
     @property
     def dihedral(self) -> dict[str, float]:
-        """Angles between the planes of the lines, fitted at the ground points' pixels; see `dihedral_angle`."""
+        """Angles between the planes of the lines, fitted at the ground points' pixels, name of the angle -> radians."""
         return {
             name: dihedral_angle(self.cameras[a], self.cameras[b], (self.pixel[a], self.pixel[b]))
             for name, (a, b) in self.pairs.items()
@@ -524,7 +524,7 @@ def _nodes(pixels: int, count: int) -> np.ndarray:
 
 
 def _through(values: np.ndarray) -> np.ndarray:
-    """Return coefficients (K, 3) of the series that has these values (K, 3) at the Chebyshev points."""
+    """Return the K coefficients (K, 3) of the Chebyshev series that has these values (K, 3) at the Chebyshev points."""
     count = len(values)
     basis = chebyshev.chebvander(chebyshev.chebpts1(count), count - 1)
     weight = np.full(count, 2.0 / count)
@@ -538,7 +538,7 @@ def _coefficients(function: Callable[[np.ndarray], np.ndarray], pixels: int, cou
 
 
 def _chopped(coefficients: np.ndarray) -> np.ndarray:
-    """Return the series without its last terms that are rounding."""
+    """Return the Chebyshev series without its last terms that are only rounding errors."""
     size = np.max(np.abs(coefficients), axis=-1)
     used = np.flatnonzero(size > _NOISE * np.max(size))
     return coefficients[: used[-1] + 1]

@@ -63,7 +63,7 @@ rotation (the air rotates with the Earth in it).
 
 
 def _gravity(_: float, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Return the acceleration by the Earth's gravity, a `Force`."""
+    """Return the acceleration due to the Earth's gravity, as one of the `FORCES`."""
     return acceleration(position)
 
 
@@ -75,9 +75,10 @@ New forces are added here. Orbits that are called sun-synchronous follow the mea
 
 
 def node_rate(semi_major_axis: float, eccentricity: float, inclination: float) -> float:
-    """Return the secular rate of the node by J2, in rad/s, from mean elements.
+    """Return the secular rate of the ascending node due to J2, in rad/s, from mean elements.
 
-    -3/2 J2 (R/p)^2 n cos i (Kaula 1966, eq. 3.74).
+    The rate is -3/2 J2 (R/p)^2 n cos i (Kaula 1966, eq. 3.74), with the Earth's radius R, the orbit's semi-latus rectum
+    p, mean motion n and inclination i.
     """
     n = math.sqrt(GM / semi_major_axis**3)
     p = semi_major_axis * (1.0 - eccentricity**2)
@@ -102,8 +103,9 @@ def _osculating_inclination(semi_major_axis: float, eccentricity: float, argumen
     """Return the osculating inclination of a sun-synchronous orbit at one argument of latitude.
 
     The input elements are osculating. The short-period terms of first order for a small eccentricity (Kozai 1959) lead
-    to the mean elements: a = a' + 3/2 J2 R^2/a sin^2 i cos 2u and i = i' + 3/8 J2 (R/p)^2 sin 2i cos 2u. Where the
-    argument u is None, sin u follows from z = sin i sin u.
+    to the mean elements: a = a' + 3/2 J2 R^2/a sin^2 i cos 2u and i = i' + 3/8 J2 (R/p)^2 sin 2i cos 2u. Here a, i and
+    p are semi-major axis, inclination and semi-latus rectum, a prime marks mean elements, and u is the argument of
+    latitude. Where it is None, sin u follows from z = sin i sin u.
     """
     ratio = J2 * (FIELD_RADIUS / semi_major_axis) ** 2
     inclination = sun_synchronous_inclination(semi_major_axis, eccentricity)
@@ -174,7 +176,7 @@ class Orbit:
         return state[..., :3], state[..., 3:]
 
     def gcrs(self, seconds: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return position, metres, and velocity, m/s, both (..., 3), in the GCRS; raises as `equatorial`."""
+        """Return position, metres, and velocity, m/s, both (..., 3), in the GCRS; times must lie within the orbit."""
         r, v = self.equatorial(seconds)
         return r @ self.to_gcrs.T, v @ self.to_gcrs.T
 
@@ -182,7 +184,7 @@ class Orbit:
         """Return position (m), Earth-fixed velocity and inertial velocity (m/s), all (..., 3), in axes of the ITRS.
 
         The first velocity is relative to the rotating Earth, the second relative to the stars. The arrays are
-        read-only. Raises as `equatorial`.
+        read-only. Raises ValueError for a time outside the orbit.
         """
         t = np.asarray(seconds, dtype=np.float64)
         # Callers request position, velocity and attitude one after the other at the same times.

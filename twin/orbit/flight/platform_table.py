@@ -1,6 +1,6 @@
 """Tables of readings of orbit and attitude, and their interpolation between the readings.
 
-This is what a satellite sends down, and what an analysis has: of a simulated pass as of a real one.
+This is what a satellite transmits and what an analysis uses, for a simulated pass as for a real one.
 """
 
 from __future__ import annotations
@@ -28,11 +28,13 @@ _FOURTH_DERIVATIVE = 1.1e-5
 _LAGRANGE_NODES = 10
 """Number of readings through which Lagrange's polynomial goes."""
 _LEAST_ROWS = 12
-"""Least number of readings of which every fourth still defines a curve."""
+"""Smallest number of readings for which every fourth reading still defines a curve."""
 _GROWS = 4.0
-"""Growth of the interpolation error at twice the step from which on it is not the noise of the readings."""
+"""Factor by which the interpolation error must grow at twice the step to be attributed to the interpolation and not to
+the noise of the readings.
+"""
 _SURELY = 1e3
-"""Interpolation error that no noise of readings reaches, in metres."""
+"""Interpolation error, in metres, above which it cannot be due to the noise of the readings."""
 _GAP = 5.0
 """Interval between readings, in median intervals, above which it is a gap without interpolation."""
 _UNIT_TOLERANCE = 1e-3
@@ -47,13 +49,13 @@ class PlatformTable:
     ----------
     epoch : str
         UTC, ISO 8601 ending in Z; all times are SI seconds from it, leap seconds counted.
-    orbit_time : (N,) ndarray
+    orbit_time : (N,) ndarray for N orbit readings
         Times of the orbit readings, seconds, increasing.
     position : (N, 3) ndarray
         Position of the body's origin in the ITRS, metres.
     velocity : (N, 3) ndarray or None
         Velocity relative to the rotating Earth in axes of the ITRS, m/s; None where it was not measured.
-    attitude_time : (M,) ndarray
+    attitude_time : (M,) ndarray for M attitude readings
         Times of the attitude readings, seconds, increasing.
     quaternion : (M, 4) ndarray
         x, y, z, w (scalar last) of unit length, neighbours on one side; rotates body axes into those of the ITRS,
@@ -203,7 +205,7 @@ class TabulatedTrajectory:
 
     @property
     def interpolation(self) -> Interpolation:
-        """Method by which positions are interpolated."""
+        """Name, for reports, of the method by which positions are interpolated: spline or Lagrange polynomial."""
         widest = float(np.max(np.diff(self.table.orbit_time)[~self._gaps(self.table.orbit_time)], initial=0.0))
         return "spline" if widest**4 * _FOURTH_DERIVATIVE / 384.0 <= _SPLINE_ERROR else "lagrange"
 
@@ -257,7 +259,7 @@ class TabulatedTrajectory:
         return CubicSpline(self.table.attitude_time, self.table.quaternion)
 
     def _joined(self, values: Array) -> Any:
-        """Return an interpolation of values (N, 3) at the orbit readings."""
+        """Return an interpolating function of values (N, 3) at the N orbit readings."""
         if self.interpolation == "spline":
             return CubicSpline(self.table.orbit_time, values)
         return _Lagrange(self.table.orbit_time, values)
@@ -301,13 +303,13 @@ class TabulatedTrajectory:
 
     @staticmethod
     def _gaps(time: Array) -> np.ndarray:
-        """Return which intervals between readings are gaps, (N - 1,) bool."""
+        """Return which intervals between N readings are gaps, (N - 1,) bool."""
         step = np.diff(time)
         return np.asarray(step > _GAP * np.median(step))
 
 
 class _Lagrange:
-    """Interpolation of values (N, K) at times (N,) by the polynomial through the readings around each time."""
+    """Interpolation of K quantities (N, K) at N times by the polynomial through the readings around each time."""
 
     def __init__(self, time: Array, values: Array) -> None:
         self._time, self._values = time, values
@@ -317,7 +319,7 @@ class _Lagrange:
         return self._evaluated(seconds, 0)
 
     def slope(self, seconds: Any) -> np.ndarray:
-        """Return the derivative, per second."""
+        """Return the derivatives of the interpolated quantities with respect to time, per second."""
         return self._evaluated(seconds, 1)
 
     def _evaluated(self, seconds: Any, order: int) -> np.ndarray:

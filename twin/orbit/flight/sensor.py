@@ -24,14 +24,14 @@ from twin.orbit.flight.line_camera import LineCamera, LineTimes
 _MOST_STEPS = 30
 """Largest number of Newton steps."""
 _ARRIVED = 1e-7
-"""Length of the last Newton step, in pixels and lines.
+"""Length of the last Newton step, in pixels and lines, below which the search ends.
 
-The steps shrink a thousandfold each, so the error that remains is far smaller.
+Each step is a thousandth of the one before, so the error that remains is far smaller.
 """
 
 
 class Platform(Protocol):
-    """Interface of a trajectory: Earth-fixed motion (ITRS axes) at times (N,) in seconds.
+    """Interface of a trajectory: Earth-fixed motion (ITRS axes) at N times in seconds.
 
     Each method raises ValueError for a time that the trajectory does not cover.
     """

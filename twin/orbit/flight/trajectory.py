@@ -5,7 +5,7 @@ angular momentum.
 
 Readings come at a fixed interval. Random errors are drawn for every reading of the span beforehand and interpolated by
 a cubic spline, as a user of the data would do: at a reading the error has the specified standard deviation, halfway
-between two it is somewhat smaller. Each term draws from its own random stream, so that leaving one out does not change
+between two it is somewhat smaller. Each error term has its own random stream, so that leaving one out does not change
 the others.
 
 Jitter is small fast rotations of the body about its own axes, specified by frequency. It is a sum of sinusoids and is
@@ -53,7 +53,7 @@ class Jitter:
 
     Attributes
     ----------
-    frequency : (K,) ndarray
+    frequency : (K,) ndarray for K sinusoids
         Frequencies, hertz.
     sine, cosine : (K, 3) ndarray
         Amplitudes as rotation vectors about body X, Y and Z, radians.
@@ -125,7 +125,7 @@ class Jitter:
         return replace(self, collection=collection)
 
     def exposures(self, collection: Collection, pixel: float, tolerance: float) -> list[tuple[float, Jitter]]:
-        """Return shares of the light of a collection, each with the jitter of its moment; the image is their mean.
+        """Return the parts of a light collection, each with the jitter of its moment; the image is their weighted mean.
 
         Parameters
         ----------
@@ -158,7 +158,7 @@ class Jitter:
         )
 
     def read(self, times: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """Return the jitter as readings at times (K,), interpolated by a cubic spline, show it.
+        """Return the jitter as seen in readings at K times that are interpolated by a cubic spline.
 
         Jitter faster than half of the readings' rate is aliased to a lower frequency.
         """
@@ -227,7 +227,8 @@ class Attitude:
     def body_to_itrs(self, position: np.ndarray, velocity: np.ndarray, inertial_velocity: np.ndarray) -> np.ndarray:
         """Return the axes of the body as columns, (..., 3, 3): x_itrs = matrix @ x_body.
 
-        The arguments are those of `orbital_to_itrs`.
+        Arguments are position (m), velocity relative to the rotating Earth and inertial velocity (m/s), all in axes of
+        the ITRS.
         """
         return self.orbital_to_itrs(position, velocity, inertial_velocity) @ rotation_matrix(self.offset)
 
@@ -368,7 +369,7 @@ def _draw_errors(
     def drawn(
         name: str, sigma: Sequence[float], interval: float, make: Callable[..., Series] = _noise, *more: float
     ) -> tuple[Series, ...]:
-        """Return the series of a term; none where it is off."""
+        """Return the series of an error term as a tuple, empty where the term is off."""
         if name not in terms or not any(sigma):
             return ()
         return (make(readings(first, last, interval), np.array(sigma), streams[name], *more),)
@@ -390,7 +391,7 @@ def _draw_errors(
 
 
 def _sum(series: tuple[Series, ...], seconds: np.ndarray) -> np.ndarray:
-    """Return the sum of series at times, (..., 3)."""
+    """Return the sum of several error series at times (...), in seconds, (..., 3)."""
     t = np.asarray(seconds, dtype=np.float64)
     return sum((term(t) for term in series), np.zeros((*t.shape, 3)))
 
@@ -411,7 +412,7 @@ class Trajectory:
         Errors of the measured orbit and attitude; None for the true trajectory.
     jitter : Series or None
         Departure of the body from the law: rotation vectors (..., 3) about the body's own axes at times (...), seconds;
-        None for none. Of a measured trajectory it is the jitter that the attitude readings show.
+        None without jitter. For a measured trajectory it is the jitter that the attitude readings show.
     """
 
     orbit: Orbit
@@ -477,7 +478,7 @@ class Trajectory:
     def with_errors(self, spec: ErrorsSpec, seed: int, terms: Sequence[str] = TERMS) -> Trajectory:
         """Return the trajectory as the satellite measures it.
 
-        Errors replace those that the trajectory may have, and jitter is what readings of the attitude show of it.
+        The new errors replace any that the trajectory has, and the jitter becomes the one that attitude readings show.
 
         Parameters
         ----------

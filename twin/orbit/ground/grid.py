@@ -50,7 +50,7 @@ class GroundFrame:
         return float(normal * np.cos(self.latitude)), float(meridian)
 
     def itrs(self, east: Any, north: Any, height: Any) -> np.ndarray:
-        """Return points in the ITRS: coordinates (...), metres -> (..., 3), metres."""
+        """Return the (..., 3) points in the ITRS, in metres, of coordinates (...), in metres."""
         return _EARTH.ecef(*self.geographic(east, north), height)
 
     def local(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -156,7 +156,7 @@ Beyond = Literal["mirror", "grid-wrap", "nothing"]
 
 @dataclass(frozen=True, eq=False)
 class SplineGrid:
-    """Cubic B-spline over a grid.
+    """Cubic B-spline over a regular grid of plane ground coordinates.
 
     Attributes
     ----------
@@ -167,7 +167,7 @@ class SplineGrid:
     first : tuple of float
         East and north of the first row's first column, metres.
     beyond : Beyond
-        Continuation outside: mirrored about the outer rows and columns, repeated, or none.
+        Continuation outside: mirrored about the outer rows and columns, repeated, or not defined there.
     """
 
     coefficients: np.ndarray
@@ -177,7 +177,7 @@ class SplineGrid:
 
     @property
     def reach(self) -> tuple[float, float, float, float]:
-        """West, east, south and north bound of its domain, metres, if it is not continued beyond the grid."""
+        """West, east, south and north bound of the domain of a spline that is not continued beyond its grid, in metres."""
         (rows, columns), (east, north) = self.coefficients.shape, self.first
         # A position needs one B-spline before its cell and two after.
         return (
@@ -205,7 +205,7 @@ class SplineGrid:
         )
 
     def on_grid(self, east: np.ndarray, north: np.ndarray, derivative: tuple[int, int] = (0, 0)) -> np.ndarray:
-        """Return values, or first derivatives, on a regular grid: east (E,) and north (N,), metres -> (N, E).
+        """Return values, or first derivatives, on a regular grid of N rows and E columns, (N, E).
 
         Parameters
         ----------
@@ -214,7 +214,7 @@ class SplineGrid:
         north : (N,) ndarray
             North of the rows, metres.
         derivative : tuple of int
-            Order of the derivative by east and by north, 0 or 1.
+            Order of the derivative with respect to east and to north, 0 or 1.
 
         Raises
         ------
@@ -266,7 +266,7 @@ class SplineGrid:
 
 
 _MOST_POSTS = 4096
-"""Largest number of posts along a side of a fractal; it repeats beyond."""
+"""Largest number of grid points along a side of a fractal terrain, which repeats beyond."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,7 +276,7 @@ class Terrain:
     Attributes
     ----------
     surface : SplineGrid
-        Cubic spline through the posts, defined everywhere, metres.
+        Cubic spline through the grid points, defined everywhere, metres.
     """
 
     surface: SplineGrid
@@ -309,9 +309,9 @@ class Terrain:
 
     @classmethod
     def through(cls, posts: np.ndarray, spacing: tuple[float, float], first: tuple[float, float]) -> Terrain:
-        """Return a spline through posts (rows to the north, columns to the east), mirrored beyond them.
+        """Return a spline through a grid of heights (rows to the north, columns to the east), mirrored beyond it.
 
-        Spacing and position of the first post are in metres, as in `SplineGrid`.
+        Heights, spacing (east, north) and position of the first grid point (east, north) are in metres.
         """
         posts = np.asarray(posts, dtype=np.float64)
         return cls(SplineGrid(spline_filter(posts, order=3, mode="mirror"), spacing, first, "mirror"))
@@ -321,7 +321,7 @@ class Terrain:
         """Return the elevation model of the Jacksboro fault that matplotlib ships, shifted by the offset.
 
         Its middle lies at minus the offset. Its heights, above the geoid there, are taken as heights about their mean;
-        its posts, 3 arc seconds, keep their distance in metres.
+        its grid points, 3 arc seconds apart, keep their distance in metres.
         """
         posts, spacing = _jacksboro()
         about = posts - posts.mean()
@@ -347,23 +347,23 @@ class Terrain:
         return self.surface(east, north)
 
     def on_grid(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
-        """Return heights on a regular grid: (E,), (N,) -> (N, E), in metres."""
+        """Return heights on a regular grid of N rows (north) and E columns (east), (N, E), in metres."""
         return self.surface.on_grid(east, north)
 
     def slopes(self, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return exact slopes toward east and toward north on a regular grid, (N, E) each."""
+        """Return exact slopes toward east and toward north on a regular grid, (N, E) each, in metres per metre."""
         return self.surface.on_grid(east, north, (1, 0)), self.surface.on_grid(east, north, (0, 1))
 
     @cached_property
     def limits(self) -> tuple[float, float]:
-        """Bounds of its heights, metres."""
+        """Lower and upper bound of the terrain's heights, in metres."""
         # A B-spline lies between its coefficients.
         return float(self.surface.coefficients.min()), float(self.surface.coefficients.max())
 
 
 @cache
 def _jacksboro() -> tuple[np.ndarray, tuple[float, float]]:
-    """Return heights (rows to the north), in metres, and the posts' distance east and north, in metres."""
+    """Return heights (rows to the north), in metres, and the distance of grid points east and north, in metres."""
     # Locate the data without importing matplotlib, which is only needed for figures.
     package = find_spec("matplotlib")
     assert package is not None

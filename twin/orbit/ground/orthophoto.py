@@ -1,4 +1,4 @@
-"""Simulated ground and its control: reflectance, orthophoto of another date, reference elevation model.
+"""Simulated ground and its control data: reflectance, orthophoto of another date, reference elevation model.
 
 Orthophoto and elevation model carry the same error in plan, a constant shift and a smooth part: the ground shown at a
 position of the map lies at that position minus the error.
@@ -33,9 +33,9 @@ Images of land have power spectra near frequency^-2 to frequency^-3 (Burton and 
 natural scenes in general).
 """
 _WILD = 2.5
-"""Longest wavelength of wild vegetation, in fields."""
+"""Longest wavelength of wild vegetation, in units of the mean side of a field."""
 _BLOCK = 8.0
-"""Side of a block of fields of one direction, in fields."""
+"""Side of a block of fields of one direction, in units of the mean side of a field."""
 _LANE = 0.97
 """Share of a field's side between the lanes that separate fields."""
 _ROAD_WIDTH = 8.0
@@ -189,7 +189,9 @@ def _fields(
 
 
 def _split(half: float, size: float, random: np.random.Generator) -> Iterator[tuple[float, float, float, float]]:
-    """Yield rectangles about the origin (west, east, south, north), of mean area size^2, that fill a square."""
+    """Yield rectangles about the origin (west, east, south, north), of mean area `size`^2, that fill a square of half
+    side `half`.
+    """
     waiting = [(-half, half, -half, half)]
     while waiting:
         west, east, south, north = waiting.pop()
@@ -209,7 +211,7 @@ def _split(half: float, size: float, random: np.random.Generator) -> Iterator[tu
 def _draw_roads(
     level: np.ndarray, extent: Extent, spec: TextureSpec, first: tuple[float, float], seed: np.random.SeedSequence
 ) -> None:
-    """Draw wandering lines across the whole ground, one in each `roads` metres, in both directions."""
+    """Draw wandering lines across the whole ground, one per `roads` metres (key of the texture), in both directions."""
     random = np.random.default_rng(seed)
     value = float(min(_ROAD_BRIGHTNESS * spec.mean, _BRIGHTEST))
     step = 0.1 * spec.roads
@@ -235,7 +237,7 @@ SCALE = 10_000.0
 _PER_LENGTH = 8.0
 """Number of cells of the smooth error in plan in its correlation length."""
 _ROWS_AT_ONCE = 256
-"""Number of rows of control sampled at a time, to bound memory."""
+"""Number of rows of a map sampled at a time, to bound memory."""
 _MARGIN = 50.0
 """Margin of the smooth error's grid about the true ground, in metres."""
 
@@ -245,7 +247,7 @@ class Map(Protocol):
 
     @property
     def values(self) -> np.ndarray:
-        """Values, (rows, columns)."""
+        """Values of the raster: grey values or heights in metres, (rows, columns)."""
 
     @property
     def valid(self) -> np.ndarray | None:
@@ -256,10 +258,10 @@ class Map(Protocol):
         """Distance of rows and columns on the ground, metres."""
 
     def east_north(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return east and north, in metres, at real-valued (row, column), broadcast."""
+        """Return east and north, in metres, at real-valued rows and columns, which are broadcast together."""
 
     def row_column(self, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return real-valued row and column of coordinates, in metres, broadcast: the inverse of `east_north`."""
+        """Return the real-valued row and column of coordinates east and north, in metres, which are broadcast."""
 
 
 M = TypeVar("M", bound=Map, covariant=True)
@@ -267,13 +269,13 @@ M = TypeVar("M", bound=Map, covariant=True)
 
 @dataclass(frozen=True, eq=False)
 class Maps(Generic[M]):
-    """Control of a piece of ground: orthophoto and elevation model.
+    """Control data of a patch of ground: orthophoto and elevation model.
 
     Attributes
     ----------
-    orthophoto : M
+    orthophoto : Map
         Grey values; of a simulated one uint16, 10 000 for an apparent reflectance of 1.
-    dem : M
+    dem : Map
         Heights above the ellipsoid, metres.
     """
 
@@ -288,7 +290,7 @@ class Raster:
     Attributes
     ----------
     values : (rows, columns) ndarray
-        Values; rows go to the south, columns to the east.
+        Grey values or heights in metres; rows go to the south, columns to the east.
     frame : GroundFrame
         Plane coordinates in which the grid is regular; gives exact longitude and latitude.
     west, north : float
@@ -308,11 +310,11 @@ class Raster:
         """None: every value is valid."""
 
     def east_north(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return east and north, in metres, at real-valued (row, column), broadcast."""
+        """Return east and north, in metres, at real-valued rows and columns, which are broadcast together."""
         return self.west + self.spacing * np.asarray(column), self.north - self.spacing * np.asarray(row)
 
     def row_column(self, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return row and column of coordinates: the inverse of `east_north`."""
+        """Return the real-valued row and column of coordinates east and north, in metres, which are broadcast."""
         return (self.north - np.asarray(north)) / self.spacing, (np.asarray(east) - self.west) / self.spacing
 
 
@@ -323,9 +325,9 @@ class Control(Maps[Raster]):
     Attributes
     ----------
     shift : tuple of float
-        Constant error in plan, map minus true, east and north, metres; belongs to the truth.
+        Constant error in plan, map minus true, east and north, metres; not known to the user.
     smooth : tuple of SplineGrid
-        Smooth error in plan, east and north, metres, over true coordinates; belongs to the truth.
+        Smooth error in plan, east and north, metres, over true coordinates; not known to the user.
     """
 
     shift: tuple[float, float]
@@ -393,7 +395,7 @@ def make_control(
 
 
 def _plan_error(extent: Extent, spec: ControlSpec, seed: np.random.SeedSequence) -> tuple[SplineGrid, SplineGrid]:
-    """Draw the smooth error in plan, east and north."""
+    """Draw the smooth error in plan of the maps, as splines of its east and north component, in metres."""
     spacing = spec.correlation / _PER_LENGTH
     east, north = extent.grown(_MARGIN).axes(spacing, 3)
     grids = []

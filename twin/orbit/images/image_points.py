@@ -39,7 +39,7 @@ UNMODELLED_SIGMA = 0.1
 """Standard deviation, in pixels, added to the matching's own for errors that no fit shows.
 
 Such errors are another season's light (RMS of matches 0.11 px where 0.06 is predicted) and the attitude between its
-readings. A tie point has it in the frame it was chosen in.
+readings. A tie point has this sigma alone in the frame in which it was chosen.
 """
 
 
@@ -71,7 +71,7 @@ class LineFrame:
 
 @dataclass(frozen=True, eq=False)
 class ImagedGround:
-    """Piece of ground with its images and control.
+    """Patch of ground with its images and control data.
 
     Attributes
     ----------
@@ -99,18 +99,19 @@ _STEP = 50.0
 _FOLLOWED = 8
 """Number of iterations of the height.
 
-Each makes the error smaller by the terrain's slope times the look's, 0.2 or less.
+Each reduces the error by a factor of 0.2 or less: the terrain's slope times the tangent of the look's angle from the
+vertical.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceHeights:
-    """Heights of a reference elevation model, a cubic spline through its posts.
+    """Heights of a reference elevation model, a cubic spline through its grid points.
 
     Attributes
     ----------
     raster : Map
-        Raster of the posts.
+        Raster of the grid points' heights.
     coefficients : ndarray
         Coefficients of the spline.
     """
@@ -120,7 +121,7 @@ class ReferenceHeights:
 
     @classmethod
     def of(cls, dem: Map) -> ReferenceHeights:
-        """Interpolate a raster of heights, in metres; missing posts are replaced by the nearest ones."""
+        """Interpolate a raster of heights, in metres; missing grid points are replaced by the nearest ones."""
         values = dem.values.astype(np.float64)
         if dem.valid is not None and not dem.valid.all():
             nearest = distance_transform_edt(~dem.valid, return_distances=False, return_indices=True)
@@ -128,7 +129,9 @@ class ReferenceHeights:
         return cls(dem, spline_filter(values, order=3, mode="mirror"))
 
     def __call__(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
-        """Return heights at positions, in metres; NaN beyond the posts, and where one of the next four is missing."""
+        """Return heights at positions, in metres; NaN outside the grid, and where one of the four neighbours is
+        missing.
+        """
         place = np.stack(self.raster.row_column(east, north))
         height = map_coordinates(self.coefficients, place, order=3, mode="mirror", prefilter=False)
         last = np.array(self.coefficients.shape).reshape(2, *(1,) * (place.ndim - 1)) - 1
@@ -142,19 +145,19 @@ class ReferenceHeights:
 
     @property
     def mean(self) -> float:
-        """Mean height of all posts, metres."""
+        """Mean height of all grid points, metres."""
         valid = self.raster.valid
         return float(np.mean(self.raster.values if valid is None else self.raster.values[valid]))
 
 
 def predicted(image: LineFrame, points: np.ndarray) -> np.ndarray:
-    """Return row and column (n, 2) in the frame of ITRS points (n, 3) by the measured sensor; NaN outside."""
+    """Return row and column in the frame, (n, 2), of n ITRS points according to the measured sensor; NaN outside."""
     line, pixel = image.measured.image(points)
     return np.stack([line - image.window.first_line, pixel - image.window.first_pixel], axis=-1)
 
 
 def in_frame(image: LineFrame, place: np.ndarray, border: float) -> np.ndarray:
-    """Return which positions (..., 2) lie in a frame at least `border` pixels from its border; False for NaN."""
+    """Return a mask of positions (..., 2) that lie at least `border` pixels inside a frame's edge; False for NaN."""
     last = np.array(image.frame.shape) - 1.0 - border
     return np.asarray(np.all((place >= border) & (place <= last), axis=-1))
 
@@ -162,7 +165,7 @@ def in_frame(image: LineFrame, place: np.ndarray, border: float) -> np.ndarray:
 def _ground_of_samples(
     image: LineFrame, frame: GroundFrame, heights: ReferenceHeights, points: np.ndarray, place: np.ndarray, side: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return east, north and height, (n, side, side) each, in metres, of the ground under the templates' pixels.
+    """Return east, north and height, in metres, of the ground under n templates' pixels, (n, side, side) each.
 
     Parameters
     ----------
@@ -203,12 +206,12 @@ def _ground_of_samples(
 
 
 def _templates_of_map(photo: Map, samples: tuple[np.ndarray, np.ndarray, np.ndarray], sample: float) -> np.ndarray:
-    """Return templates (n, k, k) from an orthophoto.
+    """Return n templates of k x k pixels, (n, k, k), sampled from an orthophoto.
 
     Parameters
     ----------
     photo : Map
-        The orthophoto.
+        Orthophoto from which they are sampled.
     samples : tuple of ndarray
         Ground of the templates' pixels from `_ground_of_samples`.
     sample : float
@@ -225,12 +228,12 @@ def _templates_of_image(
     points: np.ndarray,
     place: np.ndarray,
 ) -> np.ndarray:
-    """Return templates (n, k, k) from another image.
+    """Return n templates of k x k pixels, (n, k, k), sampled from another line's image.
 
     Parameters
     ----------
     source : LineFrame
-        The other image.
+        Image from which they are sampled.
     frame : GroundFrame
         Coordinates of the ground.
     samples : tuple of ndarray
@@ -254,13 +257,13 @@ def _templates_of_image(
 CONSENSUS = 100
 """Status of a match that its neighbours contradict; others are codes of `analysis.matching.correlation.Reason`."""
 SOURCE = 101
-"""Status of a tie point in the frame it was chosen in, where its position is its definition."""
+"""Status of a tie point in the frame in which it was chosen, where its position is its definition."""
 _MASK = 16
 """Grid step, in pixels of an orthophoto, of the test that every line sees a point."""
 _GROUND_TURNS = 12
 """Number of iterations of a look's ground point."""
 _RISE = 10.0
-"""Height difference over which the displacement by height is taken as linear, in metres."""
+"""Height difference over which the displacement due to height is taken as linear, in metres."""
 Kind = Literal["map", "tie"]
 
 
@@ -269,7 +272,7 @@ POINTS_REMEDY = "a larger patch, a smaller reach or template, or more points"
 
 
 class PointsError(PhysicalError, ValueError):
-    """Error of points that cannot be measured."""
+    """Error raised when the points of a patch cannot be measured in its images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,7 +281,7 @@ class MatchedLine:
 
     Attributes
     ----------
-    predicted : (n, 2) ndarray
+    predicted : (n, 2) ndarray for n points
         Row and column in the frame of the points by the measured sensor.
     place : (n, 2) ndarray
         Row and column measured; NaN where matching gave none.
@@ -295,7 +298,7 @@ class MatchedLine:
     text : str
         Result of the consensus in words.
     displacement_field : DisplacementField or None
-        Smooth displacement from predicted to measured; None in the frame that ties were chosen in.
+        Smooth displacement from predicted to measured; None in the frame in which tie points were chosen.
     """
 
     predicted: np.ndarray
@@ -368,7 +371,8 @@ class MatchedPoints:
     kind : Kind
         "map" for points of the orthophoto, "tie" for tie points.
     east, north, height : (n,) ndarray
-        Coordinates of the map, metres; of ties where the nadir line's measured sensor meets the reference heights.
+        Coordinates in the map, metres; for tie points, where the nadir line's measured sensor meets the reference
+        heights.
     ground : (n, 3) ndarray
         The same points in the ITRS, metres.
     check : (n,) ndarray of bool
@@ -387,7 +391,7 @@ class MatchedPoints:
 
     @property
     def source(self) -> str | None:
-        """Name of the line whose frame ties were chosen in; None for points of the map."""
+        """Name of the line in whose frame tie points were chosen; None for points of the map."""
         return next((name for name, line in self.lines.items() if line.displacement_field is None), None)
 
     @property
@@ -403,7 +407,7 @@ class MatchedPoints:
 
 @dataclass(frozen=True, eq=False)
 class PatchPoints:
-    """All points measured in a patch; None for kinds that were not requested."""
+    """Control, check and tie points measured in a patch; None for kinds that were not requested."""
 
     control: MatchedPoints | None
     ties: MatchedPoints | None
@@ -485,7 +489,8 @@ def tie_points(
     Raises
     ------
     PointsError
-        The conditions of `map_points`.
+        A frame is too small for template and search range, nothing distinct is seen by every line, or there are too few
+        matches.
     """
     border = spec.template // 2 + spec.reach
     _require_room(patch, spec)
@@ -591,7 +596,7 @@ def _ground_of_looks(
 
 
 def _rise(patch: ImagedGround, image: LineFrame, ground: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return the image displacement by a metre of height, (n, 2), in lines and pixels."""
+    """Return the image displacement of n points for a metre of height, (n, 2), in lines and pixels."""
     east, north, height = patch.frame.local(ground)
     return (predicted(image, patch.frame.itrs(east, north, height + _RISE)) - at) / _RISE
 
@@ -642,7 +647,9 @@ def _matched(
 
 
 def _degree(count: int) -> int | None:
-    """Return the degree of the smooth displacement for a number of matches, four for each term; None for too few."""
+    """Return the degree of the smooth displacement for a number of matches, with at least four matches for each term;
+    None for too few matches.
+    """
     for degree, terms in ((2, 7), (1, 4), (0, 2)):
         if count >= 4 * terms:
             return degree

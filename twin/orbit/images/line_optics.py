@@ -2,8 +2,8 @@
 
 Frequencies are in cycles per pixel along the line and in cycles per line along the track. While the image of a point
 crosses the line it moves by `advance` pixels from one line to the next, less than one where the lens looks obliquely,
-and by `drift` pixels along it. With the focal plane's transfer function T(fx, fy) (cycles/m along the line and along
-the track) an image sampled at lines and pixels thus has
+and by `drift` pixels along it. With the pixel pitch p and the focal plane's transfer function T(fx, fy) (cycles/m along
+the line and along the track) an image sampled at lines and pixels thus has
 
     H(pixel, line) = T(pixel/p, -(line + drift pixel)/(advance p)) x smear(line).
 
@@ -94,8 +94,8 @@ class ImageMotion:
     def of(cls, sensor: Sensor, line: float, pixel: float, height: float) -> ImageMotion:
         """Return the motion at a position of an image, for ground of a height in metres.
 
-        It is the change of direction of one ground point from before to after its line. Light effects shift both alike
-        and change nothing at 1e-5.
+        It is the change of direction of one ground point from before to after its line. Effects on the light shift both
+        alike and change the motion by less than 1e-5 of it.
         """
         camera, step = sensor.camera, min(1.0, 0.5 * sensor.lines - 0.5)
         middle = float(np.clip(line, step - 0.5, sensor.lines - 0.5 - step))
