@@ -5,7 +5,7 @@ import importlib
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -82,3 +82,25 @@ def test_the_page_of_the_library_runs(name: str, capsys: pytest.CaptureFixture[s
         out = capsys.readouterr().out
         if printed:
             assert out == printed
+
+
+M1 = {"radius": -4.0, "thickness": -2.0, "material": "mirror", "diameter": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: optics.Camera([], 550e-9), "at least one OpticalSurface"),
+        (lambda: optics.Camera(optics.OpticalSurface(**M1), 550e-9), "at least one OpticalSurface"),
+        (lambda: optics.Camera([optics.OpticalSurface(**M1)], 550), "1e-9 to 1e-2, in metres"),
+        (lambda: optics.OpticalSurface(**M1, figure={0: 1e-9}), "Noll index 0 is outside"),
+        (lambda: optics.OpticalSurface(**M1, figure={2.5: 1e-9}), "Noll index 2.5 is outside"),
+        (lambda: optics.OpticalSurface(**M1, figure={4: float("nan")}), "term 4 must be finite"),
+        (lambda: optics.OpticalSurface(**M1, vanes=[0.008, 0.0]), "pairs of a width"),
+        (lambda: optics.noll_to_nm(2.5), "Noll index 2.5 is outside"),
+    ],
+)
+def test_numbers_that_make_no_camera_are_refused(call: Callable[[], object], words: str) -> None:
+    """In nanometres for metres, a flat list for pairs: each would silently give another camera."""
+    with pytest.raises(ValueError, match=words):
+        call()

@@ -95,6 +95,9 @@ def test_terms_of_a_map_are_those_of_poppy() -> None:
         (lambda: analysis.proportion_interval(4, 3, 0.9), "successes <= trials"),
         (lambda: analysis.robust_sigma([]), "at least one"),
         (lambda: analysis.nm_to_noll(2, 1), "n - m even"),
+        (lambda: analysis.chauvenet([]), "at least one"),
+        (lambda: analysis.fit_interior_orientation([-0.1, 0, 0.1], [-0.1, 0, 0.1], 1e-6, ["principal_distance"]).value("f"),
+         "the terms are constant, principal_distance"),
     ],
 )  # fmt: skip
 def test_input_that_cannot_be_used_is_refused(call, said: str) -> None:

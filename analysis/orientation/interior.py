@@ -493,12 +493,19 @@ class InteriorOrientation:
 
     def value(self, term: str) -> float:
         """Return the value of a term, in metres; zero for a term that was not fitted."""
-        return float(self.values[self.terms.index(term)]) if term in self.terms else 0.0
+        k = self._column(term)
+        return 0.0 if k is None else float(self.values[k])
 
     def sigma(self, term: str) -> float:
         """Return the standard deviation of a term, in metres; zero for a term that was not fitted."""
-        k = self.terms.index(term) if term in self.terms else None
+        k = self._column(term)
         return 0.0 if k is None else float(np.sqrt(self.covariance[k, k]))
+
+    def _column(self, term: str) -> int | None:
+        """Return the column of a term; None for one that was not fitted, ValueError for one that does not exist."""
+        if term not in TERMS:
+            raise ValueError(f"unknown term {term!r}; the terms are {', '.join(TERMS)}")
+        return self.terms.index(term) if term in self.terms else None
 
     @property
     def correlation(self) -> Array:

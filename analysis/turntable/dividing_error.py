@@ -497,8 +497,8 @@ def chauvenet(readings: ArrayLike, present: NDArray[np.bool_] | None = None) -> 
     [True, True, True, True, True, False]
     """
     x = np.asarray(readings, np.float64)
-    if not np.all(np.isfinite(x)):
-        raise ValueError("Chauvenet's criterion: readings must be finite; exclude failed readings")
+    if not x.size or not np.all(np.isfinite(x)):
+        raise ValueError("Chauvenet's criterion: readings must be finite, and at least one; exclude failed readings")
     keep = np.ones(x.shape, bool) if present is None else np.array(present, bool)
     x = np.where(keep, x, 0.0)
     count = keep.sum(-1, keepdims=True)

@@ -19,6 +19,7 @@ from optics.geometry.aperture import Circle, Edge, Ray
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.surface import Surface, ZernikeFigure, plane
 from optics.geometry.tree import Body, RigidTree
+from optics.geometry.zernike import noll_to_nm
 from optics.materials.glass import refractive_index
 from optics.numerics.array_math import UnphysicalError, determinant
 from optics.numerics.backend import default_backend
@@ -33,7 +34,7 @@ MIRROR = "mirror"
 _IMAGE = "image"
 
 _AFOCAL = 1000.0
-"""Focal length over the length of the camera from which on it has no focus."""
+"""Ratio of focal length to length of the camera above which the camera counts as afocal (without a focus)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +101,7 @@ class OpticalSurface:
     tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
+        """Check that every number is within its allowed range; raise ValueError otherwise."""
         if not abs(self.radius) > 0.0:
             raise ValueError(f"radius must not be 0 or NaN (a plane has math.inf), got {self.radius}")
         numbers = self.thickness, self.conic, *self.asphere, *self.offset, *self.decenter, *self.tilt
@@ -110,17 +111,31 @@ class OpticalSurface:
             raise ValueError(f"0 <= inner_diameter < diameter is needed, got {self.inner_diameter} and {self.diameter}")
         if not isinstance(self.material, str) and not 1.0 <= self.material < inf:
             raise ValueError(f"a refractive index must be at least 1, got {self.material}")
+        for term, amount in self.figure.items():
+            noll_to_nm(term)
+            if not isfinite(amount):
+                raise ValueError(f"figure: the amount of term {term} must be finite, in metres, got {amount}")
+        if any(np.shape(vane) != (2,) for vane in self.vanes):
+            raise ValueError(f"vanes must be pairs of a width, in metres, and an angle, in radians, got {self.vanes}")
         if self.figure and not isfinite(self.diameter):
             raise ValueError("a figure needs a finite diameter: its Zernike terms are over that disk")
 
     @property
     def shape(self) -> Surface:
-        """Shape of the surface in its own frame."""
+        """Ideal shape and figure error of the surface, in its own frame (origin at the vertex)."""
         figure = ZernikeFigure(0.5 * self.diameter, self.offset, self.figure) if self.figure else None
         return Surface(1.0 / self.radius, self.conic, tuple(self.asphere), figure)
 
     def edges(self, rim: bool = True, hole: bool = True) -> tuple[Edge, ...]:
-        """Return what stops light at the surface, with its rim and hole or without."""
+        """Return the edges that stop light at the surface: rim, central hole and spider vanes.
+
+        Parameters
+        ----------
+        rim : bool
+            Include the rim of the clear aperture.
+        hole : bool
+            Include the central hole or obscuration.
+        """
         out = [Edge(Circle(0.5 * self.diameter, self.offset))] if rim and isfinite(self.diameter) else []
         if hole and self.inner_diameter:
             out.append(Edge(Circle(0.5 * self.inner_diameter, self.offset), blocks=True))
@@ -178,13 +193,15 @@ class Camera:
 
     def __post_init__(self) -> None:
         """Check that the stop and all glasses are known."""
+        if not isinstance(self.surfaces, Sequence) or not len(self.surfaces):
+            raise ValueError("surfaces must be a sequence of at least one OpticalSurface")
         object.__setattr__(self, "surfaces", tuple(self.surfaces))
         if not 0 <= self.stop < len(self.surfaces):
             raise ValueError(f"stop must be the index of one of the {len(self.surfaces)} surfaces, got {self.stop}")
         if not isfinite(self.surfaces[self.stop].diameter):
             raise ValueError(f"the stop, surface {self.stop}, needs a finite diameter")
-        if not 0.0 < self.wavelength < inf:
-            raise ValueError(f"wavelength must be positive, in metres, got {self.wavelength}")
+        if not 1e-9 <= self.wavelength <= 1e-2:
+            raise ValueError(f"wavelength must be 1e-9 to 1e-2, in metres, got {self.wavelength}")
         if self.medium not in ("vacuum", "air"):
             raise ValueError(f"medium must be 'vacuum' or 'air', got {self.medium!r}")
         ahead = 1.0
@@ -211,17 +228,17 @@ class Camera:
 
     @cached_property
     def vertices(self) -> np.ndarray:
-        """Places of the surfaces' vertices and, last, of the image plane along z, metres, (K + 1,)."""
+        """Positions along z of the vertices of the K surfaces and, last, of the image plane, (K + 1,), metres."""
         return np.cumsum([0.0, *(surface.thickness for surface in self.surfaces)])
 
     @property
     def image_pose(self) -> Pose:
-        """Frame of the image plane in that of the camera."""
+        """Position and orientation of the image plane in the camera's frame."""
         return Pose(rotation_matrix(self.image_tilt), np.array([0.0, 0.0, self.vertices[-1]]))
 
     @cached_property
     def assembly(self) -> Assembly:
-        """Camera as the ray trace takes it."""
+        """Camera as an assembly of bodies and optical elements, the form in which rays are traced."""
         bodies, elements, before = [Body(_IMAGE, self.image_pose)], {}, 1.0
         for k, (surface, z, index) in enumerate(zip(self.surfaces, self.vertices[:-1], self.indices, strict=True)):
             name, bends = f"s{k}", Interaction.PASS if index == before else Interaction.REFRACT
@@ -234,7 +251,7 @@ class Camera:
 
     @cached_property
     def systems(self) -> tuple[SystemBatch, SystemBatch]:
-        """Camera to the image plane, and as far as the stop."""
+        """Two systems to trace: all surfaces and the image plane; and the surfaces as far as the aperture stop."""
         names = self.assembly.sequences[_IMAGE]
         return assemble(self.assembly, [names]), assemble(self.assembly, [names[: self.stop + 1]])
 
@@ -250,7 +267,15 @@ class Camera:
         return np.array([0.0, 0.0, -self.surfaces[self.stop].diameter])
 
     def matrix(self, position: np.ndarray, direction: np.ndarray) -> RayMatrix:
-        """Return the derivatives of a ray (position and direction (3,)) on the image plane by its launch."""
+        """Return the derivatives of a ray on the image plane with respect to its launch point and launch direction.
+
+        Parameters
+        ----------
+        position : (3,) ndarray
+            Launch point, metres.
+        direction : (3,) ndarray
+            Launch direction, a unit vector.
+        """
         axes = transverse_axes(direction[None], np.eye(3)[:1])
         return ray_matrix(default_backend(), self.systems[0], self.stop, position[None], direction[None], axes)
 
@@ -260,7 +285,8 @@ class Camera:
 
     @cached_property
     def paraxial(self) -> Paraxial:
-        """Paraxial focal lengths and pupils about the axis, in metres."""
+        """Focal lengths, and positions and magnification of the pupils, for rays close to the axis; lengths in metres.
+        """
         return paraxial(self._axial, -float(self.launch[2]), abs(self.surfaces[-1].thickness))
 
     @property

@@ -12,7 +12,7 @@ import numpy as np
 MAX_NOLL = 66
 """Highest supported Noll index (all terms to radial order 10); beyond it monomials lose digits."""
 RANK_TOLERANCE = 1e-6
-"""Relative size below which combinations of terms on an aperture are excluded from fits over it."""
+"""Relative size (singular value over the largest) below which combinations of Zernike terms are left out of a fit."""
 
 
 def noll_to_nm(index: int) -> tuple[int, int]:
@@ -45,7 +45,7 @@ def noll_to_nm(index: int) -> tuple[int, int]:
     ...
     ValueError: Noll index 0 is outside 1..66
     """
-    if not 1 <= index <= MAX_NOLL:
+    if index != int(index) or not 1 <= index <= MAX_NOLL:
         raise ValueError(f"Noll index {index} is outside 1..{MAX_NOLL}")
     n = 0
     first = 1
@@ -100,7 +100,7 @@ def name(index: int) -> str:
 
 @cache
 def cartesian_terms(index: int) -> tuple[tuple[int, int, float], ...]:
-    """Return the terms (a, b, c) of Z_j(x, y) = sum c x^a y^b on the unit disk."""
+    """Return the Zernike polynomial of a Noll index as terms (a, b, c): the sum of c x^a y^b on the unit disk."""
     n, signed = noll_to_nm(index)
     m = abs(signed)
     norm = sqrt(n + 1) * (sqrt(2) if m else 1.0)
@@ -175,7 +175,7 @@ def gradient_basis(last: int, x: Any, y: Any, axis: int) -> np.ndarray:
     x, y : (N,) array_like
         Unit-disk coordinates.
     axis : int
-        0 for the derivative by x, 1 by y.
+        0 for the derivative with respect to x, 1 for y.
     """
     columns = []
     for j in range(1, last + 1):
@@ -223,12 +223,12 @@ def fit(last: int, x: Any, y: Any, values: Any, weights: Any | None = None) -> n
 
 
 def triangle_size(order: int) -> int:
-    """Return the number of monomials x^a y^b with a + b <= order."""
+    """Return the number of monomials x^a y^b of degree a + b <= order."""
     return (order + 1) * (order + 2) // 2
 
 
 def triangle_order(size: int) -> int:
-    """Return the order that has ``size`` monomials, the inverse of ``triangle_size``."""
+    """Return the degree up to which there are ``size`` monomials x^a y^b, the inverse of ``triangle_size``."""
     order = (isqrt(8 * size + 1) - 3) // 2
     if triangle_size(order) != size:
         raise ValueError(f"{size} is not the number of monomials up to any order")
@@ -236,13 +236,13 @@ def triangle_order(size: int) -> int:
 
 
 def triangle_index(a: int, b: int) -> int:
-    """Return the index of x^a y^b in the list ordered by total degree."""
+    """Return the index of the monomial x^a y^b in a list ordered by total degree a + b."""
     d = a + b
     return d * (d + 1) // 2 + b
 
 
 def triangle_polynomial(x: Any, y: Any, coefficients: Sequence[Any], order: int) -> tuple[Any, Any, Any]:
-    """Return the sum of c_ab x^a y^b with a + b <= order, and its two slopes, by nested Horner schemes.
+    """Return a polynomial, the sum of c_ab x^a y^b with a + b <= order, and its derivatives with respect to x and y.
 
     Parameters
     ----------
@@ -256,7 +256,7 @@ def triangle_polynomial(x: Any, y: Any, coefficients: Sequence[Any], order: int)
     Returns
     -------
     tuple
-        Height, metres, and its derivatives by x and y.
+        Height, metres, and its derivatives with respect to x and y.
     """
     height: Any = 0.0 * x
     slope_x: Any = 0.0 * x
@@ -274,12 +274,12 @@ def triangle_polynomial(x: Any, y: Any, coefficients: Sequence[Any], order: int)
 
 
 def monomials(coefficients: Mapping[int, Any], order: int, radius: float) -> np.ndarray:
-    """Return the coefficients of x^a y^b (metres from the centre) of sum a_j Z_j(x/radius, y/radius).
+    """Return a sum of Zernike polynomials, a_j Z_j(x/radius, y/radius), as coefficients of x^a y^b.
 
     Parameters
     ----------
     coefficients : mapping of int to number
-        Noll index j -> a_j, metres rms; may be complex.
+        Noll index j -> amplitude a_j, metres rms; may be complex.
     order : int
         Highest degree a + b, at least that of the terms.
     radius : float
@@ -288,7 +288,7 @@ def monomials(coefficients: Mapping[int, Any], order: int, radius: float) -> np.
     Returns
     -------
     (triangle_size(order),) ndarray
-        Coefficients ordered by ``triangle_index``.
+        Coefficients ordered by ``triangle_index``, for x and y in metres from the centre.
     """
     out = np.zeros(triangle_size(order), np.result_type(float, *coefficients.values()))
     for j, amplitude in coefficients.items():
@@ -299,7 +299,9 @@ def monomials(coefficients: Mapping[int, Any], order: int, radius: float) -> np.
 
 @lru_cache(maxsize=256)
 def unit_monomials(last: int, order: int, radius: float) -> np.ndarray:
-    """Return ``monomials`` of each of Z_1..Z_last with amplitude 1; terms beyond the order are 0.
+    """Return the coefficients of x^a y^b of each Zernike polynomial Z_1..Z_last with amplitude 1.
+
+    Terms of a degree beyond ``order`` are 0.
 
     Parameters
     ----------
@@ -324,7 +326,7 @@ def unit_monomials(last: int, order: int, radius: float) -> np.ndarray:
 
 
 def order_of(indices: Any) -> int:
-    """Return the highest radial order among Noll indices; -1 for none."""
+    """Return the highest radial order among Noll indices; -1 if there are none."""
     # the radial order never decreases with the Noll index
     last = max(indices, default=0)
     return noll_to_nm(last)[0] if last else -1
