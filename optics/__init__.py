@@ -118,10 +118,10 @@ _PLACES = {
     "waves.diffraction": ("airy",),
     "waves.sampled_psf": ("annular_mtf", "encircled_energy", "mtf_from_psf"),
 }
-"""Module -> its public names."""
+"""Name of a module below ``optics`` -> the public names that are imported from it."""
 
 _CALLED = {"fit_zernikes": "fit", "zernike_name": "name", "pupil_quadrature": "disk", "glass": "find_glass"}
-"""Public name -> the name in its module, where that is short within its room."""
+"""Public name of the package -> the name of the same function in its own module, where the two differ."""
 
 
 def __getattr__(name: str) -> Any:

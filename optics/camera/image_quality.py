@@ -35,7 +35,10 @@ from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import DEGREE, VIGNETTED_RINGS, PupilFunction, fit_pupils
 
 _STATISTICS_PHASE = 36.0
-"""Phase for which twelve rings of nodes are taken, radians: enough for squares of smooth wavefronts."""
+"""Phase from the middle to the rim of the stop, radians, that sets the number of quadrature nodes for rms values.
+
+It gives twelve rings of nodes, enough to integrate the square of a smooth wavefront error.
+"""
 
 
 Spectrum = Mapping[float, float]
@@ -79,7 +82,11 @@ class Wavefront:
 
 
 def _chief(camera: Camera, field: Field) -> tuple[np.ndarray, float]:
-    """Return where the chief ray meets the image plane, metres, and how far upstream the exit pupil lies, metres."""
+    """Return where the chief ray meets the image plane, (3,), metres, and the distance of the exit pupil upstream,
+    metres.
+
+    The chief ray passes through the middle of the stop.
+    """
     if camera.is_afocal:
         raise UnphysicalError("the camera is afocal: parallel light leaves it parallel, so that it makes no image")
     launch, direction = (array[0] for array in launch_rays(camera, field, np.zeros((1, 2))))
@@ -160,7 +167,9 @@ def wavefront(camera: Camera, field: Field = (0.0, 0.0), terms: int = 28) -> Wav
 
 
 def _colours(camera: Camera, spectrum: Spectrum | None) -> list[tuple[Camera, float]]:
-    """Return the camera in light of each wavelength of a spectrum, and the share of that light."""
+    """Return, for each wavelength of a spectrum, the camera in its light and the fraction of the total light that it
+    has.
+    """
     shares = {camera.wavelength: 1.0} if spectrum is None else spectrum
     total = sum(shares.values())
     if not total > 0.0 or min(shares.values()) < 0.0:
@@ -169,7 +178,10 @@ def _colours(camera: Camera, spectrum: Spectrum | None) -> list[tuple[Camera, fl
 
 
 def _field_at(camera: Camera, field: Field, nodes: PupilNodes, origin: np.ndarray) -> PupilField:
-    """Return the plane waves about a point of the image plane (3,) from nodes of the stop, of unit power."""
+    """Return the plane waves at nodes of the stop that interfere about a point of the image plane, with total power 1.
+
+    ``origin`` (3,) is that point, in metres in the camera's frame.
+    """
     imaging, to_stop = camera.systems
     rays = imaging_rays(default_backend(), imaging, to_stop, direction_of(field), camera.launch, camera.aperture, nodes)
     return pupil_field(rays, camera.wavelength, camera.image_pose.inverse().apply(origin))
@@ -240,7 +252,9 @@ def psf(
 
 
 def _pupil(camera: Camera, field: Field, origin: np.ndarray) -> PupilFunction:
-    """Return the exit pupil about a point of the image plane (3,) with what edges take of it."""
+    """Return the exit pupil as seen from a point ``origin`` (3,) of the image plane, without the parts that edges
+    block.
+    """
     pieces = shadow_pieces(camera, field)
     nodes = disk(VIGNETTED_RINGS if pieces is not None else 12)
     traced = _field_at(camera, field, nodes, origin)

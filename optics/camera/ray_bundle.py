@@ -24,10 +24,11 @@ Field = tuple[float, float]
 """Angles (x, y) of a far point, radians."""
 
 RINGS = 12
-"""Rings of the quadrature over the stop: exact for squares of wavefronts up to order 23."""
+"""Number of rings of quadrature nodes over the stop; exact for squares of wavefronts that are polynomials to order 23.
+"""
 
 _MOST_NODES = 4_000_000
-"""Points of the stop at which a beam is traced at most, to bound memory."""
+"""Largest number of points of the stop through which one beam is traced, which bounds the memory."""
 
 
 class LightLostError(PhysicalError, ValueError):
@@ -186,7 +187,16 @@ def trace(camera: Camera, position: ArrayLike, direction: ArrayLike) -> TracedRa
 
 
 def trace_stop(camera: Camera, field: Field, points: np.ndarray) -> TracedRays:
-    """Trace rays of a far point through points of the stop (N, 2), in units of its radius, stopped or not.
+    """Trace rays of a far point through given points of the stop, whether or not an edge stops them.
+
+    Parameters
+    ----------
+    camera : Camera
+        Camera to trace through.
+    field : (float, float)
+        Angles x and y of the far point, radians.
+    points : (N, 2) ndarray
+        N points of the stop, in units of its radius.
 
     Raises
     ------
@@ -203,16 +213,21 @@ def trace_stop(camera: Camera, field: Field, points: np.ndarray) -> TracedRays:
 
 
 def shadow_pieces(camera: Camera, field: Field, ring: bool = True) -> np.ndarray | None:
-    """Return the polygons (1, K, V, 2) of the stop's unit disk in which edges stop light, or None where none does.
+    """Return the polygons that together cover the part of the stop where edges block light, or None if none do.
 
     Parameters
     ----------
     camera : Camera
-        Camera with the edges; the rim of the stop is none of them.
+        Camera with the edges; the rim of the stop is not one of them.
     field : (float, float)
         Angles x and y of the far point, radians.
     ring : bool
-        Count the stop's own ``inner_diameter`` in.
+        Include the hole of the stop itself (its ``inner_diameter``).
+
+    Returns
+    -------
+    (1, K, V, 2) ndarray or None
+        K polygons of V corners (x, y), in units of the stop's radius.
     """
     every = {f"s{k}": s.edges(k != camera.stop, k != camera.stop or ring) for k, s in enumerate(camera.surfaces)}
     edges = {name: own for name, own in every.items() if own}
@@ -226,7 +241,7 @@ def shadow_pieces(camera: Camera, field: Field, ring: bool = True) -> np.ndarray
 
 
 def light_nodes(camera: Camera, field: Field, phase: float) -> PupilNodes:
-    """Return a quadrature over the light in the stop.
+    """Return quadrature nodes and weights over the part of the stop that light passes.
 
     Parameters
     ----------
@@ -235,7 +250,8 @@ def light_nodes(camera: Camera, field: Field, phase: float) -> PupilNodes:
     field : (float, float)
         Angles x and y of the far point, radians.
     phase : float
-        Phase over which the integrand runs from the middle of the stop to its rim, radians.
+        Largest change of the integrand's phase from the middle of the stop to its rim, radians; more phase needs more
+        nodes.
 
     Returns
     -------
@@ -245,7 +261,7 @@ def light_nodes(camera: Camera, field: Field, phase: float) -> PupilNodes:
     Raises
     ------
     ValueError
-        No light of the field comes through, or the phase takes more nodes than memory allows.
+        No light of the field comes through, or the phase needs more nodes than memory allows.
     """
     rings, arms = disk_size(phase)
     if rings * arms > _MOST_NODES:
@@ -265,7 +281,7 @@ def light_nodes(camera: Camera, field: Field, phase: float) -> PupilNodes:
 
 
 def chief_point(camera: Camera, field: Field) -> np.ndarray:
-    """Return where the chief ray of a field meets the image plane, stopped or not, (3,), metres."""
+    """Return where the chief ray of a field point meets the image plane, (3,), metres, even if an edge would stop it."""
     return np.asarray(trace_stop(camera, field, np.zeros((1, 2))).position[0])
 
 

@@ -1,1 +1,1 @@
-"""Optimisation of prescriptions with exact derivatives."""
+"""Optimisation of mirror prescriptions (shapes and positions) with exact derivatives."""

@@ -36,7 +36,7 @@ _NUMBERS: Mapping[str, Path] = FrozenMap(
 
 @dataclass(frozen=True)
 class Variable:
-    """Variable of an optimisation.
+    """Number of a prescription that the optimisation may change, within bounds.
 
     Attributes
     ----------
@@ -102,12 +102,12 @@ class Prescription:
         return tuple(self.surfaces)
 
     def value(self, variable: Variable) -> float:
-        """Return the value of a variable, in SI units.
+        """Return the value that a variable has in this prescription, in SI units.
 
         Raises
         ------
         KeyError
-            There is no such number.
+            The prescription has no such number.
         """
         if variable.quantity == BIAS:
             return self.field_bias
@@ -122,11 +122,14 @@ class Prescription:
         return surface.even[term] if term < len(surface.even) else 0.0
 
     def values(self, variables: Sequence[Variable]) -> np.ndarray:
-        """Return the values of all variables, (V,)."""
+        """Return the values of V variables in this prescription, (V,), in SI units."""
         return np.array([self.value(v) for v in variables])
 
     def with_values(self, variables: Sequence[Variable], values: np.ndarray) -> Prescription:
-        """Return the prescription with other values (V,) of the variables; missing aspheric terms are added."""
+        """Return a copy of the prescription in which the V variables have the given values (V,), in SI units.
+
+        Aspheric terms that a variable names and the prescription lacks are added.
+        """
         surfaces, poses, bias = dict(self.surfaces), dict(self.poses), self.field_bias
         for variable, number in zip(variables, (float(v) for v in values), strict=True):
             name, quantity = variable.element, variable.quantity
@@ -147,9 +150,9 @@ class Prescription:
 
     @cached_property
     def assembly(self) -> Assembly:
-        """Assembly of the surfaces as bodies and elements, without apertures.
+        """Assembly of rigid bodies and optical elements for the ray trace, without apertures.
 
-        Its sequences are ``imaging`` and ``to_stop``.
+        Its sequence ``imaging`` leads through all surfaces to the image, ``to_stop`` ends at the stop.
         """
         bodies, elements = [], {}
         for name, surface in self.surfaces.items():
@@ -163,7 +166,10 @@ class Prescription:
         return Assembly(RigidTree(tuple(bodies)), elements, {"imaging": self.names, "to_stop": self.names[: stop + 1]})
 
     def tangents(self, variables: Sequence[Variable], sequence: str) -> SystemBatch:
-        """Return a batch of V equal systems; the v-th carries the derivative by the v-th variable."""
+        """Return V equal systems for V variables; system v carries the derivatives with respect to variable v.
+
+        ``sequence`` names the sequence of elements, ``imaging`` or ``to_stop``.
+        """
         assembly = self.assembly
         no_step = (self.names[-1], "scale", 0)  # scaling the image plane has no effect
         steps = [_step(v) if v.quantity in _STEPS else no_step for v in variables]
@@ -182,11 +188,11 @@ class Prescription:
 
 
 def _or_zero(value: np.ndarray, tangent: np.ndarray | None) -> np.ndarray:
-    """Return the tangent, or zeros of the value's shape where there is none."""
+    """Return the derivative ``tangent``, or zeros of the shape of ``value`` where it is None."""
     return np.zeros_like(value) if tangent is None else tangent
 
 
 def _step(variable: Variable) -> tuple[str, str, int]:
-    """Return the (body, kind, axis) of a derivative by a variable of position or tilt."""
+    """Return the (body, kind of motion, axis) that a variable of position or tilt changes, to differentiate by it."""
     body, kind, axis = _STEPS[variable.quantity]
     return variable.element + body, kind, axis

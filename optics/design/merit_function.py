@@ -29,12 +29,12 @@ LAUNCH_DISTANCE = 9.0
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """Beams by which a prescription is evaluated.
+    """Field points, entrance pupil and pupil nodes whose rays are traced to evaluate a prescription.
 
     Attributes
     ----------
     fields : (F, 2) ndarray
-        Field angles x, y about the field bias, radians.
+        Angles x, y of F field points from the field's centre, radians.
     diameter : float
         Diameter of the entrance pupil, metres.
     nodes : PupilNodes
@@ -50,7 +50,7 @@ class Beams:
 
     @property
     def pupil(self) -> np.ndarray:
-        """Pupil coordinates of a beam's rays, (N, 2): the chief ray, the nodes, the rim."""
+        """Pupil coordinates of the N rays of a beam, (N, 2), in units of its radius: chief ray, quadrature nodes, rim."""
         angle = 2.0 * np.pi * np.arange(self.rim) / self.rim
         nodes = np.stack([self.nodes.x, self.nodes.y], axis=-1)
         return np.concatenate([np.zeros((1, 2)), nodes, np.stack([np.cos(angle), np.sin(angle)], axis=-1)])
@@ -58,20 +58,20 @@ class Beams:
 
 @dataclass(frozen=True, eq=False)
 class DesignRays:
-    """Traced beams, F fields of N rays each, and derivatives by V variables (a first axis of that size).
+    """Rays of the beams of F fields, N rays each, and their derivatives with respect to V variables.
 
     Attributes
     ----------
     position, direction : (F, N, 3) ndarray
-        Positions (metres) and directions on the image in its own frame.
+        Positions (metres) and unit directions on the image in its own frame.
     path : (F, N) ndarray
         Optical path from the incoming wavefront through the prescription's origin, metres.
     points : (K + 1, F, N, 3) ndarray
-        Launch points, and intersections with each surface and the image, prescription frame, metres.
+        Launch points, and intersections with the K surfaces (image included), prescription frame, metres.
     d_position, d_direction, d_path, d_points : ndarray, optional
-        Derivatives, (V, ...) each; None if not requested.
+        Derivatives of these with respect to the variables, with a first axis of size V; None if not requested.
     d_bias : (V,) ndarray, optional
-        Derivatives of the field bias.
+        Derivatives of the field bias with respect to the variables.
     """
 
     position: np.ndarray
@@ -86,9 +86,11 @@ class DesignRays:
 
 
 def beam_axes(fields: np.ndarray, bias: complex) -> tuple[np.ndarray, np.ndarray]:
-    """Return the directions (F, 3) of the fields' light, and two axes of the wavefronts (F, 2, 3), the first near x.
+    """Return the directions (F, 3) of the light of F fields, and two axes (F, 2, 3) in each wavefront, the first near
+    x.
 
-    ``bias`` may be complex, for a complex step.
+    ``fields`` (F, 2) are angles from the field's centre and ``bias`` is the angle of that centre from the parent
+    axis, in radians. ``bias`` may be complex, to obtain derivatives by a complex step.
     """
     x, y = fields[:, 0], fields[:, 1] + bias
     along = np.stack([np.tan(x) + 0.0 * y, np.tan(y), np.ones_like(y)], axis=-1)
@@ -102,14 +104,14 @@ def beam_axes(fields: np.ndarray, bias: complex) -> tuple[np.ndarray, np.ndarray
 def trace_beams(
     backend: Backend, prescription: Prescription, beams: Beams, variables: Sequence[Variable] | None = None
 ) -> DesignRays:
-    """Trace all beams, and differentiate them if variables are given.
+    """Trace the rays of all fields, with derivatives with respect to the variables if these are given.
 
     Raises
     ------
     AimError
         A chief ray does not reach the stop.
     BeamMissedError
-        A beam is lost.
+        A ray misses a surface.
     """
     assembly = prescription.assembly
     along, axes = beam_axes(beams.fields, prescription.field_bias)
@@ -144,7 +146,7 @@ def _differentiated(
     rays: DesignRays,
     chief: np.ndarray,
 ) -> DesignRays:
-    """Return the rays with their derivatives."""
+    """Return traced rays together with their derivatives with respect to the variables."""
     along, axes = beam_axes(beams.fields, prescription.field_bias)
     stepped = beam_axes(beams.fields, prescription.field_bias + 1j * COMPLEX_STEP)
     biased = np.array([v.quantity == BIAS for v in variables], dtype=float)
@@ -202,7 +204,10 @@ def _differentiated(
 
 @dataclass(frozen=True)
 class Operands:
-    """Operands of the merit function and its constraints.
+    """Targets of the merit function and limits of its constraints.
+
+    "The line" is the line of field points with y = 0 that the camera images. L is the distance of a chief ray's image
+    from that of the field's centre, and W its field angle.
 
     Attributes
     ----------
@@ -221,7 +226,8 @@ class Operands:
         ``wavefront`` (rms waves, piston and tilt removed) or ``spot`` (rms about the mean, in units of the wavelength
         times the focal ratio).
     distortion : float
-        Weight of the chief rays' departure from L = f tan W, residuals per relative departure; 0 for none.
+        Weight of the relative departure of chief rays from L = f tan W, as residual per relative departure; 0 leaves
+        distortion out.
     anamorphism : float, optional
         Largest allowed difference of f along the line from f across it, relative to f across; None: free.
     """
@@ -238,7 +244,10 @@ class Operands:
 
 @dataclass(frozen=True)
 class Passage:
-    """Segment of the beams that passes a surface: from point ``segment`` to the next, on the given side in y."""
+    """Surface that beams pass without touching it, the segment of the beams that does so, and the side in y.
+
+    The segment leads from point number ``segment`` of the rays to the next.
+    """
 
     segment: int
     surface: int
@@ -252,19 +261,19 @@ class Evaluation:
     Attributes
     ----------
     residuals : (P,) ndarray
-        Residuals whose squares sum to the mean square error over the fields (waves^2).
+        P residuals whose squares sum to the mean square error over the fields (waves^2).
     errors : (F,) ndarray
-        Rms error per field, waves.
+        Rms error of each of the F fields, waves.
     principal_distance : float
-        Principal distance along the line, metres.
+        Principal distance along the imaged line (fields with y = 0), metres.
     distance_across : float
         Principal distance across the line, from the fields in the plane of symmetry, metres.
     extents : (E,) ndarray
-        Extents along z from the farthest point of one surface to that of another, for all pairs, metres.
+        Extents along z from the farthest point of one surface to that of another, for all E pairs, metres.
     clearances : ndarray
-        Clearance of every passage, metres.
+        Distance in y between beams and the edge of the surface, for every passage, metres.
     d_residuals, d_principal_distance, d_distance_across, d_extents, d_clearances : ndarray, optional
-        Derivatives, variables first; None if not requested.
+        Derivatives with respect to the variables, which are the first axis; None if not requested.
     """
 
     residuals: np.ndarray
@@ -286,7 +295,7 @@ class Evaluation:
 
     @property
     def envelope(self) -> float:
-        """Extent along z over all surfaces, metres."""
+        """Extent along z over all surfaces including the image, metres: the largest of ``extents``."""
         return float(self.extents.max())
 
 
@@ -313,7 +322,7 @@ class MeritFunction:
 
     @classmethod
     def of(cls, backend: Backend, start: Prescription, beams: Beams, operands: Operands) -> MeritFunction:
-        """Return a merit function whose beams must pass surfaces on the same sides as in the prescription ``start``.
+        """Return a merit function whose beams pass surfaces on the same sides as they do in the prescription ``start``.
 
         Raises
         ------
@@ -335,7 +344,7 @@ class MeritFunction:
         return cls(backend, beams, operands, tuple(passages))
 
     def evaluate(self, prescription: Prescription, variables: Sequence[Variable] | None = None) -> Evaluation:
-        """Trace and evaluate a prescription, with derivatives by the variables if they are given.
+        """Trace and evaluate a prescription, with derivatives with respect to the variables if these are given.
 
         Raises
         ------
@@ -361,7 +370,7 @@ class MeritFunction:
         return Evaluation(*values, d_residuals, d_distance, d_across, d_extents, slopes)
 
     def _errors(self, rays: DesignRays) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-        """Return residuals (P,), their derivatives (V, P), and errors per field (F,) in waves."""
+        """Return P residuals (P,), their derivatives by V variables (V, P), and rms errors of F fields (F,), in waves."""
         nodes = self.beams.nodes
         pupil = slice(1, 1 + nodes.count)
         weight = np.sqrt(nodes.share / len(rays.path))
@@ -401,18 +410,18 @@ class MeritFunction:
 
     @property
     def _focal_ratio(self) -> float:
-        """Focal ratio for the unit of spots; 1 where the principal distance is free."""
+        """Required principal distance over pupil diameter, for the unit of spot sizes; 1 where that distance is free."""
         distance = self.operands.principal_distance
         return 1.0 if distance is None else distance / self.beams.diameter
 
     def _principal_distance(
         self, rays: DesignRays, prescription: Prescription
     ) -> tuple[float, np.ndarray | None, np.ndarray, np.ndarray | None]:
-        """Return f along the line (metres) and the relative departures of its fields from L = f tan W.
+        """Return the principal distance f along the line (metres) and the relative departures of its fields from L = f
+        tan W.
 
-        Each is followed by its derivatives.
-
-        The order is f, its derivatives, the departures, their derivatives.
+        L is the distance of a chief ray's image from that of the field's centre, and W the field angle. Four values
+        are returned: f, its derivatives with respect to the variables, the departures, and their derivatives.
         """
         line = _on_line(self.beams)
         # between (tan x, tan b, 1) and (0, tan b, 1): tan W = tan x cos b, as both have the same part across x
@@ -433,10 +442,11 @@ class MeritFunction:
         return distance, d_distance, departure, d_position / slope - np.outer(d_slope, position) / slope**2
 
     def _distance_across(self, rays: DesignRays) -> tuple[float, np.ndarray | None]:
-        """Return f across the line (metres) and its derivatives; NaN where there are no fields for it.
+        """Return the principal distance f across the line (metres) and its derivatives with respect to the variables.
 
-        f = sum(L tan W) / sum(tan^2 W) over the fields in the plane of symmetry off the line, with L from the image of
-        the field's centre.
+        f = sum(L tan W) / sum(tan^2 W) over the fields in the plane of symmetry off the line, with W the field angle
+        and L the distance of the chief ray's image from that of the field's centre. It is NaN where there are no such
+        fields.
         """
         fields = self.beams.fields
         off_line = (fields[:, 0] == 0.0) & (fields[:, 1] != 0.0)
@@ -453,7 +463,11 @@ class MeritFunction:
         return abs(slope), np.sign(slope) * (d_position @ weight)
 
     def _clearance(self, rays: DesignRays, passage: Passage) -> tuple[float, np.ndarray]:
-        """Return the smallest distance in y between a beam segment and a surface's edge, and its derivatives (V,)."""
+        """Return the smallest distance in y between a beam segment and a surface's edge, metres, and its derivatives
+        (V,).
+
+        The derivatives are with respect to the V variables.
+        """
         points = rays.points.reshape(len(rays.points), -1, 3)
         edge = int(np.argmax(passage.side * points[passage.surface, :, 1]))
         start, end = points[passage.segment], points[passage.segment + 1]
@@ -473,14 +487,15 @@ class MeritFunction:
 
 
 def _on_line(beams: Beams) -> np.ndarray:
-    """Return the mask of fields that lie on the line, off its centre; (F,)."""
+    """Return the mask (F,) of the F fields that lie on the imaged line (y = 0), away from the field's centre."""
     return np.asarray((beams.fields[:, 1] == 0.0) & (beams.fields[:, 0] != 0.0))
 
 
 def _crossing(start: np.ndarray, end: np.ndarray, level: float) -> np.ndarray:
-    """Return the intersection of segments (..., 3) with the plane z = level, or their nearer end, as (..., 2).
+    """Return where segments meet the plane z = ``level``, or their end nearest to it where they do not reach it.
 
-    The two numbers are y and the fraction of the segment.
+    ``start`` and ``end`` (..., 3) are the ends of the segments, metres. The result (..., 2) holds the coordinate y of
+    the crossing, metres, and the fraction of the segment at which it lies.
     """
     span = end - start
     fraction = np.clip((level - start[..., 2]) / span[..., 2], 0.0, 1.0)
@@ -488,9 +503,9 @@ def _crossing(start: np.ndarray, end: np.ndarray, level: float) -> np.ndarray:
 
 
 def _extents(rays: DesignRays) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the extents along z from each surface to each other one, (E,), and their derivatives (V, E).
+    """Return the extents along z between all E pairs of surfaces (E,), metres, and their derivatives (V, E).
 
-    The largest extent is the envelope.
+    The derivatives are with respect to the V variables. The largest extent is the envelope.
     """
     z = rays.points[1:, ..., 2].reshape(len(rays.points) - 1, -1)
     surfaces = np.arange(len(z))

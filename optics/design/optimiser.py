@@ -32,10 +32,9 @@ ITERATIONS = 400
 TOLERANCE = 1e-6
 """Relative decrease of the mean square error per iteration below which the search ends."""
 HELD = 2e-6
-"""Violation, metres, below which a constraint counts as fulfilled."""
+"""Largest violation of a constraint, metres, with which it still counts as fulfilled."""
 MIN_GAIN = 1e-3
-"""Relative decrease of the rms error from which a prescription counts as improved: the accuracy of the least squares.
-"""
+"""Smallest relative decrease of the rms error that counts as an improvement: the accuracy of the least squares."""
 
 Advance = Callable[[int, int], None]
 
@@ -56,7 +55,7 @@ class DesignError(PhysicalError, ValueError):
 
 @dataclass(frozen=True)
 class ActiveConstraint:
-    """Active constraint of an optimised prescription.
+    """Constraint that an optimised prescription just fulfils, so that relaxing it would reduce the error.
 
     Attributes
     ----------
@@ -113,14 +112,16 @@ class Design:
 
     @property
     def improved(self) -> bool:
-        """True when the rms error over the fields has fallen by at least ``MIN_GAIN``."""
+        """True when the rms error over the fields has fallen by at least the fraction ``MIN_GAIN``."""
         return rms_error(self.after) < (1.0 - MIN_GAIN) * rms_error(self.before)
 
 
 def _violations(
     operands: Operands, along: Any, across: Any, extents: np.ndarray, clearances: np.ndarray, factor: float = 1.0
 ) -> np.ndarray:
-    """Return violations (C,), metres, positive when violated (the first, of the principal distance, with either sign).
+    """Return violations of C constraints (C,), metres; positive when violated.
+
+    The first, of the principal distance, is an equation: it is violated with either sign.
 
     Parameters
     ----------
@@ -131,12 +132,12 @@ def _violations(
     across : float or ndarray
         Principal distance across the line, metres.
     extents : (E,) ndarray
-        Extents along z, metres.
+        Extents along z of E pairs of surfaces, metres.
     clearances : (P,) ndarray
-        Clearances, metres.
+        Distances between beams and the edges of surfaces, for P passages, metres.
     factor : float
-        Factor of the limits. With 0 and derivatives in place of the values, variables last, the result is the
-        derivatives of the violations, (C, V).
+        Factor of the limits. With 0, and with derivatives with respect to V variables (last axis) instead of the
+        values, the result is the derivatives of the violations, (C, V).
     """
     out: list[Any] = []
     if operands.principal_distance is not None:
@@ -152,13 +153,13 @@ def _violations(
 
 
 def _values(evaluation: Evaluation, operands: Operands) -> np.ndarray:
-    """Return the violations of an evaluation, (C,)."""
+    """Return the violations of the C constraints in an evaluation, (C,), metres; positive when violated."""
     e = evaluation
     return _violations(operands, e.principal_distance, e.distance_across, e.extents, e.clearances)
 
 
 def _slopes(evaluation: Evaluation, operands: Operands) -> np.ndarray:
-    """Return the derivatives of the violations, (V, C)."""
+    """Return the derivatives (V, C) of the violations of C constraints with respect to V variables."""
     e = evaluation
     assert e.d_residuals is not None
     assert e.d_extents is not None
@@ -168,7 +169,9 @@ def _slopes(evaluation: Evaluation, operands: Operands) -> np.ndarray:
 
 
 def _limits(evaluation: Evaluation, operands: Operands) -> list[tuple[str, float]]:
-    """Return the kind and the limit of each constraint: metres, for the anamorphism relative to f."""
+    """Return the kind and the limit of each constraint: in metres, but for the anamorphism relative to the principal
+    distance.
+    """
     limits = (
         ("principal distance", operands.principal_distance, 1),
         ("anamorphism", operands.anamorphism, 2),
@@ -179,19 +182,19 @@ def _limits(evaluation: Evaluation, operands: Operands) -> list[tuple[str, float
 
 
 def _equations(operands: Operands, count: int) -> np.ndarray:
-    """Return the mask of the C constraints that are equations."""
+    """Return the mask (C,) of the C constraints that are equations and not inequalities."""
     return (operands.principal_distance is not None) & (np.arange(count) == 0)
 
 
 def initial_merit(
     backend: Backend, start: Prescription, variables: Sequence[Variable], beams: Beams, operands: Operands
 ) -> tuple[MeritFunction, Evaluation]:
-    """Return the merit function of a design that starts from a prescription, and that prescription's evaluation.
+    """Return the merit function for designs that start from a prescription, and the evaluation of that prescription.
 
     Raises
     ------
     DesignError
-        No light passes the start, or it violates a bound.
+        No light passes the start, or it violates a bound of a variable.
     """
     for variable, value in zip(variables, start.values(variables), strict=True):
         if not variable.low <= value <= variable.high:
@@ -213,7 +216,9 @@ def descend(
     iterations: int = ITERATIONS,
     advance: Advance | None = None,
 ) -> Design:
-    """Return the local optimum that is reached from a start, which may differ from that of ``merit``'s passages.
+    """Return the local optimum that the constrained least squares reach from a start.
+
+    ``start`` may differ from the prescription by which ``merit`` determined the sides on which beams pass surfaces.
 
     Parameters
     ----------
@@ -224,11 +229,11 @@ def descend(
     before : Evaluation
         Evaluation of ``initial``.
     start : Prescription
-        Initial prescription; it passes all light and is inside the bounds.
+        Prescription from which the search begins; it passes all light and is inside the bounds.
     variables : sequence of Variable
         Variables of the optimisation.
     steps : int
-        Number of steps of the envelope from the start's to the required one.
+        Number of steps in which the envelope goes from that of the start to the required one.
     iterations : int
         Largest number of least-squares iterations at the last step.
     advance : callable, optional
@@ -260,7 +265,9 @@ def descend(
 def _step(
     merit: MeritFunction, start: Prescription, variables: tuple[Variable, ...], iterations: int
 ) -> tuple[Prescription, int, bool]:
-    """Return one constrained least-squares solution, its number of Jacobians, and whether it converged."""
+    """Run one constrained least-squares search; return the prescription, the number of Jacobians, and True if it
+    converged.
+    """
     size = _sizes(start, variables)
 
     def evaluate(x: np.ndarray, differentiate: bool) -> Sample | None:
@@ -289,10 +296,11 @@ def rms_error(evaluation: Evaluation) -> float:
 def active_constraints(
     merit: MeritFunction, prescription: Prescription, variables: tuple[Variable, ...], before: Evaluation
 ) -> tuple[ActiveConstraint, ...]:
-    """Return the active constraints of an optimum, by their Lagrange multipliers.
+    """Return the constraints that limit an optimum, with the decrease of the error if each were relaxed.
 
     At an optimum the gradient of the mean square error is a combination of the gradients of the active constraints,
-    with weights that are not negative; each weight is the decrease of the error when its limit is relaxed.
+    with weights (Lagrange multipliers) that are not negative; each weight is the decrease of the error when its limit
+    is relaxed.
 
     Parameters
     ----------
@@ -333,7 +341,7 @@ def active_constraints(
 
 
 def _constraint_names(merit: MeritFunction, prescription: Prescription, names: Sequence[str]) -> list[str]:
-    """Return names that distinguish the constraints of one kind."""
+    """Return a distinct name for each constraint, by adding the surfaces to kinds that occur several times."""
     surfaces = ("scene", *prescription.names)
     passages = iter(merit.passages)
     sides = iter(("long", "short"))
@@ -356,11 +364,11 @@ def _constraint_names(merit: MeritFunction, prescription: Prescription, names: S
 
 
 _AT_LIMIT = 20e-6
-"""Margin, metres, below which a constraint counts as active."""
+"""Largest distance of a constrained quantity from its limit, metres, with which the constraint counts as active."""
 
 
 def _sizes(prescription: Prescription, variables: Sequence[Variable]) -> np.ndarray:
-    """Return the sizes by which variables are made dimensionless."""
+    """Return the typical size of each variable, in its SI unit, by which it is divided to become dimensionless."""
     least = [_SMALLEST[v.quantity] for v in variables]
     return np.asarray(np.maximum(np.abs(prescription.values(variables)), least))
 
@@ -376,7 +384,7 @@ _SMALLEST = {
     "tilt": 0.01,
     "field_bias": 0.01,
 }
-"""Smallest sizes by which variables are made dimensionless, SI units."""
+"""Quantity -> smallest size by which its variables are divided to become dimensionless, SI units."""
 
 
 def _require_fulfilled(merit: MeritFunction, after: Evaluation) -> None:
@@ -406,13 +414,14 @@ def _require_fulfilled(merit: MeritFunction, after: Evaluation) -> None:
 SAME = 0.01
 """Relative difference of the rms error within which two starts count as having reached equally good prescriptions."""
 DRAWS_PER_SPREAD = 8
-"""Number of failed draws at one spread before it is halved."""
+"""Number of random starts that may fail in a row before their spread about the nominal prescription is halved."""
 _SHARE = {"curvature": 0.01, "A4": 0.3, "A6": 0.3, "A8": 0.3}
-"""Relative spread (one sigma) of a drawn start; for aspheric terms relative to the largest of their kind."""
+"""Quantity -> standard deviation of a random start relative to the value; for aspheric terms, to the largest of a kind.
+"""
 _SPREAD = {"conic": 0.3, "y": 1e-3, "tilt": 1e-3, BIAS: 1e-3}
-"""Spread of other variables, SI units."""
+"""Quantity -> standard deviation of a random start for the other variables, SI units."""
 _PLACE = 0.01
-"""Spread of positions along z, relative to the envelope."""
+"""Standard deviation of positions along z in a random start, relative to the envelope."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -544,18 +553,18 @@ def search(
 def drawn_start(
     merit: MeritFunction, nominal: Prescription, variables: Sequence[Variable], rng: np.random.Generator
 ) -> Prescription:
-    """Return a prescription drawn at random about another that passes light.
+    """Return a prescription with random variables about a nominal one, through which light passes.
 
-    The spread is halved whenever ``DRAWS_PER_SPREAD`` draws in a row pass none.
+    The spread is halved whenever ``DRAWS_PER_SPREAD`` random prescriptions in a row pass no light.
 
     Parameters
     ----------
     merit : MeritFunction
         Merit function whose beams have to pass.
     nominal : Prescription
-        Centre of the draws.
+        Prescription about which the random ones are distributed.
     variables : sequence of Variable
-        Variables that are drawn, inside their bounds.
+        Variables that are random, inside their bounds.
     rng : np.random.Generator
         Random number generator.
     """

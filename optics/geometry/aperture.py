@@ -32,7 +32,7 @@ class DiskNumbers:
 
 @dataclass(frozen=True, eq=False)
 class RingNumbers:
-    """Disk with a concentric hole, whose squared radius is ``hole_squared``, in m^2."""
+    """Disk about (x, y), in metres, with the squares of its radius and of that of its concentric hole, in m^2."""
 
     x: Any
     y: Any
@@ -87,7 +87,7 @@ class Circle:
     inner: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
+        """Check that the radii are positive and the hole is smaller than the disk."""
         if not 0.0 <= self.inner < self.radius:
             raise ValueError(f"a circular aperture needs 0 <= inner < radius, found {self.inner} and {self.radius}")
 
@@ -96,7 +96,9 @@ class Circle:
         return self.numbers().contains(x, y)
 
     def numbers(self, size: Any = 1.0) -> DiskNumbers | RingNumbers:
-        """Return the numbers of the test, for a body scaled by ``size`` (1 is nominal; may be an array)."""
+        """Return the centre and squared radii that ``contains`` needs, for a body scaled by ``size`` (1 is nominal; or
+        an array).
+        """
         x, y, square = size * self.centre[0], size * self.centre[1], (size * self.radius) ** 2
         return RingNumbers(x, y, square, (size * self.inner) ** 2) if self.inner else DiskNumbers(x, y, square)
 
@@ -117,7 +119,7 @@ class Circle:
         return Circle(self.radius, self.centre)
 
     def scaled(self, size: float) -> Circle:
-        """Return this shape on a body scaled by ``size`` (1 is nominal)."""
+        """Return the shape with all lengths multiplied by ``size``, as on a body that expands by this factor."""
         return Circle(size * self.radius, (size * self.centre[0], size * self.centre[1]), size * self.inner)
 
     def outline(self, points: int = 96) -> np.ndarray:
@@ -146,7 +148,7 @@ class _HalfSizeShape:
         return min(self.half_x, self.half_y)
 
     def scaled(self, size: float) -> Self:
-        """Return this shape on a body scaled by ``size`` (1 is nominal)."""
+        """Return the shape with all lengths multiplied by ``size``, as on a body that expands by this factor."""
         return type(self)(*self._scaled(size), (size * self.centre[0], size * self.centre[1]))
 
     def _scaled(self, size: Any) -> tuple[Any, Any]:
@@ -158,7 +160,7 @@ class Rectangle(_HalfSizeShape):
     """Rectangle of half-widths ``half_x``, ``half_y`` about ``centre`` (metres)."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
+        """Check that both half-widths are positive."""
         if not (self.half_x > 0.0 and self.half_y > 0.0):
             raise ValueError(
                 f"a rectangular aperture needs positive half-widths, found {self.half_x} and {self.half_y}"
@@ -174,11 +176,13 @@ class Rectangle(_HalfSizeShape):
         return self.numbers().contains(x, y)
 
     def numbers(self, size: Any = 1.0) -> RectangleNumbers:
-        """Return the numbers of the test, for a body scaled by ``size`` (1 is nominal; may be an array)."""
+        """Return the centre and half-widths that ``contains`` needs, for a body scaled by ``size`` (1 is nominal; or an
+        array).
+        """
         return RectangleNumbers(size * self.centre[0], size * self.centre[1], *self._scaled(size))
 
     def outline(self, points: int = 96) -> np.ndarray:
-        """Return a closed outline, shape (n, 2), in metres."""
+        """Return points along the closed outline, shape (n, 2), in metres; n is about ``points``."""
         x0, x1, y0, y1 = self.bounds
         n = max(points // 4, 1)
         s = np.linspace(0.0, 1.0, n, endpoint=False)
@@ -192,7 +196,7 @@ class Ellipse(_HalfSizeShape):
     """Ellipse of semi-axes ``half_x``, ``half_y`` about ``centre`` (metres), such as a round beam's footprint."""
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
+        """Check that both semi-axes are positive."""
         if not (self.half_x > 0.0 and self.half_y > 0.0):
             raise ValueError(f"an elliptical aperture needs positive half axes, found {self.half_x} and {self.half_y}")
 
@@ -206,7 +210,9 @@ class Ellipse(_HalfSizeShape):
         return self.numbers().contains(x, y)
 
     def numbers(self, size: Any = 1.0) -> EllipseNumbers:
-        """Return the numbers of the test, for a body scaled by ``size`` (1 is nominal; may be an array)."""
+        """Return the centre and semi-axes that ``contains`` needs, for a body scaled by ``size`` (1 is nominal; or an
+        array).
+        """
         return EllipseNumbers(size * self.centre[0], size * self.centre[1], *self._scaled(size))
 
     def outline(self, points: int = 96) -> np.ndarray:

@@ -25,16 +25,20 @@ _COINCIDENT = 1e-13
 
 
 def area(polygons: np.ndarray) -> np.ndarray:
-    """Return the signed areas (...), positive counterclockwise, of polygons (..., V, D)."""
+    """Return the signed areas (...) of polygons, positive counterclockwise.
+
+    ``polygons`` (..., V, D) holds V corners each, whose first two of D columns are x and y.
+    """
     x, y = polygons[..., 0] - polygons[..., :1, 0], polygons[..., 1] - polygons[..., :1, 1]
     return np.asarray(0.5 * np.sum(x[..., :-1] * y[..., 1:] - x[..., 1:] * y[..., :-1], axis=-1))
 
 
 def area_in_disk(polygons: np.ndarray) -> np.ndarray:
-    """Return the signed areas (...) inside the unit disk, positive counterclockwise, of polygons (..., V, D).
+    """Return the signed areas (...) of the parts of polygons inside the unit disk, positive counterclockwise.
 
-    The area is the sum, over the sides, of the area between the side and the centre: a triangle where the side runs
-    inside the disk, a sector where it runs outside.
+    ``polygons`` (..., V, D) holds V corners each, whose first two of D columns are x and y. The area is the sum, over
+    the sides, of the area between the side and the centre: a triangle where the side runs inside the disk, a sector
+    where it runs outside.
     """
     start = polygons[..., 0] + 1j * polygons[..., 1]
     end = np.roll(start, -1, axis=-1)
@@ -54,9 +58,9 @@ def covered(polygons: np.ndarray, points: np.ndarray, smallest: float = 0.0) -> 
     Parameters
     ----------
     polygons : (B, K, V, 2) ndarray
-        Polygons of B batches; those whose corners all coincide are empty.
+        K polygons of V corners in each of B batches; those whose corners all coincide are empty.
     points : (N, 2) ndarray
-        Points, common to all batches.
+        N points, common to all batches.
     smallest : float
         Area up to which a polygon counts as empty.
     """
@@ -75,7 +79,10 @@ def covered(polygons: np.ndarray, points: np.ndarray, smallest: float = 0.0) -> 
 
 
 def hull(points: np.ndarray) -> np.ndarray:
-    """Return the convex hulls (N, V, D), counterclockwise, of N sets of P points (N, P, D)."""
+    """Return the convex hulls of N sets of P points, counterclockwise, as polygons (N, V, D) of V corners.
+
+    ``points`` (N, P, D) have x and y in the first two of D columns; the others are carried along.
+    """
     x, y = points[..., 0], points[..., 1]
     rows = np.arange(len(points))
     start = np.lexsort((y, x), axis=-1)[:, 0]
@@ -104,7 +111,7 @@ def clip(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np.ndar
     Parameters
     ----------
     polygons : (N, V, D) ndarray
-        Convex polygons.
+        N convex polygons of V corners, with x and y in the first two of D columns.
     normal : (N, 2) ndarray
         Normals of the clipping lines.
     limit : (N,) ndarray
@@ -113,7 +120,7 @@ def clip(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np.ndar
     Returns
     -------
     (N, W, D) ndarray
-        Clipped polygons, with corners in the original order.
+        Clipped polygons of W corners, in the original order.
     """
     depth = limit[:, None] - polygons[..., 0] * normal[:, :1] - polygons[..., 1] * normal[:, 1:]
     inside = depth >= 0.0
@@ -131,7 +138,7 @@ def clip(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np.ndar
 
 
 def padded(polygons: np.ndarray, corners: int) -> np.ndarray:
-    """Return polygons (N, V, D) padded with repeated corners to at least ``corners`` each."""
+    """Return N polygons (N, V, D) of V corners with corners repeated until each has at least ``corners``."""
     missing = corners - polygons.shape[1]
     if missing <= 0:
         return polygons
@@ -139,16 +146,17 @@ def padded(polygons: np.ndarray, corners: int) -> np.ndarray:
 
 
 def compact(polygons: np.ndarray) -> np.ndarray:
-    """Return polygons (N, V, D) without corners that coincide with the one before them, to rounding."""
+    """Return N polygons (N, V, D) of V corners without those corners that coincide, to rounding, with the one before."""
     step = polygons[..., :2] - np.roll(polygons[..., :2], 1, axis=1)
     selected = np.hypot(step[..., 0], step[..., 1]) > _COINCIDENT
     return _packed(polygons, selected)
 
 
 def _packed(corners: np.ndarray, selected: np.ndarray) -> np.ndarray:
-    """Return the corners (N, V, D) selected by a mask (N, V), in polygons of as few corners as possible.
+    """Return the corners selected by a mask, in polygons of as few corners as possible.
 
-    A polygon without a selected corner keeps its first corner.
+    ``corners`` (N, V, D) are N polygons of V corners with D columns, and ``selected`` (N, V) is the mask. A polygon
+    without a selected corner keeps its first corner.
     """
     many = np.maximum(np.sum(selected, axis=1), 1)
     order = np.argsort(~selected, axis=1, kind="stable")
@@ -157,9 +165,10 @@ def _packed(corners: np.ndarray, selected: np.ndarray) -> np.ndarray:
 
 
 def sides(windows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return outward unit normals (N, W, 2) and limits (N, W) of the sides of counterclockwise polygons.
+    """Return outward unit normals (N, W, 2) and limits (N, W) of the W sides of N counterclockwise polygons.
 
-    A side without length, whose direction would be rounding error, gets no limit.
+    A point lies inside a side where its product with the normal is at most the limit. A side without length, whose
+    direction would be rounding error, gets no limit.
     """
     step = np.roll(windows[..., :2], -1, axis=1) - windows[..., :2]
     length = np.hypot(step[..., 0], step[..., 1])
@@ -169,12 +178,12 @@ def sides(windows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def intersect(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np.ndarray:
-    """Clip each polygon by W half-planes.
+    """Return the part of each polygon that lies in all of W half-planes.
 
     Parameters
     ----------
     polygons : (N, V, D) ndarray
-        Convex polygons.
+        N convex polygons of V corners, with x and y in the first two of D columns.
     normal : (N, W, 2) ndarray
         Outward normals of the half-planes.
     limit : (N, W) ndarray
@@ -183,7 +192,7 @@ def intersect(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np
     Returns
     -------
     (N, U, D) ndarray
-        The clipped polygons.
+        The clipped polygons, of U corners.
     """
     height = np.einsum("nvx,nwx->nwv", polygons[..., :2], normal)
     beyond = np.sum(height > limit[..., None], axis=-1)
@@ -201,21 +210,21 @@ def intersect(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np
 
 
 def difference(polygons: np.ndarray, holes: np.ndarray, order: Iterable[int] | None = None) -> list[np.ndarray]:
-    """Return the parts of convex polygons (N, V, D) outside counterclockwise convex holes (N, W, D), as convex pieces.
+    """Return the parts of convex polygons that lie outside convex holes, as convex polygons.
 
     Parameters
     ----------
     polygons : (N, V, D) ndarray
-        Convex polygons.
+        N convex polygons of V corners, with x and y in the first two of D columns.
     holes : (N, W, D) ndarray
-        Holes, counterclockwise and convex.
+        One hole of W corners for each polygon, counterclockwise and convex.
     order : iterable of int, optional
-        Order in which the sides of the holes are used for clipping, one piece for each; first to last by default.
+        Order in which the sides of the holes are used for clipping, one result for each; first to last by default.
 
     Returns
     -------
     list of (N, ., D) ndarray
-        Convex pieces, many of them empty.
+        Convex polygons, many of them empty, that together cover what is left.
     """
     normal, limit = sides(holes)
     out = []
@@ -234,14 +243,14 @@ def quadrature(polygons: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray
     Parameters
     ----------
     polygons : (N, V, D) ndarray
-        Polygons of either orientation.
+        N polygons of V corners, of either orientation, with x and y in the first two of D columns.
     count : int
         Number of nodes along each side of the box.
 
     Returns
     -------
     points : (N, count^2) ndarray
-        Nodes x + iy.
+        Nodes as complex numbers x + iy.
     weights : (N, count^2) ndarray
         Area weights.
     """
@@ -258,12 +267,12 @@ def quadrature(polygons: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray
 def from_boundary(
     nodes: np.ndarray, rise: np.ndarray, low: np.ndarray, high: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``quadrature`` over regions whose boundaries are given by nodes of integrals along them.
+    """Return nodes and area weights over regions given by their boundaries, as ``quadrature`` does for polygons.
 
     Parameters
     ----------
     nodes : (N, P, 2) ndarray
-        Nodes on the boundaries.
+        P nodes on the boundary of each of N regions.
     rise : (N, P) ndarray
         Weights of the nodes in integrals over dy.
     low, high : (N, 2) ndarray
@@ -289,12 +298,12 @@ def from_boundary(
 
 
 def _moments(nodes: np.ndarray, rise: np.ndarray, count: int) -> np.ndarray:
-    """Return the integrals (N, count, count) of Legendre products P_i(x) P_j(y) over N regions.
+    """Return the integrals (N, count, count) of products P_i(x) P_j(y) of Legendre polynomials over N regions.
 
     Parameters
     ----------
     nodes : (N, P, 2) ndarray
-        Nodes on the boundaries.
+        P nodes on the boundary of each region.
     rise : (N, P) ndarray
         Weights of the nodes in integrals over dy.
     count : int
@@ -311,7 +320,7 @@ def _moments(nodes: np.ndarray, rise: np.ndarray, count: int) -> np.ndarray:
 
 @cache
 def _lagrange(count: int) -> np.ndarray:
-    """Return the matrix (count, count) from integrals of Legendre polynomials to weights of Gauss points."""
+    """Return the matrix (count, count) that turns integrals of Legendre polynomials into weights of Gauss points."""
     points, weights = gauss(count)
     out = np.asarray(weights[:, None] * _legendre(points, count).T * (np.arange(count) + 0.5))
     out.setflags(write=False)

@@ -42,7 +42,7 @@ def rotation_matrix(vector: Any) -> np.ndarray:
 
 
 def _ratios(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return sin(a)/a and (1 - cos a)/a^2 from a^2; both are entire functions of a^2."""
+    """Return sin(a)/a and (1 - cos a)/a^2 for a rotation angle a (radians) from its square; smooth at a = 0."""
     sine = np.zeros_like(square)
     cosine = np.zeros_like(square)
     for n in range(_SERIES_TERMS, 0, -1):
@@ -71,7 +71,9 @@ def rotation_vector(matrix: Any) -> np.ndarray:
 
 
 def about_axis(axis: int, angle: float) -> np.ndarray:
-    """Return the (3, 3) rotation by ``angle`` radians about coordinate axis 0, 1 or 2 (right-hand rule)."""
+    """Return the matrix (3, 3) of the rotation through ``angle`` radians about coordinate axis 0, 1 or 2 (right-hand
+    rule).
+    """
     vector = np.zeros(3)
     vector[axis] = angle
     return rotation_matrix(vector)
@@ -85,7 +87,7 @@ def triple(vector: Any) -> tuple[float, float, float]:
 
 _UNIT = np.eye(3)
 _ORTHOGONALITY_TOLERANCE = 1e-12 + 1e-5 * _UNIT
-"""Tolerance of a rotation times its transpose about the unit matrix.
+"""Largest allowed difference (3, 3) of a rotation matrix times its transpose from the unit matrix.
 
 Axes must be perpendicular to rounding; their lengths may have the error of a matrix that a file gives in a few digits.
 """

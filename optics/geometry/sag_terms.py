@@ -32,22 +32,29 @@ class SagTerm(Protocol):
     POWERS: ClassVar[Mapping[str, int]]
 
     def sag(self, x: Any, y: Any) -> Any:
-        """Return the height at x, y in metres, NumPy arrays (...) -> (...); NaN outside the term's domain."""
+        """Return the height in metres at points x, y (metres), NumPy arrays of one shape; NaN outside the term's
+        domain.
+        """
         ...
 
     def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
-        """Return height (metres) and slopes by x and y, Dr.Jit arrays; finite also outside the domain of ``sag``."""
+        """Return the height (metres) at points x, y and its derivatives along x and y, as Dr.Jit arrays.
+
+        They are finite also outside the domain of ``sag``.
+        """
         ...
 
 
 def scaled_term(term: SagTerm, scale: Any) -> SagTerm:
-    """Return the term on a body scaled by a factor; the factor and so the numbers may be arrays, also complex."""
+    """Return the term on a body whose lengths are multiplied by ``scale``; the factor may be an array, also complex."""
     kind = type(term)
     return kind(**{name: getattr(term, name) * scale**power for name, power in kind.POWERS.items()})
 
 
 def of_kinds(terms: Sequence[SagTerm], kinds: Sequence[type[SagTerm]]) -> tuple[SagTerm, ...]:
-    """Return one term of each kind, in the order of ``kinds``: those of ``terms``, or zero terms for missing kinds."""
+    """Return one term of each kind, in the order of ``kinds``: the one in ``terms``, or a term of zeros where it is
+    missing.
+    """
     by_kind: Mapping[Any, SagTerm] = {type(term): term for term in terms}
     return tuple(by_kind[kind] if kind in by_kind else kind() for kind in kinds)
 
@@ -59,9 +66,9 @@ def kinds_of(terms: Sequence[SagTerm]) -> tuple[type[SagTerm], ...]:
 
 @dataclass(frozen=True)
 class XYPolynomial:
-    """Freeform sag: sum of c_ab x^a y^b of orders 2 to 4.
+    """Freeform sag: sum of c_ab x^a y^b over 2 <= a + b <= 4, with x, y and the sag in metres.
 
-    The field ``x2y`` is the coefficient of x^2 y; units are 1/m, 1/m^2 and 1/m^3.
+    The field ``x2y`` is the coefficient of x^2 y; units are 1/m, 1/m^2 and 1/m^3 for degrees a + b of 2, 3 and 4.
     """
 
     POWERS: ClassVar[Mapping[str, int]] = FrozenMap(
@@ -83,7 +90,7 @@ class XYPolynomial:
     y4: Any = 0.0
 
     def _terms(self) -> dict[tuple[int, int], Any]:
-        """Return the mapping (a, b) -> c_ab."""
+        """Return the mapping from exponents (a, b) to the coefficient of x^a y^b."""
         return {
             (2, 0): self.x2,
             (1, 1): self.xy,
@@ -100,11 +107,11 @@ class XYPolynomial:
         }
 
     def sag(self, x: Any, y: Any) -> Any:
-        """Return the height, in metres."""
+        """Return the height at points x, y, in metres (NumPy arrays)."""
         return np.asarray(sum(c * x**a * y**b for (a, b), c in self._terms().items()))
 
     def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
-        """Return the height and its slopes."""
+        """Return the height at points x, y, in metres, and its derivatives along x and y (Dr.Jit arrays)."""
         coefficients: list[Any] = [0.0] * zernike.triangle_size(4)
         for (a, b), c in self._terms().items():
             coefficients[zernike.triangle_index(a, b)] = c
@@ -117,9 +124,10 @@ LAST_NOLL = 36
 
 @dataclass(frozen=True)
 class ZernikeSag:
-    """Freeform sag as designed: sum of a_j Z_j((x - x0)/radius, (y - y0)/radius), Noll order, a_j = rms over the disk.
+    """Freeform sag as designed: a sum of Zernike polynomials, a_j Z_j((x - x0)/radius, (y - y0)/radius).
 
-    A mirror's figure error is not part of it; that belongs to the state (``Motion.figure``).
+    j is the Noll index and the amplitude a_j the rms over the disk of ``radius`` about (x0, y0), in metres. A mirror's
+    figure error is not part of it; that belongs to the state (``Motion.figure``).
     """
 
     POWERS: ClassVar[Mapping[str, int]] = FrozenMap(
@@ -171,14 +179,14 @@ class ZernikeSag:
         return {j: getattr(self, f"Z{j}") for j in range(1, LAST_NOLL + 1)}
 
     def sag(self, x: Any, y: Any) -> Any:
-        """Return the height, in metres."""
+        """Return the height at points x, y, in metres (NumPy arrays)."""
         if not self.radius:
             return np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))
         u, v = (np.asarray(x) - self.x0) / self.radius, (np.asarray(y) - self.y0) / self.radius
         return np.asarray(sum(a * zernike.zernike(j, u, v) for j, a in self.amplitudes.items()))
 
     def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
-        """Return the height and its slopes."""
+        """Return the height at points x, y, in metres, and its derivatives along x and y (Dr.Jit arrays)."""
         import drjit as dr
 
         is_zero = self.radius == 0.0

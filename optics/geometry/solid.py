@@ -40,13 +40,16 @@ A metre in single precision, in which paths are traced, has steps of 6e-8 m.
 """
 
 _BITS = 60
-"""Planes are rounded to 2**-60, 1e-18 of a unit normal or a metre, far below the rounding of doubles."""
+"""Number of binary places to which planes are rounded: 2**-60 is 1e-18 of a unit normal or a metre.
+
+That is far below the rounding of float64 numbers.
+"""
 
 _Plane = tuple[int, int, int, int]
-"""Integer normal and offset of a half-space n . x <= d."""
+"""Half-space of points x with n . x <= d: the three components of its normal n, and its offset d, as integers."""
 
 _Corner = tuple[int, int, int, int]
-"""Homogeneous integer coordinates x, y, z, w with w > 0."""
+"""Corner in homogeneous integer coordinates (x, y, z, w) with w > 0: the point (x, y, z) / w."""
 
 _Rings = dict[int, list[int]]
 """Corners of each face, counterclockwise as seen from outside, by face number."""
@@ -78,12 +81,12 @@ class Polyhedron:
 
 
 def half_space_intersection(normals: np.ndarray, offsets: np.ndarray) -> Polyhedron:
-    """Return the body of all x with normals . x <= offsets.
+    """Return the convex body of all points x with normals . x <= offsets.
 
     Parameters
     ----------
     normals : (F, 3) ndarray
-        Outward unit vectors.
+        Outward unit normals of F planes.
     offsets : (F,) ndarray
         Distances of the planes from the origin along the normals, metres.
 
@@ -121,7 +124,10 @@ def _integers(plane: Iterable[float]) -> _Plane:
 
 
 def _box(planes: list[_Plane], first: int) -> tuple[list[_Corner], _Rings]:
-    """Return corners and faces of the box to cut from, and append its planes to ``planes``, numbered from ``first``."""
+    """Return corners and faces of the box from which bodies are cut, and append its planes to ``planes``.
+
+    The planes of the box are numbered from ``first``.
+    """
     extent = int(MAX_EXTENT)
     corners = [(x, y, z, 1) for x in (-extent, extent) for y in (-extent, extent) for z in (-extent, extent)]
     outlines = {(-1, 0, 0): (0, 1, 3, 2), (1, 0, 0): (4, 6, 7, 5), (0, -1, 0): (0, 4, 5, 1)}
@@ -173,7 +179,7 @@ def _cut(corners: list[_Corner], rings: _Rings, planes: Sequence[_Plane], k: int
 
 
 def _edges(ring: Sequence[int]) -> Iterable[tuple[int, int]]:
-    """Return pairs of consecutive corners of a closed ring."""
+    """Return pairs of consecutive corners of a closed ring; the last is joined to the first."""
     return zip(ring, (*ring[1:], ring[0]), strict=True)
 
 
@@ -226,7 +232,7 @@ def _without(rings: _Rings, u: int, v: int) -> _Rings | None:
 
 
 class Coating(Enum):
-    """Surface treatment of a face."""
+    """Surface treatment of a face of a glass solid, which decides whether it reflects, transmits or absorbs."""
 
     MIRROR = "mirror"  # metallised: reflects from inside and outside
     TRANSMITTING = "transmitting"  # polished, anti-reflection coated

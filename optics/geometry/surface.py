@@ -18,9 +18,10 @@ from optics.numerics.number_tree import FrozenMap
 
 @dataclass(frozen=True)
 class ZernikeFigure:
-    """Sag error sum a_j Z_j((x - cx)/radius, (y - cy)/radius), Noll order, a_j = rms over the disk in metres.
+    """Sag error in metres as a sum of Zernike polynomials, a_j Z_j((x - cx)/radius, (y - cy)/radius).
 
-    A state may change the terms (``Motion.figure``); the disk is fixed.
+    j is the Noll index and a_j the rms over the disk of ``radius`` about (cx, cy), in metres. A state may change the
+    terms (``Motion.figure``); the disk is fixed.
     """
 
     radius: float
@@ -28,18 +29,18 @@ class ZernikeFigure:
     terms: Mapping[int, float] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
-        """Freeze the terms."""
+        """Freeze the mapping of terms."""
         if not self.radius > 0.0:
             raise ValueError(f"a figure needs a positive radius, found {self.radius}")
         object.__setattr__(self, "terms", FrozenMap({int(k): float(v) for k, v in self.terms.items()}))
 
     def numbers(self, order: int) -> FigureNumbers:
-        """Return the figure as a polynomial of degree ``order``, at least the figure's own order."""
+        """Return the figure as a polynomial in x and y of degree ``order``, at least the figure's own radial order."""
         return FigureNumbers(*self.centre, tuple(zernike.monomials(self.terms, order, self.radius)))
 
     @property
     def order(self) -> int:
-        """Highest radial order; -1 without terms."""
+        """Highest radial order of the Zernike terms; -1 without terms."""
         return zernike.order_of(self.terms)
 
     def sag(self, x: Any, y: Any) -> np.ndarray:
@@ -66,7 +67,7 @@ class GridFigure:
     bounds: tuple[float, float, float, float]
 
     def __post_init__(self) -> None:
-        """Copy, freeze and check."""
+        """Copy and freeze the values, and check their shape and bounds."""
         values = np.array(self.values, dtype=np.float64)
         if values.ndim != 2 or min(values.shape) < 4 or not np.all(np.isfinite(values)):
             raise ValueError("a grid figure needs a finite array of at least 4 x 4 values")
@@ -87,7 +88,9 @@ class GridFigure:
 
     @property
     def numbers(self) -> GridNumbers:
-        """Grid parameters for a kernel, with the coefficients ``spline`` at the start of its table."""
+        """Position, spacing and size of the grid for a kernel; its coefficients ``spline`` come first in the kernel's
+        table.
+        """
         dx, dy = self.spacing
         rows, columns = self.values.shape
         return GridNumbers(self.bounds[0], self.bounds[2], 1.0 / dx, 1.0 / dy, float(columns), float(rows), 0.0)
@@ -107,7 +110,7 @@ class GridFigure:
         return GridFigure(self.values + other.values, self.bounds)
 
     def sampled_as(self, other: GridFigure) -> GridFigure:
-        """Resample the figure on the grid of another one."""
+        """Return the figure interpolated at the samples of the grid ``other``."""
         x0, x1, y0, y1 = other.bounds
         rows, columns = other.values.shape
         x, y = np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows))
@@ -149,7 +152,10 @@ Figure = ZernikeFigure | GridFigure | SummedFigure
 
 @dataclass(frozen=True, eq=False)
 class FigureNumbers:
-    """Figure as a polynomial about (x, y), metres: c_ab of x^a y^b, ordered by ``zernike.triangle_index``."""
+    """Figure as a polynomial: sum of c_ab x^a y^b about a centre, with lengths in metres.
+
+    The coefficients c_ab are ordered by ``zernike.triangle_index``.
+    """
 
     x: Any
     y: Any
@@ -157,7 +163,7 @@ class FigureNumbers:
 
     @property
     def order(self) -> int:
-        """Highest degree a + b."""
+        """Highest degree a + b of the terms x^a y^b."""
         return triangle_order(len(self.coefficients))
 
 
@@ -285,7 +291,21 @@ def level(
 
 
 def newton_step(p: Any, d: Any, t: Any, surface: SurfaceNumbers, table: Any = None, active: Any = True) -> Any:
-    """Return a better distance than t from p along d to a surface; other arguments as for ``level``."""
+    """Improve by one Newton step the distance t, in metres, from points p along unit directions d to a surface.
+
+    Parameters
+    ----------
+    p, d : Dr.Jit vector
+        Points in the surface's frame, metres, and unit directions.
+    t : Dr.Jit float
+        Distances so far, metres.
+    surface : SurfaceNumbers
+        Numbers of the surface.
+    table : Dr.Jit float, optional
+        Spline coefficients of grid figures.
+    active : Dr.Jit bool
+        Mask of the rays that matter; the table is not read elsewhere.
+    """
     import drjit as dr
 
     value, nx, ny, nz = level(*along(p, d, t), surface, table, active)
@@ -293,14 +313,17 @@ def newton_step(p: Any, d: Any, t: Any, surface: SurfaceNumbers, table: Any = No
 
 
 def along(p: Any, d: Any, t: Any) -> tuple[Any, Any, Any]:
-    """Return the coordinates of p + t d."""
+    """Return the coordinates x, y, z of the point at distance t from p in direction d: p + t d."""
     import drjit as dr
 
     return dr.fma(t, d.x, p.x), dr.fma(t, d.y, p.y), dr.fma(t, d.z, p.z)
 
 
 def grid_figure(x: Any, y: Any, grid: GridNumbers, table: Any, active: Any = True) -> tuple[Any, Any, Any]:
-    """Return the cubic B-spline of a ``GridFigure`` and its slopes; ``table`` holds padded coefficients row by row."""
+    """Return the cubic B-spline of a ``GridFigure`` at points x, y (metres), and its derivatives along x and y.
+
+    ``table`` holds the coefficients of the padded grid, row by row.
+    """
     import drjit as dr
 
     float_type = type(x)
@@ -332,7 +355,9 @@ def grid_figure(x: Any, y: Any, grid: GridNumbers, table: Any, active: Any = Tru
 
 
 def _weights(f: Any) -> tuple[list[Any], list[Any]]:
-    """Return the cubic B-spline weights of samples -1, 0, 1, 2 at fraction f, and their derivatives."""
+    """Return the cubic B-spline weights of the four samples -1, 0, 1, 2 at position f between 0 and 1, and their
+    derivatives.
+    """
     e = 1.0 - f
     values = [
         e * e * e / 6.0,
@@ -394,20 +419,19 @@ class Surface:
         return self.figure if isinstance(self.figure, GridFigure) else None
 
     def with_figure(self, figure: Figure | None) -> Surface:
-        """Return this shape with another figure."""
+        """Return a surface of the same ideal shape with ``figure`` instead of its own figure; None removes it."""
         return replace(self, figure=figure)
 
     def scaled(self, scale: float) -> Surface:
-        """Return the surface of a body scaled by a factor.
-
-        The figure is not scaled, as in ``optics.raytrace.system``.
+        """Return the surface with all lengths multiplied by ``scale``, except for the figure error, which stays as it
+        is.
         """
         even = tuple(a / scale ** (2 * n + 3) for n, a in enumerate(self.even))
         terms = tuple(scaled_term(term, scale) for term in self.terms)
         return replace(self, curvature=self.curvature / scale, even=even, terms=terms)
 
     def figure_disk(self, aperture: Aperture | None) -> ZernikeFigure:
-        """Return the Zernike figure to which terms are added.
+        """Return the Zernike figure whose disk a state's Zernike terms refer to.
 
         It is the surface's own, or one without terms over the smallest circle that encloses the aperture.
 

@@ -53,7 +53,7 @@ class Body:
         return self.path.rpartition("/")[0]
 
     def moved(self, motion: Motion) -> Body:
-        """Return the body with the pose that a rigid motion gives it as its nominal pose."""
+        """Return the body whose nominal pose is the one that a rigid motion gives this body."""
         local_rotation, offset, _ = _affine([motion], [self])
         rotation, translation = self.pose.rotation, self.pose.translation
         return replace(self, pose=Pose(product(rotation, local_rotation[0]), translation + matvec(rotation, offset[0])))
@@ -160,9 +160,9 @@ class PlacedBodies:
     index : mapping of str to int
         Body path -> index along the second axis.
     rotation : (S, bodies, 3, 3) ndarray
-        World rotations.
+        Rotation matrices from each body's frame to the world.
     translation : (S, bodies, 3) ndarray
-        World keys of the origins, metres.
+        World positions of the bodies' origins, metres.
     scale : (S, bodies) ndarray
         Size of each body itself relative to nominal.
     """
@@ -189,7 +189,7 @@ class RigidTree:
     bodies: tuple[Body, ...]
 
     def __post_init__(self) -> None:
-        """Check names and order."""
+        """Check that names are unique and that parents come before their children."""
         seen: set[str] = set()
         for body in self.bodies:
             if body.path in seen:
@@ -327,7 +327,7 @@ class RigidTree:
 
     @cached_property
     def _nominal_state(self) -> PlacedBodies:
-        """Nominal state; shared by all callers and therefore read-only."""
+        """World poses of all bodies in the nominal state; shared by all callers and therefore read-only."""
         rotation, translation = (array[None].copy() for array in self._nominal)
         scale = np.ones(rotation.shape[:2])
         for array in (rotation, translation, scale):
@@ -368,7 +368,7 @@ def _local_motions(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the rotation, translation, scale and expansion of motions in each body's frame.
 
-    The shapes are (B, S, 3, 3), (B, S, 3), (B, S) and (B, S).
+    The shapes are (B, S, 3, 3), (B, S, 3), (B, S) and (B, S) for B bodies in S states; translations are in metres.
     """
     size = len(bodies), len(states)
     rotate, shift = np.zeros((*size, 3), dtype), np.zeros((*size, 3), dtype)
@@ -402,7 +402,8 @@ def _local_motions(
 
 
 def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
-    """Return the state that applies ``then`` on top of ``first``: x -> first(then(x)) in every body's frame.
+    """Return the state that applies ``then`` on top of ``first``: in every body's frame a point x goes to
+    first(then(x)).
 
     Exact for the rigid parts; figures, conic constants and indices add.
 
@@ -415,12 +416,12 @@ def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
 
 
 def composed(states: Sequence[State], bodies: Mapping[str, Body]) -> State:
-    """Return the state that applies several states, each on top of the one before it (see ``compose``)."""
+    """Return one state that applies several states, each on top of the one before it in every body's frame."""
     return compose_each([states], bodies)[0]
 
 
 def compose_each(sequences: Sequence[Sequence[State]], bodies: Mapping[str, Body]) -> list[State]:
-    """Return the composed state of each sequence of states, computed together (see ``composed``)."""
+    """Return, for each sequence of states, the one state that applies them all; the sequences are computed together."""
     chains: list[dict[str, list[Motion]]] = [{} for _ in sequences]
     for chain, states in zip(chains, sequences, strict=True):
         for state in states:
@@ -437,7 +438,7 @@ def compose_each(sequences: Sequence[Sequence[State]], bodies: Mapping[str, Body
 
 
 def _composed_pairs(pairs: Sequence[tuple[Motion, Motion]], bodies: Sequence[Body]) -> list[Motion]:
-    """Return the composition of each pair of motions, about the origins of N bodies."""
+    """Return, for each of N bodies, the one motion that applies a pair of motions, taken about the body's origin."""
     (rot_1, offset_1, scale), (rot_2, offset_2, _) = (_affine([pair[k] for pair in pairs], bodies) for k in range(2))
     rotation, offset = product(rot_1, rot_2), matvec(rot_1, scale[:, None] * offset_2) + offset_1
     rotate = _composed_rotations(pairs, rotation)
@@ -484,7 +485,10 @@ def _sum(first: GridFigure | None, then: GridFigure | None) -> GridFigure | None
 
 
 def _affine(motions: Sequence[Motion], bodies: Sequence[Body]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rotation R (N, 3, 3), offset (N, 3) and scale s (N,) of x -> R s x + offset, as in ``RigidTree.place``."""
+    """Return each motion as the map of a point x of its body to R s x + offset, in metres, in the body's frame.
+
+    Rotation R (N, 3, 3), offset (N, 3) and scale s (N,) are given for N bodies.
+    """
     pivot = np.array([body.pivots[motion.pivot] for motion, body in zip(motions, bodies, strict=True)])
     rotate, shift = (np.array([getattr(motion, name) for motion in motions]) for name in ("rotate", "shift"))
     scale = np.array([(1.0 + motion.scale) * (1.0 + motion.expansion) for motion in motions])

@@ -19,13 +19,13 @@ import numpy as np
 from optics.numerics.array_math import UnphysicalError
 
 PointMap = Callable[[np.ndarray], np.ndarray]
-"""Smooth map of points, (N, 2) -> (N, 2), metres."""
+"""Smooth map of N points (x, y) in a plane, (N, 2) -> (N, 2), metres."""
 
 BEND_TOLERANCE = 1e-9
 """Largest distance between a mapped outline and the shape that represents it, metres: 1/7000 of a 7 um pixel."""
 
 _MOST_PIECES = 4096
-"""Largest number of pieces of one edge; a map that needs more counts as not smooth."""
+"""Largest number of straight parts into which one edge is divided; a map that needs more counts as not smooth."""
 
 _BLOCK = 1 << 14
 """Number of frequencies processed in one block: their arrays stay in the processor's cache."""
@@ -188,9 +188,17 @@ class Disk:
         return float(x - hx), float(x + hx), float(y - hy), float(y + hy)
 
     def spectrum(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
-        """Return the Fourier transform, area * 2 J1(q)/q with q = |radius stretch^T k|, in m^2.
+        """Return the Fourier transform of the disk or ellipse, in m^2.
 
-        Arguments are those of ``Polygon.spectrum``.
+        It is area * 2 J1(q)/q with q = |radius stretch^T k|, where k is 2 pi times the frequency and J1 a Bessel
+        function.
+
+        Parameters
+        ----------
+        fx : ndarray
+            Frequencies along x, cycles/m, of at most two axes.
+        fy : ndarray
+            Frequencies along y, cycles/m; they broadcast with ``fx``.
         """
         # imported late: scipy takes 0.1 s, and commands that only check files import this module
         from scipy.special import j1
@@ -204,9 +212,19 @@ class Disk:
         return np.asarray(out).reshape(shape)
 
     def mapped(self, point_map: PointMap, tolerance: float = BEND_TOLERANCE) -> Disk | Polygon:
-        """Return the ellipse nearest to the mapped rim, or a polygon if no ellipse is within the tolerance.
+        """Return the ellipse nearest to the disk's rim under a smooth map, or a polygon if no ellipse is close enough.
 
-        Arguments and errors are those of ``Polygon.mapped``.
+        Parameters
+        ----------
+        point_map : callable
+            Map of N points (N, 2) -> (N, 2), metres.
+        tolerance : float
+            Largest distance of the new rim from the mapped one, metres.
+
+        Raises
+        ------
+        ValueError
+            The map is not finite on the rim, or too rough for the tolerance.
         """
 
         def rim(t: np.ndarray) -> np.ndarray:
@@ -309,7 +327,11 @@ class _Edges:
         return cls(start + 0.5 * vector, vector, orientation * np.stack([vector[:, 1], -vector[:, 0]], axis=-1))
 
     def sum(self, kx: np.ndarray, ky: np.ndarray) -> np.ndarray:
-        """Return the sum of (k . n) exp(-i k . m) sinc(k . d/2) over the edges, for kx (., C) and ky (R, .)."""
+        """Return the sum over the edges of (k . n) exp(-i k . m) sinc(k . d/2), for each wave vector k, in rad/m.
+
+        n is the outward normal of an edge, m its midpoint and d its vector, in metres; ``kx`` (., C) and ``ky`` (R, .)
+        are the components of k for C columns and R rows.
+        """
         total = np.zeros(np.broadcast_shapes(kx.shape, ky.shape), complex)
         for m, d, n in zip(self.middle, self.vector, self.normal, strict=True):
             half = 0.5 * d[0] * kx + 0.5 * d[1] * ky
@@ -323,7 +345,11 @@ class _Edges:
         return total
 
     def sum_near_zero(self, kx: np.ndarray, ky: np.ndarray, area: float) -> np.ndarray:
-        """Return the spectrum i/|k|^2 sum (k . n) (exp(-i k . m) sinc(k . d/2) - 1) for small k, (M,) each."""
+        """Return the spectrum of the outline for M wave vectors k near zero, without loss of digits, m^2.
+
+        It is i/|k|^2 times the sum over the edges of (k . n) (exp(-i k . m) sinc(k . d/2) - 1), with n the outward
+        normal of an edge, m its midpoint and d its vector; ``kx`` and ``ky`` (M,) are in rad/m.
+        """
         size = np.hypot(kx, ky)
         safe = np.where(size == 0.0, 1.0, size)
         ux, uy = kx / safe, ky / safe
@@ -346,7 +372,7 @@ def _sinc_less_one(s: np.ndarray) -> np.ndarray:
 
 
 def _phasor(k: np.ndarray, position: float) -> np.ndarray:
-    """Return exp(-i k x) at x = ``position``."""
+    """Return exp(-i k x) for wave numbers k, rad/m, at x = ``position``, metres."""
     phase = k * -position
     out = np.empty(phase.shape, complex)
     np.cos(phase, out=out.real)
@@ -355,7 +381,9 @@ def _phasor(k: np.ndarray, position: float) -> np.ndarray:
 
 
 def _wave_numbers(fx: np.ndarray, fy: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
-    """Return 2 pi fx and 2 pi fy with two axes each, and the broadcast shape of the result."""
+    """Return wave numbers 2 pi fx and 2 pi fy, rad/m, as arrays of two axes each, and the broadcast shape of the
+    result.
+    """
     fx, fy = np.asarray(fx, float), np.asarray(fy, float)
     shape = np.broadcast_shapes(fx.shape, fy.shape)
     if len(shape) > 2:
@@ -366,11 +394,12 @@ def _wave_numbers(fx: np.ndarray, fy: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _polyline(
     curve: Callable[[np.ndarray], np.ndarray], spans: int, point_map: PointMap, tolerance: float
 ) -> np.ndarray:
-    """Return points (N, 2) on the image of a closed curve whose chords deviate from it by at most the tolerance.
+    """Return points (N, 2) on the image of a closed curve whose chords deviate from it by at most the tolerance,
+    metres.
 
-    The curve has the parameter 0 <= t < spans and is smooth between integer t. Each span is divided evenly into as few
-    pieces as its curvature requires; a chord's distance from the curve falls with the square of their number. It is
-    measured at three points, because a curve with an inflection crosses its chord in the middle.
+    ``curve`` maps the parameter 0 <= t < ``spans`` to points and is smooth between integer t. Each span is divided
+    evenly into as few parts as its curvature requires; a chord's distance from the curve falls with the square of
+    their number. It is measured at three points, because a curve with an inflection crosses its chord in the middle.
     """
     if not tolerance > 0.0:
         raise ValueError(f"the tolerance must be positive, found {tolerance}")
