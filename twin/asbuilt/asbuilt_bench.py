@@ -26,13 +26,13 @@ from twin.monitor.truth import line_points
 from twin.tolerance.tolerance_bench import ToleranceBench
 
 STEP = 0.05
-"""Step of the central differences by the parameters, in standard deviations of the prior.
+"""Step of the central differences with respect to a parameter, in standard deviations of its prior.
 
-The relative error of a derivative is the square of this step times its curvature over a standard deviation.
+The relative error of a derivative is the step squared, times the curvature per standard deviation, over the slope.
 """
 
 _SHARE = 1e-2
-"""Step of the derivatives by actuators, as a share of their range."""
+"""Step of the numerical derivatives with respect to an actuator, as a share of the actuator's range."""
 
 
 class AsBuiltBench(Site):
@@ -56,9 +56,9 @@ class AsBuiltBench(Site):
     kinds : tuple of MeasuredKind
         Measurements in the order of the file.
     afters : tuple of str or None
-        Last move that had been made before each measurement.
+        Name of the last actuator move made before each measurement; None before the first move.
     merits : ToleranceBench
-        Bench of the merits.
+        Evaluator of the merits (image quality and its requirements).
 
     Raises
     ------
@@ -106,7 +106,7 @@ class AsBuiltBench(Site):
 
     @cached_property
     def candidates(self) -> tuple[MeasuredKind, ...]:
-        """Possible further measurements."""
+        """Further measurements that the file names as possible."""
         return self._kinds(self.test.candidates, "candidates")
 
     def beams(self, fields: tuple[tuple[float, float], ...]) -> VariedBeams:
@@ -117,11 +117,11 @@ class AsBuiltBench(Site):
 
     @cached_property
     def optics(self) -> CameraOptics:
-        """Nominal camera."""
+        """Nominal camera, for tracing rays."""
         return CameraOptics.within(self.experiment.instrument, self.camera, self.backend)
 
     def bench(self, merits: Mapping[str, MeritSpec]) -> ToleranceBench:
-        """Return a bench on which merits are computed."""
+        """Return the evaluator that computes these merits for the camera."""
         budget = ToleranceBudgetSpec.model_construct(
             instrument=self.test.instrument,
             camera=self.camera,
@@ -136,9 +136,9 @@ class AsBuiltBench(Site):
     # predictions
 
     def view(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> View:
-        """Return the states of parameters (S, K) after a move.
+        """Return the instrument's states for parameters (S, K), after the actuator move named ``after``.
 
-        Array dimensions: S states, K parameters.
+        ``further`` are the amounts of one more move, SI. Array dimensions: S states, K parameters.
         """
         states: Sequence[State] = self.parameters.states(values, after, further)
         return View(values, states, lambda bodies: self.parameters.temperatures(values, bodies))
@@ -161,7 +161,8 @@ class AsBuiltBench(Site):
     def slope(
         self, values: np.ndarray, kinds: Sequence[MeasuredKind] | None = None, afters: Sequence[str | None] = ()
     ) -> np.ndarray:
-        """Return the derivatives (D, K) of the predictions at parameters (K,), by central differences.
+        """Return the derivatives (D, K) of the predicted readings with respect to the parameters, by central
+        differences.
 
         Array dimensions: D readings, K parameters.
         """
@@ -169,7 +170,7 @@ class AsBuiltBench(Site):
         return self._by_parameters(values, lambda moved: self._predicted(moved, kinds, afters))
 
     def _by_parameters(self, values: np.ndarray, work: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """Return the derivatives (D, K) of a function of states, (S, K) -> (S, D), at parameters (K,).
+        """Return the derivatives (D, K) of a function of the parameters, which maps (S, K) to (S, D), by differences.
 
         Array dimensions: D readings, K parameters, S states.
         """
@@ -181,11 +182,17 @@ class AsBuiltBench(Site):
     # the estimate
 
     def groups(self, data: Sequence[np.ndarray]) -> tuple[MeasuredGroup, ...]:
-        """Return the measurements with their data for the estimate."""
+        """Return the measurements, each with its data, errors and systematic errors, as the estimate needs them."""
         return tuple(kind.group(values) for kind, values in zip(self.kinds, data, strict=True))
 
     def data(self) -> tuple[np.ndarray, ...]:
-        """Return the contents of the data files; raise InputError if a file is unreadable or holds something else."""
+        """Return the readings in the data files of all measurements, SI.
+
+        Raises
+        ------
+        InputError
+            A file is unreadable or holds something else.
+        """
         return tuple(kind.read() for kind in self.kinds)
 
     def estimate(self, data: Sequence[np.ndarray], start: np.ndarray | None = None) -> StateEstimate:
@@ -194,9 +201,9 @@ class AsBuiltBench(Site):
         Parameters
         ----------
         data : sequence of ndarray
-            Data of each measurement.
+            Readings of each measurement, SI.
         start : ndarray, optional
-            Parameters at which the iteration starts.
+            Parameters at which the iteration starts; by default the prior mean.
 
         Raises
         ------
@@ -211,7 +218,7 @@ class AsBuiltBench(Site):
     # a drawn instrument
 
     def draw(self, rng: np.random.Generator, law: str) -> np.ndarray:
-        """Draw the parameters (K,) of an instrument from the prior, or from the prior given under ``simulate``.
+        """Draw the parameters (K,) of an instrument from the prior, or from the one under ``simulate`` in the file.
 
         Array dimensions: K parameters.
 
@@ -269,7 +276,8 @@ class AsBuiltBench(Site):
     def merit_parts(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> np.ndarray:
         """Return the parts of the merits, (S, P), for parameters (S, K); NaN where the light is lost.
 
-        Array dimensions: S states, P parts of the merits, K parameters.
+        Array dimensions: S states, P parts of the merits (smooth quantities, such as the MTF at one field), K
+        parameters.
         """
         return nan_where_lost(
             lambda rows: self.merits.parts_of(
@@ -280,9 +288,10 @@ class AsBuiltBench(Site):
         )
 
     def merit_residuals(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> np.ndarray:
-        """Return residuals (S, R) whose sum of squares a move minimises.
+        """Return residuals (S, R) of the merits, whose sum of squares the optimum actuator move minimises.
 
-        It is the sum over the merits of the mean square over fields or points, in units of the requirement.
+        The sum of squares is the sum over the merits of the mean square over fields or points, in units of the
+        requirement.
 
         Array dimensions: S states, R residuals.
 
@@ -309,7 +318,7 @@ class AsBuiltBench(Site):
         )
 
     def merit_slope(self, values: np.ndarray, after: str | None) -> np.ndarray:
-        """Return the derivatives (R, K) of the merits' residuals with respect to the parameters, at parameters (K,).
+        """Return the derivatives (R, K) of the merits' residuals with respect to the parameters, at ``values`` (K,).
 
         Array dimensions: R residuals, K parameters.
         """
@@ -317,7 +326,7 @@ class AsBuiltBench(Site):
 
     @cached_property
     def actuator_steps(self) -> np.ndarray:
-        """Steps of the numerical derivatives by the actuators, SI, (C,).
+        """Steps of the numerical derivatives with respect to the actuators, SI, (C,).
 
         Array dimensions: C actuators.
         """
@@ -327,7 +336,7 @@ class AsBuiltBench(Site):
 def nan_where_lost(
     work: Callable[[slice], np.ndarray], count: int, shape: tuple[int, ...], first: int = 0
 ) -> np.ndarray:
-    """Evaluate a function of states, (S, *shape), with NaN for each state whose light is lost.
+    """Evaluate a function for S states, with NaN for each state whose light is lost.
 
     Array dimensions: S states.
 

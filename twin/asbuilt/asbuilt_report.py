@@ -33,11 +33,11 @@ _MOST_COMBINATIONS = 12
 _FEW = 3
 """Largest number of candidate measurements that the verdict names."""
 BANDS = FrozenMap({"prior": GREY, "as built": BLUE, "after the next move": GREEN})
-"""Labels of the bands in a figure, and their colours."""
+"""Label of each band of quantiles in a figure (prior, as built, after the move) -> its colour."""
 
 
 def asbuilt_report(run: AsBuiltRun) -> Report:
-    """Return the report of an instrument as built."""
+    """Return the report: verdict, predicted merits, observable combinations of motions, measurements, next move."""
     with look("asbuilt"):
         along = to_svg(_along_figure(run))
         known = to_svg(_known_figure(run))
@@ -155,7 +155,7 @@ def _is_nothing(run: AsBuiltRun, name: str) -> bool:
 
 
 def _short(amount: str | float) -> str:
-    """Return an amount as text with four digits."""
+    """Return the amount of a move as text with four digits."""
     if isinstance(amount, str):
         number, _, unit = amount.partition(" ")
         return f"{plain(float(number), 4)} {unit}"

@@ -28,7 +28,7 @@ from twin.framework.record import Quantity, Record
 from twin.tolerance.monitor_merit import Merit, merit_unit, shown_merit
 
 LEVELS = (0.025, 0.16, 0.5, 0.84, 0.975)
-"""Levels of the reported quantiles."""
+"""Probabilities of the quantiles that are reported: median, 68 % and 95 % intervals."""
 WORST_FACTOR = 9.0
 """Chi-square per degree of freedom beyond which measurements contradict each other: residuals of three sigma on
 average.
@@ -36,9 +36,9 @@ average.
 _INSTRUMENT, _POSTERIOR, _PRIOR, _MOVE, _MADE = range(5)
 """Random streams."""
 ALONG = tuple((float(x), 0.0) for x in np.linspace(-1.0, 1.0, 11))
-"""Fields of the plot of the wavefront along the line."""
+"""Fields (x, y), as shares of the half field, at which the wavefront along the line is plotted."""
 _DRAW = 7e4
-"""Memory of one draw with its states of the prior, of the posterior and after the next move, bytes."""
+"""Memory in bytes of one random state drawn from the prior, one from the posterior and one after the next move."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,18 +88,18 @@ class AsBuiltRun:
     bench : AsBuiltBench
         The instrument.
     data : tuple of ndarray
-        Data of each measurement.
+        Readings of each measurement, SI.
     estimate : StateEstimate
         Estimated state.
     known : tuple of Combination
-        Combinations of motions, the best determined first.
+        Independent combinations of motions, the best determined by the measurements first.
     standings : tuple of Standing
         Predicted distributions of the merits.
     along : tuple of ndarray
         Rms wavefront error along the line, waves: nominal (F,), and quantiles ``LEVELS`` under the prior, the posterior
         and, with actuators, after the next move, (2 or 3, 5, F).
     advice : Advice or None
-        Next move; None without actuators.
+        Recommended next move; None without actuators.
     true : ndarray or None
         Parameters of a simulated instrument; None for a real one.
     warnings : tuple of str
@@ -243,7 +243,7 @@ def _prediction(
 
 
 def _along(bench: AsBuiltBench, cases: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nominal rms wavefront error along the line, and its quantiles over several sets of states."""
+    """Return the rms wavefront error along the line: nominal, and its quantiles over several sets of states."""
     field = bench.bench({"along": MeritSpec(kind="wavefront", fields=ALONG, at_most=1.0)})
 
     def rms(values: np.ndarray, further: np.ndarray | None) -> np.ndarray:
@@ -352,7 +352,7 @@ def _known_plain(run: AsBuiltRun) -> list[dict[str, Any]]:
 
 
 def moves_plain(run: AsBuiltRun, amounts: np.ndarray) -> dict[str, Any]:
-    """Return amounts of the actuators (C,) in the form of the files.
+    """Return the amounts of an actuator move (C,), SI, as actuator name -> quantity with unit, as in a file.
 
     Array dimensions: C actuators.
     """
@@ -376,7 +376,10 @@ def _advice_plain(run: AsBuiltRun) -> dict[str, Any] | None:
 
 
 def responses(run: AsBuiltRun) -> dict[str, Any] | None:
-    """Return the estimated response of each uncertain actuator, relative to the traced one; None if there is none."""
+    """Return the ratio of each uncertain actuator's estimated travel to the commanded one, with its sigma.
+
+    None if no actuator has an uncertain response.
+    """
     start = len(run.bench.parameters.components)
     names = [run.bench.parameters.names[k] for k in run.bench.parameters.gains]
     if not names:

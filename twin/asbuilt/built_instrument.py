@@ -48,9 +48,9 @@ def instrument_text(run: AsBuiltRun) -> str:
 
 
 def unknown(run: AsBuiltRun) -> tuple[list[Component], np.ndarray]:
-    """Return the components of motions that are uncertain, without thermal ones, and their covariance (C, C), SI.
+    """Return the uncertain components of bodies' motions and their posterior covariance (C, C), SI.
 
-    Errors of moves are added to the components of the bodies that were moved.
+    Thermal components are left out. Errors of actuator moves are added to the components of the bodies that were moved.
 
     Array dimensions: C uncertain components.
     """
@@ -97,7 +97,7 @@ def unknown(run: AsBuiltRun) -> tuple[list[Component], np.ndarray]:
 
 
 def _pull(run: AsBuiltRun, actuator: int) -> np.ndarray:
-    """Return the derivatives of an actuator's total travel with respect to all parameters, (K,).
+    """Return the derivatives (K,) of one actuator's total travel with respect to all estimated parameters, SI.
 
     Array dimensions: K parameters.
     """

@@ -1,4 +1,5 @@
-"""Kinds of measurements on an instrument: prediction for a state, error model, and data.
+"""Kinds of measurements on an instrument: predicted readings for a state of the instrument, error model, and data
+files.
 
 A new kind is a class here, an entry of ``KINDS`` and its keys in ``scenes.specs.asbuilt.MeasurementsSpec``.
 """
@@ -32,13 +33,19 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.tolerance.tolerance_bench import ToleranceBench
 
 UNKNOWN_FOCUS = 50e-6
-"""Standard deviation of the free focus of a simulated measurement, metres; results do not depend on it."""
+"""Standard deviation, in a simulated measurement, of a focus that the estimate leaves free, metres.
+
+Results do not depend on it.
+"""
 UNKNOWN_ZERO = 20.0 * ARCSEC
-"""Standard deviation of the free zero of angles of a simulated measurement, radians."""
+"""Standard deviation, in a simulated measurement, of a zero of angles that the estimate leaves free, radians."""
 UNKNOWN_FRAME = 100e-6
-"""Standard deviation of the free frame of a simulated measuring machine, metres and radians."""
+"""Standard deviation, in a simulated measurement, of the measuring machine's frame, metres and radians.
+
+The estimate leaves this frame free.
+"""
 _LINE_DEGREE = 7
-"""Degree of the polynomial in the tangent that fits image positions along a line to 1e-10 m."""
+"""Degree of the polynomial in the tangent of the field angle that fits positions along a line to 1e-10 m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +57,7 @@ class View:
     Attributes
     ----------
     values : (S, K) ndarray
-        Parameters.
+        Estimated parameters (motions, actuator errors) of each state, SI.
     states : sequence of State
         S states of the instrument.
     warmth : callable
@@ -76,7 +83,7 @@ class Site(ABC):
 
     @abstractmethod
     def bench(self, merits: Mapping[str, MeritSpec]) -> ToleranceBench:
-        """Return a bench on which merits are computed."""
+        """Return the evaluator that computes these merits for the camera."""
 
 
 class MeasuredKind(ABC):
@@ -100,12 +107,12 @@ class MeasuredKind(ABC):
     labels : tuple of str
         Labels of its readings, (D,).
     blocks : tuple of str
-        Group of each reading that one gross error would affect together, (D,).
+        Group to which each reading belongs, (D,); one gross error affects all readings of a group.
     """
 
     kind: ClassVar[str]
     shown: ClassVar[tuple[str, float]]
-    """Unit in which its readings are reported, and its size in SI."""
+    """Unit in which its readings are reported, and the size of that unit in SI."""
 
     def __init__(self, site: Site, name: str, spec: Any, key: tuple[str, ...]) -> None:
         self.site, self.name, self.spec, self.key = site, name, spec, key
@@ -116,7 +123,7 @@ class MeasuredKind(ABC):
 
     @abstractmethod
     def prepare(self) -> None:
-        """Compute what all states share."""
+        """Compute once what the predictions for all states have in common."""
 
     labels: tuple[str, ...]
     blocks: tuple[str, ...]
@@ -130,17 +137,17 @@ class MeasuredKind(ABC):
 
     @abstractmethod
     def covariance(self) -> np.ndarray:
-        """Return the covariance of the random errors, (D, D).
+        """Return the covariance of the readings' random errors, (D, D), in squared SI units.
 
         Array dimensions: D readings.
         """
 
     def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the design matrix (D, B) of systematic errors, and their standard deviations (B,).
+        """Return the effect of each systematic error on the readings, (D, B), and two sets of sigmas (B,).
 
-        The first standard deviations are for the estimate, the second ones for simulated data.
+        The first set of standard deviations is for the estimate, the second ones for simulated data.
 
-        A free bias has an infinite standard deviation in the estimate.
+        A bias that the estimate leaves free has an infinite standard deviation in the estimate.
 
         Array dimensions: D readings, B systematic errors.
         """
@@ -148,13 +155,13 @@ class MeasuredKind(ABC):
 
     @abstractmethod
     def read(self) -> np.ndarray:
-        """Return the data, (D,), SI; raise InputError if a file does not hold them.
+        """Return the measured readings, (D,), SI; raise InputError if a file does not hold them.
 
         Array dimensions: D readings.
         """
 
     def group(self, values: np.ndarray) -> MeasuredGroup:
-        """Return the measurement with data (D,) for the estimate.
+        """Return the measurement with its readings (D,), errors and systematic errors, as the estimate needs it.
 
         Array dimensions: D readings.
         """
@@ -203,12 +210,12 @@ class WavefrontReadings(MeasuredKind):
         self.blocks = tuple(f"field {field_text(field)}" for field in spec.fields for _ in terms)
 
     def predict(self, view: View) -> np.ndarray:
-        """Return the terms, field after field."""
+        """Return the Zernike terms of every state, field after field, metres rms."""
         paths = self.beams.light(view.states).paths
         return np.asarray(np.einsum("ftn,sfn->sft", self.rows, paths).reshape(len(view.states), -1))
 
     def covariance(self) -> np.ndarray:
-        """Return the same variance for all terms, without correlation."""
+        """Return the covariance of the Zernike terms: the same variance for all, without correlation."""
         return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
 
     def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -232,7 +239,7 @@ class WavefrontReadings(MeasuredKind):
         return table, np.array(sigmas), np.array(typical)
 
     def read(self) -> np.ndarray:
-        """Return the coefficients of the files."""
+        """Return the Zernike terms in the measurement's files, metres rms, in the program's orientation."""
         return np.asarray(read_coefficients(self).ravel())
 
 
@@ -243,7 +250,7 @@ class FocusReadings(MeasuredKind):
     shown = ("um", 1e-6)
 
     def prepare(self) -> None:
-        """Trace the beams and compute the rows from optical paths to best focus."""
+        """Trace the beams and compute the linear map from optical paths to the best focus of each field."""
         self.fields = self.spec.fields if self.spec.fields is not None else self._from_file[0]
         self.beams = self.site.beams(self.fields)
         self.rows = self.beams.focus_rows()
@@ -256,12 +263,12 @@ class FocusReadings(MeasuredKind):
         return np.asarray(np.einsum("fn,sfn->sf", self.rows, paths))
 
     def covariance(self) -> np.ndarray:
-        """Return the covariance with the error that all fields have in common."""
+        """Return the covariance of the foci: independent errors, and one error common to all fields."""
         count = len(self.labels)
         return np.asarray(self.spec.sigma**2 * np.eye(count) + self.spec.common**2)
 
     def read(self) -> np.ndarray:
-        """Return the values of the test's file, or of focus.json."""
+        """Return the best foci in the test's file, or in focus.json, metres."""
         return np.array(self.spec.values if self.spec.values is not None else self._from_file[1])
 
     @cached_property
@@ -287,7 +294,7 @@ class MtfReadings(MeasuredKind):
     shown = ("", 1.0)
 
     def prepare(self) -> None:
-        """Set up a bench with this MTF as its merit."""
+        """Set up the evaluator with this MTF as its merit."""
         spec = self.spec
         asked = MeritSpec(kind="mtf", fields=spec.fields, frequency=spec.frequency, at_least=0.0)
         self.tried = self.site.bench({self.name: asked})
@@ -301,11 +308,11 @@ class MtfReadings(MeasuredKind):
         return self.tried.parts_of(view.states)
 
     def covariance(self) -> np.ndarray:
-        """Return the same variance for all readings, without correlation."""
+        """Return the covariance of the MTF values: the same variance for all, without correlation."""
         return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
 
     def read(self) -> np.ndarray:
-        """Return the values of the test's file."""
+        """Return the MTF values in the test's file."""
         return np.stack([self.spec.along_line, self.spec.along_track], axis=-1).ravel()
 
 
@@ -346,7 +353,7 @@ class DistortionReadings(MeasuredKind):
         return line_tangents(sight, self.line, self.axes)[2]
 
     def predict(self, view: View) -> np.ndarray:
-        """Return the positions by a polynomial through the traced points of the line."""
+        """Return the image positions along the line, metres, by a polynomial through traced points of the line."""
         tangents = self._tangents(view.states)
         size = np.max(np.abs(tangents), axis=1, keepdims=True)
         table = (tangents / size)[..., None] ** np.arange(1, _LINE_DEGREE + 1)
@@ -355,15 +362,15 @@ class DistortionReadings(MeasuredKind):
         return np.asarray(np.squeeze(asked @ terms, -1))
 
     def covariance(self) -> np.ndarray:
-        """Return independent variances."""
+        """Return the covariance of the image positions: an independent variance for each."""
         return np.diag(self.sigmas**2)
 
     def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the free zero of the angles."""
+        """Return the effect on the positions of an unknown zero of the angles, which the estimate leaves free."""
         return (self.focal * (1.0 + self.tangents**2))[:, None], np.array([np.inf]), np.array([UNKNOWN_ZERO])
 
     def read(self) -> np.ndarray:
-        """Return the positions of the file."""
+        """Return the image positions in the measurement's file, metres."""
         return np.array(self.values)
 
     @cached_property
@@ -411,15 +418,15 @@ class SpotReadings(MeasuredKind):
         return self.path.mean_spots(states).reshape(len(states), -1)
 
     def predict(self, view: View) -> np.ndarray:
-        """Return the energy centroids as means of rays."""
+        """Return the spot positions relative to the nominal ones, pixels: energy centroids, as means of traced rays."""
         return self._places(view.states) - self.nominal
 
     def covariance(self) -> np.ndarray:
-        """Return the same variance for all coordinates, without correlation."""
+        """Return the covariance of the spot coordinates: the same variance for all, without correlation."""
         return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
 
     def read(self) -> np.ndarray:
-        """Return the positions of the file minus the nominal ones."""
+        """Return the spot positions in the file minus the nominal ones, pixels."""
         path = self.file("file", self.spec.file, "a CSV file, or the recovered.json of a run")
         spots = self._recovered(path) if path.suffix.lower() == ".json" else self._table(path)
         out = []
@@ -466,7 +473,7 @@ class SightReadings(MeasuredKind):
     shown = ("", 1.0)
 
     def prepare(self) -> None:
-        """Select the measured quantities."""
+        """Select the quantities (rotations, principal distance) that the file measures."""
         names = ("alpha", "beta", "gamma", "principal_distance")
         self.which = [names.index(name) for name in self.spec.measured]
         self.labels = self.blocks = self.spec.measured
@@ -474,18 +481,18 @@ class SightReadings(MeasuredKind):
             raise self.wrong("the correlation matrix is singular", "correlation", "a positive definite matrix")
 
     def predict(self, view: View) -> np.ndarray:
-        """Return the changes by exact chief rays."""
+        """Return the rotations (rad) and the change of principal distance (m) from exactly traced chief rays."""
         truth = self.site.experiment.sight.truth(list(view.states))
         return np.asarray(truth.vector(self.site.camera)[:, self.which])
 
     def covariance(self) -> np.ndarray:
-        """Return the covariance with the specified correlation."""
+        """Return the covariance of the measured changes, with the correlation specified in the file."""
         sigma = np.array([getattr(self.spec, f"sigma_{name}") for name in self.spec.measured])
         rows = self.spec.correlation
         return np.asarray(np.diag(sigma**2) if rows is None else np.array(rows) * np.outer(sigma, sigma))
 
     def read(self) -> np.ndarray:
-        """Return the values of the test's file."""
+        """Return the rotations and the change of principal distance in the test's file, SI."""
         return np.array([getattr(self.spec, name) for name in self.spec.measured])
 
 
@@ -501,15 +508,15 @@ class TemperatureReadings(MeasuredKind):
         self.labels = self.blocks = self.bodies
 
     def predict(self, view: View) -> np.ndarray:
-        """Return the temperatures of the state."""
+        """Return the temperatures of the bodies above nominal in each state, kelvin."""
         return np.asarray(view.temperatures_of(self.bodies))
 
     def covariance(self) -> np.ndarray:
-        """Return the covariance with the error that all readings have in common."""
+        """Return the covariance of the temperatures: independent errors, and one error common to all readings."""
         return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)) + self.spec.common**2)
 
     def read(self) -> np.ndarray:
-        """Return the values of the test's file."""
+        """Return the temperatures in the test's file above nominal, kelvin."""
         return np.array(self.spec.values)
 
 
@@ -534,15 +541,15 @@ class PositionReadings(MeasuredKind):
         return np.asarray(np.einsum("sji,sbj->sbi", placed.rotation[:, root], offset).real)
 
     def predict(self, view: View) -> np.ndarray:
-        """Return the displacements against the drawing."""
+        """Return the displacements of the bodies' origins from the drawing in each state, metres."""
         return np.asarray((self._places(view.states) - self.nominal).reshape(len(view.states), -1))
 
     def covariance(self) -> np.ndarray:
-        """Return the same variance for all coordinates, without correlation."""
+        """Return the covariance of the displacements: the same variance for all coordinates, without correlation."""
         return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
 
     def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return shift and rotation of the measuring machine's frame."""
+        """Return the effect on the readings of an unknown shift and rotation of the measuring machine's frame."""
         if self.spec.frame != specs.FREE:
             return super().biases()
         shifts = np.tile(np.eye(3), (len(self.bodies), 1))
@@ -551,7 +558,7 @@ class PositionReadings(MeasuredKind):
         return columns, np.full(6, np.inf), np.full(6, UNKNOWN_FRAME)
 
     def read(self) -> np.ndarray:
-        """Return the values of the test's file."""
+        """Return the displacements in the test's file, metres."""
         return np.array(self.spec.values).ravel()
 
 

@@ -10,7 +10,7 @@ from analysis.instrument_state.state_estimate import NextMove, StateEstimate, be
 from twin.asbuilt.asbuilt_bench import AsBuiltBench, nan_where_lost, selected_moves
 
 MOST_ROUNDS = 3
-"""Largest number of times that the optimum move is computed about the state to which the previous one leads."""
+"""Largest number of times that the optimum move is computed again, linearised about the state after the last one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,9 +25,10 @@ class Advice:
         Expected merit without and with the move: the posterior mean of the sum of squares of all merits in units of
         their requirements, by exact traces.
     ignorance : float
-        Part of the merit that is due to the uncertainty of the state and could be corrected if the state were known.
+        Part of the expected merit after the move that a move could still correct if the state were known exactly.
     worth : dict
-        Name of a possible measurement -> expected reduction of the merit after the move that follows from it.
+        Name of a possible measurement -> expected reduction of the merit after the move, if the measurement is made
+        before it.
     """
 
     move: NextMove
@@ -38,14 +39,14 @@ class Advice:
 
 
 def optimal_move(bench: AsBuiltBench, mean: np.ndarray, after: str | None) -> NextMove:
-    """Return the move that minimises the expected merit, linearised about the state to which it leads.
+    """Return the actuator move with the smallest expected merit, linearised about the state to which it leads.
 
     Array dimensions: K parameters.
 
     Parameters
     ----------
     bench : AsBuiltBench
-        Bench with actuators.
+        Instrument under estimation, with its actuators and merits.
     mean : (K,) ndarray
         Estimated parameters.
     after : str, optional
@@ -73,9 +74,10 @@ def optimal_move(bench: AsBuiltBench, mean: np.ndarray, after: str | None) -> Ne
 def _about(
     bench: AsBuiltBench, mean: np.ndarray, after: str | None, amounts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the residuals of the merits (R,) after a move, and their derivatives by the actuators (R, C).
+    """Return the merits' residuals (R,) after a move, and their derivatives with respect to the actuators.
 
-    Array dimensions: R residuals, C actuators.
+    Squares of the residuals sum to the merits in units of their requirements; the derivatives are (R, C), per SI unit
+    of travel. Array dimensions: R residuals, C actuators.
     """
     count = len(amounts)
     steps = np.diag(bench.actuator_steps)
@@ -92,7 +94,7 @@ def advice(bench: AsBuiltBench, estimate: StateEstimate, draws: np.ndarray, rng:
     Parameters
     ----------
     bench : AsBuiltBench
-        Bench with actuators.
+        Instrument under estimation, with its actuators and merits.
     estimate : StateEstimate
         Estimated state.
     draws : (S, K) ndarray
@@ -126,9 +128,9 @@ def advice(bench: AsBuiltBench, estimate: StateEstimate, draws: np.ndarray, rng:
 def expected(
     bench: AsBuiltBench, values: np.ndarray, after: str | None, further: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the merits of states (S,), sums of squares in units of the requirements; NaN where the light is lost.
+    """Return the merit of each state (S,): the sum over all merits of their squares relative to the requirements.
 
-    Array dimensions: S states.
+    NaN where the light is lost. Array dimensions: S states.
     """
     return nan_where_lost(
         lambda rows: np.sum(bench.merit_residuals(values[rows], after, selected_moves(further, rows)) ** 2, axis=1),

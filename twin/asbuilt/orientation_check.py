@@ -22,7 +22,7 @@ from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, Section, answer
 
 FREE_FOCUS = 100.0 * UNKNOWN_FOCUS
-"""Standard deviation that represents a free focus, metres."""
+"""Standard deviation, metres, that stands for a focus without prior knowledge."""
 ANOTHER, NONE = 3, 4
 """Exit codes: another reading than the stated one explains the data; none does."""
 
@@ -40,7 +40,7 @@ class OrientationCheck:
     stated : Orientation
         Orientation specified in the file of the test.
     evidence : OrientationEvidence
-        Chi-square and evidence of every orientation.
+        Chi-square and Bayesian evidence of every orientation.
     """
 
     setup: AsBuiltSetup
@@ -164,7 +164,7 @@ ORIENTATION: Record[OrientationCheck] = Record(
 
 
 def check_report(check: OrientationCheck) -> Report:
-    """Return the report of a check of orientations."""
+    """Return the report of a check: which orientations of the measured wavefronts the data allow."""
     verdict, more = answer(*_words(check))
     evidence = check.evidence
     rows: list[list[Cell]] = [

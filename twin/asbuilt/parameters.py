@@ -1,8 +1,8 @@
 """Parameters of an as-built estimate: the motions of the prior, and response and errors of the actuators.
 
-A parameter vector holds the components of the prior, then one gain error for each actuator whose response is uncertain,
-then one error for each actuator of each move. The state at a time is the sum of the components and of all moves until
-then.
+A parameter vector holds the components of the prior (motions and temperatures of bodies), then one gain error for each
+actuator whose response is uncertain (travel over commanded amount, minus 1), then one error for each actuator of each
+move. The state at a time is the sum of the components and of all moves until then.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ class Parameters:
     Attributes
     ----------
     stated : DisturbancePrior
-        Components of the prior, M.
+        Prior of the M components (motions and temperatures of bodies).
     words : tuple of str
         Description of each component with the shortest name of its body, (M,).
-    numbers : tuple of VariedNumber
+    numbers : tuple of VariedParameter
         Effect of one SI unit of each component.
-    actuators : tuple of VariedNumber
+    actuators : tuple of VariedParameter
         Effect of one SI unit of each actuator, C.
     names : tuple of str
         Names of the actuators.
     gains : tuple of int
-        Indices of the actuators whose response is uncertain.
+        Indices of the actuators whose response (travel over commanded amount) is uncertain.
     gain_sigmas : ndarray
         Standard deviations of their responses, relative.
     moves : tuple of str
@@ -114,7 +114,7 @@ class Parameters:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Names of all parameters."""
+        """Names of all parameters, in the order of the parameter vector."""
         return (
             *self.words,
             *(f"response of {self.names[k]}" for k in self.gains),
@@ -123,7 +123,7 @@ class Parameters:
 
     @property
     def prior(self) -> StatePrior:
-        """Prior of all parameters."""
+        """Prior mean and covariance of all parameters."""
         count, rest = len(self.components), np.concatenate([self.gain_sigmas, self.error_sigmas])
         covariance = np.zeros((count + len(rest), count + len(rest)))
         covariance[:count, :count] = self.stated.covariance
@@ -131,7 +131,7 @@ class Parameters:
         return StatePrior.of(self.labels, covariance)
 
     def moved(self, values: np.ndarray, after: str | None) -> np.ndarray:
-        """Return the total travel of the actuators for parameters (S, K), (S, C), SI.
+        """Return the total travel (S, C) of the actuators for parameters (S, K), SI.
 
         Array dimensions: S states, K parameters, C actuators.
 
@@ -154,7 +154,7 @@ class Parameters:
         return out
 
     def gain(self, values: np.ndarray) -> np.ndarray:
-        """Return the ratio of each actuator's response to the traced one, (S, C).
+        """Return the ratio of each actuator's travel to the commanded amount, (S, C); 1 where it is not uncertain.
 
         Array dimensions: S states, C actuators.
         """
@@ -184,7 +184,7 @@ class Parameters:
         return states_of((*self.numbers, *self.actuators), amounts)
 
     def temperatures(self, values: np.ndarray, bodies: Sequence[str]) -> np.ndarray:
-        """Return the temperatures of bodies above nominal, (S, bodies), kelvin.
+        """Return the temperatures of the named bodies above nominal, one row per state, kelvin.
 
         A body without its own temperature has that of the nearest body that carries it.
 

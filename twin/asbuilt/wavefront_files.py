@@ -1,4 +1,4 @@
-"""Zernike coefficients of measured wavefronts from the files of a measurement, brought to the program's orientation."""
+"""Zernike coefficients of measured wavefronts from files, brought to the program's orientation."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class WavefrontMeasurement(Protocol):
 
     Attributes
     ----------
-    spec : Any
+    spec : Spec
         Specification of the measurement in the test.
     beams : VariedBeams
         Beams of its fields.
@@ -55,7 +55,7 @@ def read_coefficients(measurement: WavefrontMeasurement, orientation: Orientatio
 
     Parameters
     ----------
-    measurement : NamesWavefronts
+    measurement : WavefrontMeasurement
         The measurement.
     orientation : Orientation, optional
         Orientation of its files; the specified one by default.
@@ -115,7 +115,7 @@ def _of_map(measurement: WavefrontMeasurement, number: int, name: str, orientati
 
 
 def _less(measured: WavefrontMap, reference: WavefrontMap, measurement: WavefrontMeasurement) -> WavefrontMap:
-    """Return a map minus the error of the reference surface."""
+    """Return a wavefront map minus the error map of the reference surface."""
     if measured.values.shape != reference.values.shape:
         shapes = f"{reference.values.shape} points, the maps {measured.values.shape}"
         raise measurement.wrong(

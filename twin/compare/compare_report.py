@@ -27,7 +27,7 @@ _MOST_IMAGES = 8
 
 
 def compare_report(comparison: Comparison) -> Report:
-    """Return the report of a comparison."""
+    """Return the report: tables of the inputs and results that differ, and images of the runs side by side."""
     names = comparison.names
     first_sentences, lead = answer(*verdict(comparison))
     summary = Table(
@@ -115,12 +115,12 @@ def _text(value: Leaf) -> str:
 
 
 def _value(value: Leaf) -> Cell:
-    """Return a value of a result as a cell."""
+    """Return a value of a result as a cell of a table."""
     return str(value) if isinstance(value, bool) else value
 
 
 def _shape(array: ArrayDifference) -> str:
-    """Return the shapes of both arrays as text."""
+    """Return the shapes of the arrays of both runs as text."""
     here, there = ("none" if s is None else " x ".join(map(str, s)) for s in (array.shape, array.other_shape))
     return here if here == there else f"{here}, {there}"
 
@@ -216,7 +216,7 @@ class Differences:
     arrays : tuple[ArrayDifference, ...]
         Images that differ by more than the tolerance of their peak.
     compared : int
-        Number of numbers and arrays that both runs have.
+        Number of result values and arrays that both runs have.
     """
 
     inputs: tuple[Mapping[str, Leaf], ...]
@@ -379,7 +379,7 @@ def compare(folders: Sequence[Path], rtol: float, sigmas: float | None) -> Compa
 
 
 def numbers(comparison: Comparison) -> Mapping[str, Any]:
-    """Return the content of compare.json."""
+    """Return the content of compare.json: inputs, numbers and arrays of each run that differ from the first run's."""
     others = []
     for run, diff in zip(comparison.runs[1:], comparison.diffs, strict=True):
         others.append(
@@ -403,7 +403,10 @@ def numbers(comparison: Comparison) -> Mapping[str, Any]:
 
 
 def _plain(one: NumberDifference | ArrayDifference, without: str, *derived: str) -> dict[str, Any]:
-    """Return the fields of a difference and derived numbers as plain data; None for numbers that are not finite."""
+    """Return the fields of a difference, without one of them and with derived numbers, as plain data for JSON.
+
+    None for numbers that are not finite.
+    """
     values = {key: value for key, value in vars(one).items() if key not in without.split()}
     more = {key: getattr(one, key) for key in derived}
     return values | {key: value if value is not None and abs(value) < math.inf else None for key, value in more.items()}

@@ -83,10 +83,11 @@ class NumberDifference:
     reference, other : Leaf
         Both values; None where a file lacks the key.
     sigma : float | None
-        Standard deviation of the difference of two independent measurements, from both files' sigmas; None if they
-        state none.
+        Standard deviation of the difference of two independent measurements, from both files' sigmas; None if the files
+        hold none.
     sigma_of : str
-        ``noise`` of the images alone, or ``stated``; empty without a sigma.
+        ``noise`` if sigma is that of the images' noise alone, ``stated`` if it is the total sigma in the files; empty
+        without.
     scale : float
         Largest number of the same kind in both files.
     """
@@ -322,9 +323,9 @@ def is_sigma(key: str) -> bool:
 def sigma_of(reference: Mapping[str, Leaf], other: Mapping[str, Leaf], key: str) -> tuple[float | None, str]:
     """Return the sigma of the difference of two numbers, and its source.
 
-    The source is ``noise`` if both runs state ``x_sigma_noise`` beside the number, otherwise ``stated``, from
-    ``x_sigma`` or ``sigma``. An estimator's error from the motions is the same in runs of the same motions, and does
-    not scatter between them.
+    For a number with the key ``x`` the source is ``noise`` if both runs hold ``x_sigma_noise`` beside it, otherwise
+    ``stated``, from ``x_sigma`` or ``sigma``. An estimator's error from the motions is the same in runs of the same
+    motions, and does not scatter between them.
 
     Parameters
     ----------
@@ -344,7 +345,7 @@ def sigma_of(reference: Mapping[str, Leaf], other: Mapping[str, Leaf], key: str)
 
 
 def _quantity_kind(key: str) -> str:
-    """Return the name that numbers of one kind have in common.
+    """Return the name that all numbers of one kind share, such as all values of a table's column.
 
     It is a table's column, or the last part of a key that is an identifier, such as ``zernike_waves`` of Zernike terms.
     """
@@ -355,11 +356,11 @@ def _quantity_kind(key: str) -> str:
 
 
 _PLACE = re.compile(r"\[(?:\[[^\]]*\]|[^\[\]])*\]")
-"""Index in a key after a list's name: number of an entry, or its distinguishing name."""
+"""Pattern of an index in a key after a list's name: the number of an entry, or its distinguishing name."""
 
 
 def _scales(*contents: Mapping[str, Leaf]) -> dict[str, float]:
-    """Return the largest number of each kind, relative to which small numbers are zero within rounding."""
+    """Return the largest absolute number of each kind; a number far smaller is zero within rounding."""
     out: dict[str, float] = {}
     for numbers in contents:
         for key, value in numbers.items():
@@ -402,7 +403,7 @@ def content_of(path: Path, name: str) -> Content:
 
 
 def plain(data: Any) -> Content:
-    """Return the content of nested plain data."""
+    """Return the numbers, texts and arrays of nested mappings and lists."""
     statements = {key: data[key] for key in STATEMENTS if key in data} if isinstance(data, Mapping) else {}
     rest = {key: value for key, value in data.items() if key not in statements} if isinstance(data, Mapping) else data
     values = dict(leaves(rest))
@@ -415,7 +416,7 @@ def leaves(data: Any, key: str = "", series: bool = True) -> Iterator[tuple[str,
 
     Parameters
     ----------
-    data : Any
+    data : dict, list, number, str or None
         Mappings and lists.
     key : str
         Key of the data, which precedes the keys in it.

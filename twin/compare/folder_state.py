@@ -137,7 +137,7 @@ class Elsewhere:
     processor : tuple[str, ...]
         Differences that only change rounding: processor, linear algebra, C library.
     known : bool
-        Whether the manifest states where the run was made.
+        Whether the manifest records the machine and program of the run.
     """
 
     program: tuple[str, ...]

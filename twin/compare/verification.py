@@ -41,7 +41,7 @@ MOST_LISTED = 20
 """Largest number of quantities of a file in the JSON, those that differ most."""
 SAME, ROUNDED, DIFFERENT, EXCLUDED = "same", "rounding", "different", "excluded"
 REDRAWN = "redrawn"
-"""State of a picture of numbers that differ by rounding: its lines have other corners."""
+"""State of a picture whose numbers differ by rounding only, so that its lines have slightly different corners."""
 GONE, NEW = "only in the run", "only in the repeated run"
 EXCLUDED_FILES: Mapping[str, str] = {
     "html": "a page that states when and where it was made; its numbers are those of the other files",
@@ -53,21 +53,24 @@ EXCLUDED_FILES: Mapping[str, str] = {
 RELATIVE = 1e-9
 """Largest difference that counts as rounding, relative to the largest number of its kind or to an array's peak.
 
-Sums in another order, as those of stray light, change numbers by 1e-14, and readings of 1.5 arcsec by a relative 1e-11.
+Sums in a different order, as those of stray light, change numbers by a relative 1e-14, and recovered angles of 1.5
+arcsec by a relative 1e-11.
 """
 RELATIVE_ELSEWHERE = 1e-6
 """Largest relative difference that counts as rounding on another processor, whose linear algebra rounds otherwise.
 
-Fits with a condition of 1e8 and more change by a relative 1e-8 (orthonormal Zernike terms by 4e-8). No number here is
-known to a millionth.
+Fits with a condition number of 1e8 and more change by a relative 1e-8 (orthonormal Zernike terms by 4e-8). No number
+here is known to a millionth.
 """
 SIGMA_SHARE = 1e-3
-"""Largest difference that counts as rounding, as a share of the number's standard deviation; the last digit that a file
-states is a millionth of it.
+"""Largest difference that counts as rounding, as a share of the number's standard deviation.
+
+The last digit that a file holds is a millionth of that standard deviation.
 """
 RELATIVE_OF_SIGMAS = 1e-6
-"""Largest relative difference of standard deviations, which are computed from matrices with a condition of 1e4 and
-more.
+"""Largest relative difference of standard deviations that counts as rounding.
+
+They are computed from matrices with a condition number of 1e4 and more.
 """
 PIXEL_SHARE, GREY_LEVELS = 1e-4, 2
 """Share of the pixels, and grey levels, by which recorded frames may differ on another processor.
@@ -173,7 +176,7 @@ def file_state_of(compared: FileDifference, elsewhere: bool = False) -> FileStat
     compared : FileDifference
         Differences of the file; sentences count only if nothing else differs.
     elsewhere : bool
-        See `file_state`.
+        Whether the run was repeated on a different processor, which rounds otherwise.
     """
     quantities = [*(_number(one, elsewhere) for one in compared.numbers)]
     quantities += [_array(array, compared.drawn, elsewhere) for array in compared.arrays]
@@ -391,7 +394,7 @@ def repeat_block(state: FolderState) -> Repetition:
 
 
 def _responses(result: BlockResult, plan: Plan) -> difference.Content:
-    """Return the responses of a block, run by run."""
+    """Return the responses of a block of a study, run by run, as numbers to compare."""
     arrays = {
         f"{response}{ending}": getattr(result, part)[:, r]
         for r, response in enumerate(plan.setup.study.responses)

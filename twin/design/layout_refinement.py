@@ -61,7 +61,7 @@ def ratios(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> dic
     sigmas : dict
         Disturbances -> quantity -> sigma, SI.
     bench : LayoutBench
-        Bench of the design.
+        Evaluator of the layouts of the design.
     """
     wanted = bench.setup.test.goal.wanted.items()
     return {
@@ -80,7 +80,7 @@ def refined(
     Parameters
     ----------
     bench : LayoutBench
-        Bench of the design.
+        Evaluator of the layouts of the design.
     ask : Ask
         Function that evaluates derivatives and layouts.
     part : str
@@ -256,7 +256,7 @@ class LayoutNumber:
         Parameters
         ----------
         bench : LayoutBench
-            Bench of the design.
+            Evaluator of the layouts of the design.
         by : float
             Change, SI.
         """
@@ -296,7 +296,7 @@ def numbers_of(bench: LayoutBench, beams: Layout, order: int = ORDER) -> tuple[L
     Parameters
     ----------
     bench : LayoutBench
-        Bench of the design.
+        Evaluator of the layouts of the design.
     beams : Layout
         The layout.
     order : int
@@ -318,7 +318,7 @@ def known_of(bench: LayoutBench, beams: Layout) -> dict[str, Information]:
     Parameters
     ----------
     bench : LayoutBench
-        Bench of the design.
+        Evaluator of the layouts of the design.
     beams : Layout
         The layout.
 
@@ -340,7 +340,7 @@ def slope_of(bench: LayoutBench, number: LayoutNumber) -> Slope:
     Parameters
     ----------
     bench : LayoutBench
-        Bench of the design.
+        Evaluator of the layouts of the design.
     number : LayoutNumber
         Parameter of a layout.
     """

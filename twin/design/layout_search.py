@@ -149,7 +149,7 @@ def merit(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> floa
     sigmas : dict
         Disturbances -> quantity -> sigma, SI.
     bench : LayoutBench
-        Bench of the design.
+        Evaluator of the layouts of the design.
     """
     return max(ratios(sigmas, bench).values())
 
@@ -164,7 +164,7 @@ def optima(found: Found, bench: LayoutBench) -> list[list[End]]:
     found : Found
         Results of a search; ends without a layout are omitted.
     bench : LayoutBench
-        Bench of the design.
+        Evaluator of the layouts of the design.
     """
 
     def least(end: End) -> float:
@@ -202,7 +202,7 @@ class Workers:
     Parameters
     ----------
     bench : LayoutBench
-        Bench of the design.
+        Evaluator of the layouts of the design.
     count : int
         Number of further processes, 0 for none.
     journal : Journal
@@ -290,7 +290,7 @@ class Search:
     Parameters
     ----------
     bench : LayoutBench
-        Bench of the design.
+        Evaluator of the layouts of the design.
     workers : int
         Number of further processes, 0 for none.
     seed : int
@@ -350,7 +350,7 @@ class _OneSearch:
     Parameters
     ----------
     bench : LayoutBench
-        Bench of the design.
+        Evaluator of the layouts of the design.
     ask : Ask
         Function that evaluates beams, layouts and derivatives.
     rng : Generator

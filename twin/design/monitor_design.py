@@ -63,7 +63,7 @@ class MonitorDesignRun:
     setup : MonitorDesignSetup
         The design.
     bench : LayoutBench
-        Bench that evaluated the layouts.
+        Evaluator of the layouts.
     results : Found
         Results of the search.
     points : tuple of Point

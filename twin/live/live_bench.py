@@ -229,7 +229,7 @@ class LiveBench:
         -------
         tuple[dict[str, Any], ndarray | None]
             Plain data for the page, and the images after the perturbation, uint16 (C, H, W); None without images. An
-            impossible state has ``problem`` in place of readings.
+            impossible state has ``problem`` instead of readings.
         """
         began = time.perf_counter()
         message: dict[str, Any] = {"type": "state", "n": asked.n, "t": asked.t}

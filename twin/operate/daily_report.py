@@ -1,6 +1,6 @@
 """Daily report of an instrument in operation: one self-contained page, to be stored or sent by mail.
 
-Its figures show the courses of the quantities with their bands, and the innovations against their limit.
+Its figures show the time series of the quantities with their bands, and the innovations against their limit.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ if TYPE_CHECKING:
 BANDS = ((1.9600, 0.22, "95 %"), (0.9945, 0.42, "68 %"))
 """Multiple of sigma, opacity and name of the bands, the wide one first."""
 _MOST_ERROR_BARS = 60
-"""Largest number of single readings drawn with error bars; more would hide the course."""
+"""Largest number of single readings drawn with error bars; more would hide the curve."""
 _LIMIT_EXTENTS = 3.0
-"""A limit is drawn within this multiple of the course's extent; a larger one would flatten the course."""
+"""A limit is drawn within this multiple of the extent of the time series; a larger one would flatten the curve."""
 
 
 def dates(times: np.ndarray) -> np.ndarray:
@@ -64,7 +64,7 @@ def dates(times: np.ndarray) -> np.ndarray:
 
 
 def courses_svg(name: str, overview: Overview, trend: Trend, quantities: Sequence[Quantity], wide: int = 1) -> str:
-    """Draw the courses of quantities over one span, one panel each.
+    """Draw the time series of quantities over one span, one panel each.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def courses_svg(name: str, overview: Overview, trend: Trend, quantities: Sequenc
     overview : Overview
         Overview of the operation, for requirements, jumps and events.
     trend : Trend
-        Course of all quantities.
+        Time series of all quantities.
     quantities : Sequence[Quantity]
         Quantities to draw.
     wide : int
@@ -90,7 +90,7 @@ def courses_svg(name: str, overview: Overview, trend: Trend, quantities: Sequenc
 
 
 def _course(axes: Axes, overview: Overview, trend: Trend, quantity: Quantity) -> None:
-    """Draw the course of one quantity with its bands, readings, jumps, events and requirement."""
+    """Draw the time series of one quantity with its bands, readings, jumps, events and requirement."""
     q = overview.quantities.index(quantity)
     parts = [("estimate", trend.past, svg.BLUE, svg.SKY, "-")]
     if trend.future is not None:
@@ -312,7 +312,7 @@ def _changed_section(overview: Overview, begin: int, end: int) -> Section:
 
 
 def _trend_section(history: History, overview: Overview, last: int) -> Section:
-    """Return the section with the courses of the quantities."""
+    """Return the section with the time series of the quantities."""
     quantities = overview.quantities
     chosen = [quantity for quantity in quantities if overview.required(quantity) is not None] or list(quantities)[:3]
     others = [quantity for quantity in quantities if quantity not in chosen]

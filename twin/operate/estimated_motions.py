@@ -36,12 +36,12 @@ PIVOTED = ("rotate", "scale")
 
 @dataclass(frozen=True, eq=False)
 class EstimatedMotions:
-    """Estimate of all stated motions at one time.
+    """Estimate of all specified motions at one time.
 
     Attributes
     ----------
     components : tuple[Component, ...]
-        The M stated components.
+        The M specified components.
     mean : (M,) ndarray
         Estimated amounts, in SI units.
     covariance : (M, M) ndarray
@@ -248,7 +248,7 @@ class Prior:
     components : tuple[Component, ...]
         The J components of the file.
     table : (J, M) ndarray
-        Matrix from the stated motions to these components.
+        Matrix from the specified motions to these components.
     omitted : tuple[OmittedComponent, ...]
         Components that the file omits.
     """

@@ -124,7 +124,7 @@ def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance:
     truth : Mapping[str, Any]
         Truth of the life, plain data of its file.
     advance : Advance
-        Called with the progress.
+        Callback that receives the progress.
     """
     with tempfile.TemporaryDirectory() as place:
         initialise_record(place, plan.model, simulated=True)
@@ -250,7 +250,7 @@ def true_changes(truth: Mapping[str, Any], quantities: Sequence[Quantity], times
 
 
 def _single(readings: Sequence[Mapping[str, Any]], quantities: Sequence[Quantity]) -> Estimate:
-    """Return the estimate from each reading alone, by the best estimator under the stated disturbances."""
+    """Return the estimate from each reading alone, by the best estimator under the specified disturbances."""
     values, sigmas = [], []
     for read in readings:
         groups = {**read["cameras"], **{name: read[name] for name in (ANGLE_GROUP, GROUND_GROUP) if name in read}}

@@ -2,8 +2,8 @@
 
 The record's estimate at several times, with the covariance between times, gives the cameras' prior in every pass.
 Between two readings nearly all of an error is common to the times of a pass; the rest is what moves meanwhile by the
-stated time laws. An adjustment of images that uses the estimate as readings of the cameras needs both. The code of the
-block adjustment itself does not depend on records.
+specified time laws. An adjustment of images that uses the estimate as readings of the cameras needs both. The code of
+the block adjustment itself does not depend on records.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ def run_operated_block(
     seed : int
         Seed of all random numbers.
     advance : Advance
-        Called with the progress.
+        Callback that receives the progress.
     pool : Pool | None
         Processes that reduce the points; None for this process alone.
 

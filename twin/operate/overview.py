@@ -454,7 +454,7 @@ def line_change_text(overview: Overview, jump: DetectedJump) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Trend:
-    """Course of all quantities over a span.
+    """Time series of all quantities over a span.
 
     Attributes
     ----------
@@ -476,7 +476,7 @@ MOST_POINTS = 600
 
 
 def trend(history: History, overview: Overview, begin: int, end: int, count: int = 240) -> Trend:
-    """Return the course of all quantities over a span.
+    """Return the time series of all quantities over a span.
 
     Parameters
     ----------

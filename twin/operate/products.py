@@ -2,10 +2,10 @@
 
 They are the camera models that locate its images, the state of the instrument as a job, and its uncertainty as a prior.
 
-Motions whose stated time law is `white` differ in every image and every reading, such as the differences between
+Motions whose specified time law is `white` differ in every image and every reading, such as the differences between
 orbits. No reading determines them for an image taken at another moment, and an image takes seconds. Camera models are
-not corrected for them, and their stated sizes make ERR_RAND, the error that images do not share. All other motions are
-corrected as estimated, and their uncertainty makes ERR_BIAS.
+not corrected for them, and their specified sizes make ERR_RAND, the error that images do not share. All other motions
+are corrected as estimated, and their uncertainty makes ERR_BIAS.
 
 The products have a period of validity. The estimate p(t) of a time t, used at another time t', has the error p(t) -
 P(t'), where P is the truth. p(t') is the mean of P(t') given the same readings, and p(t) depends on these readings, so
@@ -120,7 +120,7 @@ def validity(
     limits : Sequence[ValidityLimit]
         Limits in between; one at the time itself counts as before it.
     beside : Course | None
-        Estimate just after the time, used in place of that at the time.
+        Estimate just after the time, used instead of that at the time.
     """
     low = max((one for one in (first, *limits) if one.time <= time), key=lambda one: one.time)
     high = min((one for one in (last, *limits) if one.time > time), key=lambda one: one.time, default=last)
@@ -330,7 +330,7 @@ def make_products(
 
 
 def _components(operation: Operation) -> list[Component]:
-    """Return the stated components in the order of the model, which may have been traced in another order."""
+    """Return the specified components in the order of the model, which may have been traced in another order."""
     stated = operation.experiment.stated
     assert stated is not None, "a plan states what moves"
     by_key = {(component.cause, component.name): component for component in stated.components}
@@ -398,7 +398,7 @@ def _version(operation: Operation, history: History) -> str:
 def _changes(
     operation: Operation, course: Course, motions: EstimatedMotions, notes: tuple[str, ...]
 ) -> dict[str, EstimatedChange]:
-    """Return each camera's change at the course's only time, without white motions."""
+    """Return each camera's change at the only time of the estimate, without white motions."""
     stated = operation.model.series_filter.stated
     white = np.array([law.white for law in stated.laws])
     size = np.array([component.unit_size for component in motions.components]) * stated.sigmas

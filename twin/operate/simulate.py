@@ -1,10 +1,10 @@
 """Simulated life of an instrument in operation.
 
-Amounts of every stated motion are drawn over time by the laws of their disturbances; every reading is rendered and
+Amounts of every specified motion are drawn over time by the laws of their disturbances; every reading is rendered and
 recovered; and the telemetry of a real instrument is written as files, which the record ingests like any others. The
 truth is written to a file of its own, which the operation never reads.
 
-Laws without steps are drawn by `scenes.models.drawn_motions`; steps occur at random at a stated mean rate, or at the
+Laws without steps are drawn by `scenes.models.drawn_motions`; steps occur at random at a specified mean rate, or at the
 dates of events. The filter and the smoother, which such lives test, are not used here.
 """
 
@@ -74,7 +74,7 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Life:
-    """Course of every stated motion of an instrument at T times.
+    """Course of every specified motion of an instrument at T times.
 
     Attributes
     ----------
@@ -193,7 +193,7 @@ def _jumps(
 
 
 def _step(stated: DisturbancePrior, where: Sequence[int], rng: np.random.Generator) -> Array:
-    """Return random sizes (M,) of a step of some motions in SI units, correlated as stated; zero for the others.
+    """Return random sizes (M,) of a step of some motions in SI units, correlated as specified; zero for the others.
 
     Array dimensions: M motions.
     """
@@ -249,7 +249,7 @@ class Simulation:
     sensor_sigma : float
         Standard deviation of a temperature sensor, in kelvin.
     sensors : tuple[str, ...] | None
-        Bodies with a sensor; None for all bodies with a stated temperature.
+        Bodies with a sensor; None for all bodies with a specified temperature.
     dead : Mapping[str, int]
         Body -> time from which its sensor gives no readings.
     stuck : Mapping[str, int]
@@ -324,7 +324,7 @@ def simulate_record(
     what : Simulation
         Parameters of the simulation.
     advance : Advance
-        Called with the progress.
+        Callback that receives the progress.
     """
     motions = experiment.stated
     assert motions is not None  # a plan states them

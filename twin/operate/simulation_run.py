@@ -156,7 +156,7 @@ def simulate_into(
     backend : Backend
         Backend that traces.
     advance : Advance
-        Called with the progress.
+        Callback that receives the progress.
 
     Returns
     -------
@@ -265,7 +265,7 @@ def _require_empty(history: History) -> None:
 
 
 def _require_known_sensors(experiment: MonitorExperiment, what: Simulation) -> None:
-    """Raise InputErrorText for a sensor on a body without a stated temperature, or a faulty sensor that is missing."""
+    """Raise InputErrorText for a sensor on a body without a specified temperature, or a faulty sensor not simulated."""
     assert experiment.stated is not None  # a plan states something
     warm = {component.body for component in experiment.stated.components if component.kind == "temperature"}
     for body in what.sensors or ():

@@ -175,7 +175,7 @@ class Call:
         setup : OperationSetup
             The plan.
         history : History | None
-            The record as of an earlier time, in place of the command's.
+            The record as of an earlier time, instead of the command's.
 
         Raises
         ------

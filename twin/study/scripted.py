@@ -1,4 +1,4 @@
-"""Studies from a script: ranges in place of numbers in the perturbation of an instrument."""
+"""Studies from a script: ranges instead of numbers in the perturbation of an instrument."""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
 """Allocation of tolerance limits: the limits that reach a required yield at the least cost.
 
-The same random draws serve all limits: with x = scale * u the merits follow from their second-order model, and the
-quantile of the worst margin at the required yield has a gradient. The limits change by a bounded factor in each round.
-Then the model is computed again about the new limits, and exact traces of a part of the cameras give its offset. A
-Monte Carlo run of independent cameras validates the result.
+The same random draws serve all limits: each varied parameter is its limit times a fixed random number, the merits
+follow from their second-order model, and the quantile of the worst margin at the required yield (the share of cameras
+that pass) has a gradient with respect to the limits. The limits change by a bounded factor in each round. Then the
+model is computed again about the new limits, and exact traces of some of the cameras correct its quantile by an offset.
+A Monte Carlo run of independent cameras validates the result.
 """
 
 from __future__ import annotations
@@ -34,15 +35,13 @@ BOUND = 2.0
 _STEPS = 60
 """Largest number of iterations of the optimiser in a round."""
 _STEP = 1e-5
-"""Step of the logarithm of a limit for the numerical derivative of the margins, along the derivatives of the merits'
-parts.
-"""
+"""Step of the numerical derivative of the margins with respect to the natural logarithm of a limit."""
 _SETTLED = 0.1
-"""Change of the logarithms of the limits below which no further round is made."""
+"""Change of the natural logarithms of the limits, largest over the limits, below which no further round is made."""
 _LAST = 4
 """Largest number of final rounds that tighten all limits together while the exact traces miss the required yield."""
 _NEAR = 0.02
-"""Share of the cameras on either side of the quantile whose gradients are averaged."""
+"""Share of all cameras, on either side of the quantile of the worst margin, whose gradients are averaged."""
 _SAFE = 1.0
 """Number of standard deviations of the sampled yield by which the chosen limits are to exceed the required yield."""
 
@@ -58,15 +57,16 @@ class Allocation:
     scales, rounded : (E,) ndarray
         Ratio of the new to the specified limit of every tolerance, before and after rounding to the grades.
     limits : dict
-        New limit of every tolerance by name, in the form of the files.
+        New limit of every tolerance by name, as a budget file states it: a quantity with its unit, or a pure number.
     costs : (2, E) ndarray
-        Cost of every limit, before and after the allocation.
+        Cost of every limit in the budget's unit of cost, before and after the allocation.
     predicted : tuple of float
-        Yield of the specified and of the new limits, predicted by the corrected model.
+        Yield (share of cameras that meet all requirements) of the specified and of the new limits, by the corrected
+        model.
     reached : bool
         True if the yield of the rounded limits reaches the required yield.
     unrounded : bool
-        True if the yield of the limits before rounding reaches it.
+        True if the yield of the limits before rounding reaches the required yield.
     """
 
     scales: np.ndarray
@@ -99,7 +99,7 @@ def allocate(
     setup : ToleranceSetup
         Tolerance budget.
     bench : ToleranceBench
-        Bench of the budget.
+        Camera of the budget with its varied parameters, compensators and merits.
     model : MeritModel
         Second-order model of the merits at the specified limits.
     samples : Samples
@@ -162,12 +162,12 @@ def allocate(
 
 
 class CostCurve:
-    """Cost of a limit: a monotone curve through specified points in logarithms, extrapolated by straight lines.
+    """Cost of a limit against the limit: straight-line extrapolation and monotone interpolation, both in logarithms.
 
     Parameters
     ----------
     points : sequence of tuple
-        Ratios to the specified limit and their costs, ascending; at least two.
+        Pairs (ratio of the limit to the specified limit, cost of that limit), ascending; at least two.
     """
 
     def __init__(self, points: Sequence[tuple[float, float]]) -> None:
@@ -176,7 +176,7 @@ class CostCurve:
         self._slope = self._line.derivative()
 
     def __call__(self, level: float) -> tuple[float, float]:
-        """Return the logarithm of the cost and its derivative at the logarithm of a limit's ratio."""
+        """Return the logarithm of the cost and its derivative at ``level``, the logarithm of the limit's ratio."""
         x, y = self._x, self._y
         if x[0] <= level <= x[-1]:
             return float(self._line(level)), float(self._slope(level))
@@ -196,7 +196,7 @@ class _Costs:
     curves : tuple of CostCurve
         Curve of every tolerance (E): logarithm of the cost against the logarithm of the ratio to the specified limit.
     fixed : (E,) ndarray of bool
-        True for a limit that the allocation must not change: so specified, or of a distribution that is not centred on
+        True for a limit that the allocation must not change: the file fixes it, or its distribution is not centred on
         zero.
     """
 
@@ -220,31 +220,28 @@ class _Costs:
         return np.exp([curve(x)[0] for curve, x in zip(self.curves, level.tolist(), strict=True)])
 
     def of_level(self, level: np.ndarray) -> float:
-        """Return the total cost of all limits."""
+        """Return the total cost of all limits, with limits at exp(level) times the specified ones."""
         return float(np.sum(self.of_each(level)))
 
     def slope(self, level: np.ndarray) -> np.ndarray:
-        """Return the derivatives of the costs with respect to the level, (E,).
-
-        Array dimensions: E tolerances.
-        """
+        """Return the derivative of each limit's cost with respect to the logarithm of the limit, one per tolerance."""
         values = np.array([curve(x) for curve, x in zip(self.curves, level.tolist(), strict=True)])
         return np.asarray(np.exp(values[:, 0]) * values[:, 1])
 
 
 class _MarginModel:
-    """Worst margins of cameras as functions of the limits, about the limits of a bench.
+    """Model of each camera's worst margin as a function of the limits, about the limits of a budget.
 
     Array dimensions: S cameras, M merits.
 
     Parameters
     ----------
     bench : ToleranceBench
-        Bench at whose limits the model was made.
+        Camera of the budget, at whose limits the model was made.
     model : MeritModel
-        Second-order model of its merits.
+        Second-order model of the merits.
     samples : Samples
-        Random draws, and the seeds of the adjustment errors.
+        Random parameters of the cameras, and the seeds of their adjustment errors.
     costs : _Costs
         Costs of the limits.
     share : float
@@ -276,15 +273,18 @@ class _MarginModel:
     def at(
         cls, bench: ToleranceBench, total: np.ndarray, samples: Samples, costs: _Costs, share: float
     ) -> _MarginModel:
-        """Return the margins about limits at exp(total) (E,) times those of a bench.
+        """Build the model of the margins about limits at exp(total) times those of a bench (the camera of a budget).
 
-        Array dimensions: E tolerances.
+        Array dimensions: ``total`` has one entry per tolerance.
         """
         now = bench.scaled(np.exp(total))
         return cls(now, sensitivities(now).model, samples, costs, share)
 
     def _margins(self, values: np.ndarray) -> np.ndarray:
-        """Return the worst margin of every camera, (S,), from merits (S, M); large but finite without light.
+        """Return the worst margin of every camera, (S,), from merits (S, M).
+
+        A margin is the excess over the requirement in units of it, negative where it is met; large but finite without
+        light.
 
         Array dimensions: S cameras, M merits.
         """
@@ -299,7 +299,10 @@ class _MarginModel:
         return float(np.mean(self._worst(self.model.parts(np.exp(level))) + self.offset <= 0.0))
 
     def quantile(self, level: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the worst margin at the required yield, and its gradient averaged over cameras near the quantile."""
+        """Return the worst margin at the required yield, and its gradient with respect to the logarithms of the limits.
+
+        The gradient is averaged over cameras near the quantile.
+        """
         parts = self.model.parts(np.exp(level))
         margin = self._worst(parts)
         order = np.argsort(margin)
@@ -314,7 +317,7 @@ class _MarginModel:
         return float(margin[order[at]]) + self.offset, slope
 
     def cheapest(self, low: np.ndarray, high: np.ndarray, total: np.ndarray) -> np.ndarray:
-        """Return the step to the cheapest limits within bounds that pass, or to the tightest ones if none passes.
+        """Return the step to the cheapest limits that reach the required yield, or else to the tightest limits.
 
         Array dimensions: E tolerances.
 
@@ -323,7 +326,7 @@ class _MarginModel:
         low, high : (E,) ndarray
             Bounds of the step in the logarithms of the limits.
         total : (E,) ndarray
-            Logarithms of the bench's limits over the specified ones.
+            Logarithms of the ratios of the present limits to the specified ones.
 
         Returns
         -------
@@ -350,9 +353,9 @@ class _MarginModel:
         return self._between(start, np.clip(solution.x, low, high), total)
 
     def tightened(self, low: np.ndarray) -> np.ndarray:
-        """Return the first step (E,) towards the tightest limits, ``low``, that passes, or ``low`` if none does.
+        """Return the first step towards the tightest limits that reaches the required yield, or the whole step.
 
-        Array dimensions: E tolerances.
+        ``low`` and the result are changes of the logarithms of the limits, one per tolerance.
         """
         for part in np.linspace(0.0, 1.0, 33):
             if self.quantile(part * low)[0] <= 0.0:
@@ -360,7 +363,7 @@ class _MarginModel:
         return low
 
     def _between(self, inside: np.ndarray, outside: np.ndarray, total: np.ndarray) -> np.ndarray:
-        """Return the cheapest step that passes on the line from a passing step to another."""
+        """Return the cheapest step reaching the required yield on the line from ``inside``, which does, to ``outside``."""
         best = inside
         for part in np.linspace(0.0, 1.0, 17)[1:]:
             step = inside + part * (outside - inside)
@@ -373,14 +376,14 @@ class _MarginModel:
 def _rounded_to_grades(
     setup: ToleranceSetup, trade: _MarginModel, total: np.ndarray, spec: AllocationSpec, looser: bool
 ) -> tuple[dict[str, str | float], np.ndarray]:
-    """Round limits down to grades and, if ``looser``, raise one after the other by grades where the yield allows.
+    """Round limits down to grades (preferred values); if ``looser``, raise them again where the yield allows.
 
     Array dimensions: E tolerances.
 
     Returns
     -------
     limits : dict
-        Limit of every tolerance by name, in the form of the files.
+        Limit of every tolerance by name, as a budget file states it.
     scales : (E,) ndarray
         Ratios of the limits to the specified ones.
     """
@@ -414,9 +417,9 @@ def _rounded_to_grades(
 def _grades_near(
     limit: str | float, kind: str, value: float, grades: Sequence[float]
 ) -> list[tuple[str | float, float]]:
-    """Return the grade at or below a value and the next ones above it, in the form of the files and in SI.
+    """Return the grade at or below a value and the next ones above it, each as text of a file and in SI units.
 
-    Grades are numbers in the unit of the old limit.
+    Grades are preferred values of a limit, in the unit of the old limit.
     """
     parts = split_quantity(limit)
     unit = amount_si(f"1 {parts[1]}", kind) if parts is not None else 1.0

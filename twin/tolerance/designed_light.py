@@ -18,7 +18,7 @@ from twin.camera.camera_optics import CameraOptics
 from twin.tolerance.monitor_merit import Merit
 
 TRANSFER = 1e-3
-"""Largest allowed difference between an MTF at fixed pupil nodes and that of the nominal pupil."""
+"""Largest allowed error of an MTF computed at fixed points of the pupil, against that of the nominal pupil."""
 
 
 def budget_spectrum(test: ToleranceBudgetSpec, camera: CameraSpec) -> SpectrumSpec | None:
@@ -40,9 +40,9 @@ def budget_spectrum(test: ToleranceBudgetSpec, camera: CameraSpec) -> SpectrumSp
 
 @dataclass(frozen=True, eq=False)
 class WavefrontNorm:
-    """Square roots of the quadratic forms from wavefront coefficients (T,) to mean squares over the illuminated pupil.
+    """Matrices from polynomial coefficients of a wavefront to residuals whose squares sum to its mean square.
 
-    Array dimensions: T polynomial coefficients, F fields.
+    The mean square is over the illuminated pupil. Array dimensions: T polynomial coefficients, F fields.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class WavefrontNorm:
         terms : (S, F, K, T) ndarray
             Coefficients of K wavelengths about a common image point.
         shares : (K,) ndarray
-            Weights of the wavelengths; they sum to 1.
+            Weights of the wavelengths in the spectrum; they sum to 1.
 
         Returns
         -------
@@ -115,7 +115,7 @@ def fixed_transfers(
     cosines: np.ndarray,
     degree: int,
 ) -> dict[int, list[list[VariedTransfer]]]:
-    """Return the transfer functions of every merit of kind mtf, by field and direction.
+    """Return the operators that give the MTF of every merit of kind mtf from the wavefront, by field and direction.
 
     Array dimensions: F fields, C wavelengths, N rays.
 
@@ -130,7 +130,7 @@ def fixed_transfers(
     fields : (F, 2) ndarray
         Fields of the bench.
     light : tuple of ndarray
-        Wavelengths, metres, and their weights, (C,) each.
+        Wavelengths, metres, and their weights in the spectrum, (C,) each.
     cosines : (C or 1, F, N, 2) ndarray
         Direction cosines of the traced rays.
     degree : int

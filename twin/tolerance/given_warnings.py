@@ -17,7 +17,7 @@ from twin.sensors.area_detector import coarse_warnings
 from twin.tolerance.tolerance_bench import ToleranceBench
 
 FAR = 1e-3
-"""Relative error of a monitor's sigma by interpolation above which a warning is given."""
+"""Relative error of a monitor's sigma by interpolated derivatives, above which a warning is given."""
 
 
 def instrument_warnings(setup: ToleranceSetup, bench: ToleranceBench) -> tuple[str, ...]:
@@ -37,7 +37,7 @@ def beam_warnings(bench: ToleranceBench, states: Sequence[State]) -> tuple[str, 
     Parameters
     ----------
     bench : ToleranceBench
-        Bench of the budget.
+        Camera of the budget with its varied parameters, compensators and merits.
     states : sequence of State
         States of the worst cameras.
     """

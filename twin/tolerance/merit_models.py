@@ -18,16 +18,18 @@ from twin.framework.procedure import Advance, silent
 from twin.tolerance.tolerance_bench import AdjustedCameras, ToleranceBench
 
 MOST_PAIRED = 600
-"""Largest number of varied parameters for which the second order has mixed terms; of more they would fill the memory.
+"""Largest number of varied parameters for which the second-order model has mixed derivatives.
+
+More of them would fill the memory.
 """
 FARTHEST = 10.0
 """Largest and, inverted, smallest ratio to its limit at which a tolerance is traced."""
 _MOST_TURNS = 40
-"""Largest number of iterations of the root search."""
+"""Largest number of iterations when the inverse limit of a tolerance is searched."""
 _GRID = 241
-"""Number of ratios, in geometric steps, at which the model is searched for a loss."""
+"""Number of ratios to its limit, in geometric steps, at which the model of a tolerance is searched for a loss."""
 _CLOSE = 1e-4
-"""Relative accuracy, in the loss, of an inverse limit."""
+"""Relative accuracy, in the loss of a merit, with which an inverse limit is found."""
 _AT_ONCE = 8_000_000
 """Largest number of elements of a product that are held in memory at a time."""
 _MOST_HELD, _FEWEST = 25_000_000, 500
@@ -36,20 +38,21 @@ _MOST_HELD, _FEWEST = 25_000_000, 500
 
 @dataclass(frozen=True, eq=False)
 class MeritModel:
-    """Parts of the merits to the second order: parts = nominal + slope x + x curvature x / 2.
+    """Second-order model of the parts of the merits: parts = nominal + slope x + x curvature x / 2.
 
-    x are the varied parameters in units of their sizes; the compensators are adjusted ideally.
+    x are the varied parameters in units of their sizes (the limit of a tolerance, the standard deviation of a figure
+    term); the compensators are adjusted ideally.
 
-    Array dimensions: P parts of the merits, K varied parameters.
+    Array dimensions: P parts of the merits (smooth quantities, such as the MTF at one field), K varied parameters.
 
     Attributes
     ----------
     nominal : (P,) ndarray
         Parts of the nominal camera, adjusted.
     slope : (P, K) ndarray
-        First derivatives.
+        First derivatives of the parts with respect to x.
     curvature : (P, K, K) ndarray
-        Symmetric second derivatives.
+        Second derivatives of the parts with respect to x, symmetric.
     paired : bool
         True if the curvature has mixed terms of two parameters.
     """
@@ -60,16 +63,18 @@ class MeritModel:
     paired: bool = True
 
     def linear(self, x: np.ndarray) -> np.ndarray:
-        """Return the parts (S, P) to the first order at x (S, K).
+        """Return the parts of the merits (S, P) to the first order, at parameters x (S, K) in units of their sizes.
 
-        Array dimensions: S cameras, P parts of the merits, K varied parameters.
+        Array dimensions: S cameras, P parts of the merits (smooth quantities, such as the MTF at one field), K varied
+        parameters.
         """
         return np.asarray(self.nominal + x @ self.slope.T)
 
     def quadratic(self, x: np.ndarray) -> np.ndarray:
-        """Return the parts (S, P) to the second order at x (S, K).
+        """Return the parts of the merits (S, P) to the second order, at parameters x (S, K) in units of their sizes.
 
-        Array dimensions: S cameras, P parts of the merits, K varied parameters.
+        Array dimensions: S cameras, P parts of the merits (smooth quantities, such as the MTF at one field), K varied
+        parameters.
         """
         step = max(1, _AT_ONCE // max(1, self.curvature.shape[0] * x.shape[1]))
         parts = [
@@ -86,7 +91,8 @@ class MeritModel:
 class ScaledModel:
     """Second-order model at fixed random draws in which every tolerance can be scaled.
 
-    Array dimensions: P parts of the merits, S cameras (random draws), E tolerances.
+    Array dimensions: P parts of the merits (smooth quantities, such as the MTF at one field), S cameras (random draws),
+    E tolerances.
 
     Attributes
     ----------
@@ -113,7 +119,7 @@ class ScaledModel:
         model : MeritModel
             Model in the varied parameters.
         x : (S, K) ndarray
-            Random draws; with many parameters only as many are used as fit in memory.
+            Random parameters of each camera in units of their sizes; only as many cameras are used as fit in memory.
         entries : sequence of sequence of int
             Indices of the parameters of each of E tolerances.
         """
@@ -129,16 +135,20 @@ class ScaledModel:
         return cls(model.nominal, first, second)
 
     def parts(self, scales: np.ndarray) -> np.ndarray:
-        """Return the parts (S, P) with the tolerances scaled by scales (E,).
+        """Return the parts of the merits (S, P) with each tolerance multiplied by its entry of ``scales`` (E,).
 
-        Array dimensions: S cameras, P parts of the merits, E tolerances.
+        Array dimensions: S cameras, P parts of the merits (smooth quantities, such as the MTF at one field), E
+        tolerances.
         """
         return np.asarray(self.nominal + (self.first + self.second @ scales) @ scales)
 
     def slope(self, scales: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Return the derivatives (W, P, E) of the parts of selected draws by the logarithms of the scales.
+        """Return the derivatives (W, P, E) of the parts of the merits with respect to the logarithms of the scales.
 
-        Array dimensions: W selected cameras, P parts of the merits, E tolerances.
+        ``rows`` selects the cameras.
+
+        Array dimensions: W selected cameras, P parts of the merits (smooth quantities, such as the MTF at one field), E
+        tolerances.
         """
         return np.asarray((self.first[rows] + 2.0 * (self.second[rows] @ scales)) * scales)
 
@@ -155,11 +165,11 @@ class Sensitivities:
         Merits of the nominal camera, adjusted, SI.
     values : (E, 2, M) ndarray
         Merits with each tolerance at its lower and upper limit, SI; for a figure error the average over its random
-        terms.
+        Zernike terms.
     moves : (E, 2, C) ndarray
-        Compensator moves for it, SI; NaN for a figure error.
+        Compensator moves with each tolerance at these limits, SI; NaN for a figure error.
     problems : tuple of str
-        Reason why the camera has no light there, (E,); empty where it has light.
+        Reason why no light reaches the image with a tolerance at its limits, (E,); empty where it does.
     model : MeritModel
         Model of all parameters together.
     """
@@ -174,7 +184,7 @@ class Sensitivities:
 def sensitivities(bench: ToleranceBench, advance: Advance = silent) -> Sensitivities:
     """Trace every parameter at plus and minus its size and derive the second-order model of the merits.
 
-    Mixed terms follow from the first derivatives of the wavefronts.
+    Mixed second derivatives follow from the first derivatives of the wavefronts.
     """
     count = len(bench.numbers)
     x = np.concatenate([np.zeros((1, count)), np.eye(count), -np.eye(count)])
@@ -208,11 +218,10 @@ def sensitivities(bench: ToleranceBench, advance: Advance = silent) -> Sensitivi
 
 
 def _figure_error_parts(bench: ToleranceBench, model: MeritModel, rows: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Return the parts (L, P) that represent a figure error at shares (L,) of its limit.
+    """Return the parts of the merits (L, P) that represent a figure error at L shares of its limit.
 
-    Parts that depend quadratically on the wavefront get their mean over the random terms, the others their rms.
-
-    Array dimensions: L shares, P parts of the merits.
+    Parts that depend quadratically on the wavefront get their mean over the random Zernike terms, the others their rms.
+    P counts the parts (smooth quantities, such as the MTF at one field).
     """
     mean = 0.5 * np.outer(share**2, model.curvature[:, rows, rows].sum(axis=1))
     rms = np.outer(share, np.sqrt(np.sum(model.slope[:, rows] ** 2, axis=1)))
@@ -224,14 +233,14 @@ def _figure_error_parts(bench: ToleranceBench, model: MeritModel, rows: np.ndarr
 
 @dataclass(frozen=True, eq=False)
 class InverseLimits:
-    """Ratio to its limit at which each tolerance alone degrades each merit by its loss.
+    """Inverse limits: ratio to its limit at which each tolerance alone degrades each merit by the allowed loss.
 
     Array dimensions: M merits, E tolerances.
 
     Attributes
     ----------
     losses : (M,) ndarray
-        Loss of each merit, SI.
+        Allowed loss of each merit, SI.
     shares : (E, M) ndarray
         Ratios to the limits; infinite where the loss is not reached at ``FARTHEST`` times the limit, NaN where no loss
         is defined.
@@ -259,7 +268,10 @@ def default_losses(bench: ToleranceBench, nominal: np.ndarray) -> np.ndarray:
 
 
 def inverse_limits(bench: ToleranceBench, sensitivity: Sensitivities, advance: Advance = silent) -> InverseLimits:
-    """Find the inverse limits by exact traces of both signs; those of figure errors by the model alone."""
+    """Find the size of each tolerance that alone causes each merit's loss, by exact traces of both signs.
+
+    For figure errors the second-order model is used instead of traces.
+    """
     losses = default_losses(bench, sensitivity.nominal)
     entries = list(bench.entries.values())
     guess = np.array(
@@ -289,7 +301,7 @@ def inverse_limits(bench: ToleranceBench, sensitivity: Sensitivities, advance: A
 
 
 def _loss(bench: ToleranceBench, sensitivity: Sensitivities, values: np.ndarray, m: int) -> np.ndarray:
-    """Return by how much values of a merit are worse than the nominal camera's; infinite where the light is lost."""
+    """Return by how much a merit's values are worse than the nominal camera's, SI; infinite where the light is lost."""
     loss = bench.merits[m].worse(values, sensitivity.nominal[m])
     return np.asarray(np.where(np.isnan(loss), np.inf, loss))
 
@@ -316,7 +328,7 @@ def _model_ratio(
 
 
 def _roots(excess: Callable[[np.ndarray, np.ndarray], np.ndarray], start: np.ndarray, advance: Advance) -> np.ndarray:
-    """Find the zeros of increasing functions from individual starting levels; infinite beyond the farthest level.
+    """Find the zeros of increasing functions from individual starting levels; infinite beyond ``FARTHEST``.
 
     Steps grow threefold until two levels bracket the zero; then the method of false position (Illinois variant)
     converges.
@@ -326,7 +338,7 @@ def _roots(excess: Callable[[np.ndarray, np.ndarray], np.ndarray], start: np.nda
     Parameters
     ----------
     excess : callable
-        Function from indices of the functions and one level for each to their values.
+        Takes indices of the functions and one level (logarithm of a ratio to a limit) for each; returns their values.
     start : (R,) ndarray
         Starting levels.
     advance : Advance

@@ -46,12 +46,12 @@ from twin.tolerance.variations import VariedParameter, states_of
 ROTATIONS = ("d_alpha", "d_beta", "d_gamma")
 """Keys of the three rotations of a camera."""
 STEP = 0.1
-"""Step of the numerical derivatives by compensators, as a share of their range."""
+"""Step of the numerical derivatives with respect to compensators, as a share of their range."""
 
 
 @dataclass(frozen=True, eq=False)
 class MonitorMerit:
-    """Monitor of the instrument of a budget, with the merits about its readings.
+    """Monitor of the instrument of a budget, with the merits that are standard deviations of its readings.
 
     Array dimensions: D spot coordinates, K varied parameters and compensators, M independent motions, J cameras with 4
     parameters each, Q readings.
@@ -61,19 +61,19 @@ class MonitorMerit:
     experiment : MonitorExperiment
         Nominal instrument with the disturbances of its prior.
     path : SpotPath
-        Light path of its spots, on area CCDs that are set to their spots.
+        Light path of the monitor spots, with area CCDs centred on their spots.
     images : SpotPath
-        Light path of those cameras alone whose spots move.
+        Light path of only those cameras whose spots move.
     stated : Disturbances
         Disturbances of the nominal instrument as independent motions.
     noise : (D, D) ndarray
-        Noise covariance of its spot shifts, px^2.
+        Covariance of the nominal instrument's spot shifts due to image noise, px^2.
     changes : tuple of ndarray
-        Changes of the derivatives of spots (K, D, M) and camera parameters (K, 4 J, M), per SI unit of each varied
-        parameter and compensator.
+        Changes of the derivatives of spots (K, D, M) and camera parameters (K, 4 J, M), with respect to the independent
+        motions, per SI unit of each varied parameter and compensator.
     asked : dict
-        Name of a merit -> rows (Q, 4 J) from camera parameters to its readings, and the gain of its estimator; None for
-        the posterior's.
+        Name of a merit -> matrix (Q, 4 J) from camera parameters to its readings, and the matrix from spot shifts to
+        camera parameters of its estimator; None for the posterior estimator.
     """
 
     experiment: MonitorExperiment
@@ -105,7 +105,7 @@ class MonitorMerit:
             Nominal instrument of the budget.
         camera : str
             Name of the camera that the budget evaluates.
-        numbers : sequence of VariedNumber
+        numbers : sequence of VariedParameter
             K varied parameters, the compensators last.
         ranges : (C,) ndarray
             Ranges of the compensators, SI.
@@ -180,7 +180,7 @@ class MonitorMerit:
         return self._read(spots, parameters, noise)
 
     def exact(self, states: Sequence[State]) -> dict[str, np.ndarray]:
-        """Return the variances with derivatives that are traced in every state."""
+        """Return the variances of all readings of every merit, with derivatives that are traced in every state."""
         motions = self.experiment.stated
         assert motions is not None
         known = self.experiment
@@ -190,7 +190,15 @@ class MonitorMerit:
         return self._read(changes[0] @ root, changes[1] @ root, self._noise(states))
 
     def interpolation_errors(self, amounts: np.ndarray, states: Sequence[State]) -> dict[str, float]:
-        """Return the largest relative error of each merit's sigma against ``exact``; arguments as in ``variances``."""
+        """Return the largest relative error of each merit's sigma by interpolated instead of traced derivatives.
+
+        Parameters
+        ----------
+        amounts : (S, K) ndarray
+            Amounts of K varied parameters and compensators in S states, SI.
+        states : sequence of State
+            The S states that they add up to.
+        """
         near, right = self.variances(amounts, states), self.exact(states)
         return {
             name: float(np.max(np.abs(np.sqrt(near[name].max(axis=1) / right[name].max(axis=1)) - 1.0)))
@@ -198,7 +206,7 @@ class MonitorMerit:
         }
 
     def _noise(self, states: Sequence[State]) -> np.ndarray:
-        """Return the covariance of the spot shifts by image noise in every state, (S, D, D), px^2.
+        """Return the covariance of the spot shifts due to image noise in every state, (S, D, D), px^2.
 
         Array dimensions: S states, D spot coordinates.
         """
@@ -213,9 +221,17 @@ class MonitorMerit:
         return out
 
     def _read(self, spots: np.ndarray, parameters: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the variances for changes of the derivatives (S, D, M), (S, 4 J, M) and noise (S, D, D).
+        """Return the variances of all readings of every merit, SI, from the derivatives and noise of given states.
 
-        Array dimensions: S states, D spot coordinates, M independent motions, J cameras with 4 parameters each.
+        Parameters
+        ----------
+        spots : (S, D, M) ndarray
+            Changes of the derivatives of the spots in S states: D spot coordinates with respect to M independent
+            motions.
+        parameters : (S, 4 J, M) ndarray
+            Changes of the derivatives of the parameters of J cameras.
+        noise : (S, D, D) ndarray
+            Covariance of the spot shifts due to image noise, px^2.
         """
         out = {name: np.empty((len(noise), len(rows))) for name, (rows, _) in self.asked.items()}
         for s, covariance in enumerate(noise):
@@ -242,7 +258,7 @@ def _require_monitor(setup: ToleranceSetup, experiment: MonitorExperiment, name:
 
 
 def readings_of(merit: MeritSpec, cameras: Sequence[str]) -> tuple[str, ...]:
-    """Return the readings of which a merit takes the worst: ``angle``, or ``d_alpha`` etc. of one camera."""
+    """Return the readings of which a merit takes the worst: ``angle``, or such as ``d_alpha`` of one camera."""
     if merit.kind == "monitor_focus":
         return ("d_f",)
     if merit.reading is None:
@@ -278,9 +294,9 @@ class Merit:
     spec : MeritSpec
         Kind, fields and requirement.
     fields : (F,) ndarray of int
-        Indices of its fields among those of the bench.
+        Indices of its fields among all fields of the budget.
     parts : slice
-        Columns of the bench's parts that belong to it.
+        Columns of this merit in the array of the parts of all merits.
     """
 
     name: str
@@ -289,9 +305,9 @@ class Merit:
     parts: slice
 
     def values(self, parts: np.ndarray) -> np.ndarray:
-        """Return the merit (...,) from the bench's parts (..., P), SI; a change counts by its absolute value.
+        """Return the value of this merit, SI, from the parts of all merits, the last axis of ``parts``.
 
-        Array dimensions: P parts of the merits.
+        A change counts by its absolute value; of several parts the worst counts.
         """
         selected = parts[..., self.parts]
         match self.spec.kind:
@@ -309,23 +325,23 @@ class Merit:
                 return np.asarray(np.max(np.abs(selected), axis=-1))
 
     def passes(self, values: np.ndarray) -> np.ndarray:
-        """Return True where values meet the requirement; NaN does not."""
+        """Return True where values of the merit, SI, meet the requirement; NaN does not."""
         if self.spec.more_is_better:
             return np.asarray(values >= self.spec.requirement)
         return np.asarray(values <= self.spec.requirement)
 
     def margin(self, values: np.ndarray) -> np.ndarray:
-        """Return how far values exceed the requirement, in units of it; negative where they meet it."""
+        """Return how far values of the merit exceed the requirement, relative to it; negative where they meet it."""
         ratio = values / self.spec.requirement
         return np.asarray(1.0 - ratio if self.spec.more_is_better else ratio - 1.0)
 
     def worse(self, values: np.ndarray, than: float | np.ndarray) -> np.ndarray:
-        """Return by how much values are worse than a reference value."""
+        """Return by how much values of the merit are worse than a reference value, SI."""
         return np.asarray(than - values if self.spec.more_is_better else values - than)
 
 
 PART_COUNTS = {"boresight": 2, "roll": 1, "principal_distance": 1}
-"""Number of parts of each kind of merit for which it does not depend on fields."""
+"""Number of parts (smooth quantities) of those kinds of merits for which it does not depend on fields."""
 AT_FIELDS = ("wavefront", "mtf", "chief_ray", "obstruction")
 """Kinds of merits that have fields."""
 
@@ -386,7 +402,7 @@ def merit_head(merit: Merit) -> str:
 
 
 def merit_unit(merit: Merit) -> tuple[str, float]:
-    """Return the unit in which a merit is reported, and its size in SI."""
+    """Return the unit in which a merit is reported, and the size of that unit in SI."""
     unit = MERIT_UNITS[merit.spec.kind]
     if unit is None:
         return ("waves", 1.0) if merit.spec.kind == "wavefront" else ("", 1.0)
@@ -396,7 +412,7 @@ def merit_unit(merit: Merit) -> tuple[str, float]:
 KIND = "obstruction"
 """Kind of the merit that is the obstructed share of a beam."""
 RINGS = 7
-"""Number of rings of rays over the stop, as for image quality."""
+"""Number of rings of rays over the stop by which an obstructed share is computed, as for image quality."""
 AT_ONCE = 40
 """Number of states traced in one launch, to bound memory."""
 

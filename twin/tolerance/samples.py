@@ -28,11 +28,11 @@ from twin.tolerance.tolerance_bench import ToleranceBench
 KIND = "tolerance"
 """Name of the base command in the study that draws the cameras."""
 DRAWS = "draws"
-"""Key of the random draws in the study's tree."""
+"""Key of the random parameters of the cameras in the study's input data."""
 
 
 class ToleranceBase:
-    """Base job of the study that draws cameras: merits and compensator moves of every camera."""
+    """Base job of the study that draws cameras; it computes merits and compensator moves of every camera."""
 
     model: type[Spec] = ToleranceSetup
     block = AT_ONCE
@@ -49,7 +49,7 @@ class ToleranceBase:
         self._bench(tree, backend)
 
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
-        """Return the outcome of every run."""
+        """Return merits and compensator moves of every run, or the reason why a camera has no light."""
         out: list[Outcome] = [Failure("not done")] * len(runs)
         groups: dict[str, list[int]] = {}
         others: dict[str, tuple[Any, ...]] = {}
@@ -78,7 +78,7 @@ class ToleranceBase:
         return outcomes(bench, x, seeds)
 
     def _bench(self, tree: Tree, backend: Backend) -> ToleranceBench:
-        """Return the bench of a tree, kept between blocks because a study passes the same tree object to each."""
+        """Return the camera of a budget given as plain data, kept between blocks of runs with the same data."""
         known = self._benches.get(id(tree))
         if known is None or known[0] is not tree:
             setup = validate(ToleranceSetup, YamlFile("", tree, {}))
@@ -94,7 +94,7 @@ def outcomes(bench: ToleranceBench, x: np.ndarray, seeds: Sequence[int]) -> list
     Parameters
     ----------
     bench : ToleranceBench
-        Bench of the budget.
+        Camera of the budget with its varied parameters, compensators and merits.
     x : (S, K) ndarray
         Varied parameters in units of their sizes.
     seeds : sequence of int
@@ -120,7 +120,7 @@ def outcomes(bench: ToleranceBench, x: np.ndarray, seeds: Sequence[int]) -> list
 
 
 def adjustment_errors(bench: ToleranceBench, seeds: Sequence[int]) -> np.ndarray | None:
-    """Return adjustment errors in standard deviations, (S, C); None without steps and errors.
+    """Return errors of the compensator moves in standard deviations, (S, C); None for exact moves.
 
     Array dimensions: S cameras, C compensators.
     """
@@ -150,7 +150,7 @@ def sampling_study(setup: ToleranceSetup, bench: ToleranceBench, samples: int, s
     setup : ToleranceSetup
         Tolerance budget.
     bench : ToleranceBench
-        Bench of the budget.
+        Camera of the budget with its varied parameters, compensators and merits.
     samples : int
         Number of cameras.
     seed : int
@@ -194,7 +194,7 @@ class Samples:
     values : (S, M) ndarray
         Merits, SI; NaN for a camera without light.
     moves : (S, C) ndarray
-        Compensator moves, SI.
+        Moves of the compensators, SI.
     settled : (S,) ndarray
         Change of the rms wavefront error by a further step of the adjustments, waves; it shows convergence.
     seeds : (S,) ndarray of int
@@ -254,7 +254,7 @@ def draw_samples(
     setup : ToleranceSetup
         Tolerance budget.
     bench : ToleranceBench
-        Bench of the budget in this process.
+        Camera of the budget with its varied parameters, compensators and merits, in this process.
     backend : Backend
         Array backend of the ray trace.
     samples : int

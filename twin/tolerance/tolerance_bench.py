@@ -36,16 +36,17 @@ from twin.tolerance.variations import VariedParameter, compensator_parameters, s
 
 
 def residual_change(slopes: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Return the linear change (S, R) of the residuals by slopes (S, R, C) for a change of the moves (S, C).
+    """Return the linear change (S, R) of the wavefront residuals due to a change of the compensator moves (S, C).
 
-    Array dimensions: S cameras, R residuals, C compensators.
+    ``slopes`` (S, R, C) are the derivatives of the residuals with respect to the moves. Array dimensions: S cameras, R
+    residuals, C compensators.
     """
     return np.asarray((slopes @ change[..., None])[..., 0])
 
 
 @dataclass(frozen=True, eq=False)
 class Adjustments:
-    """Compensators and their effect on the residuals of the wavefront.
+    """Compensators and their effect on the wavefront residuals, whose squares sum to the mean square error.
 
     Array dimensions: C compensators, R residuals.
 
@@ -58,7 +59,8 @@ class Adjustments:
     accuracies : (C,) ndarray
         Standard deviations of the moves, SI.
     slope : (R, C) ndarray
-        Derivatives of the nominal camera's residuals, waves per SI unit; 0 where the range is zero.
+        Derivatives of the nominal camera's residuals with respect to the moves, waves per SI unit; 0 where the range is
+        zero.
     """
 
     ranges: np.ndarray
@@ -74,9 +76,9 @@ class Adjustments:
         Parameters
         ----------
         slopes : (S, R, C) ndarray
-            Derivatives of the residuals of each camera.
+            Derivatives of each camera's residuals with respect to the moves, waves per SI unit.
         residuals : (S, R) ndarray
-            Residuals at the current moves.
+            Wavefront residuals at the current moves, waves.
         moves : (S, C) ndarray
             Current moves, SI.
         free : (C,) ndarray of bool
@@ -111,18 +113,18 @@ class Adjustments:
         return np.asarray(target * size)
 
     def corrected(self, slopes: np.ndarray, change: np.ndarray, miss: np.ndarray) -> np.ndarray:
-        """Return slopes (S, R, C) updated by the outcome of a step, by Broyden's rank-one update.
+        """Return the derivatives of the residuals (S, R, C) after Broyden's rank-one update by the outcome of a step.
 
         Array dimensions: S cameras, R residuals, C compensators.
 
         Parameters
         ----------
         slopes : (S, R, C) ndarray
-            Slopes before the step.
+            Derivatives of the residuals with respect to the moves before the step, waves per SI unit.
         change : (S, C) ndarray
             Change of the moves, SI.
         miss : (S, R) ndarray
-            Residuals after the step minus those predicted by the slopes.
+            Residuals after the step minus those predicted by the derivatives, waves.
         """
         size = np.where(self.ranges > 0.0, self.ranges, 1.0)
         step = change / size
@@ -145,13 +147,13 @@ class Adjustments:
         Parameters
         ----------
         slopes : (S, R, C) ndarray
-            Derivatives of the residuals.
+            Derivatives of the residuals with respect to the moves, waves per SI unit.
         residuals : (S, R) ndarray
-            Residuals at ``moves``.
+            Wavefront residuals at ``moves``, waves.
         moves : (S, C) ndarray
             Ideal moves, SI.
         errors : (S, C) ndarray
-            Errors in standard deviations.
+            Errors of the executed moves, in standard deviations.
         """
         free = np.ones(len(self.ranges), dtype=bool)
         wanted, executed = moves.copy(), moves.copy()
@@ -181,21 +183,22 @@ FIRST_RULE, LARGEST_RULE = 3, 17
 EVERY = 4
 """Spacing, in points of the line, of those at which distortion is evaluated."""
 _MOVE = 1e-3
-"""Step of the numerical derivatives by compensators, as a share of their range."""
+"""Step of the numerical derivatives with respect to compensators, as a share of their range."""
 
 
 @dataclass(frozen=True, eq=False)
 class AdjustedCameras:
     """Perturbed cameras after their adjustments.
 
-    Array dimensions: S cameras, C compensators, P parts of the merits, F fields, K wavelengths, N rays.
+    Array dimensions: S cameras, C compensators, P parts of the merits (smooth quantities, such as the MTF at one
+    field), F fields, K wavelengths, N rays.
 
     Attributes
     ----------
     moves : (S, C) ndarray
         Compensator moves, SI.
     parts : (S, P) ndarray
-        Parts of all merits; NaN where the light is lost.
+        Parts of all merits (smooth quantities); NaN where the light is lost.
     problems : tuple of str
         Reason why the light is lost, (S,); empty where it is not.
     settled : (S,) ndarray
@@ -240,9 +243,9 @@ class ToleranceBench:
 
     Attributes
     ----------
-    numbers : tuple of VariedNumber
+    numbers : tuple of VariedParameter
         Varied parameters.
-    compensators : tuple of VariedNumber
+    compensators : tuple of VariedParameter
         Adjusted parameters.
     merits : tuple of Merit
         Merits of the budget.
@@ -347,7 +350,7 @@ class ToleranceBench:
         colours : (C,) ndarray
             Wavelengths, metres.
         shares : (C,) ndarray
-            Weights of the wavelengths; they sum to 1.
+            Weights of the wavelengths in the spectrum; they sum to 1.
         """
         model = self.optics.model
         self.colours, self.shares = colours, shares
@@ -371,7 +374,7 @@ class ToleranceBench:
         self._adjust = Adjustments(self.ranges, self.grid_steps, self.accuracies, self._adjustment_slope())
 
     def _adjustment_slope(self) -> np.ndarray:
-        """Return the derivatives (R, C) of the residuals by the compensators, waves per SI unit.
+        """Return the derivatives (R, C) of the residuals with respect to the compensators, waves per SI unit.
 
         They are 0 where the range is zero.
 
@@ -417,11 +420,11 @@ class ToleranceBench:
             Errors of the compensator moves in standard deviations. With them each compensator moves by whole steps with
             its error, in order, and the later ones compensate the earlier. None for the ideal adjustment.
         paths : bool
-            True if the optical paths are wanted.
+            True to return the optical paths of the rays as well.
 
         Returns
         -------
-        Tried
+        AdjustedCameras
             The adjusted cameras; one whose light is lost does not affect the others.
         """
         starts = range(0, len(amounts), AT_ONCE)
@@ -498,13 +501,13 @@ class ToleranceBench:
     def parts_of(self, states: Sequence[State]) -> np.ndarray:
         """Return the parts of all merits (S, P) in given states; raise PhysicalError if the light is lost.
 
-        Array dimensions: S cameras, P parts of the merits.
+        Array dimensions: S cameras, P parts of the merits (smooth quantities, such as the MTF at one field).
         """
         amounts, moves = np.zeros((len(states), len(self.numbers))), np.zeros((len(states), len(self.ranges)))
         return self._parts(states, amounts, moves, self.beams.light(states) if len(self.fields) else None)
 
     def residuals_of(self, states: Sequence[State]) -> np.ndarray:
-        """Return residuals (S, R) whose squares sum to the mean squares of the merits, in units of the requirements.
+        """Return residuals (S, R) whose squares sum to the merits' mean squares, in units of the requirements.
 
         They change linearly with small motions. An MTF is represented by the wavefront at its fields, in units of a
         quarter of a wavelength rms. Obstruction and monitor merits have no residuals.
@@ -540,12 +543,13 @@ class ToleranceBench:
         Mean squares and MTFs are quadratic in a wavefront that itself is nearly linear in the parameters. Parts that
         are no function of a wavefront get 0.
 
-        Array dimensions: P parts of the merits, K varied parameters, F fields, C wavelengths, N rays.
+        Array dimensions: P parts of the merits (smooth quantities, such as the MTF at one field), K varied parameters,
+        F fields, C wavelengths, N rays.
 
         Parameters
         ----------
         slopes : (K, F, C N) ndarray
-            Derivatives of the optical paths by the varied parameters, metres per unit.
+            Derivatives of the optical paths with respect to the varied parameters, metres per unit.
         """
         out = np.zeros((self.parts, len(slopes), len(slopes)))
         residuals = self._residuals(slopes).reshape(len(slopes), len(self.fields), -1) if len(self.fields) else None
@@ -567,7 +571,7 @@ class ToleranceBench:
     ) -> np.ndarray:
         """Return the parts of all merits, (S, P).
 
-        Array dimensions: S cameras, P parts of the merits.
+        Array dimensions: S cameras, P parts of the merits (smooth quantities, such as the MTF at one field).
         """
         out = np.empty((len(states), self.parts))
         known: dict[str, np.ndarray] = {}
@@ -600,7 +604,7 @@ class ToleranceBench:
         return out
 
     def _change(self, merit: Merit, line: dict[str, np.ndarray], light: BeamLight | None) -> np.ndarray:
-        """Return the parts of a merit that is a change against the nominal camera, of the line or of chief rays."""
+        """Return the parts of a merit that is a change from the nominal camera, of the line of sight or chief rays."""
         if merit.spec.kind != "chief_ray":
             return line[merit.spec.kind]
         assert light is not None
@@ -619,7 +623,7 @@ class ToleranceBench:
         )
 
     def _line(self, states: Sequence[State]) -> dict[str, np.ndarray]:
-        """Return the parts of the merits about the line, by kind."""
+        """Return the parts of the merits about the image line (boresight, roll, distortion, ...), by kind."""
         if not self._wanted & {"boresight", "roll", "principal_distance", "distortion"}:
             return {}
         sight, axes = self.experiment.sight, self.experiment.sight.axes[self.camera]
@@ -644,7 +648,7 @@ class ToleranceBench:
         return np.arange(0, LINE_POINTS, EVERY)
 
     def scaled(self, scales: np.ndarray) -> ToleranceBench:
-        """Return the same bench with limits scaled by scales (E,).
+        """Return the same budget and camera with every limit multiplied by its entry of ``scales`` (E,).
 
         Array dimensions: E tolerances.
         """
@@ -673,12 +677,14 @@ class ToleranceBench:
     def values(self, parts: np.ndarray) -> np.ndarray:
         """Return the values of all merits, (..., M), from their parts (..., P).
 
-        Array dimensions: M merits, P parts of the merits.
+        Array dimensions: M merits, P parts of the merits (smooth quantities, such as the MTF at one field).
         """
         return np.stack([merit.values(parts) for merit in self.merits], axis=-1)
 
     def worst_margins(self, values: np.ndarray) -> np.ndarray:
         """Return the worst margin of each camera, (S,), from merits (S, M); infinite without light.
+
+        A margin is the excess over the requirement in units of it, negative where it is met.
 
         Array dimensions: S cameras, M merits.
         """

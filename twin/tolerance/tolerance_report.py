@@ -26,7 +26,7 @@ from twin.tolerance.tolerance_run import EXACT, LEVELS, MeritResult, ToleranceRu
 _FEW = 3
 """Number of tolerances that the verdict names."""
 _LITTLE = 0.01
-"""Share of every merit's variance below which a tolerance may be loosened."""
+"""Share of the variance, in every merit, below which the report says that a tolerance may be loosened."""
 _MOST_CURVES = 6
 """Largest number of merits that are plotted."""
 _ROUNDING = 1e-7
@@ -34,7 +34,7 @@ _ROUNDING = 1e-7
 
 
 def tolerance_report(run: ToleranceRun) -> Report:
-    """Return the report of a tolerance budget."""
+    """Return the report of a budget: verdict, yield, sensitivities, inverse limits, variance shares and allocation."""
     test = run.setup.test
     with look("tolerance"):
         curves = to_svg(_yield_figure(run))
@@ -130,7 +130,7 @@ def _verdict(run: ToleranceRun) -> str:
 
 
 def _dear(run: ToleranceRun) -> str:
-    """Return a sentence with the tolerances that cause most of the variance, and those that could be loosened."""
+    """Return a sentence naming the tolerances that cause most of the variance, and those that could be loosened."""
     worst = _importance(run)
     order = sorted(worst, key=lambda name: -worst[name])
     dear = [f"{name} ({100.0 * worst[name]:.0f} %)" for name in order[:_FEW] if worst[name] > 0.0]
@@ -331,7 +331,7 @@ def _allocation_sections(run: ToleranceRun) -> tuple[Section, ...]:
 
 
 def _tol_table(run: ToleranceRun) -> Table:
-    """Return the table of the limits for the workshop."""
+    """Return the table of the limits for the workshop, one row per tolerance."""
     limits = run.allocation.limits if run.allocation is not None else {}
     rows: list[list[Cell]] = []
     for name, tolerance in run.setup.test.tolerances.items():

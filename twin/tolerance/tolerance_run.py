@@ -38,11 +38,11 @@ LEVELS = (0.5, 0.9, 0.95)
 _MORE = 7919
 """Number added to the seed for the independent cameras that validate an allocation."""
 _NOTHING = 1e-15
-"""Metres and radians below which a motion is rounding error."""
+"""Size of a motion, in metres or radians, below which it is rounding error."""
 EXACT = 4
 """Number of cameras in which the derivatives of the monitor are traced as a check."""
 NEAR_MODEL = 0.05
-"""Largest relative difference of a model's quantile from that of the samples without a warning."""
+"""Relative difference between a model's quantile and that of the traced cameras, above which a warning is given."""
 _PAIR, _DRAWN, _SHOWN, _MODELLED = 6.6e3, 32.0, 120.0, 40.0
 """Bytes of two numbers that vary together, by which the merits are modelled to the second order; of each camera, of a
 number that varies, of a merit or compensator in the tables, and of a merit of the models.
@@ -70,7 +70,7 @@ class Yield:
 
     @classmethod
     def count(cls, passing: np.ndarray) -> Yield:
-        """Return the yield of cameras that pass or not, (S,).
+        """Return the yield from whether each camera passes, (S,).
 
         Array dimensions: S cameras.
         """
@@ -83,7 +83,7 @@ class Yield:
         return self.passed / self.of
 
     def judged(self, wanted: float) -> str:
-        """Return ``met``, ``missed``, or ``open`` if the confidence interval contains the required share."""
+        """Return ``met``, ``missed``, or ``open`` if the confidence interval contains the required yield ``wanted``."""
         return "met" if self.low >= wanted else "missed" if self.high < wanted else "open"
 
 
@@ -102,13 +102,13 @@ class MeritResult:
     levels : tuple of float
         Values that shares ``LEVELS`` of the cameras do not exceed (for an MTF: exceed), SI.
     linear, quadratic : tuple of float
-        The same quantiles by the linear and the quadratic model.
+        The same quantiles by the first-order and by the second-order model, SI.
     passing : Yield
         Share of cameras that meet the requirement.
     model_passing : tuple of float
-        That share by the linear and by the quadratic model.
+        Share of cameras that meet the requirement, by the first-order and by the second-order model.
     shares : dict
-        Tolerance -> share of the variance that vanishes without it, by the quadratic model.
+        Tolerance -> share of the merit's variance that vanishes without it, by the second-order model.
     """
 
     merit: Merit
@@ -132,11 +132,11 @@ class ToleranceRun:
     setup : ToleranceSetup
         Tolerance budget.
     bench : ToleranceBench
-        Bench of the budget.
+        Camera of the budget with its varied parameters, compensators and merits.
     sensitivity : Sensitivities
         Sensitivities and the model of the merits.
     inverse : InverseLimits
-        Inverse limits for a loss.
+        Size of each tolerance that alone causes each merit's allowed loss.
     samples : Samples
         Monte Carlo cameras.
     merits : tuple of MeritResult
@@ -197,7 +197,8 @@ def run_tolerance(
     InputError
         A name does not exist, the nominal camera has no light at a field, or the memory does not suffice.
     RunFolderError, Incomplete
-        See ``draw_samples``.
+        The folder of finished work belongs to another run or cannot be written, or the workers could not finish all
+        runs.
     """
     test, force = setup.test, force or Workforce()
     engine_warnings: dict[
@@ -319,7 +320,7 @@ class ModelPredictions:
     linear, quadratic : (S, M) ndarray
         Merits to the first and to the second order, SI.
     without : (E, S', M) ndarray
-        Merits to the second order without each tolerance, of the first S' cameras.
+        Merits to the second order with one tolerance at a time left out, of the first S' cameras.
     """
 
     linear: np.ndarray
@@ -328,7 +329,7 @@ class ModelPredictions:
 
     @classmethod
     def of(cls, bench: ToleranceBench, sensitivity: Sensitivities, samples: Samples) -> ModelPredictions:
-        """Evaluate the models at the draws of the cameras."""
+        """Evaluate the models of first and second order at the random parameters of the cameras."""
         scaled = ScaledModel.of(sensitivity.model, samples.x, list(bench.entries.values()))
         identity = np.eye(len(bench.entries))
         return cls(
@@ -420,7 +421,7 @@ def _warnings(
 
 
 def _allocation_warnings(allocation: Allocation, judged: Yield, spec: AllocationSpec) -> list[str]:
-    """Return warnings about limits that miss the required yield, or a model that contradicts exact traces."""
+    """Return warnings about limits that miss the required yield, or a model that disagrees with exact traces."""
     out = []
     if not allocation.reached and allocation.unrounded:
         out.append(
@@ -550,7 +551,10 @@ def _tolerance_plain(run: ToleranceRun) -> dict[str, Any]:
 
 
 def _moves_at(run: ToleranceRun, entry: int, end: int) -> dict[str, str | float | None]:
-    """Return each compensator's move with a tolerance at an end of its limit; None for a figure error."""
+    """Return each compensator's move, as a quantity with unit, with a tolerance at its lower or upper limit.
+
+    None for a figure error.
+    """
     moves = run.sensitivity.moves[entry, end].tolist()
     return {
         compensator.name: amount_text(move, compensator.kind) if np.isfinite(move) else None

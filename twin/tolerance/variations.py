@@ -31,7 +31,7 @@ from scenes.yaml.spec import Spec
 HEAT = ("temperature", "gradient")
 """Kinds of motions that are thermal."""
 SHAPE = ("scale", "expansion", "radius", "conic", "index", "abbe")
-"""Kinds of motions that are neither rigid nor a figure error."""
+"""Kinds of motions that change a body's shape or material, and are neither rigid nor a figure error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class BodyMove:
     figure : FrozenMap
         Noll index -> rms of the sag, metres.
     shape : FrozenMap
-        Name in ``SHAPE`` -> change.
+        Kind of shape change in ``SHAPE`` -> change, SI.
     """
 
     rotate: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -105,7 +105,13 @@ def tolerance_parameters(
 def compensator_parameters(
     setup: ToleranceSetup, instrument: Instrument, thermal: ThermalModel
 ) -> tuple[VariedParameter, ...]:
-    """Return one parameter for each compensator; see ``tolerance_parameters``."""
+    """Return one varied parameter (a motion per SI unit) for each compensator of a budget.
+
+    Raises
+    ------
+    InputError
+        A body does not exist, or does not allow the motion.
+    """
     maker = _Maker(setup.test, instrument, thermal)
     return tuple(maker.compensator(name, compensator) for name, compensator in setup.test.compensators.items())
 
@@ -113,7 +119,13 @@ def compensator_parameters(
 def actuator_parameter(
     test: Spec, instrument: Instrument, thermal: ThermalModel, name: str, actuator: CompensatorSpec
 ) -> VariedParameter:
-    """Return the parameter of an actuator under ``actuators`` of a test; see ``tolerance_parameters``."""
+    """Return the varied parameter (a motion per SI unit) of one actuator under ``actuators`` of a test.
+
+    Raises
+    ------
+    InputError
+        The body does not exist, or does not allow the motion.
+    """
     moves = _Maker(test, instrument, thermal)._moves(actuator, ("actuators", name), actuator.range_si or 1.0)
     return VariedParameter(name, name, actuator.parts[1], 1.0, moves)
 
@@ -194,7 +206,7 @@ class _Maker:
         return self.instrument.assembly.tree[path]
 
     def _heat(self, body: str, kind: str, axis: str, key: KeyPath, limit: float) -> FrozenMap[str, BodyMove]:
-        """Return the effect of a change of temperature per unit, between zero and the limit."""
+        """Return each body's motion due to a change of temperature, per kelvin or K/m, between zero and the limit."""
         try:
             return heat_moves(self.thermal, self.instrument, body, kind, AXES.get(axis, 0), limit)
         except TemperatureError as error:
@@ -212,7 +224,7 @@ def heat_moves(
 ) -> FrozenMap[str, BodyMove]:
     """Return the effect of a change of temperature on every body, per SI unit.
 
-    It is the difference quotient between zero and an amount.
+    It is the motion at ``amount`` divided by ``amount``.
 
     Parameters
     ----------
@@ -280,7 +292,7 @@ def spectrum_shares(terms: Sequence[int], power: float) -> np.ndarray:
     terms : sequence of int
         Noll indices.
     power : float
-        Exponent of the spectrum.
+        Exponent of the variance's decrease with radial order.
     """
     order = np.array([noll_to_nm(j)[0] for j in terms])
     variance = (order + 1.0) ** -power
@@ -325,7 +337,7 @@ def states_of(numbers: Sequence[VariedParameter], amounts: np.ndarray) -> list[S
 
     Parameters
     ----------
-    numbers : sequence of VariedNumber
+    numbers : sequence of VariedParameter
         K parameters.
     amounts : (S, K) ndarray
         Amounts, SI.
@@ -369,7 +381,7 @@ def states_of(numbers: Sequence[VariedParameter], amounts: np.ndarray) -> list[S
 def _motions(
     count: int, rotate: np.ndarray, shift: np.ndarray, figure: dict[int, np.ndarray], shape: dict[str, np.ndarray]
 ) -> list[Motion]:
-    """Return the motions of one body in S states."""
+    """Return the motions of one body in each of several states."""
     turns, shifts = rotate.tolist(), shift.tolist()
     figures = {j: values.tolist() for j, values in figure.items()}
     shapes = {name: values.tolist() for name, values in shape.items()}

@@ -86,7 +86,7 @@ class Operation:
     Problem
         The record has no reading of the monitor.
     InputError
-        The plan states motions that its instrument cannot make.
+        The plan specifies motions that its instrument cannot make.
     """
 
     def __init__(
@@ -405,7 +405,7 @@ class Operation:
     def too_many_jumps(self) -> bool:
         """True if more jumps were detected than the plan specifies, at a false-alarm rate of one in a thousand.
 
-        A body without a stated rate counts as one expected jump.
+        A body without a specified rate counts as one expected jump.
         """
         stated, lasted = self.model.series_filter.stated, (self.estimator_state.time - self.epoch) / MICRO
         mean_intervals = {body: law.every_s for body, law in zip(stated.bodies, stated.laws, strict=True) if law.jump}
@@ -416,7 +416,7 @@ class Operation:
     def _unexplained(self, innovations: Sequence[tuple[int, float, int]]) -> Array:
         """Return chi-square and degrees of freedom (N, 2) of readings, zero for readings that detected jumps explain.
 
-        If more jumps were detected than the plan states, none is taken as an explanation.
+        If more jumps were detected than the plan specifies, none is taken as an explanation.
 
         Array dimensions: N readings.
         """
@@ -434,7 +434,7 @@ class Operation:
     def _course(
         self, times: NDArray[np.int64], estimates: Sequence[tuple[Array, Array]], sigma_inflation: Array
     ) -> Course:
-        """Return the course of all quantities from parameters and covariances at the times."""
+        """Return the time series of all quantities from parameters and covariances at the times."""
         rows = self.model.rows
         changes = np.array([one for one, _ in estimates]).reshape(len(times), rows.shape[1])
         covariance = np.array([one for _, one in estimates]).reshape(len(times), rows.shape[1], rows.shape[1])
@@ -475,7 +475,7 @@ class Operation:
         return out
 
     def motions(self, time_us: int, acting: bool = False) -> Motions:
-        """Return every stated motion at one time, given all readings.
+        """Return every specified motion at one time, given all readings.
 
         Parameters
         ----------

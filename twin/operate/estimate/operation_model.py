@@ -1,8 +1,8 @@
 """Model on which the estimate of an instrument in operation depends, and its plans of operation.
 
-`traced_model` traces what each stated motion does to the spots and to the cameras' parameters, and what the temperature
-sensors read of it. Plans of operation are read from a file, checked against the record's instrument and stored in the
-record.
+`traced_model` traces what each specified motion does to the spots and to the cameras' parameters, and what the
+temperature sensors read of it. Plans of operation are read from a file, checked against the record's instrument and
+stored in the record.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class OperationModel:
 
     @cached_property
     def rows(self) -> Array:
-        """(Q, 4 K) derivatives of the quantities by the parameters.
+        """(Q, 4 K) derivatives of the quantities with respect to the parameters.
 
         Numerators are in the quantities' units; denominators are rad and m of one camera after the other.
 
@@ -76,7 +76,7 @@ class OperationModel:
 def traced_model(
     setup: OperationSetup, reference_sigma: Array, sensors: Sequence[str], experiment: MonitorExperiment
 ) -> OperationModel:
-    """Trace the effects of all stated motions and build the filter.
+    """Trace the effects of all specified motions and build the filter.
 
     Array dimensions: C spots.
 
@@ -99,7 +99,7 @@ def traced_model(
     Raises
     ------
     InputError
-        The instrument lacks a body of the plan, or the body cannot move or be warmed as stated.
+        The instrument lacks a body of the plan, or the body cannot move or be warmed as specified.
     """
     plan = setup.operation
     stated, motions = experiment.disturbances, experiment.stated
@@ -125,14 +125,15 @@ def traced_model(
 def heat_inputs(
     stated: DisturbancePrior, thermal: ThermalModel, sensors: Sequence[str], sigma: float
 ) -> HeatInputs | None:
-    """Return the readings of temperature sensors as functions of the stated temperatures; None if no sensor reads any.
+    """Return the model of the temperature sensors' readings in terms of the prior's temperatures; None without sensors.
 
-    A sensor is located at its body's origin. A body without a stated temperature has that of the body that carries it.
+    None is also returned if no sensor reads a temperature of the prior. A sensor is located at its body's origin. A
+    body without a specified temperature has that of the body that carries it.
 
     Parameters
     ----------
     stated : DisturbancePrior
-        All M stated components of motion and temperature.
+        All M specified components of motion and temperature.
     thermal : ThermalModel
         Thermal model of the instrument.
     sensors : Sequence[str]

@@ -208,7 +208,7 @@ class RequirementStatus(_Dated):
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """Estimate of all M stated motions at one time.
+    """Estimate of all M specified motions at one time.
 
     Attributes
     ----------
@@ -260,7 +260,7 @@ class FilterResult:
     sigma_inflation : float
         Factor by which present sigmas are inflated because the latest readings contradict the prior; 1 if they do not.
     too_many_jumps : bool
-        Whether more jumps were detected than the plan states.
+        Whether more jumps were detected than the plan specifies.
     requirements : tuple[RequirementStatus, ...]
         Status of the plan's requirements.
     bad_readings : tuple[tuple[int, str], ...]

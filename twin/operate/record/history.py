@@ -384,7 +384,7 @@ class History:
             return list(connection.execute(query.order_by(c.time_us, c.number)))
 
     def save_checkpoint(self, plan: str, number: int, time_us: int, entry_id: int, content: bytes) -> bool:
-        """Save the state of an estimate, in place of an earlier one of the same number.
+        """Save the state of an estimate, instead of an earlier one of the same number.
 
         Parameters
         ----------
