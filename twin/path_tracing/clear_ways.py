@@ -22,13 +22,13 @@ from scenes.models.scenery import LEAST_CLEARANCE, Scenery, SceneSurface
 from twin.path_tracing.path_families import decode
 
 FACING = 0.05
-"""Smallest cosine between a segment and the normals of a curved aperture from which all of another one is visible.
+"""Smallest cosine between a segment and the normals of a curved aperture for which it counts as wholly visible.
 
 It is three degrees from grazing, more than the triangles' normals differ from those of the surface.
 """
 
 EXITS = 4
-"""Number of exits of a surface: two clear apertures, each with two sides."""
+"""Number of ways in which light can leave a surface: two clear apertures, each with two sides."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +48,9 @@ class Patch:
     corners : (8, 3) ndarray
         Corners of the box, world frame, metres.
     normals : (T, 3) ndarray
-        Normals of the surface's triangles, world frame.
+        Unit normals of the T triangles of the surface, world frame.
     solid : str or None
-        Glass body of the surface, None for none.
+        Glass body of the surface; None if it belongs to no glass body.
     """
 
     surface: int
@@ -88,18 +88,18 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Clear path segment from an aperture to the next one of a family.
+    """Clear path segment from an aperture to the next one that a family of paths meets.
 
     Attributes
     ----------
     start : int
         Index of the surface that light leaves, -1 for the source.
     exit_side : int
-        Exit of that surface: 2 * (index of the aperture) + (1 where light leaves toward -z).
+        How light leaves that surface: 2 * (index of the aperture) + (1 where it leaves toward -z).
     end : Patch
         Aperture at the end.
     after : int
-        Index of the family's next segment in the list, -1 for none.
+        Index of the family's next segment in the list; -1 if there is none.
     behind : int
         1 where the next segment leaves the end toward -z.
     """
@@ -277,7 +277,7 @@ def _patch(number: int, index: int, surface: SceneSurface, aperture: Aperture) -
 
 
 class _Obstacles:
-    """Triangles of all surfaces, in the world frame."""
+    """Triangles of all surfaces, in the world frame, which may obstruct a path segment."""
 
     def __init__(self, surfaces: Sequence[SceneSurface]) -> None:
         corners = [s.pose.apply(s.vertices) for s in surfaces]
@@ -318,7 +318,7 @@ def _reaches(triangles: np.ndarray, planes: np.ndarray, margin: float) -> bool:
 
 
 def _cut(corners: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """Return the part of a convex polygon where its levels are not positive."""
+    """Return the part of a convex polygon where a linear function, given at its corners, is not positive."""
     out = []
     for k, level in enumerate(levels):
         after = (k + 1) % len(levels)

@@ -25,18 +25,21 @@ from optics.numerics.backend import Backend
 from twin.path_tracing.path_families import Event
 
 NEAREST = 1e-6
-"""Smallest distance of ``near_distance``, in direction cosines."""
+"""Smallest distance from the specular direction that ``near_distance`` draws, in direction cosines."""
 
 
 def near_distance(u: Any) -> Any:
-    """Draw a distance between ``NEAREST`` and ``fresnel_scatter.MAX_DISTANCE``, log-uniform, from u in [0, 1)."""
+    """Draw the distance of a scattered direction from the specular one, in direction cosines, log-uniformly.
+
+    It is between ``NEAREST`` and ``fresnel_scatter.MAX_DISTANCE``; u is a uniform random number in [0, 1).
+    """
     import drjit as dr
 
     return NEAREST * dr.exp(u * log(fresnel_scatter.MAX_DISTANCE / NEAREST))
 
 
 def near_density(distance: Any) -> Any:
-    """Return the density of the square of ``near_distance``."""
+    """Return the probability density of the squared distance that ``near_distance`` draws."""
     import drjit as dr
 
     return dr.select(
@@ -50,19 +53,19 @@ class OutgoingPaths:
 
     Attributes
     ----------
-    direction : Any
+    direction : Dr.Jit Vector3
         Specular or refracted direction.
-    normal : Any
+    normal : Dr.Jit Vector3
         Unit normal, on either side.
-    index : Any
+    index : Dr.Jit array
         Refractive index on the side that the path goes to.
-    event : Any
+    event : Dr.Jit array
         Event at the surface.
-    weight : Any
+    weight : Dr.Jit array
         Weight of the path.
-    toward : Any
+    toward : Dr.Jit array
         Cosine of the arriving direction with ``normal``.
-    diffusing : Any
+    diffusing : Dr.Jit mask
         True where the path is diffused.
     """
 
@@ -81,11 +84,11 @@ class TableSampling:
 
     Attributes
     ----------
-    tables : Any
-        Tables of the scene.
-    marks : Any
-        Marks of the paths' finishes, see ``tables.MARKS``.
-    cosine : Any
+    tables : FinishTables
+        Tables of the scene's measured surface finishes.
+    marks : Dr.Jit array
+        Numbers of the tables of each path's surface finish, see ``tables.MARKS``.
+    cosine : Dr.Jit array
         Cosine of the angle of incidence.
     """
 
@@ -97,28 +100,28 @@ class TableSampling:
 def sample_scattering(
     rng: Any, met: Any, specular: Any, share: Any, floor: Any, weight: Any, all_of_it: bool = False
 ) -> tuple[Any, Any]:
-    """Draw which paths are scattered.
+    """Draw which paths are scattered, and return them with the weights of all paths.
 
     Parameters
     ----------
-    rng : Any
+    rng : Dr.Jit random generator
         Random generator.
-    met : Any
+    met : Dr.Jit mask
         Paths that are at a surface.
-    specular : Any
+    specular : Dr.Jit mask
         Those of them that are reflected or transmitted.
-    share : Any
+    share : Dr.Jit array
         Share of the light that is scattered.
-    floor : Any
+    floor : Dr.Jit array
         Smallest probability of scattering where the share is not zero.
-    weight : Any
+    weight : Dr.Jit array
         Weights of the paths.
     all_of_it : bool
-        A surface may scatter all of the light.
+        True if a surface may scatter all of the light.
 
     Returns
     -------
-    tuple of (Any, Any)
+    tuple of (Dr.Jit mask, Dr.Jit array)
         Mask of the scattered paths, and the weights.
     """
     import drjit as dr
@@ -148,17 +151,17 @@ def sample_bsdf(
     ----------
     backend : Backend
         Array types.
-    rng : Any
+    rng : Dr.Jit random generator
         Random generator.
-    met : Any
+    met : Dr.Jit mask
         Paths that are at a surface.
-    share : Any
+    share : Dr.Jit array
         Share of the light whose direction is drawn from a lobe.
     lobe : callable
         Returns scale, exponent, kind and area of the lobe for active paths.
-    floor : Any
+    floor : Dr.Jit array
         Smallest probability of drawing from a lobe that exists.
-    near : Any
+    near : Dr.Jit array
         Share of the directions that are drawn with ``near_distance``, None for none.
     leaving : OutgoingPaths
         Paths as they would continue without scattering.
@@ -230,15 +233,17 @@ def sample_bsdf(
 
 
 LEAST_SURVIVAL = 0.2
-"""Smallest survival probability of a path: a class from which the first paths brought nothing may still bring light,
-and is sampled with at most five times the variance.
+"""Smallest survival probability of a path.
+
+A class from which the first paths brought nothing may still bring light, and is sampled with at most five times the
+variance.
 """
 
 PRIOR = 0.1
-"""Share of the variance that is assigned to all classes together, in equal parts, before anything is learnt."""
+"""Share of the variance that is assigned to all classes of paths in equal parts before anything is learnt."""
 
 NOMINAL_COST = 0.15
-"""Computing time of a surface of the nominal path, relative to that of any other surface, as measured."""
+"""Measured computing time at a surface of the nominal path, relative to that at any other surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,7 +270,7 @@ class LearnedRoulette:
         return np.where((numbers < self.first) | (passed >= len(self.survival)), 1.0, self.survival[known])
 
     def survives(self, numbers: np.ndarray, survival_probability: np.ndarray) -> np.ndarray:
-        """Draw which paths survive."""
+        """Draw which paths survive, from the seed and the paths' numbers; return a mask."""
         with np.errstate(over="ignore"):
             # splitmix64 of Steele, Lea and Flood (2014), with other constants than those of the paths' random streams
             z = (numbers.astype(np.uint64) + np.uint64(self.seed)) * np.uint64(0xD1342543DE82EF95)
@@ -278,7 +283,7 @@ class LearnedRoulette:
 
 @dataclass(frozen=True, eq=False)
 class PathHistory:
-    """History of the paths of a launch.
+    """History of the N paths of a launch.
 
     Attributes
     ----------

@@ -1,12 +1,12 @@
 """Loop over the surfaces of a path, recorded once as one Dr.Jit kernel; all numbers of the scene enter as arrays.
 
 In each step a path is traced to the next surface (``surface_intersection``), the surface divides its light, and the
-path continues in one of the possible directions. Neighbouring paths are processed together, in packets of the machine's
-vectors. A packet takes as long as its longest path, and includes everything that any of its paths needs: what only some
-surfaces need (Newton's method, Fresnel's formulas, a lobe, a detector) is computed only in packets that need it.
-Sources let neighbours start alike, and paths that leave nominal light (``sequential``) are sorted so that neighbours
-behave alike. Sorting once more, after four more steps, would save 9 percent of the packets' steps and cost as much, as
-measured.
+path continues in one of the possible directions. Neighbouring paths are processed together, as many as fit into the
+processor's vector registers (a packet). A packet takes as long as its longest path, and includes everything that any of
+its paths needs: what only some surfaces need (Newton's method, Fresnel's formulas, a lobe, a detector) is computed only
+in packets that need it. Sources let neighbours start alike, and paths that leave nominal light (``sequential``) are
+sorted so that neighbours behave alike. Sorting once more, after four more steps, would save 9 percent of the packets'
+steps and cost as much, as measured.
 """
 
 from __future__ import annotations
@@ -41,23 +41,23 @@ class Features:
     form : layout.SurfaceForm
         Components of the surfaces' shapes.
     glass : bool
-        There are glass bodies.
+        True if there are glass bodies.
     branching : bool
-        Some finish does more than one thing with light that continues.
+        True if some surface finish does more than reflect and absorb light.
     segments : bool
-        There are clear segments.
+        True if there are clear segments.
     bare : bool
-        Some glass is uncoated.
+        True if some glass is uncoated.
     measured : bool
-        Some finish has a table of its coating or its scattering.
+        True if some surface finish has a table of its coating or its scattering.
     roulette : bool
-        Paths of low weight are ended at random.
+        True if paths of low weight are ended at random.
     near : bool
-        Some scattered directions are drawn close to the specular one.
+        True if some scattered directions are drawn close to the specular one.
     keep_nominal : bool
-        Detections of the nominal family are recorded as well.
+        True if detections of the nominal family are recorded as well.
     log : bool
-        The events of every path are recorded.
+        True if the events of every path are recorded.
     """
 
     form: layout.SurfaceForm
@@ -78,18 +78,18 @@ class Limits:
 
     Attributes
     ----------
-    steps : Any
+    steps : Dr.Jit array
         Largest number of steps.
-    capacity : Any
+    capacity : Dr.Jit array
         Number of detections that can be recorded.
-    floors : Sequence[Any]
+    floors : sequence of Dr.Jit arrays
         Smallest probability of each possible direction after none, one, and more unlikely ones; 0: proportional to
         power.
-    scatter_floors : Sequence[Any]
+    scatter_floors : sequence of Dr.Jit arrays
         Smallest probability of drawing a direction from a scatter lobe, likewise.
-    near : Any
+    near : Dr.Jit array
         Share of these directions that are drawn close to the specular one.
-    weak : Any
+    weak : Dr.Jit array
         Weight below which a path may be ended by roulette.
     """
 
@@ -107,25 +107,25 @@ class Launch:
 
     Attributes
     ----------
-    position, direction : Any
+    position, direction : Dr.Jit Vector3
         Position, metres, and unit direction, ``Vector3``.
-    weight : Any
+    weight : Dr.Jit array
         Power of the path.
-    path : Any
+    path : Dr.Jit array
         Number of the path.
-    rng : Any
+    rng : Dr.Jit random generator
         Random generator of the path.
-    segment : Any
+    segment : Dr.Jit array
         Row of the clear segment that it is on, 0 for none.
-    length : Any
+    length : Dr.Jit array
         Optical path so far, metres.
-    body : Any
+    body : Dr.Jit array
         Number of the glass body that it is in, 0 for none.
-    ahead : Any
+    ahead : Dr.Jit array
         Distance ahead at which the search for the next surface starts, metres.
-    signature : Any
+    signature : Dr.Jit array
         Signature of its events so far.
-    steps : Any
+    steps : Dr.Jit array
         Number of these events.
     """
 
@@ -144,7 +144,7 @@ class Launch:
 
 @dataclass(frozen=True, eq=False)
 class PreparedScene:
-    """Scene for the kernel: array types, Mitsuba with its variant set, triangles and tables."""
+    """Scene as the kernel needs it: array types, Mitsuba with its variant set, triangles and tables of numbers."""
 
     backend: Backend
     mi: Any
@@ -155,13 +155,13 @@ class PreparedScene:
 def follow(
     prepared: PreparedScene, features: Features, limits: Limits, launch: Launch, accumulators: Accumulators
 ) -> Any:
-    """Trace all paths to their end; nothing is evaluated yet.
+    """Record the trace of all paths to their end; Dr.Jit evaluates it later.
 
     The weight that escapes to infinity and the weight still under way at the step limit are accumulated as well.
 
     Returns
     -------
-    Any
+    Dr.Jit array
         Number of steps of each path from its start.
     """
     import drjit as dr
@@ -194,7 +194,7 @@ def follow(
 def _step(
     prepared: PreparedScene, features: Features, limits: Limits, path: Any, accumulators: Accumulators
 ) -> Callable[..., tuple[Any, ...]]:
-    """Return the loop's body: one step of every path."""
+    """Return the function that traces one step of every path, the body of the kernel's loop."""
     import drjit as dr
 
     backend, tables = prepared.backend, prepared.tables
@@ -312,7 +312,7 @@ def _step(
 
 
 def _by_number(number: Any, values: Sequence[Any]) -> Any:
-    """Return the value after none, one, and more."""
+    """Return the first of three values where ``number`` is 0, the second where it is 1, else the third."""
     import drjit as dr
 
     return dr.select(number == 0, values[0], dr.select(number == 1, values[1], values[2]))
@@ -324,14 +324,14 @@ class Shares:
 
     Attributes
     ----------
-    reflected, transmitted, diffused : Any
+    reflected, transmitted, diffused : Dr.Jit array
         Shares of the light.
-    scattered : Any
+    scattered : Dr.Jit array
         Share of the reflected or transmitted light for which a scattered direction is drawn.
-    ratio, bent : Any
+    ratio, bent : Dr.Jit array
         Refractive index before over that behind, and cosine of the angle of refraction, 0 for total reflection; None
         without glass.
-    marks : Sequence[Any]
+    marks : sequence of Dr.Jit arrays
         Marks of measured finishes, see ``tables.MARKS``.
     """
 
@@ -361,11 +361,11 @@ class Choice:
 
     Attributes
     ----------
-    reflecting, through, diffusing : Any
+    reflecting, through, diffusing : Dr.Jit mask
         Masks of the paths.
-    weight : Any
+    weight : Dr.Jit array
         Weight with which they continue.
-    unlikely : Any
+    unlikely : Dr.Jit mask
         True where a floor made the direction more likely than its share of the light.
     """
 
@@ -377,7 +377,10 @@ class Choice:
 
 
 def choose(shared: Shares, weight: Any, floor: Any, rng: Any, met: Any) -> Choice:
-    """Draw the direction of paths at a surface, each with its share of the light and at least ``floor``."""
+    """Draw whether paths at a surface are reflected, transmitted or diffused.
+
+    Each possibility has the probability of its share of the light, but at least ``floor``.
+    """
     import drjit as dr
 
     continuing = shared.continuing
@@ -398,7 +401,7 @@ def choose(shared: Shares, weight: Any, floor: Any, rng: Any, met: Any) -> Choic
 def shares(
     prepared: PreparedScene, features: Features, row: Any, met: Any, place: Intersection, inside: Any, before: Any
 ) -> Shares:
-    """Return how the finish of each path's row divides the light."""
+    """Return how the surface finish that each path meets divides the light."""
     import drjit as dr
 
     tables, glass = prepared.tables, features.glass

@@ -12,15 +12,15 @@ from scenes.models.scenery import Scenery
 
 
 class Event(IntEnum):
-    """Event of a path at a surface; from ``DIFFUSE`` on it is stray light."""
+    """Kind of event of a path at a surface; values from ``DIFFUSE`` on are stray light."""
 
     REFLECT = 0
     TRANSMIT = 1
     DIFFUSE = 2
     SCATTER = 3
-    """Into the lobe around the reflected direction."""
+    """Scattered into the lobe around the reflected direction."""
     SCATTER_THROUGH = 4
-    """Into the lobe around the refracted direction."""
+    """Scattered into the lobe around the refracted direction."""
 
 
 OUTSIDE = 8
@@ -55,19 +55,19 @@ def signature(codes: Iterable[int]) -> int:
 
 
 MARKS = {Event.REFLECT: "", Event.TRANSMIT: ">", Event.DIFFUSE: "~", Event.SCATTER: "*", Event.SCATTER_THROUGH: ">*"}
-"""Mark after a part's name in the text of a family; a reflection has none."""
+"""Kind of event -> character after a surface's name in the text of a family; a reflection has none."""
 
 
 @dataclass(frozen=True)
 class SurfaceEvent:
-    """Event of a family: the part, the kind of event, and True if outside the clear apertures of its elements."""
+    """Event of a family: the surface's name, the kind of event, and True if outside the surface's clear apertures."""
 
     part: str
     event: Event
     outside: bool = False
 
     def __str__(self) -> str:
-        """Return the part's name and its mark: ``>`` through, ``~`` diffused, ``*`` scattered, ``!`` outside."""
+        """Return the surface's name and the event: ``>`` through, ``~`` diffused, ``*`` scattered, ``!`` outside."""
         return f"{self.part}{MARKS[self.event]}{'!' if self.outside else ''}"
 
 
@@ -99,7 +99,7 @@ def nominal_codes(scenery: Scenery, assembly: Assembly, sequence: str) -> tuple[
 
 
 def surface_events(scenery: Scenery, codes: tuple[int, ...]) -> tuple[SurfaceEvent, ...]:
-    """Return the events of codes."""
+    """Return the events, with the names of their surfaces, that numeric codes stand for."""
     parts = scenery.parts
     return tuple(SurfaceEvent(parts[part], event, outside) for part, event, outside in map(decode, codes))
 

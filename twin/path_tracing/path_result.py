@@ -27,20 +27,20 @@ class Accumulators:
 
     Attributes
     ----------
-    absorbed : Any
-        (rows of finishes,) absorbed weight, detected light included.
-    left : Any
+    absorbed : Dr.Jit array
+        (surface finishes,) weight absorbed at each, detected light included.
+    left : Dr.Jit array
         (3,) weight escaped to infinity, weight still under way at the step limit, weight at the start.
-    sums : Any
+    sums : Dr.Jit array
         (detectors * NOMINAL_SUMS) count, weight, its square, weighted x, y, x^2, y^2 of the nominal family.
-    images : Any
+    images : Dr.Jit array
         (CLASSES * pixels of all detectors) weight.
-    counter : Any
+    counter : Dr.Jit array
         (1,) number of detections to record.
-    records : dict of str to Any
+    records : dict of str to Dr.Jit array
         ``signature``, ``path``, ``detector``, ``x``, ``y``, ``weight``, ``length``, ``kind``, each (capacity,).
-    log : Any
-        (paths * steps) code of every event, or None.
+    log : Dr.Jit array or None
+        (paths * steps) code of every event; None if events are not recorded.
     capacity : int
         Number of detections that can be recorded.
     """
@@ -156,7 +156,7 @@ class Family:
     energy : float
         Detected share of the emitted power.
     error : float
-        Standard error of the energy.
+        Standard error of ``energy`` due to the finite number of paths.
     count : int
         Number of paths.
     centroid : (float, float)
@@ -185,7 +185,7 @@ KINDS = {NOMINAL: "nominal", GHOST: "ghost", STRAY: "stray"}
 
 @dataclass(frozen=True)
 class Balance:
-    """Energy balance of the emitted power.
+    """Energy balance: where the emitted power of all paths ends.
 
     Attributes
     ----------
@@ -216,7 +216,7 @@ class Balance:
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Single detections, as arrays with an entry for each.
+    """Single detections of N paths, as arrays with an entry for each.
 
     Attributes
     ----------
@@ -227,7 +227,7 @@ class Detections:
     place : (N, 2) ndarray
         Position x, y in the detector's frame, metres.
     weight : ndarray
-        Detected power.
+        Detected power, relative to the emitted power.
     length : ndarray
         Optical path, metres.
     signature : ndarray
@@ -270,7 +270,7 @@ class PathResult:
     detections: Detections
 
     def of(self, detector: str, kind: str) -> tuple[Family, ...]:
-        """Return the families of one kind at one detector, by falling energy."""
+        """Return the families of one kind at one detector, the strongest first."""
         return tuple(f for f in self.families if f.detector == detector and f.kind == kind)
 
     def nominal(self, detector: str) -> Family:
@@ -301,14 +301,14 @@ class Key:
 
 
 class Collector:
-    """Sum over the launches of a run.
+    """Sum of detections and power over the launches of a run.
 
     Parameters
     ----------
     scenery : Scenery
         Scene.
     nominal : Sequence[int]
-        Signature of the nominal family of each detector, 0 for none.
+        Signature of the nominal family of each detector; 0 if it has none.
     keep : bool
         Keep single detections.
     """
@@ -366,7 +366,7 @@ class Collector:
             self._put(Key(detector, signature, kind), sums[k], int(r["path"][first[k]]))
 
     def strongest(self, most: int) -> list[Key]:
-        """Return the families with most energy whose events are not known beforehand."""
+        """Return the ``most`` families with the most power whose events are not known beforehand."""
         keys = [k for k in self.sums if k.kind != NOMINAL]
         return sorted(keys, key=lambda k: -self.sums[k][1])[:most]
 

@@ -29,14 +29,14 @@ from twin.path_tracing.path_result import Accumulators, Arrival, record
 from twin.path_tracing.surface_intersection import Flight, Intersection, locate
 
 GROUP = 4
-"""Number of consecutive surfaces that a packet passes without a test whether any of its paths is still active."""
+"""Number of consecutive surfaces between two tests of whether any path processed together is still active."""
 
 ENDED, MISSED, TURNED = range(3)
 """Reasons why a path has left: absorbed by the detector; does not meet the next surface as nominal light does; takes
 another direction there or has reached the end."""
 
 DRAWS_PER_FLOAT64 = 1
-"""Number of steps of the random generator for a float64."""
+"""Number of steps that the random generator takes for one float64."""
 
 _MULTIPLIER = 0x5851F42D4C957F2D
 """Multiplier of the generator PCG32, state <- state * multiplier + increment (O'Neill, 2014)."""
@@ -44,7 +44,7 @@ _MULTIPLIER = 0x5851F42D4C957F2D
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """Surface of the nominal path.
+    """Surface of the nominal path, with what nominal light does there.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Step:
     aperture : int
         Index of its clear aperture that is met.
     segment : int
-        Row of the clear segment that leads to it, as in ``tables.segment_table``, 0 for none.
+        Index of the clear segment that leads to it in ``tables.segment_table``; 0 if there is none.
     code : int
         Code of the event there.
     detects : bool
@@ -61,7 +61,7 @@ class Step:
     front : bool
         True where it is met from +z.
     body : int
-        Number of the glass body in which the path arrives, 0 in the open.
+        Number of the glass body in which the path arrives; 0 for air or vacuum.
     after : int
         Number of the glass body in which the path leaves.
     clearance : float
@@ -86,12 +86,12 @@ class Step:
 
     @property
     def event(self) -> Event:
-        """Event of nominal light; at the detector, that of light which it does not absorb."""
+        """Event of nominal light at the surface; at the detector, that of light which it does not absorb."""
         return decode(self.code)[1]
 
     @property
     def row(self) -> int:
-        """Row of its finish."""
+        """Index of the surface's finish in the table of finishes, for the side that is met."""
         return layout.ROWS_PER_SURFACE * self.surface + (0 if self.front else 1)
 
     @property
@@ -115,12 +115,12 @@ class Step:
 
     @property
     def ends(self) -> bool:
-        """True where no light continues."""
+        """True where all light is absorbed, so that every path ends."""
         return self.absorbed == 1.0
 
     @property
     def known(self) -> bool:
-        """True where the finish allows the event of nominal light, without a table."""
+        """True where the finish allows the event of nominal light and is not a measured table."""
         f = self.finish
         share = f.transmission if self.event == Event.TRANSMIT else f.reflectance
         possible = (self.total and not f.diffuse) or f.bare or share > 0.0 or (self.detects and self.ends)
@@ -178,9 +178,9 @@ class NominalPart:
     ----------
     launch : Launch
         Paths after their last nominal surface; their random generators are ``draws`` steps behind.
-    passed : Any
+    passed : Dr.Jit array
         Number of surfaces that each has passed.
-    reason : Any
+    reason : Dr.Jit array
         ``ENDED``, ``MISSED`` or ``TURNED``.
     draws : tuple of int
         Number of steps of the random generator still to be taken, by the surfaces passed.
@@ -206,7 +206,7 @@ def trace_nominal(
     accumulators: Accumulators,
     steps: Sequence[Step],
 ) -> NominalPart:
-    """Trace paths along nominal light as far as they follow it; nothing is evaluated yet."""
+    """Record the trace of paths along nominal light, as far as they follow it; Dr.Jit evaluates it later."""
     import drjit as dr
 
     backend = prepared.backend
@@ -242,7 +242,7 @@ def trace_nominal(
 
 @dataclass(frozen=True, eq=False)
 class _NominalTracer:
-    """Data that all steps need."""
+    """Scene, limits and accumulators that the trace along the nominal path needs at every surface."""
 
     prepared: PreparedScene
     features: Features
@@ -258,10 +258,10 @@ class _NominalTracer:
         ----------
         number : int
             Index of the step.
-        state : tuple of Any
+        state : tuple of Dr.Jit arrays
             Position, direction, weight, length, state of the random generator, surfaces passed, reason why a path has
             left, and mask of the active paths.
-        rng : Any
+        rng : Dr.Jit random generator
             Random generator of the paths.
         pending : int
             Number of steps that it still has to take.
@@ -365,14 +365,14 @@ class _NominalTracer:
 
 
 def advanced(rng_state: Any, increment: Any, steps: int) -> Any:
-    """Return the state of a random generator some steps later."""
+    """Return the state of the PCG32 random generator after a number of steps."""
     factor, shift = _jump(steps)
     kind = type(rng_state)
     return rng_state * kind(factor) + increment * kind(shift) if steps else rng_state
 
 
 def _jump(steps: int) -> tuple[int, int]:
-    """Return the factors of the state and of the increment in the state some steps later."""
+    """Return two factors m and c: after ``steps`` steps, the generator's state is m * state + c * increment."""
     factor, shift = 1, 0
     for _ in range(steps):
         factor, shift = factor * _MULTIPLIER % 2**64, (shift * _MULTIPLIER + 1) % 2**64
@@ -381,7 +381,7 @@ def _jump(steps: int) -> tuple[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class OneSurface:
-    """Numbers of the surface of a step, which all paths meet; it replaces ``tables.SceneTables``."""
+    """Numbers of a single surface that all paths meet, with the interface of ``tables.SceneTables``."""
 
     prepared: PreparedScene
     step: Step
@@ -389,11 +389,14 @@ class OneSurface:
 
     @property
     def samples(self) -> Any:
-        """Coefficients of grid figures."""
+        """Coefficients of the figures on grids of all surfaces."""
         return self.prepared.tables.samples
 
     def geometry(self, surface: Any, active: Any) -> list[Any]:
-        """Return the geometry row of the surface without segments; kinds are constants of the kernel's code."""
+        """Return the surface's numbers of the geometry table, without clear segments.
+
+        Numbers that encode a kind are constants of the kernel's code.
+        """
         tables = self.prepared.tables
         out = self._numbers(tables.rows, layout.ROW * self.step.surface, layout.SEGMENTS)
         for place in layout.KINDS:
@@ -405,18 +408,21 @@ class OneSurface:
         return self._numbers(self.prepared.tables.rows, layout.ROW * surface + layout.CLEARANCE, 1)[0]
 
     def finish(self, row: Any, active: Any) -> list[Any]:
-        """Return the shares of the finish; shares of 0 or 1 are constants of the kernel's code."""
+        """Return reflectance, transmission, diffuse share and share of the lobe of the surface's finish.
+
+        Shares of 0 or 1 are constants of the kernel's code.
+        """
         tables, first = self.prepared.tables, layout.FINISH_ROW * self.step.row
         amounts = tables.host_finishes.ravel()[first : first + layout.BLOCK]
         found = zip(amounts, self._numbers(tables.finishes, first, layout.BLOCK), strict=True)
         return [self._literal(amount) if amount in (-1.0, 0.0, 1.0) else number for amount, number in found]
 
     def surface(self, number: Any, form: layout.SurfaceForm, active: Any) -> SurfaceNumbers:
-        """Return the surface's shape."""
+        """Return the numbers that describe the shape of the surface."""
         return self.prepared.tables.surface(number, form, True)
 
     def segment(self) -> list[Any]:
-        """Return the row of the step's segment."""
+        """Return the numbers of the clear segment that leads to the surface."""
         return self._numbers(self.prepared.tables.segments, layout.SEGMENT * self.step.segment, layout.SEGMENT)
 
     def _numbers(self, source: Any, first: int, count: int) -> list[Any]:
@@ -432,7 +438,7 @@ class OneSurface:
 
 @dataclass(frozen=True, eq=False)
 class Departures:
-    """Paths that have left the nominal path, sorted so that neighbours behave alike.
+    """The N paths of a launch after they have left the nominal path, sorted so that neighbours behave alike.
 
     Attributes
     ----------

@@ -52,7 +52,7 @@ class DiskSource:
     share: float = 0.5
 
     def __post_init__(self) -> None:
-        """Check the cones."""
+        """Raise ValueError if the narrow cone is not inside the wide one or a size is not possible."""
         if self.radius < 0.0 or not 0.0 <= self.cone < 1.0:
             raise ValueError(
                 f"a source needs a radius of 0 or more and a cone in [0, 1), found {self.radius}, {self.cone}"
@@ -70,7 +70,7 @@ class DiskSource:
         return cls(np.asarray(centre, np.float64), axis, transverse_axes(axis, helper), radius, cone)
 
     def aimed_at(self, directions: np.ndarray, room: float = 1.05, share: float = 0.5) -> DiskSource:
-        """Return the source with a narrow cone around given directions (N, 3).
+        """Return the source with a narrow cone around N given directions, (N, 3).
 
         Parameters
         ----------
@@ -88,14 +88,14 @@ class DiskSource:
 
     @property
     def patch(self) -> Patch:
-        """Emitting disk."""
+        """Disk of positions that emits the light, as the start of a clear segment."""
         pose = Pose(np.column_stack([*self.across, self.axis]), self.centre)
         r = self.radius
         return Patch.flat(-1, 0, pose, (-r, r, -r, r))
 
     @property
     def numbers(self) -> np.ndarray:
-        """Numbers for the kernel, (20,)."""
+        """Numbers of the source that the kernel reads, (20,)."""
         x, y, r = self.narrow or (0.0, 0.0, self.cone)
         share = self.share if self.narrow else 0.0
         gain = (self.cone / r) ** 2 if r > 0.0 else 1.0
@@ -105,7 +105,7 @@ class DiskSource:
 
 @dataclass(frozen=True, eq=False)
 class RaySource:
-    """List of rays: world positions (N, 3), metres, unit directions (N, 3), weights (N,)."""
+    """List of N rays: world positions (N, 3), metres, unit directions (N, 3), and weights (N,)."""
 
     position: np.ndarray
     direction: np.ndarray
@@ -128,14 +128,14 @@ random start, so that each path has any direction with its density in the cone.
 """
 
 _STEPS = (0.7548776662466927, 0.5698402909980532)
-"""Steps from a block to the next, of the radius squared and of the angle.
+"""Steps from a block of paths to the next, of the radius squared and of the angle in the cone, as fractions.
 
 They are those of Roberts's sequence of the plastic number, "The unreasonable effectiveness of quasirandom sequences"
 (2018), which fills the unit square evenly at any length.
 """
 
 _CELL = (1.0 / 16.0, 1.0 / 64.0)
-"""Range of the radius squared and of the angle in a block."""
+"""Range of the radius squared and of the angle that a block of paths covers in the cone, as fractions."""
 
 
 def random_streams(backend: Backend, numbers: Any, seed: int) -> Any:
@@ -221,7 +221,10 @@ def _drawn(backend: Backend, source: DiskSource, numbers: Any, total: int, seed:
 
 
 def pieces(total: int, size: int, cut: int = 0) -> Iterator[tuple[int, int]]:
-    """Yield first number and count of launches of at most ``size`` paths, none of which extends across ``cut``."""
+    """Divide a run into launches of at most ``size`` paths; yield the first path's number and the count.
+
+    No launch extends across the path number ``cut``.
+    """
     for begin, end in ((0, cut), (cut, total)):
         for first in range(begin, end, size):
             yield first, min(size, end - first)

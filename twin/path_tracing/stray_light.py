@@ -34,7 +34,7 @@ from twin.path_tracing.source import DiskSource
 from twin.path_tracing.tracer import CHUNK, FAINT, PathTracer, Progress, Sampling
 
 CONE_MARGIN = 1.25
-"""Half-angle of the source's cone relative to that of the pupil seen from the focal plane."""
+"""Half-angle of the cone into which a pinhole emits, relative to that of the pupil seen from the focal plane."""
 
 AIM_RINGS = 6
 NARROW_MARGIN = 1.2
@@ -60,7 +60,7 @@ class StrayResult:
     runs : Mapping[str, PathResult]
         Channel -> result for its source.
     photons_per_power : Mapping[str, float]
-        Channel -> photons per frame for a detected share 1 of the source's power.
+        Channel -> photons per frame that correspond to the whole emitted power of its source.
     """
 
     photons: Mapping[str, np.ndarray]
@@ -83,16 +83,16 @@ class StrayResult:
 
 @dataclass(frozen=True, eq=False)
 class ListedFamily:
-    """Family with its light relative to the nominal family of its source.
+    """Family of paths with its light relative to the nominal family of its source.
 
     Attributes
     ----------
     family : Family
         Family of paths.
     share : float
-        Its light over that of the nominal family at the source's own area CCD.
+        Its light divided by that of the nominal family at the source's own area CCD.
     sigma : float
-        Standard deviation of this share, by the number of paths.
+        Standard deviation of this share due to the finite number of paths.
     nominal : tuple of SurfaceEvent
         Events of the nominal family.
     """
@@ -249,7 +249,7 @@ A motion of a pixel is then misread by 1e-3 px, some times the centroid's noise.
 
 @dataclass(frozen=True, eq=False)
 class StrayLight:
-    """Stray light of one state.
+    """Stray light of one state on the area CCDs of C channels.
 
     Attributes
     ----------
@@ -266,11 +266,11 @@ class StrayLight:
     paths: int
 
     def share(self, nominal: np.ndarray) -> np.ndarray:
-        """Return stray over nominal light of every area CCD, (C,)."""
+        """Return the ratio of stray to nominal light on the area CCD of each of C channels, (C,)."""
         return np.asarray(self.photons.sum(axis=(1, 2)) / nominal.sum(axis=(1, 2)))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the contents of stray.json: by source, the families at any detector and the energy balance."""
+        """Return the contents of stray.json: path families at any detector and energy balance, by source."""
         sources = {
             name: {"families": [*map(FAMILY, self.traced.relative(name)[:FAMILIES])], "balance": _BALANCE(run.balance)}
             for name, run in self.traced.runs.items()
@@ -346,7 +346,10 @@ def stray_light(
 
 
 def diffraction_spots(experiment: MonitorExperiment) -> np.ndarray:
-    """Return every channel's diffraction image about its middle, (C, n, n) of unit sum, n = 2 SPREAD_PX + 1."""
+    """Return every channel's diffraction image about its middle, (C, n, n) for C channels, each of unit sum.
+
+    The side n is 2 SPREAD_PX + 1 pixels.
+    """
     path = experiment.path
     grid = Grid(-SPREAD_PX * path.pitch, path.pitch, 2 * SPREAD_PX + 1)
     spots = image(path.fields([{}]), grid, grid, single=True).astype(np.float64)

@@ -18,8 +18,9 @@ from twin.path_tracing import tables as layout
 from twin.path_tracing.clear_ways import EXITS
 
 REFINEMENTS = 3
-"""Number of Newton steps from the triangle to the surface: from below a millimetre to 1e-7 m, 1e-13 m and to rounding,
-also at grazing incidence.
+"""Number of Newton steps from the triangle to the surface.
+
+The error falls from below a millimetre to 1e-7 m, 1e-13 m and to rounding, also at grazing incidence.
 """
 
 EXACT = 1e-12
@@ -28,7 +29,7 @@ metres.
 """
 
 AHEAD = 1e-12
-"""Smallest cosine with its normal at which a face of a glass body is met."""
+"""Smallest cosine between a ray and the normal of a face at which the ray leaves a glass body through that face."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,17 +38,17 @@ class Flight:
 
     Attributes
     ----------
-    position, direction : Any
+    position, direction : Dr.Jit Vector3
         Position, metres, and unit direction, ``Vector3``.
-    body : Any
+    body : Dr.Jit array
         Number of the glass body that they are in: None in a scene without glass, 0 in the open.
-    ahead : Any
+    ahead : Dr.Jit array
         Distance ahead at which the search for a surface starts, metres.
-    active : Any
+    active : Dr.Jit mask
         Mask of the active paths.
-    coherent : Any
+    coherent : Dr.Jit mask
         Mask of the paths that follow their neighbours.
-    segment : Any
+    segment : Dr.Jit array
         Row of the clear segment of each path, 0 for none.
     segments : bool
         The scene has clear segments.
@@ -69,15 +70,15 @@ class NextSurface:
 
     Attributes
     ----------
-    near : Any
+    near : Dr.Jit array
         Approximate distance, metres.
-    surface : Any
+    surface : Dr.Jit array
         Index of the surface.
-    hit : Any
+    hit : Dr.Jit mask
         Mask of the paths that meet one.
-    expected : Any
+    expected : Dr.Jit mask
         Mask of the paths that are only expected to meet it, by their clear segment.
-    segment : list of Any
+    segment : list of Dr.Jit arrays
         Row of the segment after it, and code of its end, see ``tables.segment_table``.
     """
 
@@ -120,7 +121,10 @@ def next_surface(backend: Backend, mi: Any, scene: Any, tables: layout.SceneTabl
 
 
 def _end(backend: Backend, tables: layout.SceneTables, flight: Flight) -> tuple[Any, Any, list[Any]]:
-    """Return the approximate distance to the ends of segments, which paths can meet them, and the segments."""
+    """Return the distance to the ends of clear segments, a mask of the paths that can meet them, and the segments.
+
+    The distance is approximate, in metres.
+    """
     import drjit as dr
 
     p, d = flight.position, flight.direction
@@ -167,21 +171,21 @@ class Intersection:
 
     Attributes
     ----------
-    distance : Any
+    distance : Dr.Jit array
         Distance along the path, metres.
-    x, y : Any
+    x, y : Dr.Jit array
         Coordinates in the surface's frame, metres.
-    normal : Any
+    normal : Dr.Jit Vector3
         Unit normal in the world frame, toward +z of the surface.
-    cosine : Any
+    cosine : Dr.Jit array
         Cosine of the path's direction with the normal.
-    first, second : Any
+    first, second : Dr.Jit mask
         True inside the first and the second clear aperture.
-    exact : Any
+    exact : Dr.Jit mask
         True where the surface is met, to rounding.
-    kind : Any
+    kind : Dr.Jit array
         Bits of the surface's kind.
-    row : list of Any
+    row : list of Dr.Jit arrays
         Numbers of its geometry.
     """
 
@@ -217,9 +221,9 @@ def locate(
         Components of its surfaces' shapes.
     flight : Flight
         Paths; ``active`` are those that meet a surface.
-    near : Any
+    near : Dr.Jit array
         Approximate distance, metres.
-    surface : Any
+    surface : Dr.Jit array
         Index of the surface.
     """
     import drjit as dr

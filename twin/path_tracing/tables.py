@@ -21,28 +21,32 @@ from scenes.models.scenery import Scenery, SceneSurface
 from twin.path_tracing.clear_ways import EXITS, Segment
 
 _HEADER = 8
-"""Count of numbers of a scatter table: rings, sectors, first share, first of the rings' sums, first of the sectors'
-sums, first cosine, first azimuth, 1 where half of the draws are mirrored.
+"""Count of numbers at the head of a scatter table.
+
+They are: rings, sectors, first share, first of the rings' sums, first of the sectors' sums, first cosine, first
+azimuth, 1 where half of the draws are mirrored.
 """
 MARKS = 4
-"""Count of numbers of a finish: its coating and its scatter table, each counted from 1 with 0 for none, and 1 where all
-that it reflects is what the table scatters.
+"""Count of numbers that refer from a surface finish to its tables.
+
+They are the numbers of its coating and of its scatter table, each counted from 1 with 0 if there is none, and 1 where
+all that it reflects is what the table scatters. One is unused.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class FinishTables:
-    """Measured finishes of a scene, as Dr.Jit arrays.
+    """Measured surface finishes of a scene, as Dr.Jit arrays.
 
     Attributes
     ----------
-    marks : Any
-        (surfaces * 3 * MARKS) marks of the finishes.
-    coatings : Any
+    marks : Dr.Jit array
+        (surfaces * 3 * MARKS) numbers of the tables of every finish.
+    coatings : Dr.Jit array
         (coatings * (STEPS + 1) * 2) reflectance and transmittance.
-    headers : Any
+    headers : Dr.Jit array
         (scatter tables * _HEADER) headers.
-    numbers : Any
+    numbers : Dr.Jit array
         Numbers that the headers point to.
     most_rings, most_sectors : int
         Largest number of rings and of sectors of all tables.
@@ -57,11 +61,14 @@ class FinishTables:
     most_sectors: int
 
     def of(self, row: Any, active: Any) -> list[Any]:
-        """Return the marks of each path's finish."""
+        """Return the numbers of the coating and scatter tables of each path's surface finish, see ``MARKS``."""
         return [self._get(self.marks, row * MARKS + k, active) for k in range(MARKS - 1)]
 
     def shares(self, marks: Sequence[Any], cosine: Any, active: Any) -> tuple[Any, Any]:
-        """Return reflectance and transmittance of the paths' coatings, by the cosine on the side of air."""
+        """Return reflectance and transmittance of the coatings that paths meet.
+
+        ``cosine`` is that of the angle between path and normal on the side of air.
+        """
         number, k, w = self._place(marks[0], cosine, fresnel_scatter.COATING_STEPS)
         first = 2 * ((fresnel_scatter.COATING_STEPS + 1) * number + k)
         has = active & (marks[0] > 0.5)
@@ -76,21 +83,21 @@ class FinishTables:
         return (1.0 - w) * self._get(self.numbers, first, has) + w * self._get(self.numbers, first + 1, has)
 
     def draw(self, marks: Sequence[Any], cosine: Any, specular: Any, side: Any, u: Sequence[Any], active: Any) -> Any:
-        """Draw a scattered direction for paths whose finish has a table.
+        """Draw a scattered direction for paths whose surface finish has a scatter table.
 
         Parameters
         ----------
-        marks : Sequence[Any]
-            Marks of their finishes.
-        cosine : Any
+        marks : sequence of Dr.Jit arrays
+            Numbers of the tables of their finishes, see ``MARKS``.
+        cosine : Dr.Jit array
             Cosine of the angle of incidence.
-        specular : Any
+        specular : Dr.Jit Vector3
             Unit vector of the specular direction.
-        side : Any
+        side : Dr.Jit Vector3
             Unit normal on the side to which the light leaves.
-        u : Sequence[Any]
-            Four random numbers.
-        active : Any
+        u : sequence of Dr.Jit arrays
+            Four uniform random numbers in [0, 1).
+        active : Dr.Jit mask
             Mask of the paths.
         """
         import drjit as dr
@@ -132,7 +139,7 @@ class FinishTables:
         return self._uint(dr.maximum(mark, 1.0)) - 1, k, angle - self.backend.Float(k)
 
     def _search(self, first: Any, count: Any, most: int, u: Any, active: Any) -> tuple[Any, Any]:
-        """Return the cell whose interval of cumulative shares contains u, and the position in it."""
+        """Return the cell whose interval of cumulative shares contains the random number u, and u's position in it."""
         import drjit as dr
 
         cell = dr.binary_search(
@@ -157,7 +164,7 @@ class FinishTables:
 
 
 def measured(finish: Finish) -> bool:
-    """Return True if a finish has a table."""
+    """Return True if a surface finish has a measured table of its coating or its scattering."""
     return finish.coating is not None or finish.table is not None
 
 
@@ -202,19 +209,19 @@ def _header(drawn: ScatterSampling, first: int) -> list[float]:
 BLOCK = 4
 BLOCKS = 8
 ROW = BLOCK * BLOCKS
-"""Count of numbers of a geometry row.
+"""Count of numbers that describe a surface in the geometry table.
 
 0-8 rotation world to local, 9-11 its shift, 12 clearance, 13 refractive index behind, 14 index of the part plus one, 15
-reciprocal of the index, 16-25 two clear apertures, 26 bits of the kind, 28-31 rows of the first segment from each of
-the surface's exits, 0 for none.
+reciprocal of the index, 16-25 two clear apertures, 26 bits of the kind, 28-31 indices of the first segment for each way
+of leaving the surface, 0 if there is none.
 """
 
 CLEARANCE, INDEX, PART, INVERSE, APERTURES, KIND, SEGMENTS = 12, 13, 14, 15, 16, 26, 28
 KINDS = (20, 25, KIND)
-"""Indices of the numbers that encode a kind."""
+"""Positions in a surface's geometry numbers of those that encode a kind (of aperture, of surface)."""
 
 CURVES = 2
-"""Number of blocks of a curved surface: curvature, conic, A4, A6, A8."""
+"""Number of memory blocks that describe a curved surface: curvature, conic, and aspheric terms A4, A6, A8."""
 
 APERTURE = 5
 """Count of numbers of a clear aperture: four of its shape (for an ellipse the reciprocals of its semi-axes), and the
@@ -229,8 +236,10 @@ table.
 """
 
 FINISH_ROW = 8
-"""Count of numbers of a finish: reflectance (-1 for bare glass), transmission, diffuse, share of the lobe; scale,
-exponent and kind of the lobe, and its area.
+"""Count of numbers of a surface finish in the table of finishes.
+
+They are reflectance (-1 for bare glass), transmission, diffuse share, share of the scatter lobe; scale, exponent and
+kind of the lobe, and its area.
 """
 ROWS_PER_SURFACE = 3
 """Number of finishes of a surface: met from +z, met from -z, outside its clear apertures."""
@@ -247,7 +256,7 @@ NOMINAL_SUMS = 8
 
 
 class Kind:
-    """Bits of a surface's kind."""
+    """Bits of the number that encodes a surface's kind."""
 
     SOLID = 1
     ENDS = 2
@@ -301,29 +310,29 @@ class SceneTables:
 
     Attributes
     ----------
-    rows : Any
+    rows : Dr.Jit array
         (surfaces * ROW) geometry.
-    curves : Any
+    curves : Dr.Jit array
         (surfaces * CURVES * BLOCK) curvature, conic and aspheric terms.
-    terms : Any
+    terms : Dr.Jit array
         (surfaces * 4 * blocks) numbers of all kinds of further terms; width 1 if there are none.
-    figures : Any
+    figures : Dr.Jit array
         (surfaces * 4 * blocks) centre and coefficients of polynomial figures; width 1 if there are none.
-    grids, samples : Any
+    grids, samples : Dr.Jit array
         (surfaces * GRID_ROW) numbers of grid figures, and the coefficients of all; width 1 if there are none.
-    finishes : Any
+    finishes : Dr.Jit array
         (surfaces * 3 * FINISH_ROW) finishes.
-    planes : Any
+    planes : Dr.Jit array
         (surfaces * 4) world normal and offset of flat faces.
-    body_first, body_faces : Any
+    body_first, body_faces : Dr.Jit array
         (bodies + 1,) first surface and number of faces of each glass body.
-    detectors : Any
+    detectors : Dr.Jit array
         (detectors * 8) pixels per metre in x and y, columns, rows, first pixel.
-    nominal : Any
+    nominal : Dr.Jit array
         (detectors,) signature of the nominal family.
-    pixels : Any
+    pixels : Dr.Jit array
         Number of pixels of all detectors together.
-    segments : Any
+    segments : Dr.Jit array
         ((2 + segments) * SEGMENT) clear segments, see ``segment_table``.
     measured : FinishTables or None
         Tables of measured finishes, None if there are none.
@@ -349,11 +358,11 @@ class SceneTables:
     measured: FinishTables | None = None
 
     def geometry(self, surface: Any, active: Any) -> list[Any]:
-        """Return the geometry row of each path's surface, ``ROW`` numbers."""
+        """Return the geometry of the surface that each path meets, ``ROW`` numbers."""
         return self._row(self.rows, surface, BLOCKS, active)
 
     def surface(self, number: Any, form: SurfaceForm, active: Any) -> SurfaceNumbers:
-        """Return the shape of each path's surface."""
+        """Return the numbers that describe the shape of the surface that each path meets."""
         c = self._row(self.curves, number, CURVES, active)
         figure = grid = None
         terms: list[SagTerm] = []
@@ -372,15 +381,18 @@ class SceneTables:
         return SurfaceNumbers(c[0], c[1], tuple(c[2 : 2 + form.even]), tuple(terms), figure, grid)
 
     def finish(self, row: Any, active: Any) -> list[Any]:
-        """Return reflectance (-1 for bare glass), transmission, diffuse and lobe's share of each path's row."""
+        """Return reflectance, transmission, diffuse share and share of the lobe of the finish that each path meets.
+
+        A reflectance of -1 stands for bare glass.
+        """
         return self._row(self.finishes, 2 * row, 1, active)
 
     def lobe(self, row: Any) -> Callable[[Any], list[Any]]:
-        """Return a function that gives scale, exponent, kind and area of the lobe of each active path's row."""
+        """Return a function that gives scale, exponent, kind and area of each active path's scatter lobe."""
         return lambda active: self._row(self.finishes, 2 * row + 1, 1, active)
 
     def detector(self, number: Any, active: Any) -> list[Any]:
-        """Return the row of each path's detector."""
+        """Return pixels per metre in x and y, columns, rows and first pixel of each path's detector."""
         return self._row(self.detectors, number, 2, active)
 
     def plane(self, surface: Any, active: Any) -> list[Any]:
@@ -388,7 +400,7 @@ class SceneTables:
         return self._row(self.planes, surface, 1, active)
 
     def segment(self, number: Any, active: Any) -> list[Any]:
-        """Return the row of each path's clear segment."""
+        """Return the ``SEGMENT`` numbers of the clear segment that each path is on."""
         return self._row(self.segments, number, SEGMENT // BLOCK, active)
 
     def _row(self, source: Any, index: Any, blocks: int, active: Any) -> list[Any]:
@@ -493,10 +505,11 @@ def upload(
 
 
 def segment_table(segments: Sequence[Segment], source: Segment | None = None) -> np.ndarray:
-    """Return the rows of clear segments, (2 + segments, SEGMENT): no segment, that of the source, and all others.
+    """Return the numbers of clear segments, (2 + segments, SEGMENT).
 
-    A row has the middle of the aperture at the end and the row of the next segment; then its normal, scaled to the
-    reciprocal of its radius, and the code 4 * surface + 2 * aperture + side to which light leaves for the next segment.
+    The first line stands for no segment, the second for that of the source, and all others follow. A line has the
+    middle of the aperture at the end and the index of the next segment; then its normal, scaled to the reciprocal of
+    its radius, and the code 4 * surface + 2 * aperture + side to which light leaves for the next segment.
     """
     out = np.zeros((2 + len(segments), SEGMENT))
     for row, segment in zip(out[1:], (source, *segments), strict=True):
@@ -537,12 +550,12 @@ def _finish(finish: Finish) -> list[float]:
 
 
 def _blocks(numbers: int) -> int:
-    """Return the number of blocks of a row of so many numbers."""
+    """Return the number of memory blocks that hold a given count of numbers."""
     return -(-numbers // BLOCK)
 
 
 def _terms(surfaces: Sequence[SceneSurface], form: SurfaceForm) -> np.ndarray:
-    """Return the rows of further terms of the sag, kind by kind."""
+    """Return the numbers of further sag terms of all surfaces, ordered by the kind of term."""
     if not form.terms:
         return np.zeros(1)
     rows = [list(leaves(of_kinds(s.surface.terms, form.terms)).values()) for s in surfaces]
@@ -552,7 +565,7 @@ def _terms(surfaces: Sequence[SceneSurface], form: SurfaceForm) -> np.ndarray:
 
 
 def _figures(surfaces: Sequence[SceneSurface], form: SurfaceForm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the rows of polynomial figures and of grids, and the coefficients of all grids."""
+    """Return the numbers of polynomial figures and of grids of all surfaces, and the coefficients of all grids."""
     polynomials, grids, samples = np.zeros(1), np.zeros(1), np.zeros(1)
     if form.figure_order >= 0:
         size = 2 + triangle_size(form.figure_order)
@@ -574,7 +587,7 @@ def _figures(surfaces: Sequence[SceneSurface], form: SurfaceForm) -> tuple[np.nd
 
 
 def _aperture(aperture: Aperture | None) -> tuple[float, ...]:
-    """Return the numbers that ``within`` reads; without an aperture, no point is outside."""
+    """Return the numbers of an aperture that ``within`` reads; without an aperture, no point is outside."""
     if aperture is None:
         return (0.0, 0.0, np.inf, 0.0, RING)
     match aperture.numbers():
@@ -591,7 +604,10 @@ def _aperture(aperture: Aperture | None) -> tuple[float, ...]:
 
 
 def within(x: Any, y: Any, a: Sequence[Any]) -> Any:
-    """Return True inside a clear aperture; its ``APERTURE`` numbers may describe another shape for each path."""
+    """Return True where x and y, in metres, are inside a clear aperture.
+
+    ``a`` has the ``APERTURE`` numbers of the aperture, which may be of a different shape for each path.
+    """
     import drjit as dr
 
     box = RectangleNumbers(*a[:4]).contains(x, y)

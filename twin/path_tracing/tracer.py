@@ -24,7 +24,7 @@ VARIANTS = {"llvm": "llvm_ad_mono", "cuda": "cuda_ad_mono"}
 
 
 class VariantUnavailable(RuntimeError):
-    """Mitsuba cannot run the variant that the backend needs."""
+    """Error that Mitsuba cannot run the variant that the backend needs."""
 
 
 def load_mitsuba(backend: Backend) -> Any:
@@ -53,7 +53,7 @@ def build_scene(mi: Any, scenery: Scenery) -> Any:
 
     Parameters
     ----------
-    mi : Any
+    mi : module
         Mitsuba with its variant set.
     scenery : Scenery
         Surfaces; their triangles are transformed to the world frame in float64 and rounded once.
@@ -83,7 +83,7 @@ def build_scene(mi: Any, scenery: Scenery) -> Any:
 
 @dataclass(frozen=True)
 class Sampling:
-    """Sampling of the paths.
+    """Probabilities with which paths choose their directions and are ended.
 
     Attributes
     ----------
@@ -94,13 +94,13 @@ class Sampling:
         is exact in every run. Above 0, weak directions are drawn more often and carry less weight each, which finds
         faint ghosts; the balance then holds on average.
     second : float or None
-        Floor of paths that have taken one direction that a floor made more likely; None for ``floor``. A ghost comes
+        Floor of paths that have taken one direction that a floor made more likely; None uses ``floor``. A ghost comes
         from two weak reflections: after the first the second is worth drawing, and after the second none is.
     further : float or None
-        Floor of paths that have taken more such directions or have been scattered; None for ``floor``.
+        Floor of paths that have taken more such directions or have been scattered; None uses ``floor``.
     scatter_floor : float
-        Floor of scattering out of the specular direction; where ``second`` is given it ends with the first weak
-        direction.
+        Smallest probability of scattering out of the specular direction; where ``second`` is given it ends with the
+        first weak direction.
     near : float
         Share of scattered directions whose distance from the specular one is drawn log-uniformly: a small detector in
         the focus of specular light receives only the innermost part of a lobe.
@@ -122,14 +122,14 @@ class Sampling:
     first: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
+        """Raise ValueError if a number is outside its range."""
         shares = (*self.floors, self.scatter_floor, self.near, self.first)
         if self.steps < 1 or not all(0.0 <= share < 1.0 for share in shares) or self.roulette < 0.0:
             raise ValueError(f"invalid sampling (shares in [0, 1), at least one step): {self}")
 
     @property
     def floors(self) -> tuple[float, float, float]:
-        """Floors after none, one, and more weak directions."""
+        """Smallest probabilities of a direction after no, one, and more weak directions."""
         return (
             self.floor,
             self.floor if self.second is None else self.second,
@@ -138,7 +138,7 @@ class Sampling:
 
     @property
     def scatter_floors(self) -> tuple[float, float, float]:
-        """Floors of scattering after none, one, and more weak directions."""
+        """Smallest probabilities of scattering after no, one, and more weak directions."""
         later = self.scatter_floor if self.second is None else 0.0
         return self.scatter_floor, later, later
 
@@ -152,7 +152,7 @@ FAINT = Sampling(floor=0.1, second=0.5, further=0.0, scatter_floor=0.02, near=0.
 
 @dataclass(frozen=True, eq=False)
 class NominalPath:
-    """Trace of a launch's paths along the nominal path.
+    """Data for tracing a launch's N paths along the nominal path.
 
     Attributes
     ----------
@@ -161,7 +161,7 @@ class NominalPath:
     numbers : (N,) ndarray
         Numbers of the paths in the run.
     learned : LearnedRoulette or None
-        Russian roulette of the paths that leave it, None for none.
+        Russian roulette of the paths that leave it; None follows all of them.
     """
 
     steps: Sequence[Step]
@@ -218,7 +218,7 @@ CHUNK = 1 << 19
 
 LEAST_CAPACITY = 1 << 14
 LEAST_NOMINAL = 1 << 16
-"""Number of paths of a run from which they are traced surface by surface along the nominal path.
+"""Smallest number of paths of a run that are traced surface by surface along the nominal path.
 
 So many save the time that recording its kernel takes, as measured. Fewer are traced by the loop alone; the paths are
 the same.
