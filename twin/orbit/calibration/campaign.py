@@ -762,7 +762,10 @@ class Rejected:
     factors: Mapping[str, float]
 
     def after(self, first: Rejected) -> Rejected:
-        """Return the points rejected in two rounds, `first` and this one, with the factors on sigmas of this one."""
+        """Return the points rejected in two rounds, `first` and this one.
+
+        The factors on the sigmas are those of this round; those of the first round are 1.
+        """
         points, checks = first.points + self.points, first.check_points + self.check_points
         return Rejected(first.entered, self.left, points, first.check_entered, self.check_left, checks, self.factors)
 

@@ -38,8 +38,8 @@ happens with a probability of 3e-5. A variance from the median of n good points 
 sqrt(n) (1 / ln 2 that of the root mean square).
 """
 _MEDIAN_SPREAD = 1.0 / np.log(2.0)
-"""Relative standard deviation of a variance from the median of one squared residual, times the square root of the
-number of residuals.
+"""Relative standard deviation of a variance estimated from the median of n squared residuals, times the square root of
+n.
 """
 _FALSE_ALARM = 1e-4
 """False-alarm probability of the test of check points, the same as for image points in the adjustment."""

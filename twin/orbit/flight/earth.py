@@ -183,9 +183,7 @@ def east_north_up(lon: Any, lat: Any) -> np.ndarray:
 
 
 def curvature_radii(lat: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ellipsoid's radii of curvature along the meridian (M) and across it (N), in metres, at latitudes
-    (...).
-    """
+    """Return the ellipsoid's radii of curvature along the meridian (M) and across it (N), in m, at latitudes (...)."""
     square = 1.0 - _E2 * np.sin(lat) ** 2
     return EQUATORIAL_RADIUS * (1.0 - _E2) / square**1.5, EQUATORIAL_RADIUS / np.sqrt(square)
 

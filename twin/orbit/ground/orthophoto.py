@@ -189,8 +189,9 @@ def _fields(
 
 
 def _split(half: float, size: float, random: np.random.Generator) -> Iterator[tuple[float, float, float, float]]:
-    """Yield rectangles about the origin (west, east, south, north), of mean area `size`^2, that fill a square of half
-    side `half`.
+    """Yield rectangles of mean area `size`^2 that fill a square of half side `half` about the origin.
+
+    Each is west, east, south and north, in metres.
     """
     waiting = [(-half, half, -half, half)]
     while waiting:
@@ -211,7 +212,7 @@ def _split(half: float, size: float, random: np.random.Generator) -> Iterator[tu
 def _draw_roads(
     level: np.ndarray, extent: Extent, spec: TextureSpec, first: tuple[float, float], seed: np.random.SeedSequence
 ) -> None:
-    """Draw wandering lines across the whole ground, one per `roads` metres (key of the texture), in both directions."""
+    """Draw winding roads across the whole ground in both directions, one per `roads` metres (key of the texture)."""
     random = np.random.default_rng(seed)
     value = float(min(_ROAD_BRIGHTNESS * spec.mean, _BRIGHTEST))
     step = 0.1 * spec.roads

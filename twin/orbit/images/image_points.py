@@ -129,9 +129,7 @@ class ReferenceHeights:
         return cls(dem, spline_filter(values, order=3, mode="mirror"))
 
     def __call__(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
-        """Return heights at positions, in metres; NaN outside the grid, and where one of the four neighbours is
-        missing.
-        """
+        """Return heights at positions, in metres; NaN outside the grid or where one of four neighbours is missing."""
         place = np.stack(self.raster.row_column(east, north))
         height = map_coordinates(self.coefficients, place, order=3, mode="mirror", prefilter=False)
         last = np.array(self.coefficients.shape).reshape(2, *(1,) * (place.ndim - 1)) - 1
@@ -647,9 +645,7 @@ def _matched(
 
 
 def _degree(count: int) -> int | None:
-    """Return the degree of the smooth displacement for a number of matches, with at least four matches for each term;
-    None for too few matches.
-    """
+    """Return the degree of the smooth displacement for a number of matches, at least four per term; None for too few."""
     for degree, terms in ((2, 7), (1, 4), (0, 2)):
         if count >= 4 * terms:
             return degree

@@ -169,10 +169,10 @@ class LineOptics:
 
     @property
     def photons_per_reflectance(self) -> float:
-        """Photons on a pixel, summed over all TDI stages, from ground of apparent reflectance 1.
+        """Number of photons on a pixel, summed over all TDI stages, from ground of apparent reflectance 1.
 
-        The Sun is a black body at 1 au, the ground Lambertian, and pi/(4 F^2) of its radiance falls on the pixel, less
-        the obstruction of the pupil.
+        The Sun is a black body at 1 au, the ground is Lambertian, and the pixel's irradiance is pi/(4 F^2) times the
+        ground's radiance, with f-number F, reduced by the obstruction of the pupil.
         """
         first, last = self.ccd.band.spectrum.ends
         wavelength, weight = band_wavelengths(self.ccd.band)
@@ -195,11 +195,11 @@ class LineOptics:
         return out
 
     def factors(self, pixel: np.ndarray, line: np.ndarray, motion: ImageMotion) -> dict[str, np.ndarray]:
-        """Return the factors of `transfer` by name.
+        """Return the factors of the transfer function, by name, at frequencies in cycles per pixel and per line.
 
         They are ``lens``, ``pixel``, ``diffusion``, ``step`` (the image moves on while the charge rests) and ``stages``
-        (image and charge drift apart over the stages, by the rate's error and because the image does not advance by a
-        pixel in a line's time).
+        (image and charge drift apart over the TDI stages, due to the error of the charge's rate and because the image
+        does not advance by a pixel in a line's time).
         """
         band = self.ccd.band
         fx = pixel / band.pitch
@@ -237,7 +237,7 @@ class LineOptics:
         return np.asarray(spread / spread.sum())
 
     def _lens(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
-        """Return the transfer function of the lens about the centroid of its image."""
+        """Return the lens's transfer function at frequencies fx, fy (cycles/m), about the centroid of its image."""
         values = self._table(fx, fy)
         if self.pupil.shadow is None:
             return np.asarray(values.real)
@@ -252,14 +252,14 @@ class LineOptics:
 
 
 def _shadow(outlines: tuple[tuple[tuple[float, float], ...], ...], harmonics: np.ndarray) -> PupilShadow:
-    """Return the shadow of outlines, in units of the pupil's radius, on one pupil."""
+    """Return the shadow of obstructing outlines, given as polygons in units of the pupil's radius, on one pupil."""
     shapes = [np.array(outline, float)[None] for outline in outlines]
     pieces, _ = separate([s if area(s)[0] > 0.0 else s[:, ::-1] for s in shapes])
     return PupilShadow.within(pieces, harmonics[:, None])
 
 
 def _eikonal(terms: dict[int, float]) -> np.ndarray | None:
-    """Return a wavefront by Zernike terms as coefficients of products of Chebyshev polynomials."""
+    """Return a wavefront, given by Zernike terms, as coefficients of products of Chebyshev polynomials."""
     if not terms:
         return None
     monomials = [(a, b, size * c) for index, size in terms.items() for a, b, c in cartesian_terms(index)]
@@ -274,7 +274,7 @@ def _eikonal(terms: dict[int, float]) -> np.ndarray | None:
 
 
 def _mean_of_steps(cycles: np.ndarray, count: int) -> np.ndarray:
-    """Return the mean of exp(2 pi i k cycles) over `count` steps about their middle."""
+    """Return the mean of exp(2 pi i k cycles) over `count` equally spaced values of k, centred on 0."""
     near = np.sinc(cycles)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(np.abs(near) < 1e-9, 1.0, np.sinc(count * cycles) / near)
@@ -285,13 +285,13 @@ JITTER_TOLERANCE = 1e-3
 
 
 def _jitter(sensor: Sensor) -> Jitter | None:
-    """Return the jitter of a sensor's trajectory; None where it has none."""
+    """Return the jitter of the attitude of a sensor's trajectory; None where it has none."""
     jitter = sensor.trajectory.jitter if isinstance(sensor.trajectory, Trajectory) else None
     return jitter if isinstance(jitter, Jitter) else None
 
 
 def _with(sensor: Sensor, jitter: Jitter | None) -> Sensor:
-    """Return the sensor with another jitter."""
+    """Return the sensor with the given jitter of its trajectory instead of its own."""
     assert isinstance(sensor.trajectory, Trajectory)
     return replace(sensor, trajectory=replace(sensor.trajectory, jitter=jitter))
 
@@ -313,7 +313,7 @@ def without_jitter(sensor: Sensor) -> Sensor:
 
 
 def exposures(sensor: Sensor, optics: LineOptics) -> list[tuple[float, Sensor]]:
-    """Return shares of a pixel's light, which sum to 1, each with the sensor at its moment.
+    """Return the moments of a pixel's light collection: the sensor at each, with its share of the light (sum 1).
 
     Raises
     ------

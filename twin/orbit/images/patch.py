@@ -1,8 +1,7 @@
-"""Images of one patch of ground by the lines of a camera, with control, and comparison with the truth.
+"""Images of one patch of ground by the lines of a camera, with control data, and comparison with the truth.
 
-    lines = imaged_lines(sensors, measured, optics, seed)
-    patch = fly_patch(lines, place, (600, 600), ground, control, seed)
-    patch.images["nadir"].frame          # uint16, grey values of the detector
+    lines = imaged_lines(sensors, measured, optics, seed) patch = fly_patch(lines, place, (600, 600), ground, control,
+    seed) patch.images["nadir"].frame          # uint16, grey values of the detector
     patch.images["nadir"].image_point(row, column)      # line and pixel of the whole image
     patch.images["nadir"].measured       # Sensor: the laboratory's camera on the measured trajectory
     patch.control.orthophoto, patch.control.dem
@@ -109,7 +108,7 @@ class LineImage(LineFrame):
 
 @dataclass(frozen=True, eq=False)
 class Patch(ImagedGround):
-    """Patch of simulated ground with its images.
+    """Patch of simulated ground with its images and its true heights.
 
     Attributes
     ----------
@@ -122,9 +121,9 @@ class Patch(ImagedGround):
     terrain: Terrain
 
     def true_point(self, name: str, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        """Return the points of the true terrain that positions of a line's frame see, ITRS, (N, 3), in metres.
+        """Return the points of the true terrain that positions of a line's frame see, ITRS, in metres, (N, 3).
 
-        It is the exact inverse of `Sensor.image`. Rows and columns (N,) must lie on the frame.
+        It is the exact inverse of `Sensor.image`. The N rows and columns must lie on the frame.
         """
         image = self.images[name]
         line, pixel = (np.ravel(v) for v in image.image_point(row, column))
@@ -157,7 +156,7 @@ def fly_patch(
     Parameters
     ----------
     lines : mapping of str to ImagedLine
-        Lines by name; see `imaged_lines`.
+        Name -> line that records images.
     place : tuple of float
         Longitude and latitude of the patch's middle, radians.
     size : tuple of int
@@ -209,14 +208,14 @@ def fly_patch(
 
 
 class _Size:
-    """Size of a patch as an input that can be in error, whose file is not known here."""
+    """Size of a patch, reported in errors as the input whose file is not known here."""
 
     def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> PatchError:
         return PatchError(f"{problem}; {found} lines or pixels, allowed: {allowed}", "size")
 
 
 def _require_memory(count: int, size: tuple[int, int], extent: Extent, spacing: float) -> None:
-    """Raise an error if the images of so many lines, and the texture of their ground, do not fit into the memory."""
+    """Raise an error if the images of `count` lines, and the texture of their ground, do not fit into the memory."""
     lines, pixels = size
     texture = math.prod(len(axis) for axis in extent.axes(spacing))
     each = count * _PIXEL + texture / (lines * pixels) * _SAMPLE
@@ -355,16 +354,16 @@ class LineComparison:
         Number of wrong ones among these.
     right_rejected_by_consensus : int
         Number of right matches that consensus has rejected.
-    error : (n, 2) ndarray
+    error : (n, 2) ndarray for n points
         Measured minus true, lines and pixels; NaN without a measurement.
     wrong : (n,) ndarray of bool
         Mask of wrong measurements.
     rms : (2,) ndarray
         RMS error of accepted positions that are not wrong, lines and pixels.
     mean : (2,) ndarray
-        Their mean error.
+        Mean error of these positions, lines and pixels.
     chi_square : float
-        Chi-square of their errors under their covariances.
+        Chi-square of the errors of these positions, with their covariances.
     degrees_of_freedom : int
         Degrees of freedom, two for each position.
     """
@@ -408,7 +407,7 @@ def true_ground(patch: Patch, points: MatchedPoints) -> np.ndarray:
 
 
 def judged(patch: Patch, points: MatchedPoints) -> Mapping[str, LineComparison]:
-    """Compare measured points with the truth, by line; the frame that ties were chosen in is left out."""
+    """Compare measured points with the truth in each line, except the frame in which tie points were chosen."""
     truth = true_ground(patch, points)
     judgements = {}
     for name, line in points.searched_lines.items():

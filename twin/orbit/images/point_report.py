@@ -62,17 +62,17 @@ HEADS = (
 
 @dataclass(frozen=True, eq=False)
 class PointListing(Data):
-    """Listing of points, rows under `HEADS`, saved as CSV and named in the report."""
+    """Listing of measured points, a row for each point and line under `HEADS`, saved as CSV and named in the report."""
 
     kind: ClassVar[str] = "csv"
 
     def content(self) -> bytes:
-        """Return the rows with all their digits; missing values are empty."""
+        """Return the rows as text of the CSV file, with all their digits; missing values are empty."""
         return csv_table([HEADS, *self.data])
 
 
 def listing(patch: ImagedGround, points: PatchPoints) -> list[list[Any]]:
-    """Return a row for each point and line."""
+    """Return the rows of the listing of points, one for each point and line, with the columns of `HEADS`."""
     rows: list[list[Any]] = []
     for sort, group in points.sorts.items():
         degrees = np.degrees(patch.frame.geographic(group.east, group.north)).T
@@ -140,7 +140,7 @@ def point_artefacts(patch: ImagedGround, points: PatchPoints, *tables: Table) ->
 
 
 def flat(points: PatchPoints, below: Callable[[MatchedPoints], Mapping[str, T]]) -> dict[str, T]:
-    """Return results of points by line under a combined name of kind and line."""
+    """Return results of points by kind and line under one name for both, such as "tie, forward"."""
     groups = ((sort, below(group)) for sort, group in points.sorts.items())
     return {f"{SORTS[sort]}, {name}": line for sort, lines in groups for name, line in lines.items()}
 
@@ -229,6 +229,6 @@ def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> No
 
 
 def _round(value: float) -> float:
-    """Return the largest of 1, 2 and 5 times a power of ten that is not above the value."""
+    """Return the largest number of the form 1, 2 or 5 times a power of ten that is not above the value."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(power * max(k for k in (1.0, 2.0, 5.0) if k * power <= value * (1.0 + 1e-9)))

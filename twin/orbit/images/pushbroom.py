@@ -36,7 +36,7 @@ _HEIGHTS = 4
 """Number of nodes over height: the look bends over the ellipsoid's curvature by 3 cm in 500 m of height, and no more.
 """
 _MET = 1e-4
-"""Tolerance of the height between look and terrain, in metres."""
+"""Tolerance, in metres, of the height difference between look and terrain at their intersection."""
 _MOST_STEPS = 40
 """Largest number of secant steps."""
 
@@ -57,7 +57,7 @@ class LookMap:
         Terrain of the ground.
     span : (3, 2) ndarray
         First and last line, first and last pixel, lowest and highest height (metres) of the nodes.
-    east, north : (heights, K, M) ndarray
+    east, north : (heights, K, M) ndarray for K line and M pixel nodes
         Chebyshev coefficients over height, line and pixel, metres.
     error : float
         Largest measured difference to the rigorous sensor between the nodes, metres.
@@ -108,7 +108,7 @@ class LookMap:
         )
 
     def ground(self, lines: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return east, north and height, in metres, of the terrain seen by image points: (L,), (P,) -> (L, P) each.
+        """Return east, north and height of the terrain that L lines and P pixels see, (L, P) each, in metres.
 
         Raises
         ------
@@ -129,7 +129,7 @@ class LookMap:
         return self._met(east, north)
 
     def _met(self, east: list[np.ndarray], north: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the intersections of looks, polynomials in x, with the terrain."""
+        """Return the intersections of looks with the terrain, in metres; looks are polynomials in the scaled height x."""
         low, high = self.span[2]
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
 
@@ -162,21 +162,21 @@ class LookMap:
         )
 
     def run(self) -> tuple[float, float]:
-        """Return how far the middle look moves east and north for each metre of height."""
+        """Return how far the middle look moves east and north per metre of height, in m/m."""
         low, high = self.span[2]
         ends = np.full(2, self.span[0].mean()), np.full(2, self.span[1].mean()), np.array([low, high])
         east, north = self._at(*ends)
         return float((east[1] - east[0]) / (high - low)), float((north[1] - north[0]) / (high - low))
 
     def _at(self, line: np.ndarray, pixel: np.ndarray, height: np.ndarray) -> np.ndarray:
-        """Return east and north at single image points and heights, (2, N)."""
+        """Return east and north, in metres, at N image points and heights, (2, N)."""
         count = self.east.shape[1]
         a, b = self._basis(0, line, count), self._basis(1, pixel, self.east.shape[2])
         c = self._basis(2, height, _HEIGHTS)
         return np.stack([np.einsum("hij,nh,ni,nj->n", v, c, a, b, optimize=True) for v in (self.east, self.north)])
 
     def _basis(self, axis: int, place: np.ndarray, count: int) -> np.ndarray:
-        """Return Chebyshev polynomials along an axis at positions, (..., count)."""
+        """Return the first `count` Chebyshev polynomials along an axis at positions (...), (..., count)."""
         first, last = self.span[axis]
         return chebyshev.chebvander((2.0 * np.asarray(place) - first - last) / (last - first), count - 1)
 
@@ -198,7 +198,7 @@ def _coefficients(values: np.ndarray) -> np.ndarray:
 def _local(
     sensor: Sensor, frame: GroundFrame, line: np.ndarray, pixel: np.ndarray, height: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return east and north of looks at heights, by the rigorous sensor, in metres."""
+    """Return east and north of looks at given heights, computed by the rigorous sensor, in metres."""
     points = sensor.ground(line, pixel, height)
     if not np.all(np.isfinite(points)):
         raise UnphysicalError("a line of sight misses the Earth")
@@ -206,7 +206,7 @@ def _local(
 
 
 def _horner(terms: list[np.ndarray], x: np.ndarray) -> np.ndarray:
-    """Evaluate a polynomial with array coefficients, ascending powers, at x."""
+    """Evaluate a polynomial in x with array coefficients in ascending powers."""
     out = terms[-1] * x
     for term in terms[-2:0:-1]:
         out += term
@@ -222,7 +222,7 @@ LARGEST_ERROR = 0.002
 _NEAR = 2
 """Number of points beyond the samples for cubic interpolation."""
 BORDER = MARGIN + _NEAR + 1
-"""Least number of lines and pixels between a window and the ends of an image."""
+"""Smallest number of lines and pixels between a window and the ends of an image."""
 _SAMPLES_AT_ONCE = 4_000_000
 """Largest number of ground samples in a strip, to bound memory."""
 _CHECKS = 400
@@ -271,11 +271,11 @@ class Window:
 
     @property
     def middle(self) -> tuple[float, float]:
-        """Line and pixel of its middle."""
+        """Line and pixel of the window's middle."""
         return self.first_line + 0.5 * (self.lines - 1), self.first_pixel + 0.5 * (self.pixels - 1)
 
     def fits(self, sensor: Sensor) -> bool:
-        """Return whether it lies inside a sensor's image with the border that rendering needs."""
+        """Return whether the window lies inside a sensor's image, with the border that rendering needs."""
         return (
             min(self.first_line, self.first_pixel) >= BORDER
             and self.first_line + self.lines + BORDER <= sensor.lines
@@ -283,7 +283,7 @@ class Window:
         )
 
     def sample(self, sensor: Sensor, height: float) -> tuple[float, float]:
-        """Return the ground distance of two pixels along the line, and of two lines, at its middle, in metres."""
+        """Return the ground distance of two pixels along the line, and of two lines, at the window's middle, in metres."""
         line, pixel = self.middle
         steps = np.array([-0.5, 0.5, 0.0, 0.0])
         points = sensor.ground(line + steps, pixel + np.roll(steps, 2), height)
@@ -430,7 +430,7 @@ def _expected(
     motion: ImageMotion,
     looks: LookMap | None,
 ) -> tuple[np.ndarray, float]:
-    """Return expected photons at one moment of the collection, and the position error; arguments as `render_patch`."""
+    """Return expected photons at one moment of the light collection, and the largest position error in pixels."""
     looks = looks or look_map(sensor, scene.frame, scene.terrain, window)
     # Try samples at pixels first, then finer ones if the terrain needs them.
     for fine in (1, oversampling):
@@ -461,7 +461,7 @@ def _expected(
 
 
 def _samples(looks: LookMap, window: Window, oversampling: int, fine: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return east and north of all samples of a window with its margin.
+    """Return east and north, in metres, of all ground samples of a window with its margin.
 
     For each pixel `fine` positions along each side are computed on the terrain, the others are interpolated with
     cubics.

@@ -68,7 +68,7 @@ def _images_png(run: Simulation) -> bytes:
 
 
 def _control_png(run: Simulation) -> bytes:
-    """Draw orthophoto and elevation model."""
+    """Draw orthophoto and elevation model, and return the picture as PNG."""
     with look("simulate-control"):
         figure = new_figure(4.6)
         photo, heights = figure.subplots(1, 2)
@@ -146,7 +146,7 @@ def _show_raster(axes: Axes, raster: Raster, colours: str) -> AxesImage:
 
 
 def sections(run: Simulation) -> tuple[Section, ...]:
-    """Return the report's sections: images, control, measured points, sharpness, data."""
+    """Return the report's sections: images, control data, measured points, sharpness, data."""
     points, spec = run.points, run.spec.points
     measured = () if points is None or spec is None else (points_section(run.patch, points, spec),)
     return _images(run), _control(run), *measured, _sharpness(run), _data(run)
@@ -168,7 +168,7 @@ def _images(run: Simulation) -> Section:
 
 
 def _lines(run: Simulation, name: str, title: str, caption: str, keys: Sequence[str]) -> Table:
-    """Return a table of quantities of the lines' images."""
+    """Return the report table of the quantities `keys`, a row for each line's image."""
     rows = {line: LINE(image) for line, image in run.patch.images.items()}
     return LINE.table(name, title, caption, rows, keys, "line", digits=4)
 
@@ -214,7 +214,7 @@ def _data(run: Simulation) -> Section:
 
 
 def simulation_report(run: Simulation) -> Report:
-    """Return the report of a simulated pass."""
+    """Return the report of a simulated pass over a patch: images, control, measured points and sharpness."""
     patch = run.spec.patch
     longitude, latitude = np.degrees(run.place)
     images = run.patch.images

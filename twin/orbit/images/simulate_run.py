@@ -1,8 +1,8 @@
 """Simulated pass over a patch of ground: run, results and export.
 
 The run makes orbit, the true and the laboratory's camera, images and measured points from a test's file. simulate.json
-has what the user of the images may know. The camera, orbit and attitude, and the georeference are artefacts of their
-own for other software; the true camera and trajectory are in truth.json alone. The export writes the simulated
+has what the user of the images may know. The camera, the orbit with the attitude, and the georeference are separate
+artefacts for other software; the true camera and trajectory are in truth.json alone. The export writes the simulated
 measurements as a folder of tables with a test file that reads them back.
 """
 
@@ -83,7 +83,7 @@ class SimulatedFlight:
     Attributes
     ----------
     earth : Earth
-        Earth below it.
+        Ellipsoid and rotation of the Earth.
     truth : ThreeLineCameraSpec
         True camera.
     trajectory : Trajectory
@@ -133,7 +133,7 @@ class Simulation(SimulatedFlight):
 
     @property
     def spec(self) -> OrbitSimulateSpec:
-        """Specification of the test."""
+        """Content of the test file of the simulation."""
         return self.setup.test
 
     @property
@@ -143,7 +143,7 @@ class Simulation(SimulatedFlight):
 
 
 def fly_simulation(setup: SimulateSetup, seed: int) -> SimulatedFlight:
-    """Return orbit and cameras of a pass; the same for the same seed as those of `run_simulation`.
+    """Return orbit and cameras of a pass: for the same seed, those that `run_simulation` uses.
 
     Raises
     ------
@@ -267,7 +267,7 @@ LINE: Record[LineImage] = Record(
 
 
 def _per_pixel(raster: Raster) -> Array:
-    """Return radians of longitude per column and of latitude per row, which go to the south."""
+    """Return radians of longitude per column and of latitude per row of a map whose rows go to the south."""
     return raster.spacing / np.array(raster.frame.scale) * np.array([1.0, -1.0])
 
 
@@ -373,7 +373,7 @@ def georeference_data(run: Simulation) -> dict[str, Any]:
 
 
 def _errors(judgement: LineComparison) -> list[list[float | None]]:
-    """Return the errors of every point, None where it was not measured."""
+    """Return the errors of every point, None where the point was not measured."""
     return [[float(v) if np.isfinite(v) else None for v in row] for row in judgement.error]
 
 
@@ -420,7 +420,7 @@ def _true_grid(patch: Patch, name: str) -> dict[str, Any]:
 
 
 def _control_error(patch: Patch) -> dict[str, Any]:
-    """Return the error in plan of the control at a grid of the orthophoto."""
+    """Return the error in plan of the orthophoto, map minus true, east and north, in metres, at a grid of its pixels."""
     photo = patch.control.orthophoto
     row, column = _grid(photo.values.shape)
     east, north = patch.control.error(*photo.east_north(row, column))
@@ -447,11 +447,11 @@ TRUTH: Record[Simulation] = Record(
 
 
 _EXACT = 1e-3
-"""Sigma of control without errors, in metres."""
+"""Sigma of control points that have no errors, in metres."""
 
 
 def simulation_exported(run: Simulation) -> dict[str, str]:
-    """Return the files of one pass over a patch whose points were measured in its images, text by path.
+    """Return the files of one pass over a patch whose points were measured in its images, path -> text.
 
     Raises
     ------

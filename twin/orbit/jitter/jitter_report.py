@@ -25,11 +25,11 @@ _MOST_WRONG = 0.3
 _NAMED = 8
 """Largest number of aliases that are listed."""
 _FIT = 1.3
-"""Remaining noise, in sigmas of the points' covariances, above which there is a warning."""
+"""Ratio of the scatter of the residuals to the sigmas of the points above which there is a warning."""
 
 
 def jitter_report(run: JitterRun) -> Report:
-    """Return the report of a search for jitter."""
+    """Return the report of a search for jitter: detected oscillations, spectra and attitude over time."""
     sections = []
     for name, jitter in run.passes.items():
         suffix, head = ("", "") if len(run.passes) == 1 else (f"-{name.lower()}", f" of {name}")
@@ -74,7 +74,7 @@ def _verdict(run: JitterRun) -> tuple[str, tuple[str, ...]]:
 
 
 def _doubts(line: Oscillation) -> list[str]:
-    """Return the reasons why the frequency of an oscillation may be another."""
+    """Return the reasons why the true frequency of an oscillation may differ from the detected one."""
     frequency, doubts = f"{line.frequency[0]:.4g} Hz", []
     if not line.in_search:
         doubts.append(f"{frequency} lies beyond the search range, in which it appears as a slower oscillation")
@@ -206,7 +206,7 @@ def _course(jitter: PassJitter, suffix: str, head: str) -> Section:
 
 
 def _panels(jitter: PassJitter, least: float, each: float, label: str) -> tuple[Figure, list[Axes]]:
-    """Return a figure with a panel for each axis of the body, below each other."""
+    """Return a figure with one panel for each axis of the body, stacked vertically."""
     names = jitter.setup.test.search.axes
     figure = svg.new_figure(least + each * len(names))
     panels = list(np.atleast_1d(figure.subplots(len(names), 1, sharex=True)))

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 TEST_FILE = "jitter.yaml"
 _WRONG = 20.0
-"""Largest error of a wrong match in a simulation, in pixels."""
+"""Largest error that a simulated wrong match gets, in pixels."""
 _SPARE = 1.3
 """Number of candidates drawn per point; some lie beyond an edge of a line."""
 _REMEDY = "points that several lines see, spread over the strip; a larger `height_sigma` or another `height`"
@@ -53,11 +53,11 @@ class PassJitter:
     result : JitterSearch
         Detected oscillations and spectra.
     course : Course or None
-        Attitude as a spline; None where the file asks for none.
+        Attitude over time, as a spline; None where the file does not ask for it.
     measurements : PassMeasurements
         Measurements of the pass.
     truth : Jitter or None
-        True jitter of a simulation, as a sum of lines; None for measurements.
+        True jitter of a simulation, as a sum of sinusoids; None for measurements.
     """
 
     setup: AnyJitter
@@ -69,7 +69,7 @@ class PassJitter:
 
     @property
     def columns(self) -> list[int]:
-        """Columns of rotation vectors for the axes that are searched."""
+        """Indices, among the components X, Y, Z of rotation vectors, of the axes that are searched."""
         return [AXES.index(axis) for axis in self.setup.test.search.axes]
 
     @property
@@ -79,23 +79,23 @@ class PassJitter:
 
     @property
     def noise_factors(self) -> dict[str, float]:
-        """Remaining standard deviation of each line over that of its points' covariances."""
+        """Standard deviation of each line's residuals divided by that of its points' covariances."""
         return dict(zip(self.sights.lines, np.sqrt(self.result.factors[:-1]).tolist(), strict=True))
 
     @property
     def next_p_value(self) -> float:
-        """p-value of the highest remaining power."""
+        """p-value of the highest power that remains in the spectrum after the detected oscillations are removed."""
         after = self.result.after
         return float(after.chance(after.power[after.best]))
 
     def by_axis(self, values: np.ndarray) -> dict[str, float]:
-        """Return a row of values (A,) as a mapping by axis."""
+        """Return the values (A,) of the A searched axes as a mapping, name of the axis -> value."""
         return dict(zip(self.setup.test.search.axes, np.asarray(values).tolist(), strict=True))
 
 
 @dataclass(frozen=True, eq=False)
 class Oscillation:
-    """Detected oscillation.
+    """Detected oscillation of the attitude: its frequency, amplitudes and phases about the searched axes.
 
     Attributes
     ----------
@@ -110,23 +110,23 @@ class Oscillation:
 
     @property
     def amplitude(self) -> tuple[np.ndarray, np.ndarray]:
-        """Amplitudes (A,) about the axes, in radians, and their standard deviations."""
+        """Amplitudes about the A searched axes, (A,), in radians, and their standard deviations."""
         lines = self.jitter.result.lines
         return lines.amplitude[self.number], lines.amplitude_sigma[self.number]
 
     @property
     def phase(self) -> np.ndarray:
-        """Phases (A,) at the epoch, in radians."""
+        """Phases about the A searched axes at the epoch, (A,), in radians."""
         return np.asarray(self.jitter.result.lines.phase[self.number])
 
     @property
     def pixels(self) -> np.ndarray:
-        """Amplitudes (A,) in angles of a pixel."""
+        """Amplitudes about the A searched axes, (A,), in units of the angle of a pixel."""
         return np.asarray(self.amplitude[0] / self.jitter.sights.pixel)
 
     @property
     def truth(self) -> tuple[float, np.ndarray] | None:
-        """Frequency (Hz) and amplitudes (A,) (rad) of the nearest true oscillation.
+        """Frequency (Hz) and amplitudes about the A searched axes (A,) (rad) of the nearest true oscillation.
 
         None if none lies within a resolution element, or for measurements.
         """
@@ -149,7 +149,7 @@ class Oscillation:
 
     @property
     def in_search(self) -> bool:
-        """True if the frequency lies within the search."""
+        """True if the frequency lies within the range of frequencies that the file searches."""
         search = self.jitter.setup.test.search
         return bool(search.lowest <= self.frequency[0] <= search.highest)
 
@@ -179,7 +179,7 @@ class JitterRun:
 
     @property
     def simulated(self) -> bool:
-        """True for a simulation, which has a truth."""
+        """True for a simulation, whose true jitter is known."""
         return isinstance(self.setup, JitterSetup)
 
 
@@ -225,7 +225,7 @@ def run_jitter(setup: AnyJitter, backend: Backend | None, seed: int, advance: Ad
 
 
 def fly_strip(setup: JitterSetup, seed: int) -> tuple[PassMeasurements, Jitter | None]:
-    """Simulate a pass whose points all lines see, with noise; return its measurements and the true jitter.
+    """Simulate a pass over points that all lines see, with noise; return its measurements and the true jitter.
 
     Raises
     ------
@@ -303,7 +303,7 @@ def exported(run: JitterRun) -> dict[str, str]:
 
 @dataclass(frozen=True, eq=False)
 class BlindMultiple:
-    """Multiple k / dt of the reciprocal gap of a pair of lines.
+    """Frequency k / dt that a pair of lines, which see a point a time dt apart, cannot observe by itself.
 
     Attributes
     ----------
@@ -318,7 +318,8 @@ class BlindMultiple:
     frequency : float
         Frequency k / dt, in hertz.
     response : float
-        Response of all lines together at this frequency, of the worst axis, relative to its maximum.
+        Response of all lines together to an oscillation of this frequency, for the worst axis, divided by the largest
+        response over the searched frequencies.
     blind : bool
         True if all lines together are blind at this frequency.
     """
@@ -333,7 +334,7 @@ class BlindMultiple:
 
 
 def blind_multiples(jitter: PassJitter) -> list[BlindMultiple]:
-    """Return the frequencies of the search at which a pair of lines by itself is blind."""
+    """Return the searched frequencies, multiples k / dt of the reciprocal gap, that a pair of lines cannot observe."""
     before, multiples = jitter.result.before, []
     share = np.min(before.response / np.max(before.response, axis=0), axis=1)
     for (first, second), (_, gap, _) in jitter.sights.gaps.items():
@@ -349,10 +350,10 @@ def blind_multiples(jitter: PassJitter) -> list[BlindMultiple]:
 
 
 def transfers(jitter: PassJitter) -> dict[str, dict[str, float]]:
-    """Return the transfer at Nyquist of all detected oscillations together, by line and direction.
+    """Return the MTF at the Nyquist frequency due to all detected oscillations, by line and direction.
 
-    It is the root mean square over the phases, along the line (by roll) and along the track (by pitch), for lines whose
-    file describes how they collect light.
+    It is the root mean square over the phases, along the line (due to roll) and along the track (due to pitch), for
+    lines whose file describes how they collect light.
     """
     directions, by_line = {"roll": "along_line", "pitch": "along_track"}, {}
     swings = [(line.frequency[0], jitter.by_axis(line.pixels)) for line in jitter.oscillations]
@@ -404,7 +405,7 @@ def _gaps(jitter: PassJitter) -> dict[str, float]:
 
 
 def _detectable(jitter: PassJitter) -> dict[str, float]:
-    """Return the median detectable amplitude over the searched frequencies by axis, in radians."""
+    """Return the median, over the searched frequencies, of the smallest detectable amplitude by axis, in radians."""
     return jitter.by_axis(np.median(jitter.result.detectable[~jitter.result.before.blind], axis=0))
 
 

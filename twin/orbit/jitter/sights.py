@@ -5,10 +5,10 @@ its prior as a covariance. The remaining disagreement of the lines observes the 
 sightings, at any angle between the lines: across the track always, along it as far as the height is known better than
 the angles of the lines determine it.
 
-`SteadyPlatform` is a pass without anything fast: polynomials through the readings of orbit and attitude. Readings
-interpolated by a spline carry their noise into the attitude between them, with the period of the readings, and image
-points that are compared with such an attitude would show that period whatever the satellite did. Polynomials have no
-period.
+`SteadyPlatform` describes a pass without fast motions, by polynomials through the readings of orbit and attitude.
+Readings interpolated by a spline carry their noise into the attitude between them, with the period of the readings, and
+image points that are compared with such an attitude would show that period whatever the satellite did. Polynomials have
+no period.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from twin.orbit.measured.pass_measurements import PassMeasurements
 _ORBIT, _PER = 6, 60.0
 """Degree of the polynomial of the orbit, and seconds per further degree: accurate to 0.1 mm."""
 _ATTITUDE = 4
-"""Degree of the polynomial of the body's attitude against the orbital frame: it is slow, and each line's trend takes up
-the remainder.
+"""Degree of the polynomial of the body's attitude relative to the orbital frame: the attitude changes slowly, and each
+line's trend takes up the remainder.
 """
 
 
@@ -51,9 +51,9 @@ class SteadyPlatform:
     span : tuple of float
         First and last time of the readings used.
     position_series : (K, 3) ndarray
-        Chebyshev coefficients of the position, ITRS, in metres.
+        K Chebyshev coefficients of the position, ITRS, in metres.
     rotation_series : (K, 3) ndarray
-        Chebyshev coefficients of rotation vectors from `middle`, in radians.
+        K Chebyshev coefficients of rotation vectors from `middle`, in radians.
     middle : (3, 3) ndarray
         Mean rotation of the body against the orbital frame.
     law : Attitude
@@ -68,7 +68,7 @@ class SteadyPlatform:
 
     @classmethod
     def of(cls, path: TabulatedTrajectory, first: float, last: float) -> SteadyPlatform:
-        """Fit the readings between two times and, on each side, over the same duration again where there are any.
+        """Fit the readings between two times, in seconds, and in an equally long span on each side.
 
         Raises
         ------
@@ -89,7 +89,7 @@ class SteadyPlatform:
         return cls(span, position, _chebyshev_fit(looks, rotation, span, _ATTITUDE), middle, path.law)
 
     def position(self, seconds: Any) -> np.ndarray:
-        """Return the position in the ITRS, in metres; (...) -> (..., 3)."""
+        """Return the position in the ITRS, in metres; (..., 3) for times (...)."""
         return self._series(self.position_series, seconds)
 
     def velocity(self, seconds: Any) -> np.ndarray:
@@ -98,7 +98,7 @@ class SteadyPlatform:
         return self._series(chebyshev.chebder(self.position_series) * (2.0 / (last - first)), seconds)
 
     def inertial_velocity(self, seconds: Any) -> np.ndarray:
-        """Return the inertial velocity in axes of the ITRS, in m/s; (...) -> (..., 3)."""
+        """Return the inertial velocity in axes of the ITRS, in m/s; (..., 3) for times (...)."""
         return np.asarray(self.velocity(seconds) + earth_rotation_velocity(self.position(seconds)))
 
     def body_to_itrs(self, seconds: Any) -> np.ndarray:
@@ -136,13 +136,13 @@ def _chebyshev_fit(time: np.ndarray, values: np.ndarray, span: tuple[float, floa
 _SPARE = 200
 """Number of lines before and after the points' lines in which they are searched."""
 _TURN = 1e-5
-"""Step of the difference quotients by rotation, in radians."""
+"""Step of the difference quotients with respect to rotation, in radians."""
 _STEP = 10.0
-"""Step of the difference quotients by position, in metres."""
+"""Step of the difference quotients with respect to position, in metres."""
 _EXACT = 1e-3
 """Standard deviation, in metres, added to that of ground points, some of which are given as exact."""
 _LEAST_POINTS = 15
-"""Least number of points that two lines or more must see."""
+"""Smallest number of points that two lines or more must see."""
 _NOISE, _ROUNDS = 4.0, 4
 """Limit, in sigmas, within which a measured line's residual counts as noise, and rounds of rejecting the others."""
 _FAR = 200.0
@@ -150,7 +150,7 @@ _FAR = 200.0
 
 
 class SightsError(PhysicalError, ValueError):
-    """Error of points that do not observe the attitude."""
+    """Error raised when the points of a pass do not observe its attitude."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,9 +171,9 @@ class Sights:
     points : int
         Number of points that two lines or more see.
     pairs : Mapping[tuple[str, str], tuple[ndarray, ndarray]]
-        (first line, second line) -> times (n,) of the first sighting, and disparities (n, 2) of the second line against
-        the first, across (pixels to the right) and along (lines later), less what ground and interior orientation
-        explain; for figures.
+        (first line, second line) -> times (n,) of the first sighting of n points, and disparities (n, 2) of the second
+        line against the first, across (pixels to the right) and along (lines later), less what ground and interior
+        orientation explain; for figures.
     """
 
     observations: Observations
@@ -294,7 +294,7 @@ class _Prior:
 
     Attributes
     ----------
-    tie : (n,) ndarray of bool
+    tie : (n,) ndarray of bool for n points
         True where only the height has a prior.
     ground : (n, 3) ndarray
         Prior positions, ITRS, in metres.
@@ -312,10 +312,10 @@ class _Prior:
         return np.asarray(self.root.swapaxes(1, 2) @ self.root)
 
     def of(self, rows: np.ndarray, ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the prior's observations of some points, all of them ties or none.
+        """Return the prior's observations of some points, either all tie points or none of them.
 
-        They are the derivatives (n, k, 3) by a step from positions (n, 3), and the residuals (n, k) of the prior's
-        positions.
+        They are the derivatives (n, k, 3) of k whitened residuals of n points with respect to a step from positions (n,
+        3), in metres, and the residuals (n, k) of the prior's positions.
         """
         root = self.root[rows][:, :1] if self.tie[rows[0]] else self.root[rows]
         return root, (root @ (self.ground[rows] - ground)[..., None])[..., 0]
@@ -359,7 +359,10 @@ def _improved_positions(lines: Mapping[str, _Line], shared: np.ndarray, prior: _
 
 
 def _residual_and_slope(line: _Line, ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return measured less expected line and pixel (n, 2), and their derivatives by position (n, 2, 3), per metre."""
+    """Return measured minus expected line and pixel, and their derivatives with respect to the ground position.
+
+    For n points they are (n, 2), in lines and pixels, and (n, 2, 3), per metre.
+    """
     expected = np.stack(line.sensor.image(ground), axis=-1)
     by = [(np.stack(line.sensor.image(ground + _STEP * axis), axis=-1) - expected) / _STEP for axis in np.eye(3)]
     return line.image - expected, np.stack(by, axis=-1)
@@ -373,7 +376,9 @@ def _whitened_observations(
     prior: _Prior,
     search: JitterSearchSpec,
 ) -> tuple[Observations, dict[str, np.ndarray]]:
-    """Return the whitened observations, and measured less expected positions (n, 2) by line, in pixels."""
+    """Return the whitened observations of the attitude, and measured minus expected positions (n, 2) by line, in
+    pixels.
+    """
     axes, count = len(search.axes), len(order)
     size, width = len(shared), (search.interior + 1) + search.trend
     value, by = np.zeros((size, count, 2)), np.zeros((size, count, 2, 3))
@@ -463,7 +468,7 @@ def _moments(line: _Line, off: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def _visibility_groups(seen: np.ndarray, tie: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return lines (m,) and points (n,) of each set of points of one sort that the same two lines or more see."""
+    """Return m lines and n points, as indices, of each set of points of one sort that the same lines see."""
     groups = []
     for sort in (True, False):
         for pattern in np.unique(seen, axis=0):
@@ -475,7 +480,7 @@ def _visibility_groups(seen: np.ndarray, tie: np.ndarray) -> list[tuple[np.ndarr
 
 
 def _basis(lines: Mapping[str, _Line], shared: np.ndarray, search: JitterSearchSpec) -> np.ndarray:
-    """Return (n, width) Legendre polynomials of each point's position across the strip and of its time.
+    """Return Legendre polynomials of each of n points' position across the strip and of its time, (n, width).
 
     They are the same for all lines: the part that lines have in common moves only the ground point and is eliminated,
     with its noise.
@@ -499,7 +504,7 @@ def _pixel(camera: LineCamera) -> float:
 def _pairs(
     lines: Mapping[str, _Line], order: list[str], count: int, residual: Mapping[str, np.ndarray]
 ) -> tuple[dict[tuple[str, str], tuple[float, float, float]], dict[tuple[str, str], tuple[np.ndarray, np.ndarray]]]:
-    """Return the gaps of all pairs of lines, and the disparities of neighbours without their smooth parts."""
+    """Return the gaps of all pairs of lines, and the disparities of neighbouring lines without their smooth parts."""
     gaps, pairs = {}, {}
     for a, b in combinations(order, 2):
         _, mine, theirs = np.intersect1d(lines[a].point, lines[b].point, return_indices=True)

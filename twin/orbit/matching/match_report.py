@@ -9,11 +9,11 @@ from twin.orbit.images.point_report import found_table, how_measured, point_arte
 from twin.orbit.matching.match_run import IMAGE, Match
 
 _FAR = 0.5
-"""Share of the search range beyond which a displacement leaves the search little room."""
+"""Share of the search range above which a median displacement is reported as leaving the search too little margin."""
 
 
 def match_report(run: Match) -> Report:
-    """Return the report of a run."""
+    """Return the report of points measured in a user's images: verdict, counts, accuracy and warnings."""
     return Report(
         "Points measured in images",
         *_verdict(run),
@@ -63,13 +63,13 @@ def _facts(run: Match) -> tuple[tuple[str, str], ...]:
 
 
 def _measured(run: Match) -> Section:
-    """Return the report section on the measured points."""
+    """Return the report section on the measured points: counts, displacements and figures."""
     text = how_measured(run.setup.test.points, "the laboratory's camera on the measured platform")
     return Section("Measured points", (text,), point_artefacts(run.ground, run.points))
 
 
 def _images(run: Match) -> Section:
-    """Return the report section on the images."""
+    """Return the report section on the images: size, ground sample distance and position."""
     rows = {name: IMAGE(image) for name, image in run.ground.images.items()}
     caption = "Lines count from the first in the table of times, pixels from the one that looks farthest to the right."
     return Section("Images", (), (IMAGE.table("windows", "Images", caption, rows, label="line", digits=4),))

@@ -64,7 +64,7 @@ _PIXEL = 30.0
 
 @dataclass(frozen=True, eq=False)
 class UserGround(ImagedGround):
-    """Piece of ground in a user's images and maps."""
+    """Patch of ground in a user's images and maps."""
 
     control: Maps[MapPart]
 
@@ -84,7 +84,7 @@ class Match:
     measurements : PassMeasurements
         Points with orbit, attitude and line times, as a calibration takes them.
     accuracy : float or None
-        Accuracy of the maps' transformation to WGS 84 as its authority states it, metres; None where it is not stated.
+        Accuracy of the maps' transformation to WGS 84 according to its authority, metres; None where it gives none.
     """
 
     setup: MatchSetup
@@ -145,7 +145,7 @@ def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Ad
 
 
 def _times(spec: OrbitMatchSpec, clock: LineClock, epoch: str) -> LineTimes:
-    """Return line times by a line's own numbers, its first line in the table being 0."""
+    """Return line times with lines counted from a line's first row in the table of times, which is 0."""
     reading = PassConventions(None, spec.lines.time_scale, 0.0, spec.lines.moment, 0.0, 0.0, "right")  # type: ignore[arg-type]
     try:
         middle, _ = line_times(clock, reading, epoch, clock.line)
@@ -197,7 +197,9 @@ def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path, cou
 
 
 def _read_image(path: Path, spec: LineImageFileSpec, count: int) -> np.ndarray:
-    """Return grey values (rows, columns) of the image, or of its window; `count` like it must fit into the memory."""
+    """Return grey values (rows, columns) of the image, or of its window; `count` images of this size must fit into the
+    memory.
+    """
     from twin.orbit.measured.maps import opened
 
     file, part = str(path), spec.window
@@ -254,7 +256,7 @@ def _extent(
 
 
 def _measured(points: PatchPoints, spec: OrbitMatchSpec) -> tuple[GroundPoints, Mapping[str, ImagePoints]]:
-    """Return the accepted points, control and check before ties."""
+    """Return the accepted points: control and check points, then tie points."""
     ids: list[str] = []
     places, roles = [], []
     rows: dict[str, list[ImagePoints]] = {name: [] for name in spec.images}
@@ -280,7 +282,7 @@ def _measured(points: PatchPoints, spec: OrbitMatchSpec) -> tuple[GroundPoints, 
 
 
 def _used(points: MatchedPoints) -> np.ndarray:
-    """Return the mask of points seen by a line, or by two for ties, (n,) bool."""
+    """Return the mask of points seen by a line, or by two lines for tie points, (n,) bool."""
     seen = np.sum([line.accepted for line in points.lines.values()], axis=0)
     return np.asarray(seen >= (2 if points.kind == "tie" else 1))
 
@@ -329,5 +331,5 @@ MATCH: Record[Match] = Record(
 
 
 def exported(run: Match) -> dict[str, str]:
-    """Return a folder of measurements, text by path."""
+    """Return the files of a folder of measurements, path -> text, with a test file that reads them."""
     return campaign_files([run.measurements], run.setup.camera.plain())

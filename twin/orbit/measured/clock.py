@@ -39,7 +39,7 @@ class Readings:
 
     Attributes
     ----------
-    day : (N,) ndarray of int
+    day : (N,) ndarray of int for N readings
         Modified Julian days.
     second : (N,) ndarray
         Seconds of the day, from 0 to 86400, within a leap second up to 86401.
@@ -83,7 +83,7 @@ class Readings:
         Raises
         ------
         Problem
-            A text is not a date and time; ``within`` holds its index.
+            A text is not a date and time; the error's ``within`` holds its index.
         """
         day, second = np.empty(len(texts), np.int64), np.empty(len(texts))
         known: dict[str, int] = {}
@@ -105,7 +105,7 @@ class Readings:
         return cls(day, second)
 
     def taken(self, keep: np.ndarray | slice) -> Readings:
-        """Return the readings that a mask, slice or index (K,) selects."""
+        """Return the readings that a mask, slice or array of K indices selects."""
         return Readings(self.day[keep], self.second[keep])
 
     def instants(self, scale: str) -> Instants:
@@ -138,17 +138,20 @@ class Instants:
 
     Attributes
     ----------
-    day : (N,) ndarray of int
+    day : (N,) ndarray of int for N instants
         Whole days since MJD 0.
     second : (N,) ndarray
-        SI seconds after them.
+        SI seconds after the start of that day.
     """
 
     day: np.ndarray
     second: np.ndarray
 
     def since(self, epoch: str) -> np.ndarray:
-        """Return SI seconds (N,) from an epoch in UTC, ISO 8601 text, with leap seconds; exact to 1e-11 s in a day."""
+        """Return SI seconds from an epoch in UTC (ISO 8601 text) to N instants, (N,); exact to 1e-11 s in a day.
+
+        Leap seconds are counted.
+        """
         start = Readings.of_texts([epoch.strip()]).instants("UTC")
         day, second = start.day[0], start.second[0]
         return np.asarray((self.day - day) * DAY + (self.second - second))

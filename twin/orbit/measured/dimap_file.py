@@ -54,7 +54,7 @@ _PERIOD: Mapping[str, float] = FrozenMap(
 )
 """Seconds per unit of a line period; a period without a unit is in milliseconds."""
 _LENGTH: Mapping[str, float] = FrozenMap({"micrometer": 1e-6, "um": 1e-6, "mm": 1e-3, "m": 1.0})
-"""Metres per unit of a detector's pixel size."""
+"""Metres per unit of a detector's pixel size, by name of the unit."""
 _MOST_TERMS = 8
 """Largest number of terms of a polynomial."""
 _DAY = 86400.0
@@ -83,7 +83,7 @@ class AttitudePolynomial:
         Second of the day at which the polynomials' variable is 0.
     scale : float
         Seconds by which the variable grows by 1.
-    coefficients : (4, K) ndarray
+    coefficients : (4, K) ndarray for K powers
         Coefficients of Q0, the scalar, to Q3, ascending powers.
     """
 
@@ -93,7 +93,7 @@ class AttitudePolynomial:
     coefficients: Array
 
     def at(self, second: Array) -> Array:
-        """Return unit quaternions (N, 4), scalar first, at seconds (N,) of the day."""
+        """Return unit quaternions, scalar first, at N seconds of the day, (N, 4)."""
         values = np.polynomial.polynomial.polyval((second - self.offset) / self.scale, self.coefficients.T).T
         return np.asarray(values / np.linalg.norm(values, axis=1, keepdims=True))
 
@@ -123,7 +123,8 @@ class DimapPass:
     attitude : AttitudeReadings or AttitudePolynomial
         Attitude, as samples or as polynomials.
     forward, right : (K,) ndarray
-        Coefficients of the tangents of a pixel's look, ascending powers of the pixel from 0.
+        K coefficients of the tangents of the angles of a pixel's look, forward and to the right, ascending powers of
+        the pixel from 0.
     pitch : float or None
         Pixel pitch of the detector, metres; None where the file does not say.
     refracted : bool
@@ -217,7 +218,7 @@ class DimapPass:
         return replace(attitude, clock=self._clock(times[order]), quaternion=quaternion[order])
 
     def _ends_beyond(self, time: Array) -> list[tuple[float, int]]:
-        """Return the ends of the image, with a line to spare, that lie outside of readings at times (N,).
+        """Return the ends of the image, extended by one line, that lie outside of readings at N times.
 
         Each comes with the index of the nearest reading: 0 or -1.
         """
@@ -225,20 +226,20 @@ class DimapPass:
         return [(at, end) for at, end in ends if not in_span(at, time[0], time[-1])]
 
     def _clock(self, time: Array) -> Readings:
-        """Return clock readings at times (N,), seconds from the first line."""
+        """Return clock readings at N times, in seconds from the first line."""
         second = time + float(self.first_line.second[0])
         day = np.floor(second / _DAY)
         return Readings(int(self.first_line.day[0]) + day.astype(np.int64), second - _DAY * day)
 
     def _since(self, clock: Readings) -> Array:
-        """Return seconds (N,) from the first line."""
+        """Return the times of clock readings in seconds from the first line, (N,) for N readings."""
         return np.asarray((clock.day - self.first_line.day[0]) * _DAY + clock.second - self.first_line.second[0])
 
 
 _GRAVITY = 3.986004418e14
 """Gravitational parameter of the Earth, in m^3/s^2.
 
-Relative to the rotating Earth an acceleration differs by a seventh, 6 mm in `_NEAR`.
+Relative to the rotating Earth an acceleration differs by a seventh, which moves an orbit by 6 mm in `_NEAR` seconds.
 """
 
 
@@ -337,7 +338,7 @@ def _identified(root: Element) -> tuple[str, str]:
 
 
 def _moment(element: Element) -> Readings:
-    """Return the UTC of an element, with or without its Z."""
+    """Return the UTC time of an element, whether or not its text ends in Z."""
     try:
         return readings(element.file, [element.text], [element.line])
     except InputError as error:
@@ -440,7 +441,7 @@ def _looks(calibration: Element, band: str | None) -> tuple[Array, Array]:
 
 
 def _tangent(element: Element, name: str, first: int) -> Array:
-    """Return coefficients (K,) for powers of a pixel that is ``first`` columns behind the first of the calibration."""
+    """Return K coefficients of a look's tangent in powers of the pixel, counted ``first`` columns after the file's."""
     terms = [element.number(f"{name}_0", least=-1.0, most=1.0)]
     if name == "XLOS":
         element.one("XLOS_1")

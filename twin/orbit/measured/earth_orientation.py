@@ -45,7 +45,7 @@ class EarthOrientation:
     ----------
     file : str
         Path of the file.
-    mjd : (K,) ndarray
+    mjd : (K,) ndarray for K days
         Modified Julian dates in UTC, increasing, four or more.
     ut1_tai : (K,) ndarray
         UT1 - TAI, seconds.
@@ -80,7 +80,7 @@ class EarthOrientation:
         return TableRotation(self, epoch, celestial_pole(epoch, first, last))
 
     def at(self, mjd: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return UT1 - TAI (N,), seconds, pole (N, 2) and offsets (N, 2), radians, at dates in UTC (N,)."""
+        """Return Earth orientation at N dates in UTC: UT1 - TAI (N,), in seconds, pole and offsets (N, 2), in radians."""
         count = len(self.mjd)
         start = np.clip(np.searchsorted(self.mjd, mjd, side="right") - 2, 0, count - 4)
         which = start[..., None] + np.arange(4)
@@ -104,9 +104,9 @@ class TableRotation:
     table : EarthOrientation
         Table of Earth orientation.
     epoch : str
-        UTC, ISO 8601 text; times are SI seconds from it.
+        UTC from which times are counted in SI seconds, ISO 8601 text.
     celestial_pole : callable
-        Spline of the pole's X and Y and of the locator s by IAU 2006/2000A, radians.
+        Spline of the pole's X and Y and of the locator s according to IAU 2006/2000A, radians.
     """
 
     table: EarthOrientation
@@ -114,9 +114,9 @@ class TableRotation:
     celestial_pole: Any
 
     def turn(self, seconds: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return UT1 (...), pole and celestial pole offsets (..., 2), radians, at times (...).
+        """Return UT1 (...), in days, and pole and celestial pole offsets (..., 2), in radians, at times (...).
 
-        UT1 is the second part of a Julian date, in days, whose first part is `julian`.
+        UT1 is the second part of a Julian date whose first part is `julian`.
         """
         t = np.asarray(seconds, dtype=np.float64)
         day, second = calendar_reading(self.epoch)
@@ -130,7 +130,7 @@ class TableRotation:
         return 2400000.5 + calendar_reading(self.epoch)[0]
 
     def matrix(self, seconds: Any) -> np.ndarray:
-        """Return the rotation GCRS -> ITRS: x_itrs = matrix @ x_gcrs; (...) -> (..., 3, 3)."""
+        """Return the rotation GCRS -> ITRS: x_itrs = matrix @ x_gcrs; (..., 3, 3) for times (...)."""
         t = np.asarray(seconds, dtype=np.float64)
         ut1, pole, offsets = self.turn(t)
         x, y, s = np.moveaxis(self.celestial_pole(t), -1, 0)
@@ -138,7 +138,7 @@ class TableRotation:
         return np.asarray(erfa.c2tcio(celestial, erfa.era00(self.julian, ut1), self._polar(t, pole)))
 
     def teme_to_itrs(self, seconds: Any) -> np.ndarray:
-        """Return the rotation TEME -> ITRS, (...) -> (..., 3, 3).
+        """Return the rotation from true equator, mean equinox (TEME) to ITRS, (..., 3, 3) for times (...).
 
         It uses Greenwich mean sidereal time of 1982 and polar motion (Vallado et al., AIAA 2006-6753, appendix C).
         """
@@ -152,7 +152,7 @@ class TableRotation:
 
 
 def angular_velocity(matrix: Any, seconds: np.ndarray) -> np.ndarray:
-    """Return the angular velocity (N, 3), in rad/s, of the target axes of a rotation, in these axes.
+    """Return the angular velocity of the target axes of a rotation, in these axes, (N, 3) for N times, in rad/s.
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ _FINALS = {"MJD": (7, 15), "x": (18, 27), "y": (37, 46), "UT1-UTC": (58, 68), "d
 
 
 def _finals(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
-    """Parse finals2000A: Bulletin B where the file has it, else A.
+    """Parse the rows of a finals2000A table: values of Bulletin B where the file has them, else of Bulletin A.
 
     Days without a prediction of pole and UT1 are left out.
     """

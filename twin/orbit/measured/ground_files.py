@@ -41,11 +41,12 @@ class GroundFile:
     Attributes
     ----------
     points : GroundPoints
-        The points, in the ITRS.
+        Ground points with covariances and roles, in the ITRS.
     accuracy : float or None
-        Accuracy of the transformation to the ITRS as its authority states it, metres; None where it is not stated.
-    images : mapping of str to (n, 5) ndarray
-        Image measurements by image file, where the file has some: row of `points`, line, pixel and their sigmas.
+        Accuracy of the transformation to the ITRS according to its authority, metres; None where it gives none.
+    images : mapping of str to (n, 5) ndarray for n measurements
+        Image measurements by image file, where the file has some: index in `points`, line, pixel, and the sigmas of
+        line and pixel in pixels.
     """
 
     points: GroundPoints
@@ -55,7 +56,9 @@ class GroundFile:
 
 @dataclass(eq=False)
 class _Rows:
-    """Rows of a file: names, coordinates in its own system, sigmas (NaN where there are none), roles, lines."""
+    """Rows of a file: names, coordinates in the file's reference system, sigmas (NaN where there are none), roles, and
+    line numbers in the file.
+    """
 
     ids: list[str]
     places: np.ndarray
@@ -122,7 +125,7 @@ def _required(spec: GroundFileSpec) -> str:
 
 
 def _covariance(spec: GroundFileSpec, file: str, rows: _Rows, itrs: np.ndarray, earth_fixed: bool) -> np.ndarray:
-    """Return covariances (n, 3, 3) in axes of the ITRS, in m^2."""
+    """Return the covariances of n points in axes of the ITRS, (n, 3, 3), in m^2."""
     sigma = rows.sigmas.copy()
     missing = np.isnan(sigma).any(axis=1)
     for row in np.flatnonzero(missing)[:1]:
@@ -263,7 +266,7 @@ def _alike(first: Any, second: Any) -> bool:
 
 
 def _of_header(spec: GroundFileSpec, header: str) -> str:
-    """Return the system of a header `# WKT:`, which the test's file may repeat."""
+    """Return the coordinate system of a header `# WKT:`, which the test file may repeat."""
     import pyproj
 
     try:

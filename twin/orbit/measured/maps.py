@@ -1,8 +1,7 @@
 """Maps and coordinate reference systems: rasters, geoids and transformations to the ITRS.
 
 Rasters are GeoTIFF and other files that GDAL reads; they are read in parts, since an orthophoto may be larger than the
-memory. The part of a user's map that images show is given in the plane coordinates of the ground; its pixels stay as
-they are.
+memory. The part of a user's map that images show is used in the plane coordinates of the ground without resampling.
 
 Coordinates of any reference system are transformed to the ITRS and back, and heights above a geoid to heights above the
 ellipsoid. PROJ provides the systems. It never guesses: ballpark transformations are excluded, and a missing grid is an
@@ -68,19 +67,19 @@ class GeoRaster:
     dtype: str
 
     def coordinates_of(self, row: Any, column: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return x and y in the raster's system at real-valued (row, column), (...)."""
+        """Return x and y in the raster's system at real-valued rows and columns (...)."""
         a, b, c, d, e, f = self.transform
         return a * np.asarray(column) + b * np.asarray(row) + c, d * np.asarray(column) + e * np.asarray(row) + f
 
     def row_column_of(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return row and column of coordinates, (...): the inverse of `coordinates_of`."""
+        """Return the real-valued row and column of coordinates x and y (...) in the raster's system."""
         a, b, c, d, e, f = self.transform
         u, v, area = np.asarray(x) - c, np.asarray(y) - f, a * e - b * d
         with np.errstate(invalid="ignore"):  # coordinates outside the system are infinite
             return (a * v - d * u) / area, (e * u - b * v) / area
 
     def read(self, rows: slice | None = None, columns: slice | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return values (r, c) of a part, in the raster's data type, and the mask of valid ones (bool).
+        """Return the values of a part, in the raster's data type, and the mask of valid ones, (rows, columns) each.
 
         Parameters
         ----------
@@ -200,7 +199,7 @@ class Geoid:
     Attributes
     ----------
     raster : GeoRaster
-        The grid.
+        Grid of heights, in metres.
     """
 
     raster: GeoRaster
@@ -366,7 +365,9 @@ class Datum:
 
     @property
     def accuracy(self) -> float | None:
-        """Accuracy of the transformation to the ITRS by its authority, metres; None if unknown, or before `itrs`."""
+        """Accuracy of the transformation to the ITRS according to its authority, metres; None if unknown, or before
+        `itrs`.
+        """
         stated = self.forward.accuracy
         if stated < 0.0:
             try:
@@ -393,12 +394,12 @@ _WGS84 = "EPSG:4326"
 
 @dataclass(frozen=True, eq=False)
 class MapPart:
-    """Part of a map; implements `twin.orbit.ground.orthophoto.Map`.
+    """Part of a map; has the interface of `twin.orbit.ground.orthophoto.Map`.
 
     Attributes
     ----------
     values : (rows, columns) ndarray
-        Grey values float32 with NaN where there are none, or heights above the ellipsoid.
+        Grey values as float32 with NaN where there are none, or heights above the ellipsoid in metres.
     valid : (rows, columns) ndarray of bool or None
         Mask of valid values; None if all are.
     raster : GeoRaster
@@ -422,13 +423,13 @@ class MapPart:
     spacing: float
 
     def east_north(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return east and north, in metres, at real-valued (row, column), broadcast."""
+        """Return east and north, in metres, at real-valued rows and columns, which are broadcast together."""
         row, column = np.broadcast_arrays(np.asarray(row, float), np.asarray(column, float))
         x, y = self.raster.coordinates_of(row + self.first[0], column + self.first[1])
         return self.frame.plane(*np.radians(self.to_geographic.transform(x, y)))
 
     def row_column(self, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return row and column of plane coordinates east and north, in metres: the inverse of `east_north`."""
+        """Return the real-valued row and column of plane coordinates east and north, in metres."""
         east, north = np.broadcast_arrays(np.asarray(east, float), np.asarray(north, float))
         longitude, latitude = np.degrees(self.frame.geographic(east, north))
         x, y = self.to_geographic.transform(longitude, latitude, direction="INVERSE")
@@ -447,7 +448,7 @@ class UserMap:
     Attributes
     ----------
     raster : GeoRaster
-        The file.
+        Raster file of the map.
     to_geographic : pyproj.Transformer
         Transformation from the raster's system to longitude and latitude, degrees.
     geoid : Geoid or None
@@ -497,7 +498,7 @@ class UserMap:
         return cls(raster, transformer, geoid)
 
     def limits(self) -> tuple[float, float]:
-        """Return the least and largest height, sampled over the whole elevation model.
+        """Return the smallest and largest height, in metres, sampled over the whole elevation model.
 
         Raises
         ------

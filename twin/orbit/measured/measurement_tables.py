@@ -75,7 +75,9 @@ _SIGMAS = (("sigma",), ("plan_sigma", "height_sigma"), ("x_sigma", "y_sigma", "z
 _EARTH_AXES = np.array([6_378_137.0, 6_378_137.0, 6_356_752.314])
 """Semi-axes of the WGS84 ellipsoid, in metres."""
 CALIBRATING: Mapping[str, int] = {"control": 1, "check": 2}
-"""Ground points that a calibration needs: by role, in how many line cameras one of them must be seen."""
+"""Number of line cameras in which one or more of the ground points must be seen, by role of the point, for a
+calibration.
+"""
 
 
 def read_pass(
@@ -98,7 +100,7 @@ def read_pass(
     camera : ThreeLineCameraSpec
         Payload whose lines the tables name.
     needed : mapping of str to int
-        Least number of line cameras that must see one of the points, by role.
+        Smallest number of line cameras that must see one of the points, by role.
 
     Raises
     ------
@@ -171,7 +173,7 @@ def read_measurements(
     advance : Advance
         Callback that reports progress.
     needed : mapping of str to int
-        Least number of line cameras that must see one of the points, by role.
+        Smallest number of line cameras that must see one of the points, by role.
 
     Raises
     ------
@@ -260,7 +262,7 @@ def ground_of(table: Table) -> GroundPoints:
 
 
 def _covariance(table: Table, place: Array) -> Array:
-    """Return covariances (n, 3, 3) in axes of the ITRS, in m^2."""
+    """Return the covariances of n points in axes of the ITRS, (n, 3, 3), in m^2."""
     sets = [names for names in _SIGMAS if any(name in table for name in names)]
     allowed = "or ".join(", ".join(f"{name} [m]" for name in names) + " " for names in _SIGMAS).strip()
     if len(sets) != 1:
@@ -363,7 +365,7 @@ def _image_points_of(
 
 
 def image_covariance(table: Table, rows: NDArray[np.intp]) -> Array:
-    """Return covariances of line and pixel in rows of a table of image points, (n, 2, 2), in pixels squared."""
+    """Return the covariances of line and pixel of n rows of a table of image points, (n, 2, 2), in pixels squared."""
     a, b = table["line_sigma"][rows], table["pixel_sigma"][rows]
     c = a * b * (table["correlation"][rows] if "correlation" in table else 0.0)
     return np.stack([np.stack([a * a, c], -1), np.stack([c, b * b], -1)], axis=1)
@@ -402,7 +404,7 @@ TEST_FILE = "calibrate.yaml"
 
 
 def campaign_files(passes: Sequence[PassMeasurements], camera: Mapping[str, Any]) -> dict[str, str]:
-    """Return the files of a folder of measurements, text by path: ``data.yaml``, tables of each pass, camera.
+    """Return the files of a folder of measurements, path -> text: ``data.yaml``, tables of each pass, camera.
 
     Parameters
     ----------
@@ -523,7 +525,7 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: Conventi
     attitude : Table
         Table of the attitude, which may be the same.
     conventions : ConventionsSpec
-        Conventions of both.
+        Conventions of both tables.
 
     Raises
     ------
@@ -566,7 +568,7 @@ def _quaternions_of(numbers: Array, conventions: ConventionsSpec) -> Array:
     Parameters
     ----------
     numbers : (n, 4) ndarray
-        q1 to q4 as in the file.
+        Components q1 to q4 of n quaternions, in the file's order.
     conventions : ConventionsSpec
         Conventions of the file.
     """
@@ -586,7 +588,7 @@ def _quaternions_of(numbers: Array, conventions: ConventionsSpec) -> Array:
 
 
 def _rising(table: Table) -> NDArray[np.intp]:
-    """Return the rows in the order of time; InputError if a time occurs twice."""
+    """Return the indices of the rows in the order of time; raise InputError if a time occurs twice."""
     order = np.argsort(table["time"], kind="stable")
     for row in order[1:][np.diff(table["time"][order]) == 0.0][:1]:
         raise table.error(int(row), "time", "this time occurs twice", f"{table['time'][row]:.9g} s", "each time once")

@@ -1,9 +1,9 @@
 """Orbit and attitude files of other programs: CCSDS messages (OEM 502.0-B, AEM 504.0-B), SP3-c and SP3-d.
 
-CCSDS: an attitude's quaternion q = (e sin(a/2), cos(a/2)) belongs to the rotation by a about e that takes frame A to
-frame B. So from A to the body the axes of the body are those of A rotated by q, and components in the body become those
-in A by R(q): the convention is body_to_frame. ATTITUDE_DIR B2A, or a body that is frame A, is the other way. In version
-1 QUATERNION_TYPE gives the position of the scalar; version 2 has it last.
+CCSDS: an attitude's quaternion q = (e sin(a/2), cos(a/2)) belongs to the rotation by an angle a about a unit vector e
+that takes frame A to frame B. So from A to the body the axes of the body are those of A rotated by q, and components in
+the body become those in A by R(q): the convention is body_to_frame. ATTITUDE_DIR B2A, or a body that is frame A, is the
+other way. In version 1 QUATERNION_TYPE gives the position of the scalar; version 2 has it last.
 
 SP3: positions are in kilometres, velocities in dm/s, both Earth-fixed; the time system is in the header. A position of
 zeros is a missing one. A file without its last line EOF is complete where it has as many epochs as its header says.
@@ -57,7 +57,7 @@ class OrbitReadings:
     file : str
         Path of the file.
     clock : Readings
-        N readings, increasing.
+        N readings of the clock, increasing.
     position : (N, 3) ndarray
         Positions, metres.
     velocity : (N, 3) ndarray or None
@@ -79,7 +79,7 @@ class OrbitReadings:
     segments: tuple[Segment, ...] = ()
 
     def taken(self, part: slice) -> OrbitReadings:
-        """Return the readings of a slice, with the segments cut accordingly."""
+        """Return the orbit readings that a slice of their indices selects, with the segments cut accordingly."""
         begin, end, _ = part.indices(len(self.clock))
         here = (segment for segment in self.segments if segment.first < end and segment.last >= begin)
         segments = (
@@ -99,7 +99,7 @@ class AttitudeReadings:
     file : str
         Path of the file.
     clock : Readings
-        M readings, increasing.
+        M readings of the clock, increasing.
     quaternion : (M, 4) ndarray or None
         Components in the file's order; None for angles.
     angles : (M, 3) ndarray or None
@@ -124,7 +124,7 @@ class AttitudeReadings:
     turns: Turns | None = None
 
     def taken(self, part: slice) -> AttitudeReadings:
-        """Return the readings of a slice."""
+        """Return the attitude readings that a slice of their indices selects."""
         turns, angles = (None if values is None else values[part] for values in (self.quaternion, self.angles))
         return replace(self, clock=self.clock.taken(part), quaternion=turns, angles=angles)
 
@@ -152,9 +152,9 @@ def known_frame(name: str, file: str, line: int | None = None, key: str = "REF_F
 
 
 def require_orbit(file: str, position: np.ndarray, lines: list[int]) -> None:
-    """Raise InputError unless positions (N, 3), in metres, lie between the Earth's surface and 100 000 km.
+    """Raise InputError unless N positions (N, 3), in metres, lie between the Earth's surface and 100 000 km.
 
-    Positions that fail have the wrong unit. `lines` are the lines of the file on which they stand.
+    Positions that fail have the wrong unit. `lines` are their line numbers in the file.
     """
     radius = np.linalg.norm(position, axis=1)
     for row in np.flatnonzero((radius < 6.3e6) | (radius > 1e8))[:1]:
@@ -165,7 +165,7 @@ def require_orbit(file: str, position: np.ndarray, lines: list[int]) -> None:
 
 
 def require_unit(file: str, quaternion: np.ndarray, lines: list[int]) -> None:
-    """Raise InputError unless quaternions (M, 4) on these lines have length 1 to a thousandth."""
+    """Raise InputError unless M quaternions (M, 4), read from these lines of a file, have length 1 to a thousandth."""
     length = np.linalg.norm(quaternion, axis=1)
     for row in np.flatnonzero(np.abs(length - 1.0) > 1e-3)[:1]:
         found = f"length {length[row]:.6g}"
@@ -182,11 +182,11 @@ Positions of 1 m noise 1 s apart differ by less, and the inertial velocity diffe
 def velocity_misfit(time: Array, place: Array, speed: Array) -> tuple[Array, bool]:
     """Return the misfit of velocities to the change of Earth-fixed positions, and whether they are inertial ones.
 
-    Inertial velocities are larger by omega x P.
+    Inertial velocities are larger by omega x P, with the Earth's rotation vector omega and the position P.
 
     Parameters
     ----------
-    time : (N,) ndarray
+    time : (N,) ndarray for N readings
         Times, seconds.
     place : (N, 3) ndarray
         Positions in the ITRS, metres.
@@ -278,7 +278,20 @@ def read_oem(path: str | Path, satellite: str | None = None) -> OrbitReadings:
 
 
 def read_aem(path: str | Path, satellite: str | None = None) -> AttitudeReadings:
-    """Read the attitude of a CCSDS AEM of quaternions; arguments and errors as `read_oem`."""
+    """Read the attitude of a CCSDS AEM of quaternions.
+
+    Parameters
+    ----------
+    path : str or Path
+        Path of the file.
+    satellite : str or None
+        OBJECT_ID or OBJECT_NAME of the satellite; may be left out where there is only one.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or its segments do not fit together.
+    """
     file = str(path)
     segments = _chosen(file, _segments(path, "AEM"), satellite)
     kind, line = _same(file, segments, "ATTITUDE_TYPE")
@@ -434,7 +447,7 @@ def _scale(file: str, segments: list[_Segment]) -> str:
 
 
 def _parts(file: str, segments: list[_Segment]) -> tuple[Segment, ...]:
-    """Return the segments of an orbit.
+    """Return the segments of an orbit as parts that are interpolated separately.
 
     Nothing may be interpolated from one to the next, for they meet where an orbit breaks, as at a manoeuvre, nor used
     outside of USEABLE_START_TIME and USEABLE_STOP_TIME (502.0-B, 5.2.4).
@@ -454,7 +467,7 @@ def _parts(file: str, segments: list[_Segment]) -> tuple[Segment, ...]:
 
 
 def _joined(segments: list[_Segment]) -> tuple[list[list[str]], list[int]]:
-    """Return rows of all segments with their lines, without repeating a time at which one ends and the next begins."""
+    """Return the data rows of all segments with their line numbers; a time that two segments share is kept once."""
     rows: list[list[str]] = []
     lines: list[int] = []
     for segment in segments:

@@ -1,6 +1,6 @@
 """Measurements of a pass in the project's own conventions: frames, signs and pixel coordinates.
 
-Every analysis takes this form, from whatever files the measurements came, of a satellite or of the simulation.
+Every analysis uses this form, whether the measurements were read from a satellite's files or simulated.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ class GroundPoints:
 
     Attributes
     ----------
-    ids : (n,) ndarray of object
+    ids : (n,) ndarray of object for n points
         Unique names.
     itrs : (n, 3) ndarray
         Coordinates in the ITRS, metres; NaN for tie points without coordinates.
     covariance : (n, 3, 3) ndarray
-        Covariance of the coordinates, ITRS axes, m^2; zero for exact ones, and for ties.
+        Covariance of the coordinates, ITRS axes, m^2; zero for exact coordinates, and for tie points.
     role : (n,) ndarray of object
         Role of each point, one of `ROLES`.
     """
@@ -105,7 +105,7 @@ class ImagePoints:
 
     Attributes
     ----------
-    point : (n,) ndarray of int
+    point : (n,) ndarray of int for n image points
         Index of the ground point of each image point.
     line, pixel : (n,) ndarray
         Image coordinates; the centre of the first line's first pixel is (0, 0).
@@ -168,7 +168,7 @@ def point_names(roles: NDArray[np.object_]) -> list[str]:
 
 
 _APART = 0.01
-"""Least distance of two targets that images from orbit resolve, in metres."""
+"""Smallest distance of two targets that images from orbit resolve, in metres."""
 
 
 def duplicates(ids: NDArray[np.object_], places: Array) -> str:
@@ -194,7 +194,7 @@ _NAMED = 8
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return the first of some names, and how many more there are."""
+    """Return a text with the first of some names, and the number of further ones."""
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return ", ".join(names[:_NAMED]) + more
 

@@ -1,7 +1,8 @@
 """Orbit and attitude from files of any format: a table of readings in the ITRS, and the sensor of a DIMAP scene.
 
-Reading and interpretation are two steps: `PlatformReadings` holds the numbers of the files, `Conventions` their
-meaning, and `platform_table` makes the table of both, so that the same readings can be interpreted in another way.
+Reading the files and interpreting them are two steps: `PlatformReadings` holds the numbers of the files, `Conventions`
+their meaning, and `platform_table` makes the table from both, so that the same readings can be interpreted in another
+way.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
     Parameters
     ----------
     spec : PlatformFilesSpec
-        The files, and the conventions that they do not specify themselves.
+        Paths of the files, and the conventions that they do not specify themselves.
     folder : Path
         Folder to which relative paths refer.
 
@@ -250,7 +251,7 @@ def _one_segment(readings: PlatformReadings, conventions: Conventions) -> tuple[
 def _in_itrs(
     orbit: OrbitReadings, frame: str, time: np.ndarray, rotation: TableRotation | None
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return positions and velocities in the ITRS."""
+    """Return N positions, in metres, and velocities, in m/s, of an orbit in the ITRS, (N, 3) each."""
     if frame == "ITRS" or rotation is None:
         return orbit.position, orbit.velocity
     to_earth = to_itrs(frame, rotation)
@@ -263,7 +264,7 @@ def _in_itrs(
 
 
 def to_itrs(frame: str, rotation: TableRotation) -> Any:
-    """Return a function from seconds (N,) to rotations (N, 3, 3) from an inertial frame to the ITRS."""
+    """Return a function from N times, in seconds, to rotations (N, 3, 3) from an inertial frame to the ITRS."""
     if frame == "TEME":
         return rotation.teme_to_itrs
     if frame == "EME2000":
@@ -272,7 +273,7 @@ def to_itrs(frame: str, rotation: TableRotation) -> Any:
 
 
 def _body(attitude: AttitudeReadings, conventions: Conventions) -> np.ndarray:
-    """Return rotations (M, 3, 3) from the body to the attitude's frame."""
+    """Return rotations (M, 3, 3) from the body to the attitude's frame at M readings."""
     if attitude.quaternion is not None:
         q = attitude.quaternion if conventions.scalar == "last" else np.roll(attitude.quaternion, -1, axis=1)
         matrix = np.asarray(Rotation.from_quat(q).as_matrix())
@@ -305,7 +306,7 @@ def _stated(spec: Any, key: str, in_spec: str | None, in_file: str | None, what:
 def _earth(
     spec: PlatformFilesSpec, folder: Path, orbit: OrbitReadings, conventions: Conventions
 ) -> EarthOrientation | None:
-    """Return the Earth orientation of a table or of constant values; None where neither is given."""
+    """Return the Earth orientation from a table or from constant values; None where neither is given."""
     if spec.earth_orientation is not None:
         return earth_orientation.read_earth_orientation(folder / spec.earth_orientation)
     if spec.earth is not None:
@@ -474,4 +475,4 @@ def read_scene(path: str | Path, band: str | None = None, effects: LightEffects 
 
 
 _REMEDY = "ephemeris and attitudes from before the first line to after the last one"
-"""Text of the allowed ephemeris and attitude."""
+"""Text for error messages: the ephemeris and attitude that a file must contain."""

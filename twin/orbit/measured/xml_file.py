@@ -22,7 +22,7 @@ from twin.orbit.measured.clock import Readings
 
 
 def text_lines(path: str | Path, what: str) -> list[str]:
-    """Return the lines of a file without line ends; raises as `scenes.yaml.csv_table.table_text`."""
+    """Return the lines of a text file without line ends, or raise InputError if it cannot be read."""
     text = table_text(path, what)
     if "\0" in text:
         line = text[: text.index("\0")].count("\n") + 1
@@ -44,11 +44,11 @@ def numbers(file: str, cells: Sequence[Sequence[str]], lines: Sequence[int], hea
     file : str
         Path of the file, for messages.
     cells : sequence of sequence of str
-        The rows.
+        N rows of K texts.
     lines : sequence of int
-        Line numbers (N,) of the rows in the file.
+        Line numbers of the N rows in the file.
     heads : sequence of str
-        Names (K,) of the columns, for messages.
+        Names of the K columns, for messages.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def numbers(file: str, cells: Sequence[Sequence[str]], lines: Sequence[int], hea
 
 
 def readings(file: str, texts: Sequence[str], lines: Sequence[int]) -> Readings:
-    """Parse clock readings of N calendar texts on these lines; InputError if one is not a date and time."""
+    """Parse clock readings from N calendar texts on these lines; raise InputError if one is not a date and time."""
     try:
         return Readings.of_texts(texts)
     except Problem as problem:
@@ -89,7 +89,7 @@ def readings(file: str, texts: Sequence[str], lines: Sequence[int]) -> Readings:
 
 
 def require_increasing(file: str, clock: Readings, lines: Sequence[int]) -> None:
-    """Raise InputError unless each of the readings (N,) on these lines is later than the one before it."""
+    """Raise InputError unless each of N clock readings on these lines is later than the one before it."""
     back = (np.diff(clock.day) * 86400.0 + np.diff(clock.second)) <= 0.0
     for row in np.flatnonzero(back)[:1]:
         problem = "a time that is not later than the one before it"
@@ -143,11 +143,11 @@ class Element:
     text: str = ""
 
     def iter(self, tag: str) -> Iterator[Element]:
-        """Return the elements of this name among itself and all descendants, in the order of the file."""
+        """Return the elements of this name among the element itself and all descendants, in the order of the file."""
         return (element for element in self.below() if element.tag == tag)
 
     def below(self) -> Iterator[Element]:
-        """Return itself and all descendants, in the order of the file."""
+        """Return the element itself and all descendants, in the order of the file."""
         waiting = [self]
         while waiting:
             element = waiting.pop()
@@ -202,7 +202,7 @@ class Element:
         return element.text
 
     def floats(self, count: int | None = None) -> np.ndarray:
-        """Return the numbers of its text, (count,), separated by spaces or commas; any number if count is None.
+        """Return the numbers in the element's text, separated by spaces or commas: `count` of them, or any if None.
 
         Raises
         ------
@@ -225,14 +225,14 @@ class Element:
         Parameters
         ----------
         tags : str
-            Path.
+            Tags from this element to the one with the number.
         least : float
             Smallest allowed value.
         most : float
             Largest allowed value.
         unit : mapping of str to float or None
-            Factor by which the number is multiplied, by the value of its attribute ``unit``; the first where it has
-            none.
+            Value of the attribute ``unit`` -> factor by which the number is multiplied; the first factor where the
+            element has no such attribute.
 
         Raises
         ------
@@ -251,7 +251,13 @@ class Element:
         return value
 
     def whole(self, *tags: str, least: int = 1, most: int = 10_000_000) -> int:
-        """Return the whole number at a path below this one; raises as `number`."""
+        """Return the whole number at a path of tags below this element.
+
+        Raises
+        ------
+        InputError
+            The element is missing, is not a whole number or is out of bounds.
+        """
         element = self.one(*tags)
         value = element.number(least=least, most=most)
         if value != round(value):
@@ -259,7 +265,7 @@ class Element:
         return int(value)
 
     def wrong(self, problem: str, found: str | None = None, allowed: str | None = None) -> NoReturn:
-        """Raise InputError that names file, line and path."""
+        """Raise an InputError about this element that names file, line and path."""
         raise InputError(Issue(problem, self.file, self.line, self.path, found, allowed))
 
     def _wrong(self, problem: str, tags: tuple[str, ...], line: int, found: str, allowed: str) -> NoReturn:
@@ -333,7 +339,7 @@ def read_xml(path: str | Path, what: str) -> Element:
 
 
 def parsed_xml(text: str, file: str) -> Element:
-    """Parse the root element of a document's text; raises as `read_xml`.
+    """Parse the root element of a document's text; raise InputError if it is not XML or has entities.
 
     Parameters
     ----------
