@@ -20,14 +20,14 @@ OFFSET = ("along", "across", "down")
 DATUM = 1000.0
 """A-priori sigma, in metres, of a common shift of all control points where one is estimated."""
 _FLOOR = 1e-10
-"""Smallest eigenvalue of a camera's covariance relative to the largest: combinations that the prior fixes may still
-change by 1e-5 sigma.
+"""Lower bound of the eigenvalues of a camera's prior covariance, relative to the largest, which keeps it invertible:
+unknowns that the prior fixes may still change by 1e-5 sigma.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Process:
-    """Unknowns of one error model in one scope.
+    """Unknowns of one error model of attitude or station in one scope (a pass, a star tracker or the block).
 
     Attributes
     ----------
@@ -36,9 +36,9 @@ class Process:
     support : Support
         Unknowns of the error model.
     column : int
-        Column of the first unknown.
+        Index of the first unknown among all unknowns of the adjustment.
     kind : str
-        Quantity that it corrects, "attitude" or "station".
+        Quantity that the error model corrects, "attitude" or "station".
     """
 
     name: str
@@ -48,34 +48,34 @@ class Process:
 
     @property
     def columns(self) -> Indices:
-        """Columns of all unknowns."""
+        """Indices of the process's unknowns among all unknowns of the adjustment."""
         return np.arange(self.column, self.column + self.support.size)
 
 
 @dataclass(frozen=True, eq=False)
 class Assembly:
-    """Equations of a block.
+    """Observations, priors and order of the unknowns of a block that is to be adjusted.
 
     Attributes
     ----------
     block : Block
         Block that is adjusted.
     reduction : Reduction
-        Observations (packets) and priors of the block.
+        Observation equations and priors of the block.
     processes : mapping of (str, str) to tuple of Process
         Processes of each kind ("attitude", "station") and pass.
     all_processes : tuple of Process
         All processes, each once.
     changes : mapping of str to (4,) ndarray of int
-        Columns of the camera changes of each scene.
+        Indices of the unknowns d_alpha, d_beta, d_gamma, d_f of each scene's camera.
     units : mapping of str to (4,) ndarray
-        Scale of these unknowns, in radians and metres.
+        Unit in which each of these unknowns is expressed, in radians and metres.
     datum : (0,) or (3,) ndarray of int
-        Columns of a common shift of the control points.
+        Indices of the unknown common shift of the control points; empty if none is estimated.
     axes : mapping of str to (3, 3) ndarray
         Mean body axes of each pass as columns, ITRS.
     images : mapping of str to int
-        Index of each scene's packet set in the reduction.
+        Position of each scene's image observations in the reduction's list of observation sets.
     """
 
     block: Block
@@ -89,9 +89,9 @@ class Assembly:
     images: Mapping[str, int]
 
     def names(self) -> tuple[str, ...]:
-        """Return the (P,) names of the unknowns of a block whose error models are all constants.
+        """Return the names of all P unknowns of a block whose error models are all constants.
 
-        `network.simplified` makes such a block.
+        `network.simplified` returns such a block.
         """
         names = [""] * self.reduction.size
         for process in self.all_processes:
@@ -104,7 +104,7 @@ class Assembly:
         return tuple(name or "terrain height" for name in names)
 
     def corrections(self, of: str, times: Array) -> Corrections:
-        """Return the attitude and station corrections of a pass at times (n,)."""
+        """Return the attitude and station corrections of a pass at n times, as functions of the unknowns."""
         parts = []
         for kind in ("attitude", "station"):
             for process in self.processes[kind, of]:
@@ -195,14 +195,14 @@ def _times(block: Block) -> dict[str, Array]:
 
 
 def _scope_of(block: Block, term: Term, name: str) -> str:
-    """Return the name of the scope of an error model that a pass belongs to."""
+    """Return the name of the scope of an error model for a pass: the pass, its star tracker, or the block."""
     if term.scope == "pass":
         return name
     return "" if term.scope == "block" else next(p.tracker for p in block.passes if p.name == name)
 
 
 def _scopes(block: Block, term: Term, times: Mapping[str, Array]) -> dict[str, list[str]]:
-    """Return the passes of each scope of an error model."""
+    """Return the passes that share each realisation (scope) of an error model, by the name of the scope."""
     scopes: dict[str, list[str]] = {}
     for name in times:
         scopes.setdefault(_scope_of(block, term, name), []).append(name)
@@ -222,7 +222,7 @@ def _unit(count: int) -> sparse.csr_matrix:
 
 
 def _cameras(block: Block, priors: list[PriorGroup], size: int) -> tuple[dict[str, Indices], dict[str, Array], int]:
-    """Return columns and units of the camera changes in all passes with an image, and the number of unknowns."""
+    """Return indices and units of the unknown camera changes in passes with an image, and the number of unknowns."""
     order = [block_pass.name for block_pass in block.passes]
     changes: dict[str, Indices] = {}
     units: dict[str, Array] = {}
@@ -257,13 +257,13 @@ def _cameras(block: Block, priors: list[PriorGroup], size: int) -> tuple[dict[st
 
 
 def _alone(block: Block, camera: str) -> CameraPrior:
-    """Return the prior of one camera."""
+    """Return the prior of one camera's changes alone, marginal where cameras have a joint prior."""
     assert not isinstance(block.monitored, JointCameraPrior)
     return (block.monitored or block.known).get(camera, block.known[camera])
 
 
 def _known_group(group: str, columns: Indices, mean: Array, spread: Array, unit: Array) -> PriorGroup:
-    """Return the prior of unknowns with a covariance (k, k), scaled by units (k,)."""
+    """Return the prior of k unknowns from their mean and covariance (k, k), converted to the unknowns' units (k,)."""
     values, vectors = np.linalg.eigh(spread / unit / unit[:, None])
     # fixed combinations keep a small variance, so that the covariance has an inverse
     root = np.maximum(values, _FLOOR * max(float(values[-1]), 1.0))
@@ -292,7 +292,7 @@ def _angles(block: Block, scopes: Mapping[tuple[str, int, str], Process]) -> lis
 
 
 def _sets(assembly: Assembly, common: Indices) -> tuple[list[Packets], dict[str, int]]:
-    """Return the packet sets of a block and the set index of each scene."""
+    """Return the sets of observation equations of a block, and the index of each scene's set among them."""
     block = assembly.block
     sets: list[Packets] = []
     images: dict[str, int] = {}

@@ -20,7 +20,7 @@ SENSORS = ("ties", "control", "monitor", "laser", "terrain", "tracker_angles")
 
 @dataclass(frozen=True)
 class Term:
-    """Error model and its scope, the observations that share one realisation.
+    """Error model of the readings and its scope: which observations share one realisation of the error.
 
     The scope is a pass, all passes of one star tracker, or the whole block.
     """
@@ -88,14 +88,14 @@ class CameraPrior:
 
 @dataclass(frozen=True, eq=False)
 class JointCameraPrior:
-    """Joint prior of the changes of C cameras in T passes, which one body's motion may correlate.
+    """Joint prior of the changes of C cameras in T passes, correlated by motions of a common structure.
 
     Attributes
     ----------
     cameras : tuple of str
         Names of the cameras.
     mean : (C, T, 4) ndarray
-        Expected changes.
+        Expected changes d_alpha, d_beta, d_gamma (radians) and d_f (metres).
     covariance : (4 T C, 4 T C) ndarray
         Covariance of the changes, camera by camera and within each pass by pass.
     """
@@ -142,7 +142,7 @@ class Footprints:
     of : str
         Name of the pass.
     point : (n,) ndarray of int
-        Block points that the beam hits.
+        Indices, among the block's points, of the points that the beam hits.
     time : (n,) ndarray
         Times, in seconds.
     station : (n, 3) ndarray
@@ -181,7 +181,7 @@ class Terrain:
     Attributes
     ----------
     point : (n,) ndarray of int
-        Block points.
+        Indices, among the block's points, of the points on the terrain model.
     place : (n, 3) ndarray
         Positions on the model's surface, ITRS, in metres.
     normal : (n, 3) ndarray
@@ -243,13 +243,13 @@ class Block:
     station : tuple of Term
         Error models of the station readings, along the axes of the pass.
     image : float
-        Unit of the rays' `spread`, in metres.
+        Sigma of an image coordinate, in metres; the rays' covariances (`Rays.spread`) are in units of its square.
     points : Points
         Ground points.
     footprints : tuple of Footprints
         Footprints of a laser altimeter.
     terrain : Terrain or None
-        Terrain heights; None for none.
+        Terrain model that gives heights of points; None without one.
     angles : tuple of TrackerAngle
         Measured angles between star trackers.
     """
@@ -361,7 +361,7 @@ def make_block(
 ) -> Block:
     """Return a block of line-camera images whose attitude and station errors are constant in each pass.
 
-    Other laws of errors, laser footprints, terrain models and monitors are fields of `Block`.
+    Other error models, laser footprints, terrain models and monitors are added by setting the attributes of `Block`.
 
     Parameters
     ----------

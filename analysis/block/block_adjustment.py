@@ -70,7 +70,7 @@ def pruned(block: Block) -> Block:
 
 
 def check_places(block: Block) -> None:
-    """Raise BlockError, listing the points, if points lie far from where their images look.
+    """Raise BlockError, listing the points, if the direction to a point differs from that of its image.
 
     Raises
     ------
@@ -111,10 +111,10 @@ _DENSE = 2500
 _MOST = 20_000
 """Largest number of unknowns whose full covariance is kept in memory: 3.2 GB."""
 _COLUMNS = 256
-"""Number of columns that are mirrored at a time."""
+"""Number of columns of a symmetric inverse that are copied from its lower to its upper triangle at a time."""
 _SINGULAR = "block: the equations are singular; a sigma is too large for what observes it"
 _HUBER_ROUNDS = 4
-"""Number of first rounds with Huber weights."""
+"""Number of rounds of reweighting with Huber's weights before rejecting weights are used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,15 +128,15 @@ class BlockAdjustment:
     x : (P,) ndarray
         Unknowns, in units of their a-priori sigmas.
     covariance : (P, P) ndarray
-        Covariance of the unknowns, with the variance factors.
+        Covariance of the P unknowns, including the estimated variance factors.
     ground : (m, 3) ndarray
         Adjusted points, ITRS, in metres; NaN for undetermined points.
     spread : (m, 3, 3) ndarray
         Covariance of the points for known x, in m^2.
     weight : tuple of (n,) ndarray
-        Robust weights of each packet set.
+        Robust weights of the n measurements of each set of observations.
     standard : tuple of (n, d) ndarray
-        Standardised residuals of each packet set.
+        Standardised residuals of the n measurements, d equations each, of each set of observations.
     groups : mapping of str to GroupTest
         Test of each variance group.
     chi_square : float
@@ -210,7 +210,7 @@ class BlockAdjustment:
         return (self.x[where], self.covariance[np.ix_(where, where)]) if len(where) else None
 
     def rejected(self) -> tuple[tuple[str, str], ...]:
-        """Return point and set name of every packet that the robust weights rejected."""
+        """Return the point and the observation set (scene) of every measurement that the robust weights rejected."""
         ids = self.assembly.block.points.ids
         return tuple(
             (str(ids[p]), packets.name)
@@ -220,7 +220,7 @@ class BlockAdjustment:
 
 
 def accepted_block(adjustment: BlockAdjustment) -> Block:
-    """Return the block without rejected packets; rejected control points become tie points."""
+    """Return the block without rejected measurements; rejected control points become tie points."""
     block, sets = adjustment.assembly.block, adjustment.assembly.reduction.sets
     keep = {packets.name: weight > SETTLED for packets, weight in zip(sets, adjustment.weight, strict=True)}
     scenes = tuple(
@@ -260,7 +260,7 @@ class _Factor:
             raise BlockError(_SINGULAR) from error
 
     def solve(self, right: Array) -> Array:
-        """Return the solution for right-hand sides (P,) or (P, k)."""
+        """Solve the linear system of P equations for right-hand sides (P,) or (P, k)."""
         size = self.size if right.ndim == 1 else self.size[:, None]
         return np.asarray(size * self._solve(size * right))
 
@@ -383,7 +383,7 @@ class _AdjustmentState(State):
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    """Reduced equations, covariance (P, P) of the unknowns, checked packets and group tests of a solution."""
+    """Reduced equations, covariance of the P unknowns, standardised residuals and variance tests of a solution."""
 
     reduced: Reduced
     covariance: Array
@@ -393,13 +393,13 @@ class _Solution:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Constant part of an adjustment during reweighting."""
+    """Parts of an adjustment that stay constant during reweighting, with the functions that reweighting calls."""
 
     assembly: Assembly
     points: Reduction | SharedReduction
 
     def solve(self, state: _AdjustmentState, screening: bool) -> tuple[_AdjustmentState, _Solution]:
-        """Return the state and the solution; see `Reweighted`."""
+        """Iterate the adjustment at fixed weights and return the converged state and its solution."""
         reduction = self.assembly.reduction
         # weights that will change do not justify more than a step or two
         tolerance = 1e-2 if screening else _CONVERGED
@@ -410,17 +410,17 @@ class _Problem:
         return state, _Solution(reduced, covariance, checked, tests)
 
     def judged(self, state: _AdjustmentState, solution: _Solution) -> tuple[Array, ...]:
-        """Return the standardised residuals; see `Reweighted`."""
+        """Return the standardised residuals of every set of observations."""
         return solution.checked.standard
 
     def tests(self, state: _AdjustmentState, solution: _Solution) -> Mapping[str, GroupTest]:
-        """Return the variance group tests; see `Reweighted`."""
+        """Return the test of each variance group, by its name."""
         return solution.tests
 
     def weighed(
         self, state: _AdjustmentState, weight: tuple[Array, ...], factor: Mapping[str, float]
     ) -> _AdjustmentState:
-        """Return the state with zero weight for packets of points that fewer than three equations determine."""
+        """Return the state with new weights, zero at points that fewer than three equations would determine."""
         lost = _rows_left(self.assembly, weight) < 3
         sets = self.assembly.reduction.sets
         weights = tuple(np.where(lost[packets.point], 0.0, w) for packets, w in zip(sets, weight, strict=True))
@@ -455,19 +455,22 @@ def _solved(
 
 
 def _part_of(covariance: Array) -> Callable[[Indices], Array]:
-    """Return a function that extracts the covariance of selected unknowns."""
+    """Return a function from indices of k unknowns to their covariance (k, k)."""
     return lambda columns: np.asarray(covariance[np.ix_(columns, columns)])
 
 
 def _largest(steps: Array, spread: Array) -> float:
-    """Return the largest of steps (m, 3), in sigmas of covariances (m, 3, 3); points without covariance are ignored."""
+    """Return the largest coordinate step of m points, relative to their standard deviations.
+
+    Steps are (m, 3), covariances (m, 3, 3); points without a covariance are ignored.
+    """
     used = spread[:, 0, 0] > 0
     weighted_steps = np.linalg.solve(spread[used], steps[used][:, :, None])[:, :, 0]
     return float(np.sqrt(np.max(np.sum(steps[used] * weighted_steps, axis=1), initial=0.0)))
 
 
 def _rows_left(assembly: Assembly, weight: Sequence[Array]) -> NDArray[np.intp]:
-    """Return the (m,) number of equations with nonzero weight at each point."""
+    """Return the number of observation equations with nonzero weight at each of the m points."""
     rows = np.zeros(assembly.reduction.count, np.intp)
     for packets, w in zip(assembly.reduction.sets, weight, strict=True):
         np.add.at(rows, packets.point, packets.rows * (w > SETTLED))
@@ -537,8 +540,8 @@ class LawTest:
     kind : str
         Specified kind of process.
     excess : float
-        Sum of products of neighbours minus its expectation, in standard deviations; positive for positively correlated
-        neighbours.
+        Sum of the products of whitened unknowns that are neighbours in time, minus its expectation, in standard
+        deviations; positive if they are positively correlated.
     """
 
     group: str
@@ -547,7 +550,7 @@ class LawTest:
 
     @property
     def p_value(self) -> float:
-        """Two-sided p-value of the excess."""
+        """Two-sided p-value of `excess` under the hypothesis that the error model is right."""
         return float(2.0 * norm.sf(abs(self.excess)))
 
     def __str__(self) -> str:
@@ -559,7 +562,7 @@ class LawTest:
 
 
 def law_tests(adjustment: BlockAdjustment) -> tuple[LawTest, ...]:
-    """Test each time-dependent error model that the observations determine sufficiently."""
+    """Test error models for serial correlation, where the observations determine them sufficiently."""
     sums: dict[str, list[float]] = {}
     kinds: dict[str, str] = {}
     for process in adjustment.assembly.all_processes:
@@ -579,7 +582,11 @@ def law_tests(adjustment: BlockAdjustment) -> tuple[LawTest, ...]:
 
 
 def _neighbours(adjustment: BlockAdjustment, process: Process) -> tuple[float, float, float, float]:
-    """Return the sum of products of neighbours, its expectation and variance, and the redundancy of the process."""
+    """Return the statistic of the serial correlation test of a process, and the redundancy of the process.
+
+    The statistic is the sum of the products of whitened unknowns that are neighbours in time; its expectation and its
+    variance follow it.
+    """
     root = np.kron(process.support.whitened(), np.eye(3))
     whitened = root.T @ adjustment.x[process.columns]
     covariance = adjustment.covariance[np.ix_(process.columns, process.columns)]

@@ -104,7 +104,10 @@ class Law:
             raise BlockError(f"block: {self.group}: correlation time or period must be positive, found {self.time}")
 
     def spread(self, seconds: float) -> tuple[float, float, float]:
-        """Return the standard deviation (3) of the process `seconds` from the middle of its scope, in rad or m."""
+        """Return the standard deviation of the process about three axes, in rad or m, at a time from its middle.
+
+        `seconds` is the time from the middle of the scope (the pass, the passes of a star tracker, or the block).
+        """
         growth = {"rate": abs(seconds), "walk": float(np.sqrt(abs(seconds)))}.get(self.kind, 1.0)
         a, b, c = (s * growth for s in self.sigma)
         return a, b, c
@@ -189,11 +192,16 @@ class Support:
 
     @property
     def size(self) -> int:
-        """Number of unknowns: the three axes of each number, then the next number."""
+        """Number of unknowns of all three axes.
+
+        They are ordered by number (time), and by axis within a number.
+        """
         return 3 * len(self.numbers)
 
     def blend(self, times: Array) -> tuple[Indices, Array]:
-        """Return the indices (n, w) of one axis' unknowns that act at each time, and their coefficients (n, w).
+        """Return indices and coefficients of the unknowns of one axis on which the error at each of n times depends.
+
+        Both have shape (n, w), with w unknowns per time.
 
         At a time far from all observations all coefficients are zero.
         """
@@ -220,7 +228,7 @@ class Support:
         return position, np.where(self.numbers[position] == numbers, values, 0.0)
 
     def whitened(self) -> Array:
-        """Return a (k, k) dense root R of the precision, R R' = precision.
+        """Return a square root R of the precision of the k unknowns of one axis: R R' = precision, dense (k, k).
 
         The whitened unknowns R' z are independent and in order of time.
         """
@@ -228,7 +236,10 @@ class Support:
 
 
 def _chain(correlation: Array, variance: Array) -> sparse.csr_matrix:
-    """Return the (k, k) precision of z_n+1 = kept_n z_n + noise of variance gained_n, without that of the first."""
+    """Return the precision (k, k) of a first-order autoregression of k values, without the variance of the first.
+
+    Each value is `correlation` times the one before plus independent noise of the given `variance`.
+    """
     count = len(correlation) + 1
     steps = sparse.diags([-correlation, np.ones(count - 1)], [0, 1], shape=(count - 1, count))
     return sparse.csr_matrix(steps.T @ sparse.diags(1.0 / variance) @ steps)
@@ -255,13 +266,13 @@ class Part:
 
     @cached_property
     def sigma(self) -> Array:
-        """Standard deviations (3,) of the axes."""
+        """Standard deviations of the error model about (or along) the three axes, in radians (or metres)."""
         return np.array(self.support.law.sigma)
 
 
 @dataclass(frozen=True, eq=False)
 class Corrections:
-    """Attitude and station corrections at the times of n observations.
+    """Attitude and station corrections at the times of n observations, as linear functions of the unknowns.
 
     Attributes
     ----------
@@ -283,12 +294,12 @@ class Corrections:
 
     @cached_property
     def _blends(self) -> tuple[tuple[Indices, Array], ...]:
-        """Indices and coefficients of the unknowns of each part."""
+        """Indices and interpolation coefficients, at the n times, of the unknowns of each error model."""
         return tuple(one.support.blend(self.time) for one in self.parts)
 
     @property
     def columns(self) -> Indices:
-        """Columns (n, w) of the unknowns of all parts."""
+        """Indices (n, w), among all unknowns, of the w unknowns on which the corrections at each of n times depend."""
         parts = [np.zeros((len(self.time), 0), np.intp)]
         for part, (number, _) in zip(self.parts, self._blends, strict=True):
             columns = part.first + 3 * number[:, :, None] + np.arange(3)
@@ -296,7 +307,11 @@ class Corrections:
         return np.concatenate(parts, axis=1)
 
     def factors(self, turns: bool) -> tuple[Indices, Array]:
-        """Return columns (n, w, 3) and coefficients (n, w, 3), SI units, of the rotations or of the shifts."""
+        """Return indices and coefficients of the unknowns for the rotations or, if not `turns`, for the shifts.
+
+        Both are (n, w, 3) for n times, w unknowns and three axes; coefficients are in radians or metres per unit of the
+        unknown.
+        """
         count = len(self.time)
         columns, factors = [np.zeros((count, 0, 3), np.intp)], [np.zeros((count, 0, 3))]
         for part, (number, blend) in zip(self.parts, self._blends, strict=True):
@@ -306,7 +321,10 @@ class Corrections:
         return np.concatenate(columns, axis=1), np.concatenate(factors, axis=1)
 
     def at(self, x: Array) -> tuple[Array, Array]:
-        """Return rotations (n, 3), in rad, and shifts (n, 3) along the axes of the pass, in m, for unknowns (P,)."""
+        """Return the rotations, in rad, and the shifts along the axes of the pass, in m, for values of the unknowns.
+
+        Both are (n, 3) for n times; `x` holds all P unknowns.
+        """
         rotation, shift = np.zeros((2, len(self.time), 3))
         for part, (number, blend) in zip(self.parts, self._blends, strict=True):
             unknowns = part.sigma * x[part.first : part.first + part.support.size].reshape(-1, 3)
@@ -318,7 +336,7 @@ class Corrections:
         return rotation, shift
 
     def slopes(self, by_turn: Array, by_station: Array) -> Array:
-        """Return the (n, d, w) derivatives of d equations with respect to the unknowns.
+        """Return the derivatives of d equations per time with respect to the w unknowns that act then, (n, d, w).
 
         Parameters
         ----------
@@ -341,7 +359,9 @@ class Corrections:
 
 
 def rotated(rotation: Array, vector: Array) -> Array:
-    """Rotate vectors (n, 3), or d vectors each (n, d, 3), by rotation vectors (n, 3) of up to a degree.
+    """Rotate n vectors, or n groups of d vectors, by n small rotation vectors of up to a degree.
+
+    Vectors are (n, 3) or (n, d, 3), rotation vectors (n, 3) in radians.
 
     The series of the rotation is truncated after the third order; the error is 1e-9 of a degree.
     """
@@ -353,7 +373,7 @@ def rotated(rotation: Array, vector: Array) -> Array:
 
 
 def rotated_back(rotation: Array, vector: Array) -> Array:
-    """Rotate vectors by the inverse rotations; see `rotated`."""
+    """Rotate n vectors, or n groups of d vectors, by the inverses of n small rotation vectors, in radians."""
     return rotated(-rotation, vector)
 
 
@@ -367,10 +387,10 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def rotation_vector_derivatives(rotation: Array, by_turn: Array) -> Array:
-    """Return the (n, d, 3) derivatives with respect to rotation vectors (n, 3).
+    """Return derivatives with respect to n rotation vectors from those with respect to small added rotations.
 
-    Input are the derivatives with respect to a small rotation of the rotated body; the conversion is the right Jacobian
-    of the rotation, to second order.
+    Both have shape (n, d, 3), for d quantities. The input holds derivatives with respect to a further small rotation of
+    the rotated body; the conversion is the right Jacobian of the rotation, to second order.
     """
     # t (I - S / 2 + S^2 / 6), where t S = t x turn
     product = cross(by_turn, rotation[:, None])

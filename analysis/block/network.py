@@ -24,7 +24,7 @@ from analysis.orbit.calibration_parameters import echelon, shown
 from analysis.orbit.forward_intersection import level_axes
 
 _SHOWN = 0.25
-"""Smallest part of a combination, relative to its largest, that is listed."""
+"""Smallest coefficient of an unknown that is listed in a combination, relative to the largest coefficient."""
 _MOST_UNKNOWNS = 6
 """Largest number of unknowns of one combination that are listed."""
 _NOTHING = 1e-3
@@ -106,8 +106,8 @@ class OpenCombination:
     names : tuple of str
         Unknowns that take part.
     change : tuple of float
-        Change of each for one sigma of the combination as the observations allow, at most that of the prior, in metres
-        and radians.
+        Change of each unknown in `names` for a change of the combination by one standard deviation (the smaller of
+        those from the observations and from the prior), in metres and radians.
     sigma_ratio : float
         Ratio of the prior's sigma to that of the observations alone: 0 if they determine nothing, always below 1.
     """
@@ -124,9 +124,9 @@ class OpenCombination:
 def open_combinations(adjustment: BlockAdjustment) -> tuple[OpenCombination, ...]:
     """Return the combinations of a block's unknowns that only the priors determine, the least determined first.
 
-    Combinations that the observations determine to less than a thousandth, and the others, form one space each. In each
-    space, a combination has an unknown that is in no other one (`echelon`), because the eigenvectors of similar
-    eigenvalues are arbitrary.
+    Combinations that the observations do not determine (to less than a thousandth of the prior's weight) and those that
+    they determine weakly are two separate spaces. In each space, a combination has an unknown that is in no other one
+    (`echelon`), because the eigenvectors of similar eigenvalues are arbitrary.
     """
     plain = assembled(simplified(adjustment.assembly.block))
     ground = np.where(np.isfinite(adjustment.ground), adjustment.ground, adjustment.assembly.block.points.start)
@@ -151,7 +151,7 @@ def open_combinations(adjustment: BlockAdjustment) -> tuple[OpenCombination, ...
 
 
 def _sizes(block: Block, names: tuple[str, ...]) -> Array:
-    """Return the (P,) unit of each unknown of a simplified block, SI."""
+    """Return the unit in which each of the P unknowns of a simplified block is expressed, in radians or metres."""
     rotation, shift = block.attitude[0].law.sigma, block.station[0].law.sigma
     sizes: dict[str, float] = {}
     for block_pass in block.passes:
@@ -169,7 +169,7 @@ def _sizes(block: Block, names: tuple[str, ...]) -> Array:
 
 @dataclass(frozen=True)
 class DatumTest:
-    """Common shift of all control points, as seen by the readings and the other sensors.
+    """Common shift of all control points relative to the orbit, attitude and other measurements, with its test.
 
     Attributes
     ----------
@@ -178,7 +178,7 @@ class DatumTest:
     sigma : (3,) tuple of float
         Standard deviations of the shift, in metres.
     chi_square : float
-        Chi-square of the shift, with three degrees of freedom if there is none.
+        Chi-square of the shift, with three degrees of freedom under the hypothesis of no shift.
     """
 
     east: float
@@ -189,7 +189,7 @@ class DatumTest:
 
 
 def datum_test(adjustment: BlockAdjustment) -> DatumTest | None:
-    """Return the datum shift of an adjustment that estimated one, otherwise None."""
+    """Return the common shift of the control points with its test, or None if the adjustment did not estimate it."""
     shift = adjustment.datum()
     if shift is None:
         return None

@@ -34,7 +34,7 @@ from analysis.orbit.three_line_model import LineModel, Rays
 
 
 class Packets(Protocol):
-    """Set of packets of one kind."""
+    """Interface of a set of packets (the equations of one measurement of one ground point) of one kind."""
 
     @property
     def name(self) -> str:
@@ -54,10 +54,13 @@ class Packets(Protocol):
 
     @property
     def columns(self) -> Indices:
-        """Columns (n, w) of the unknowns that each packet depends on."""
+        """Indices (n, w), among all unknowns, of the w unknowns on which each of the n packets depends."""
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """Return whitened misclosures (k, d) and derivatives by the columns (k, d, w) and by the points (k, d, 3).
+        """Return whitened misclosures of packets, and their derivatives with respect to unknowns and points.
+
+        For k packets of d equations the misclosures are (k, d), the derivatives (k, d, w) with respect to the w
+        unknowns of `columns` and (k, d, 3) with respect to the ground points.
 
         Parameters
         ----------
@@ -70,7 +73,7 @@ class Packets(Protocol):
         """
 
     def taken(self, which: Indices, point: Indices) -> Packets:
-        """Return selected packets (k,) with new point indices (k,)."""
+        """Return selected packets (indices `which`) as a new set, with the given indices of their ground points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +93,7 @@ class LineImage:
     corrections : Corrections
         Corrections of the readings.
     change : (4,) ndarray of int
-        Columns of the camera's d_alpha, d_beta, d_gamma, d_f.
+        Indices, among all unknowns, of the camera's changes d_alpha, d_beta, d_gamma, d_f.
     unit : (4,) ndarray
         Unit of each of these unknowns, in radians and metres.
     group : str
@@ -114,12 +117,15 @@ class LineImage:
 
     @property
     def columns(self) -> Indices:
-        """Columns (n, w) of the unknowns of each packet."""
+        """Indices (n, w) of the w unknowns on which each of n image points depends.
+
+        They are the corrections of the readings and the camera changes.
+        """
         change = np.broadcast_to(self.change, (len(self.rays.point), len(self.change)))
         return np.concatenate([self.corrections.columns, change], axis=1)
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """Return whitened misclosures and derivatives; see `Packets.linearised`."""
+        """Return whitened collinearity misclosures of image points, with derivatives by unknowns and ground points."""
         rays, camera = self.rays, self.camera.drifted(self.unit * x[self.change])
         corrections = self.corrections.taken(which)
         rotation, shift = corrections.at(x)
@@ -141,7 +147,7 @@ class LineImage:
         )
 
     def taken(self, which: Indices, point: Indices) -> LineImage:
-        """Return selected packets; see `Packets.taken`."""
+        """Return selected image points as a new set, with the given indices of their ground points."""
         rays = replace(self.rays.taken(which), point=point)
         return replace(self, rays=rays, white=self.white[which], corrections=self.corrections.taken(which))
 
@@ -186,11 +192,11 @@ class Pointings:
 
     @property
     def columns(self) -> Indices:
-        """Columns (n, w) of the unknowns of each packet."""
+        """Indices (n, w) of the unknowns, corrections of the readings, on which each footprint depends."""
         return self.corrections.columns
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """Return whitened misclosures of the range and the beam's two components; see `Packets.linearised`."""
+        """Return whitened misclosures of range and beam direction, with derivatives by unknowns and ground points."""
         corrections = self.corrections.taken(which)
         rotation, shift = corrections.at(x)
         attitude = self.attitude[which]
@@ -218,7 +224,7 @@ class Pointings:
         return miss, corrections.slopes(by_turn, -by_point), by_point
 
     def taken(self, which: Indices, point: Indices) -> Pointings:
-        """Return selected packets; see `Packets.taken`."""
+        """Return selected footprints as a new set, with the given indices of their ground points."""
         rows = (self.station, self.attitude, self.aim, self.distance)
         station, attitude, aim, distance = (row[which] for row in rows)
         return replace(
@@ -234,7 +240,7 @@ class Pointings:
 
 @dataclass(frozen=True, eq=False)
 class FixedPoints:
-    """Surveyed coordinates of control points, with a shift that they may have in common.
+    """Surveyed coordinates of control points as observations, with a common shift as an optional unknown.
 
     Attributes
     ----------
@@ -247,7 +253,8 @@ class FixedPoints:
     white : (n, 3, 3) ndarray
         Matrices that whiten the misclosures.
     datum : (0,) or (3,) ndarray of int
-        Columns of the common excess of all surveyed coordinates along the ITRS axes, in metres.
+        Indices, among all unknowns, of the shift in metres along the ITRS axes that all surveyed coordinates have in
+        common; empty for none.
     group : str
         Variance group.
     """
@@ -262,18 +269,18 @@ class FixedPoints:
 
     @property
     def columns(self) -> Indices:
-        """Columns (n, 0) or (n, 3) of the unknowns of each packet."""
+        """Indices of the unknown common shift for each control point, (n, 3), or (n, 0) if it is not estimated."""
         return np.broadcast_to(self.datum, (len(self.point), len(self.datum)))
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """Return whitened misclosures and derivatives; see `Packets.linearised`."""
+        """Return whitened misclosures of surveyed coordinates, with derivatives by the common shift and the points."""
         white = self.white[which]
         shift = x[self.datum] if len(self.datum) else np.zeros(3)
         miss = np.einsum("nij,nj->ni", white, ground - self.given[which] + shift)
         return miss, white[:, :, : len(self.datum)], white
 
     def taken(self, which: Indices, point: Indices) -> FixedPoints:
-        """Return selected packets; see `Packets.taken`."""
+        """Return selected control points as a new set, with the given indices of their ground points."""
         return replace(self, point=point, given=self.given[which], white=self.white[which])
 
 
@@ -294,7 +301,7 @@ class Heights:
     sigma : (n,) ndarray
         Sigma of the independent height errors, in metres.
     common : (1,) ndarray of int
-        Column of the model's common error.
+        Index, among all unknowns, of the model's common height error.
     unit : float
         Unit of the common error, in metres.
     group : str
@@ -313,18 +320,18 @@ class Heights:
 
     @property
     def columns(self) -> Indices:
-        """Columns (n, 1) of the unknown of each packet."""
+        """Index (n, 1) of the unknown common height error for each point."""
         return np.broadcast_to(self.common, (len(self.point), 1))
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """Return whitened misclosures and derivatives; see `Packets.linearised`."""
+        """Return whitened misclosures of heights, with derivatives by the common height error and the points."""
         normal, sigma = self.normal[which], self.sigma[which]
         above = np.sum(normal * (ground - self.place[which]), axis=1) - self.unit * float(x[self.common[0]])
         by_x = np.broadcast_to(-self.unit / sigma[:, None, None], (len(which), 1, 1))
         return (above / sigma)[:, None], by_x, (normal / sigma[:, None])[:, None]
 
     def taken(self, which: Indices, point: Indices) -> Heights:
-        """Return selected packets; see `Packets.taken`."""
+        """Return selected terrain heights as a new set, with the given indices of their ground points."""
         place, normal, sigma = self.place[which], self.normal[which], self.sigma[which]
         return replace(self, point=point, place=place, normal=normal, sigma=sigma)
 
@@ -332,7 +339,9 @@ class Heights:
 _PIECE = 4_000
 """Number of points that are linearised at once."""
 _FLUSH = 4_000_000
-"""Number of entries of the reduced matrix that are collected before they are summed."""
+"""Number of contributions to entries of the reduced matrix that are collected before they are summed, which limits the
+memory.
+"""
 _WHOLE = 10_000
 """Number of unknowns up to which a dense matrix, of 0.8 GB, accumulates the sums."""
 _LOOSE = 1e-10
@@ -341,16 +350,16 @@ _LOOSE = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class PriorGroup:
-    """Prior of some unknowns: x[columns] - mean has zero mean and the given precision.
+    """Prior of k unknowns: mean and precision of a normal distribution.
 
     Attributes
     ----------
     group : str
         Variance group.
     columns : (k,) ndarray of int
-        Columns of the unknowns.
+        Indices of the k unknowns among all unknowns.
     precision : (k, k) csr_matrix
-        Precision matrix.
+        Precision matrix, the inverse of the covariance.
     mean : (k,) ndarray
         Expected values.
     """
@@ -363,18 +372,19 @@ class PriorGroup:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Points whose packets depend on the same unknowns.
+    """Ground points whose measurements depend on the same unknowns, so that they are eliminated together.
 
     Attributes
     ----------
     points : (n,) ndarray of int
         Indices of the points.
     members : tuple of (int, (n,) ndarray of int)
-        Packet sets and their packets, in order.
+        For each set of observations that sees the points: its index, and the index of each point's packet (measurement)
+        in it.
     columns : (W,) ndarray of int
-        Columns of all unknowns of a point's packets, each once.
+        Indices of the W unknowns on which the measurements of each point depend, each once.
     places : tuple of ndarray of int
-        Positions of each member's unknowns among the columns.
+        For each member, positions of its unknowns within `columns`.
     """
 
     points: Indices
@@ -385,16 +395,16 @@ class Bundle:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Weighted equations of a bundle.
+    """Linearised, weighted observation equations of a bundle of points.
 
     Attributes
     ----------
     bundle : Bundle
         Bundle of n points with D equations each.
     by_x : (n, D, W) ndarray
-        Derivatives with respect to the unknowns.
+        Derivatives of the D equations with respect to the W unknowns of the bundle.
     by_point : (n, D, 3) ndarray
-        Derivatives with respect to the point.
+        Derivatives of the D equations with respect to the point's coordinates, 1/m.
     miss : (n, D) ndarray
         Misclosures.
     """
@@ -407,12 +417,12 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Eliminated:
-    """Normal equations of packets at one state with the points eliminated.
+    """Normal equations of all measurements, linearised at one state, with the ground points eliminated.
 
     Attributes
     ----------
     data : (P, P) csc_matrix
-        Reduced normal matrix.
+        Normal matrix of the P unknowns after elimination of the m points.
     right : (P,) ndarray
         Gradient of half the sum of squares.
     spread : (m, 3, 3) ndarray
@@ -420,7 +430,7 @@ class Eliminated:
     start : (m, 3) ndarray
         Steps of the points for unchanged x, in metres.
     square : mapping of str to float
-        Weighted sum of squares of the packets of each group.
+        Weighted sum of squared residuals of each variance group.
     """
 
     data: sparse.csc_matrix
@@ -432,7 +442,9 @@ class Eliminated:
 
 @dataclass(frozen=True, eq=False)
 class Reduced(Eliminated):
-    """Normal equations of packets and priors; `right` includes the priors.
+    """Normal equations of measurements and priors with the ground points eliminated.
+
+    `right` includes the priors; `data` does not.
 
     Attributes
     ----------
@@ -445,16 +457,16 @@ class Reduced(Eliminated):
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """State of an iteration.
+    """State of the iteration: unknowns, points, robust weights and variance factors.
 
     Attributes
     ----------
     x : (P,) ndarray
-        Unknowns.
+        Values of the P unknowns, in units of their a-priori sigmas.
     ground : (m, 3) ndarray
-        Points, ITRS, in metres.
+        Coordinates of the m points, ITRS, in metres.
     weight : tuple of ndarray
-        Robust weights of the packets of each set.
+        Robust weights of the packets (measurements) of each set.
     factor : mapping of str to float
         Variance factor of each group.
     """
@@ -467,12 +479,12 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """Residuals of packets and their redundancy.
+    """Standardised residuals of all measurements, and the redundancy of the variance groups.
 
     Attributes
     ----------
     standard : tuple of (n, d) ndarray
-        Standardised residuals of each packet set.
+        Standardised residuals of the n packets (measurements), d equations each, of each set.
     taken : mapping of str to float
         Number of observations of each group minus its redundancy.
     """
@@ -483,12 +495,12 @@ class Checked:
 
 @dataclass(frozen=True, eq=False)
 class Reduction:
-    """Packets and priors of a block.
+    """Observation equations and priors of a block, which eliminates the ground points from them.
 
     Attributes
     ----------
     sets : sequence of Packets
-        Packet sets.
+        Sets of packets (the equations of one measurement of one ground point).
     priors : sequence of PriorGroup
         Priors, which must cover every unknown.
     size : int
@@ -504,7 +516,7 @@ class Reduction:
 
     @cached_property
     def bundles(self) -> tuple[Bundle, ...]:
-        """Bundles of all observed points."""
+        """Groups (bundles) of observed points whose measurements depend on the same unknowns."""
         points, codes, owners, places, tables = [], [], [], [], []
         first = 0
         for k, packets in enumerate(self.sets):
@@ -546,7 +558,7 @@ class Reduction:
 
     @cached_property
     def pieces(self) -> tuple[tuple[Bundle, ...], ...]:
-        """Bundles grouped into pieces of bounded memory."""
+        """Bundles grouped into parts of at most some thousand points, each of which is linearised at once."""
         pieces: list[list[Bundle]] = [[]]
         size = 0
         for bundle in self.bundles:
@@ -559,7 +571,7 @@ class Reduction:
 
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
-        """Mask (m,) of the observed points."""
+        """Mask (m,) of the points that have at least one measurement."""
         mask = np.zeros(self.count, bool)
         for packets in self.sets:
             mask[packets.point] = True
@@ -609,11 +621,11 @@ class Reduction:
                 yield rows
 
     def reduced(self, state: State) -> Reduced:
-        """Return the normal equations of packets and priors at a state."""
+        """Return the normal equations of measurements and priors at a state, with the ground points eliminated."""
         return self.with_priors(self.eliminated(state), state)
 
     def with_priors(self, equations: Eliminated, state: State) -> Reduced:
-        """Return the normal equations of packets with the priors added."""
+        """Return normal equations of measurements with the priors added to them."""
         gradient = np.zeros(self.size)
         for prior in self.priors:
             pull = prior.precision @ (state.x[prior.columns] - prior.mean) / state.factor.get(prior.group, 1.0)
@@ -624,7 +636,7 @@ class Reduction:
         )
 
     def eliminated(self, state: State) -> Eliminated:
-        """Return the normal equations of the packets at a state, with the points eliminated."""
+        """Return the normal equations of the measurements at a state, with the ground points eliminated."""
         data = _Collected(self.size)
         right = np.zeros(self.size)
         spread, start = np.zeros((self.count, 3, 3)), np.zeros((self.count, 3))
@@ -652,7 +664,7 @@ class Reduction:
         return Eliminated(data.total(), right, spread, start, square)
 
     def prior(self, factor: Mapping[str, float]) -> sparse.csc_matrix:
-        """Return the (P, P) a-priori precision of the unknowns, with the variance factors."""
+        """Return the a-priori precision (P, P) of the P unknowns, scaled by the variance factors of the groups."""
         rows, columns, values = [], [], []
         for prior in self.priors:
             precision = prior.precision.tocoo()
@@ -731,13 +743,13 @@ class Reduction:
         return Checked(tuple(standard), absorbed)
 
     def packets_at(self, points: Indices) -> tuple[Indices, ...]:
-        """Return, for each set, the indices of the packets that observe selected points (k,)."""
+        """Return, for each set of observations, the indices of the measurements of k selected points."""
         selected = np.zeros(self.count, bool)
         selected[points] = True
         return tuple(np.flatnonzero(selected[packets.point]) for packets in self.sets)
 
     def restricted(self, points: Indices) -> Reduction:
-        """Return the packets of selected points alone, renumbered in this order, without priors."""
+        """Return the measurements of k selected points alone, the points renumbered in this order, without priors."""
         number = np.full(self.count, -1)
         number[points] = np.arange(len(points))
         packets = self.packets_at(points)
@@ -748,7 +760,7 @@ class Reduction:
         return Reduction(sets, (), self.size, len(points))
 
     def state_of(self, points: Indices, state: State) -> State:
-        """Return the part of a state that a restricted reduction needs."""
+        """Return a state for the reduction restricted to selected points: their coordinates and weights."""
         weight = tuple(w[which] for w, which in zip(state.weight, self.packets_at(points), strict=True))
         return State(state.x, state.ground[points], weight, state.factor)
 
@@ -773,7 +785,7 @@ def _distinct(rows: Indices) -> tuple[Indices, Indices]:
 
 
 class _Collected:
-    """Sum of dense blocks at indices, in a dense matrix for few unknowns and otherwise in a sparse one."""
+    """Accumulator of small dense blocks of a large symmetric matrix, dense for few unknowns and otherwise sparse."""
 
     def __init__(self, size: int) -> None:
         self.size = size
@@ -783,7 +795,7 @@ class _Collected:
         self.entries = 0
 
     def add(self, columns: Indices, block: Array) -> None:
-        """Add a block (w, w) at its columns, which must be distinct."""
+        """Add a block (w, w) at the rows and columns of w unknowns, which must be distinct."""
         if self.whole is not None:
             self.whole[columns[:, None], columns] += block
             return
@@ -794,21 +806,21 @@ class _Collected:
             self.flush()
 
     def flush(self) -> None:
-        """Sum the collected blocks."""
+        """Add the collected blocks to the total matrix, which frees their memory."""
         if self.parts:
             row, column, value = (np.concatenate(v) for v in zip(*self.parts, strict=True))
             self.sum = self.sum + sparse.csc_matrix((value, (row, column)), shape=(self.size, self.size))
         self.parts, self.entries = [], 0
 
     def total(self) -> sparse.csc_matrix:
-        """Return the symmetrised sum."""
+        """Return the sum of all blocks as a symmetric matrix."""
         self.flush()
         total = self.sum if self.whole is None else sparse.csc_matrix(self.whole)
         return 0.5 * (total + total.T)
 
 
 class Pool(Protocol):
-    """Processes that hold objects and work on them."""
+    """Interface of worker processes that store objects and call functions on them."""
 
     @property
     def count(self) -> int:
@@ -823,7 +835,9 @@ class Pool(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SharedReduction:
-    """Packets of a block distributed over processes by points; the methods are those of `Reduction`.
+    """Observation equations of a block distributed over processes by ground points.
+
+    The methods are those of `Reduction`.
 
     Attributes
     ----------
@@ -832,13 +846,13 @@ class SharedReduction:
     pool : Pool
         Processes that hold the shares.
     points : tuple of (m_k,) ndarray of int
-        Points of each share.
+        Indices of the points of each share (the part of one process).
     packets : tuple of tuple of ndarray of int
-        Packets of each share, by set.
+        Indices of the measurements of each share, by set of observations.
     held : tuple
         Handle of each share.
     columns : tuple of (w_k,) ndarray of int
-        Columns of the unknowns that each share depends on.
+        Indices of the unknowns on which the measurements of each share depend.
     """
 
     whole: Reduction
@@ -879,7 +893,7 @@ class SharedReduction:
         ]
 
     def eliminated(self, state: State) -> Eliminated:
-        """Return the normal equations of the packets at a state, with the points eliminated."""
+        """Return the normal equations of the measurements at a state, with the ground points eliminated."""
         size, count = self.whole.size, self.whole.count
         data, right = sparse.csc_matrix((size, size)), np.zeros(size)
         spread, start = np.zeros((count, 3, 3)), np.zeros((count, 3))
@@ -893,7 +907,7 @@ class SharedReduction:
         return Eliminated(data, right, spread, start, square)
 
     def point_steps(self, at: State, equations: Eliminated, step: Array) -> Array:
-        """Return the (m, 3) steps of the points for a step of the unknowns; see `Reduction.point_steps`."""
+        """Return the steps of the m points, (m, 3), in metres, that correspond to a step of the unknowns."""
         steps = np.zeros((self.whole.count, 3))
         arguments = [
             (held, state, equations.spread[points], equations.start[points], step)
@@ -904,7 +918,7 @@ class SharedReduction:
         return steps
 
     def checked(self, at: State, spread: Array, covariance: Callable[[Indices], Array]) -> Checked:
-        """Return the standardised residuals and the redundancy of the observations; see `Reduction.checked`."""
+        """Return the standardised residuals and the redundancy of the observations, computed by all processes."""
         standard = [np.zeros((len(packets_of_set.point), packets_of_set.rows)) for packets_of_set in self.whole.sets]
         absorbed = dict.fromkeys((packets_of_set.group for packets_of_set in self.whole.sets), 0.0)
         arguments = [
@@ -920,25 +934,25 @@ class SharedReduction:
 
 
 def _columns(arguments: tuple[Reduction]) -> Indices:
-    """Return the columns of the unknowns that a share depends on."""
+    """Return the indices of the unknowns on which the measurements of a process's share depend."""
     return np.unique(np.concatenate([np.zeros(0, np.intp), *(bundle.columns for bundle in arguments[0].bundles)]))
 
 
 def _eliminated(arguments: tuple[Reduction, State]) -> Eliminated:
-    """Return the normal equations of a share."""
+    """Return the normal equations of a process's share of the measurements, with the points eliminated."""
     share, state = arguments
     return share.eliminated(state)
 
 
 def _stepped(arguments: tuple[Reduction, State, Array, Array, Array]) -> Array:
-    """Return the steps of a share's points."""
+    """Return the steps of the points of a process's share, (m, 3), in metres."""
     share, state, spread, start, step = arguments
     no_data = sparse.csc_matrix((0, 0))
     return share.point_steps(state, Eliminated(no_data, np.zeros(0), spread, start, {}), step)
 
 
 def _checked(arguments: tuple[Reduction, State, Array, Indices, Array]) -> Checked:
-    """Return the residual check of a share."""
+    """Return the standardised residuals and the redundancy of a process's share of the measurements."""
     share, state, spread, columns, covariance = arguments
 
     def part_of(selected: Indices) -> Array:

@@ -18,12 +18,12 @@ from analysis.statistics import robust_variance
 S = TypeVar("S", bound="Weighted")
 T = TypeVar("T")
 SETTLED = 1e-3
-"""Largest change of weights at convergence, and the largest weight of a packet that counts as rejected."""
+"""Largest change of robust weights at convergence, and largest weight of a rejected measurement."""
 _ROUNDS = 50
 """Largest number of rounds of reweighting."""
 _FREE_ROUNDS = 12
-"""Round from which on rejecting weights can only decrease: two packets of a point that are rejected alternately would
-otherwise never converge.
+"""Round from which on rejecting weights can only decrease: two measurements of a point that are rejected alternately
+would otherwise never converge.
 """
 Robust = Literal["huber", "igg"]
 # Limits of the standardised residual of an image point, which is Rayleigh-distributed for good points. Of these,
@@ -36,9 +36,9 @@ _LEAST_REDUNDANCY = 10.0
 group keeps its factor.
 """
 _UNCHECKED = 1e-6
-"""Redundancy below which a component of a packet counts as unchecked; it has no residual to standardise."""
+"""Redundancy below which an equation counts as unchecked by the others; its residual cannot be standardised."""
 _LARGEST_RATIO = 0.9
-"""Largest ratio of successive changes that is extrapolated."""
+"""Largest ratio of successive changes of a variance factor for which its limit is extrapolated."""
 LARGEST_FACTOR = 1e2
 """Largest variance factor; the smallest is its inverse. Weights cannot correct sigmas that are wrong by more than a
 factor of ten.
@@ -93,7 +93,7 @@ class UnsettledError(MeasurementError, ValueError):
 
 
 def standardised_packets(residual: Array, cofactors: Array, weight: Array, unit: float) -> Array:
-    """Return the (n, d) standardised residuals of n packets of d equations.
+    """Return the standardised residuals of n measurements (packets) of d equations each, (n, d).
 
     Let an observation of variance C have the weight w, and G be the variance of the adjusted observation. Without it
     the others would predict it with H = G / (1 - w G / C), and the residual is (1 - w G / C) times observed minus
@@ -123,7 +123,7 @@ def standardised_packets(residual: Array, cofactors: Array, weight: Array, unit:
 
 
 def robust_weights(standard: Array, kind: Robust | Literal["accept"]) -> Array:
-    """Return the (n,) weights of packets from their standardised residuals (n, d); d = 2 for image points.
+    """Return the robust weights of n measurements from their standardised residuals (n, d); d = 2 for image points.
 
     The weights are Huber's, IGG III, which decrease to zero, or "accept": 1 up to that zero and 0 beyond.
 
@@ -146,12 +146,12 @@ def robust_weights(standard: Array, kind: Robust | Literal["accept"]) -> Array:
 
 
 def limits(rows: int) -> tuple[float, float]:
-    """Return the lengths of d standardised residuals from which on a packet is down-weighted, and rejected."""
+    """Return the norms of d standardised residuals above which a measurement is down-weighted and rejected."""
     return float(np.sqrt(chi2.isf(0.05, rows))), float(np.sqrt(chi2.isf(1e-4, rows)))
 
 
 def bounded(factor: float) -> float:
-    """Return a variance factor limited to its bounds."""
+    """Return a variance factor limited to the range from 1 / `LARGEST_FACTOR` to `LARGEST_FACTOR`."""
     return float(np.clip(factor, 1.0 / LARGEST_FACTOR, LARGEST_FACTOR))
 
 
@@ -171,7 +171,7 @@ def extrapolated(factors: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Rule:
-    """Rule by which weights of packets and variance factors of groups follow from residuals.
+    """Settings of the reweighting: how weights of measurements and variance factors of groups follow from residuals.
 
     Attributes
     ----------
@@ -196,11 +196,11 @@ class Rule:
 
 
 class Weighted(Protocol):
-    """State with weights."""
+    """Interface of an adjustment's state that holds robust weights and variance factors."""
 
     @property
     def weight(self) -> tuple[Array, ...]:
-        """Robust weights of each packet set, 0 to 1."""
+        """Robust weights of the measurements of each set of observations, 0 to 1."""
 
     @property
     def factor(self) -> Mapping[str, float]:
@@ -208,13 +208,13 @@ class Weighted(Protocol):
 
 
 class Reweighted(Protocol[S, T]):
-    """Interface of an adjustment to its reweighting, with states S and solutions T."""
+    """Interface of an adjustment that `settled` reweights, with states of type S and solutions of type T."""
 
     def solve(self, at: S, screening: bool) -> tuple[S, T]:
         """Return state and solution for the weights of a state; a rough solution suffices while screening."""
 
     def judged(self, at: S, found: T) -> tuple[Array, ...]:
-        """Return the standardised residuals of each packet set."""
+        """Return the standardised residuals of each set of observations."""
 
     def tests(self, at: S, found: T) -> Mapping[str, GroupTest]:
         """Return the test of each variance group."""
@@ -227,7 +227,7 @@ class Reweighted(Protocol[S, T]):
         at : S
             Current state.
         weight : tuple of (n,) ndarray
-            Robust weights of each packet set, 0 to 1.
+            Robust weights of the n measurements of each set of observations, 0 to 1.
         factor : mapping of str to float
             Variance factor of each group.
         """

@@ -52,10 +52,10 @@ def checked_positions(positions: ArrayLike, count: int | None, what: str) -> Arr
 
     Parameters
     ----------
-    places : (n, 2) array_like
+    positions : (n, 2) array_like
         Positions, in pixels.
     count : int or None
-        Required number n; None for any.
+        Required number n of positions; None for any number.
     what : str
         Name of the positions, for the message.
 
@@ -96,7 +96,7 @@ def checked_templates(templates: ArrayLike, what: str) -> Array:
 
 
 class Reason(IntEnum):
-    """Code of a verdict; `text` describes it."""
+    """Verdict on a match: accepted, or the reason why it is not; `text` describes it."""
 
     ACCEPTED = 0
     TEMPLATE = 1
@@ -145,7 +145,10 @@ Part = TypeVar("Part")
 
 
 def concatenated(parts: Sequence[Part]) -> Part:
-    """Concatenate dataclasses of arrays (n, ...) or of such dataclasses; there must be at least one."""
+    """Concatenate the results of several groups of points: dataclasses whose arrays have the points as first axis.
+
+    Dataclasses may contain such dataclasses; there must be at least one.
+    """
     columns: dict[str, Any] = {}
     for field in fields(parts[0]):  # type: ignore[arg-type]
         column = [getattr(part, field.name) for part in parts]
@@ -247,7 +250,8 @@ _WINDOW = 3.0
 # Number of rows that are processed together, and the rim that the strength of a pixel depends on.
 _STRIP, _HALO = 512, 18
 _LEAST = 2.0
-"""Smallest strength of a point relative to that of noise alone."""
+"""Smallest strength (smaller eigenvalue of the structure tensor) of a selected point, relative to that of noise alone.
+"""
 
 
 def distinct_points(image: ArrayLike, count: int, *, spacing: float, border: int) -> Array:
@@ -260,7 +264,7 @@ def distinct_points(image: ArrayLike, count: int, *, spacing: float, border: int
     count : int
         Largest number of points.
     spacing : float
-        Least distance of two points along rows or columns, in pixels.
+        Smallest distance of two points along rows or columns, in pixels.
     border : int
         Number of rows and columns at each side without points; at least half of a window and the search radius.
 
@@ -329,7 +333,10 @@ def distinct_points(image: ArrayLike, count: int, *, spacing: float, border: int
 
 
 def _strength(rows: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Return the strength of each pixel, 0 where it does not exceed noise or where pixels are missing."""
+    """Return the smaller eigenvalue of the structure tensor at each pixel, 0 where noise explains it.
+
+    It is 0 near missing pixels, too.
+    """
     grey = rows.astype(np.float64)
     missing = ~np.isfinite(grey)
     if missing.all():
@@ -353,7 +360,7 @@ def _strength(rows: NDArray[np.generic]) -> NDArray[np.float32]:
 
 
 def _apart(points: NDArray[np.intp], reach: int) -> NDArray[np.intp]:
-    """Return the positions without the later of two within reach of each other: equal neighbours are both maxima."""
+    """Return the points without those closer than `reach` pixels, along rows and columns, to an earlier one."""
     keep = np.zeros(len(points), bool)
     # maxima are at least reach apart unless they are equal, so few share a cell of this size
     side = reach + 1
@@ -371,14 +378,16 @@ def _apart(points: NDArray[np.intp], reach: int) -> NDArray[np.intp]:
 LARGEST_REACH = 200
 """Largest half width of a search window, in pixels."""
 _LOBE = 3
-"""Half width of the main lobe, in pixels; peaks beyond it count as others."""
+"""Half width of the main lobe of the correlation around its best peak, in pixels; peaks beyond it are separate
+candidates.
+"""
 _EVEN = 1e-6
 """Relative standard deviation below which a patch counts as uniform, the resolution of float32."""
 
 
 @dataclass(frozen=True, eq=False)
 class Peaks:
-    """Best positions of a search.
+    """Best positions of n templates in an image, found by normalised cross-correlation.
 
     Attributes
     ----------
@@ -412,7 +421,7 @@ def search(image: ArrayLike, templates: ArrayLike, predicted: ArrayLike, reach: 
     predicted : (n, 2) array_like
         Expected row and column of their middles; the search starts from the nearest pixel.
     reach : int
-        Rows and columns to each side, in pixels.
+        Half width of the search window along rows and columns, in pixels.
 
     Raises
     ------

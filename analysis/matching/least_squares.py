@@ -84,9 +84,11 @@ it is undetermined.
 _OPEN = 1e-11
 """Eigenvalue, relative to the largest, below which a combination of unknowns is undetermined."""
 _QUANTILE = 0.9
-"""Quantile of the points' noise ratios that all points use."""
+"""Quantile, over the points, of the ratio of template noise to residual variance; its value is used for all points."""
 _HELD = 0.3
-"""Share of the curvature from which the noise's energy counts as determining a position."""
+"""Fraction of the curvature of the sum of squares above which template noise, not texture, counts as determining a
+position.
+"""
 _ONE_WAY = 0.1
 """Curvature, relative to the best direction, below which structure runs along one direction: sharp across it, it
 prevents the choice of a low-pass, which otherwise leaves little of the noise's energy.
@@ -105,13 +107,15 @@ class TemplateNoise:
     Attributes
     ----------
     inverse : (n, q, q) ndarray
-        Inverse curvature H^-1.
+        Inverse of the curvature (second derivatives) of the sum of squares with respect to the unknowns.
     lean : (n, 2) ndarray
-        Bias in row and column for a noise ratio of 1, in pixels.
+        Bias of the position in row and column for a ratio of template noise to residual variance of 1, in pixels.
     energy : (n,) ndarray
-        Largest curvature of the noise's energy along an axis, for a noise ratio of 1.
+        Largest curvature, with respect to the position along an axis, of the energy of the interpolated template noise,
+        for a noise ratio of 1.
     share : (n,) ndarray
-        Lower bound of the noise ratio s_t^2 / s^2 from the low-pass.
+        Lower bound of the ratio of template noise to residual variance (both in the image), from the effect of the
+        low-pass.
     """
 
     inverse: Array
@@ -120,7 +124,10 @@ class TemplateNoise:
     share: Array
 
     def covariance(self, good: NDArray[np.bool_]) -> Array:
-        """Return the (n, 2, 2) covariance of bias and locking, in px^2, with the noise ratio of points good (n,)."""
+        """Return the covariance (n, 2, 2), in px^2, that allows for bias and locking by template noise.
+
+        The ratio of template noise to residuals is estimated from the points selected by the mask `good` (n,).
+        """
         noise_ratios = self.share[good & np.isfinite(self.share)]
         if not len(noise_ratios):
             return np.zeros_like(self.inverse[:, :2, :2])
@@ -129,7 +136,7 @@ class TemplateNoise:
         return np.asarray(lean[:, :, None] * lean[:, None] + lock @ np.swapaxes(lock, 1, 2))
 
     def _lock(self, share: float) -> Array:
-        """Return the (n, 2, 2) displacement of row and column by the noise's energy along each axis, in pixels."""
+        """Return the displacement of row and column by template noise along each axis, (n, 2, 2), in pixels."""
         energy = share * self.energy[:, None, None] * np.eye(2)
         determined = np.isfinite(self.inverse[:, :2, :2]).all(axis=(1, 2)) & np.isfinite(self.energy)
         out = np.full_like(self.inverse[:, :2, :2], np.nan)
@@ -173,9 +180,10 @@ def template_noise(
     linear : (n, 2) or (n, 4) ndarray
         Offset, gain and, optionally, sharpness along rows and columns.
     smoothing : (n,) ndarray
-        RMS radius of the low-pass, in pixels.
+        RMS radius of the low-pass of each of the n templates, in pixels.
     design : (n, q, p) ndarray
-        Derivatives with respect to position, optionally affine matrix, and linear unknowns.
+        Derivatives of the p grey values of the model with respect to the q unknowns: position, affine matrix
+        (optional), and linear unknowns.
     residual : (n, p) ndarray
         Residuals, in DN; NaN where there is no fit.
     lowered : tuple of (n,) ndarray
@@ -214,10 +222,10 @@ def template_noise(
 def _bend(
     stack: SplineStack, which: NDArray[np.intp], position: Array, linear: Array, by_geometry: Array, residual: Array
 ) -> Array:
-    """Return the (n, q, q) sum of residuals times second derivatives of the model.
+    """Return the sum over pixels of residuals times second derivatives with respect to the q unknowns, (n, q, q).
 
-    Second derivatives of the position in the template by the unknowns multiply sums of residuals times slopes, which
-    are 0.
+    Second derivatives of the position in the template with respect to the unknowns multiply sums of residuals times
+    slopes, which are 0.
     """
     geometry, unknowns = by_geometry.shape[2], by_geometry.shape[2] + linear.shape[1]
     sharp = linear.shape[1] > 2
@@ -240,7 +248,10 @@ def _bend(
 
 
 def _inverse(square: Array, curvature: Array) -> Array:
-    """Return the (n, q, q) inverse curvature in the range of the normal matrix; NaN if too little curvature is left."""
+    """Return the inverse (n, q, q) of the curvature of the sum of squares; NaN where too little curvature is left.
+
+    It is inverted within the range of the normal matrix.
+    """
     scale = 1.0 / np.sqrt(np.einsum("nqq->nq", square))
     scales = scale[:, :, None] * scale[:, None]
     value, vector = np.linalg.eigh(square * scales)
@@ -257,7 +268,10 @@ def _inverse(square: Array, curvature: Array) -> Array:
 
 
 def _force(position: Array, linear: Array, smoothing: Array, by_geometry: Array) -> Array:
-    """Return the (n, q) expectation of F by white template noise that has unit variance after the gain."""
+    """Return the expected gradient of the sum of squares due to white template noise of unit variance, (n, q).
+
+    The variance is that in the image, after the gain; q is the number of unknowns.
+    """
     mean, wave = np.moveaxis(np.array([_noise_gain(float(radius)) for radius in smoothing]), 1, 0)
     phase = 2.0 * np.pi * position
     # (3, n, 2, p): energy of the value, of value by second derivative, of the second derivative, along rows and columns
@@ -277,9 +291,9 @@ def _force(position: Array, linear: Array, smoothing: Array, by_geometry: Array)
 
 
 def _products(row: Array, column: Array) -> Array:
-    """Return the (n, 3, 3, p) expected products of noise in value and second derivatives along rows and columns.
+    """Return expected products of interpolated noise between its value and its two second derivatives, (n, 3, 3, p).
 
-    Input are the products along either axis (3, n, p).
+    The inputs are the products along rows and along columns, each (3, n, p), for n fits of p pixels.
     """
     value, across, second_row = (row[k] * column[0] for k in range(3))
     second_column, both, second_both = row[0] * column[1], row[1] * column[1], row[0] * column[2]
@@ -288,7 +302,7 @@ def _products(row: Array, column: Array) -> Array:
 
 
 def noise_energy(factors: Array, smoothing: float) -> Array:
-    """Return the (n,) variance of a model pixel for white template noise, over all phases.
+    """Return the variance of a pixel of the model due to white template noise, mean over all sub-pixel phases, (n,).
 
     The noise has unit variance after the gain.
 
@@ -308,9 +322,9 @@ def noise_energy(factors: Array, smoothing: float) -> Array:
 
 @lru_cache(maxsize=32)
 def _noise_gain(smoothing: float) -> Array:
-    """Return the (2, 3) energy that white noise keeps along one axis after low-pass and interpolation.
+    """Return the fraction of white noise's energy that low-pass and interpolation leave along one axis, (2, 3).
 
-    The noise has unit variance.
+    The noise has unit variance before.
 
     The columns are those of the value, of value times second derivative (px^-2) and of the second derivative (px^-4);
     the rows are the mean over the phase of a pixel and the amplitude of its cosine, which is largest on whole pixels.
@@ -342,7 +356,9 @@ _RIDGE = 1e-11
 _SMOOTHINGS = (0.0, 0.35, 0.7, 1.1, 1.7, 2.6)
 """RMS radii of the Gaussians that may smooth a template, in pixels; those up to a ninth of the window are used."""
 _CHANCE = 4.0
-"""Chi-square of one unknown, exceeded by chance in 5 %."""
+"""Increase of chi-square, with one degree of freedom, that chance exceeds in 5 % of cases; a low-pass that increases
+the residuals by less is accepted.
+"""
 _INTERPOLATION = 0.004
 """Standard deviation of a position from interpolating noise-free detail up to 0.45 cycles per pixel, in pixels."""
 
@@ -356,7 +372,7 @@ class Fits:
     position : (n, 2) ndarray
         Row and column of the templates' middles in the image.
     affine : (n, 2, 2) ndarray
-        Affine matrix A: template pixels by image pixels.
+        Affine matrix A, which maps displacements in image pixels to template pixels.
     gain : (n,) ndarray
         Gain of the image against the template.
     correlation : (n,) ndarray
@@ -369,7 +385,7 @@ class Fits:
     smoothing : (n,) ndarray
         RMS radius of the Gaussian that smoothed the template, in pixels.
     iterations : (n,) ndarray of int
-        Number of steps.
+        Number of Gauss-Newton steps.
     reason : (n,) ndarray of int8
         Codes of `Reason`: ACCEPTED, TEMPLATE, OUTSIDE, IMAGE, SATURATED, FLAT, DIVERGED, MOVED, DISTORTED.
     spread : ResidualCorrelation
@@ -419,7 +435,7 @@ class Fits:
         return noise * hidden[:, None, None] + lean + _INTERPOLATION**2 * np.eye(2), relief
 
     def steps(self, good: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
-        """Return the (n,) p-value of the halves' difference without a step of displacement, and the power of that test.
+        """Return p-value and power of the test for a step of displacement between halves of a window, each (n,).
 
         See `WindowHalves.judged`.
         """
@@ -431,7 +447,10 @@ class Fits:
         return self.halves.judged(self.spread.variance * coloured * hidden, typical)
 
     def _parts(self, good: NDArray[np.bool_] | None) -> tuple[Array, Array, Array, float]:
-        """Return the covariance of visible noise, the factor of hidden noise, and tau^2 of each and a typical point."""
+        """Return covariance by residual noise, factor for noise hidden by smoothing, and variances of relief.
+
+        The variances of relief, in px^2, are that of each point and that of a typical point.
+        """
         common = self.reason == Reason.ACCEPTED if good is None else good
         noise = self.spread.covariance(common)
         return noise, self._hidden(), *self.relief.square(self.spread.variance, self._coloured(noise), common)
@@ -442,7 +461,7 @@ class Fits:
             return np.asarray(np.trace(noise, axis1=1, axis2=2) / np.trace(self.spread.plain, axis1=1, axis2=2))
 
     def _hidden(self) -> Array:
-        """Return the (n,) factor by which noise at the slopes exceeds that in the residuals; NaN if unknown.
+        """Return the factor (n,) by which noise where grey values change exceeds that in residuals; NaN if unknown.
 
         A smoothed template has one independent value per 4 pi rms^2 pixels. Its noise is in these alone and loses one
         to each unknown, while that of the image is white. With equal noise in both, and where half of the amplitude
@@ -494,7 +513,7 @@ def least_squares(
 
 
 def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: MatchOptions) -> Fits:
-    """Fit some points together."""
+    """Fit a group of points at once; arguments are those of `least_squares`."""
     count, half = len(templates), templates.shape[1] // 2
     reach = half - options.margin
     row, column = (g.ravel().astype(np.float64) for g in np.mgrid[-reach : reach + 1, -reach : reach + 1])
@@ -607,8 +626,8 @@ def _best_smoothing(
 ) -> tuple[Index, tuple[Array, Array]]:
     """Return the (n,) index of each point's strongest acceptable low-pass and the decreases of residuals and noise.
 
-    A low-pass is acceptable if templates predict the image as well as with the best one after one linear step. The
-    decreases against the first low-pass are those of `template_noise`. Points not selected get 0.
+    A low-pass is acceptable if, after one linear step, the template predicts the image as well as with the best
+    low-pass. The decreases against the first low-pass are those of `template_noise`. Points not selected get 0.
     """
     best, lowered = np.zeros(len(grey), np.intp), (np.zeros(len(grey)), np.zeros(len(grey)))
     if not selected.size:
@@ -645,7 +664,10 @@ def _step(
     iteration: int,
     options: MatchOptions,
 ) -> tuple[Array, Array, Array]:
-    """Return the Gauss-Newton step with the new linear unknowns, the design (m, q, p) and the residuals (m, p)."""
+    """Return a Gauss-Newton step, new linear unknowns, derivatives (m, q, p) and residuals (m, p) of m fits.
+
+    q is the number of unknowns, p that of pixels; linear unknowns are offset, gain and sharpness.
+    """
     offset = np.stack([window[0] - shift[:, :1], window[1] - shift[:, 1:]], axis=1)
     u = affine @ offset + stack.size // 2
     # third derivatives are needed only with sharpness terms

@@ -586,9 +586,8 @@ class Combination:
         Change of each of the k unknowns in `names`, in metres and radians, scaled so that the largest image motion
         caused by any single one is 1 mm.
     strength : float
-        Standard deviation that the combination would have if the ground points were known, divided by its standard
-        deviation with unknown ground points: 0 for an undetermined combination, 1 for one that the elimination of the
-        points does not weaken.
+        Standard deviation of the combination if each unknown is determined separately, with all others and the ground
+        points known, divided by its standard deviation in the adjustment; 0 for an undetermined combination.
     sigma : float
         Standard deviation of the combination from the data, as the image motion of the unknown that moves the image
         most, in metres.
