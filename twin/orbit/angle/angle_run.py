@@ -306,7 +306,7 @@ class SimulatedAngleRun(AngleRun):
 
     @property
     def difference(self) -> np.ndarray:
-        """Angles from planes (total least squares) minus angles from the resection, (m,) for m angles, in radians.
+        """Angles from planes (total least squares) minus those from the resection, (m,) for m angles, radians.
 
         Dihedral angles are compared; where angles are `narrow`, the angles along the track are compared instead.
         """

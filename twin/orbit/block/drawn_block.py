@@ -165,7 +165,7 @@ def _slow(steps: np.ndarray, law: Law) -> np.ndarray:
 def _courses(
     spec: OrbitAdjustSpec, laws: ReadingLawsSpec, begin: Mapping[str, float], seed: np.random.SeedSequence
 ) -> tuple[dict[str, list[Course]], dict[str, list[Course]], dict[str, np.ndarray]]:
-    """Draw the errors of attitude and station over time for each pass, and the constant rotation of each star tracker."""
+    """Draw each pass's errors of attitude and station over time, and the constant rotation of each star tracker."""
     attitudes: dict[str, list[Course]] = {name: [] for name in begin}
     stations: dict[str, list[Course]] = {name: [] for name in begin}
     constants: dict[str, np.ndarray] = {}
@@ -203,8 +203,9 @@ def _summed(parts: list[Course]) -> Course:
 def _cameras(
     spec: OrbitAdjustSpec, days: np.ndarray, random: np.random.Generator, recorded: model.JointCameraPrior | None
 ) -> tuple[dict[str, np.ndarray], dict[str, model.CameraPrior], Monitored | None]:
-    """Draw the true changes (T, 4) of each line in T passes; return them with the priors before and after monitor
-    readings.
+    """Draw each line's true changes (T, 4) in T passes.
+
+    They are returned with the priors of the changes before and after monitor readings.
     """
     if recorded is not None:
         drawn = covariance_root(recorded.covariance) @ random.standard_normal(len(recorded.covariance))
@@ -315,7 +316,10 @@ Seen = Mapping[str, tuple[np.ndarray, np.ndarray]]
 def _points(
     setup: AdjustSetup, sensors: Mapping[str, Sensor], earth: Earth, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, Seen]:
-    """Draw m points (m, 3) with their roles; return them with line and pixel by scene, NaN where a point is not seen."""
+    """Draw m points (m, 3), ITRS, in metres, with their roles.
+
+    They are returned with line and pixel by scene, NaN where a point is not seen.
+    """
     spec = setup.test
     area, wanted = spec.area, spec.points.control + spec.points.tie + spec.points.check
     count = int(np.ceil(_SPARE * wanted))

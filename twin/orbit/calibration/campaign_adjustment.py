@@ -54,9 +54,7 @@ def gauge_of(campaign: Campaign) -> Gauge:
 
 
 def _rates_of(campaign: Campaign) -> np.ndarray:
-    """Return the (3,) standard deviations of the attitude's rate in each pass, specified in the file and detected, in
-    rad/s.
-    """
+    """Return the (3,) standard deviations of each pass's attitude rate, specified and detected, in rad/s."""
     prior = campaign.spec.errors.star_tracker.drift if campaign.spec.errors.switched_on else None
     detected = (0.0, 0.0, 0.0) if campaign.drifts is None else campaign.drifts.rate
     return np.asarray(np.hypot(prior or (0.0, 0.0, 0.0), detected))

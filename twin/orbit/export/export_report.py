@@ -234,7 +234,7 @@ FOLDER = "models"
 
 
 def _names(line: ExportedLine) -> dict[str, str]:
-    """Return the paths in the run folder of a line's files: support data (ISD), and image and RPC where there are any."""
+    """Return the paths in the run folder of a line's support data (ISD), and of its image and RPC if there are any."""
     stem = f"{FOLDER}/{line.window.name}"
     names = {"isd": f"{stem}.json"}
     if line.window.frame is not None:

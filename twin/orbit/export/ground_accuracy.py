@@ -327,7 +327,7 @@ def _places(sensor: Sensor, line: Array, pixel: Array, height: float) -> tuple[A
 
 
 def _propagate(rows: Array, covariance: ArrayLike) -> Array:
-    """Return (N, K, K) covariances of K quantities at N points, through derivatives (N, K, P) with respect to P errors."""
+    """Return the covariances of K quantities at N points, (N, K, K), from P errors and derivatives (N, K, P)."""
     return np.asarray(rows @ np.asarray(covariance) @ np.swapaxes(rows, 1, 2))
 
 

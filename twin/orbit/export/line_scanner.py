@@ -284,7 +284,7 @@ def _fit_camera(sensor: Sensor, pitch: float, height: float, seconds: Array) -> 
 
 
 def _directions(sensor: Sensor, seconds: Array, pixel: Array, height: float) -> tuple[Array, Array]:
-    """Return stations (N, 3) at N times, and unit directions (N, K, 3) to what K pixels see at a height, ITRS."""
+    """Return stations (N, 3) at N times, ITRS, and unit directions (N, K, 3) to what K pixels see at a height."""
     count = len(seconds)
     step = float(seconds[1] - seconds[0])
     trajectory = _AtNodes(sensor, seconds)

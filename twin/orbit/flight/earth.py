@@ -109,9 +109,7 @@ class EarthRotation:
     polar: np.ndarray
 
     def celestial(self, seconds: Any) -> np.ndarray:
-        """Return the rotation GCRS -> CIRS, the frame of the pole and origin of date; shape (..., 3, 3) for times
-        (...).
-        """
+        """Return the rotation GCRS -> CIRS, the frame of the pole and origin of date, (..., 3, 3) for times (...)."""
         x, y, s = np.moveaxis(self.pole(np.asarray(seconds, dtype=np.float64)), -1, 0)
         return np.asarray(erfa.c2ixys(x, y, s))
 
@@ -121,8 +119,7 @@ class EarthRotation:
         return np.asarray(erfa.c2tcio(self.celestial(t), self.angle + RATE * t, self.polar))
 
     def rate(self, seconds: Any) -> np.ndarray:
-        """Return the angular velocity of the ITRS relative to the GCRS in ITRS axes, in rad/s, (..., 3) for times
-        (...).
+        """Return the angular velocity of the ITRS against the GCRS in ITRS axes, rad/s, (..., 3) for times (...).
 
         The motion of the pole (some 1e-11 rad/s) is part of it, so that velocities are the exact derivatives of
         positions.

@@ -177,7 +177,7 @@ class SplineGrid:
 
     @property
     def reach(self) -> tuple[float, float, float, float]:
-        """West, east, south and north bound of the domain of a spline that is not continued beyond its grid, in metres."""
+        """Bounds west, east, south, north (metres) of a spline that is not continued beyond its grid."""
         (rows, columns), (east, north) = self.coefficients.shape, self.first
         # A position needs one B-spline before its cell and two after.
         return (

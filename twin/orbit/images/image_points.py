@@ -645,7 +645,10 @@ def _matched(
 
 
 def _degree(count: int) -> int | None:
-    """Return the degree of the smooth displacement for a number of matches, at least four per term; None for too few."""
+    """Return the degree of the smooth displacement for a number of matches, at least four per term.
+
+    It is None for too few matches.
+    """
     for degree, terms in ((2, 7), (1, 4), (0, 2)):
         if count >= 4 * terms:
             return degree

@@ -430,7 +430,7 @@ def _expected(
     motion: ImageMotion,
     looks: LookMap | None,
 ) -> tuple[np.ndarray, float]:
-    """Return expected photons at one moment of the light collection, and the largest position error in pixels."""
+    """Return the expected photons at one moment of the light collection, and the largest position error in pixels."""
     looks = looks or look_map(sensor, scene.frame, scene.terrain, window)
     # Try samples at pixels first, then finer ones if the terrain needs them.
     for fine in (1, oversampling):

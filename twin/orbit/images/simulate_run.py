@@ -420,7 +420,7 @@ def _true_grid(patch: Patch, name: str) -> dict[str, Any]:
 
 
 def _control_error(patch: Patch) -> dict[str, Any]:
-    """Return the error in plan of the orthophoto, map minus true, east and north, in metres, at a grid of its pixels."""
+    """Return the orthophoto's error in plan, map minus true, east and north, in metres, at a grid of its pixels."""
     photo = patch.control.orthophoto
     row, column = _grid(photo.values.shape)
     east, north = patch.control.error(*photo.east_north(row, column))

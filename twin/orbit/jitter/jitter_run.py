@@ -318,8 +318,8 @@ class BlindMultiple:
     frequency : float
         Frequency k / dt, in hertz.
     response : float
-        Response of all lines together to an oscillation of this frequency, for the worst axis, divided by the largest
-        response over the searched frequencies.
+        Response of all lines together to an oscillation of this frequency, for the worst axis, divided by the axis's
+        largest response over the searched frequencies.
     blind : bool
         True if all lines together are blind at this frequency.
     """
@@ -334,7 +334,7 @@ class BlindMultiple:
 
 
 def blind_multiples(jitter: PassJitter) -> list[BlindMultiple]:
-    """Return the searched frequencies, multiples k / dt of the reciprocal gap, that a pair of lines cannot observe."""
+    """Return the searched frequencies k / dt that a pair of lines, seeing a point dt apart, cannot observe."""
     before, multiples = jitter.result.before, []
     share = np.min(before.response / np.max(before.response, axis=0), axis=1)
     for (first, second), (_, gap, _) in jitter.sights.gaps.items():

@@ -376,9 +376,7 @@ def _whitened_observations(
     prior: _Prior,
     search: JitterSearchSpec,
 ) -> tuple[Observations, dict[str, np.ndarray]]:
-    """Return the whitened observations of the attitude, and measured minus expected positions (n, 2) by line, in
-    pixels.
-    """
+    """Return whitened observations of the attitude, and measured minus expected positions (n, 2) by line, in pixels."""
     axes, count = len(search.axes), len(order)
     size, width = len(shared), (search.interior + 1) + search.trend
     value, by = np.zeros((size, count, 2)), np.zeros((size, count, 2, 3))
@@ -468,7 +466,10 @@ def _moments(line: _Line, off: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def _visibility_groups(seen: np.ndarray, tie: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return m lines and n points, as indices, of each set of points of one sort that the same lines see."""
+    """Return lines (m,) and points (n,), as indices, for each set of lines that see the same points of one sort.
+
+    Sets of fewer than two lines are left out.
+    """
     groups = []
     for sort in (True, False):
         for pattern in np.unique(seen, axis=0):

@@ -145,7 +145,7 @@ def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Ad
 
 
 def _times(spec: OrbitMatchSpec, clock: LineClock, epoch: str) -> LineTimes:
-    """Return line times with lines counted from a line's first row in the table of times, which is 0."""
+    """Return the exposure times of a line camera's image lines, counted from the first in the table, which is 0."""
     reading = PassConventions(None, spec.lines.time_scale, 0.0, spec.lines.moment, 0.0, 0.0, "right")  # type: ignore[arg-type]
     try:
         middle, _ = line_times(clock, reading, epoch, clock.line)
@@ -197,9 +197,7 @@ def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path, cou
 
 
 def _read_image(path: Path, spec: LineImageFileSpec, count: int) -> np.ndarray:
-    """Return grey values (rows, columns) of the image, or of its window; `count` images of this size must fit into the
-    memory.
-    """
+    """Return grey values (rows, columns) of an image or its window; `count` such images must fit into the memory."""
     from twin.orbit.measured.maps import opened
 
     file, part = str(path), spec.window
@@ -282,7 +280,7 @@ def _measured(points: PatchPoints, spec: OrbitMatchSpec) -> tuple[GroundPoints, 
 
 
 def _used(points: MatchedPoints) -> np.ndarray:
-    """Return the mask of points seen by a line, or by two lines for tie points, (n,) bool."""
+    """Return the mask of points accepted in one line or more, or in two or more for tie points, (n,) bool."""
     seen = np.sum([line.accepted for line in points.lines.values()], axis=0)
     return np.asarray(seen >= (2 if points.kind == "tie" else 1))
 

@@ -441,7 +441,10 @@ def _looks(calibration: Element, band: str | None) -> tuple[Array, Array]:
 
 
 def _tangent(element: Element, name: str, first: int) -> Array:
-    """Return K coefficients of a look's tangent in powers of the pixel, counted ``first`` columns after the file's."""
+    """Return K coefficients of a look's tangent in powers of the pixel.
+
+    Pixel 0 is the value ``first`` of the file's variable.
+    """
     terms = [element.number(f"{name}_0", least=-1.0, most=1.0)]
     if name == "XLOS":
         element.one("XLOS_1")

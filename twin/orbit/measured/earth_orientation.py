@@ -80,7 +80,7 @@ class EarthOrientation:
         return TableRotation(self, epoch, celestial_pole(epoch, first, last))
 
     def at(self, mjd: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return Earth orientation at N dates in UTC: UT1 - TAI (N,), in seconds, pole and offsets (N, 2), in radians."""
+        """Return UT1 - TAI (N,), in seconds, and pole and pole offsets (N, 2), in radians, at N dates in UTC."""
         count = len(self.mjd)
         start = np.clip(np.searchsorted(self.mjd, mjd, side="right") - 2, 0, count - 4)
         which = start[..., None] + np.arange(4)

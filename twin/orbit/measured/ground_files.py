@@ -56,9 +56,7 @@ class GroundFile:
 
 @dataclass(eq=False)
 class _Rows:
-    """Rows of a file: names, coordinates in the file's reference system, sigmas (NaN where there are none), roles, and
-    line numbers in the file.
-    """
+    """Rows of a file: names, coordinates in the file's system, sigmas (NaN if there are none), roles, line numbers."""
 
     ids: list[str]
     places: np.ndarray

@@ -365,8 +365,9 @@ class Datum:
 
     @property
     def accuracy(self) -> float | None:
-        """Accuracy of the transformation to the ITRS according to its authority, metres; None if unknown, or before
-        `itrs`.
+        """Accuracy of the transformation to the ITRS according to its authority, metres.
+
+        It is None if it is unknown, or before `itrs` is called.
         """
         stated = self.forward.accuracy
         if stated < 0.0:

@@ -519,7 +519,7 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: Conventi
     Parameters
     ----------
     epoch : str
-        UTC.
+        Zero of the times, UTC, ISO 8601.
     orbit : Table
         Table of the orbit.
     attitude : Table
