@@ -766,7 +766,7 @@ class Reduction:
 
 
 def _distinct(rows: Indices) -> tuple[Indices, Indices]:
-    """Return the index (k,) of each distinct row of integers (n, w), in ascending order, and the row codes (n,)."""
+    """Return an index of each of the k distinct rows of integers (n, w), and the number of each row among them."""
     if not rows.shape[1]:
         return np.zeros(1, np.intp), np.zeros(len(rows), np.intp)
     # hashes by random odd factors almost surely differ for different rows; collisions are checked below

@@ -483,6 +483,6 @@ def _second(correlation: NDArray[np.float32], row: int, column: int) -> float:
 
 
 def _vertex(values: Array) -> float:
-    """Return the vertex of the parabola through three values about the largest, in pixels from the middle one."""
+    """Return the vertex of the parabola through three neighbouring values, in pixels from the middle one."""
     curvature = values[0] - 2.0 * values[1] + values[2]
     return float(0.5 * (values[0] - values[2]) / curvature) if curvature < 0 else 0.0

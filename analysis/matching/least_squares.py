@@ -78,8 +78,8 @@ from analysis.matching.spline import SplineStack, low_passed
 from analysis.matching.window_checks import ResidualCorrelation, WindowHalves, WindowRelief, WindowScales
 
 _LEAST = 0.4
-"""Smallest curvature, relative to the normal matrix, of any combination of unknowns: with more than three fifths noise
-it is undetermined.
+"""Smallest curvature of the sum of squares along any combination of unknowns, relative to the normal matrix. Below it,
+most of the normal matrix is noise, and the combination is undetermined.
 """
 _OPEN = 1e-11
 """Eigenvalue, relative to the largest, below which a combination of unknowns is undetermined."""
@@ -354,7 +354,8 @@ _LONGEST_STEP = 0.7
 _RIDGE = 1e-11
 """Relative ridge that keeps singular normal matrices solvable."""
 _SMOOTHINGS = (0.0, 0.35, 0.7, 1.1, 1.7, 2.6)
-"""RMS radii of the Gaussians that may smooth a template, in pixels; those up to a ninth of the window are used."""
+"""RMS radii of the Gaussians that may smooth a template, in pixels; those up to a ninth of the window's side are used.
+"""
 _CHANCE = 4.0
 """Increase of chi-square, with one degree of freedom, that chance exceeds in 5 % of cases; a low-pass that increases
 the residuals by less is accepted.
@@ -427,7 +428,7 @@ class Fits:
         return noise + relief
 
     def covariances(self, good: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
-        """Return both parts of `covariance`: noise with interpolation, and displacements within the window."""
+        """Return two parts of the covariance of positions: noise with interpolation, and relief within the window."""
         noise, hidden, tau, _usual = self._parts(good)
         relief = tau[:, None, None] * self.relief.effect
         common = self.reason == Reason.ACCEPTED if good is None else good

@@ -1,10 +1,10 @@
 """Matching of templates in an image: search, least squares, thresholds, and rejection of mismatches.
 
 **Consensus.** Displacements from predicted to measured positions vary smoothly over an image: they are a polynomial of
-row and column, and optionally of height. Random minimal samples give candidates; the one with the least median distance
-of all points starts (least median of squares, Rousseeuw 1984), then the scatter, the points within its limit and their
-weighted fit are iterated until they do not change. Correct matches are lost at the false-alarm rate; a mismatch remains
-if it lies within the limit by chance.
+row and column, and optionally of height. Random minimal samples give candidates; the one with the smallest median
+distance of all points starts (least median of squares, Rousseeuw 1984), then the scatter, the points within its limit
+and their weighted fit are iterated until they do not change. Correct matches are lost at the false-alarm rate; a
+mismatch remains if it lies within the limit by chance.
 """
 
 from __future__ import annotations
@@ -174,11 +174,11 @@ def match_windows(
 
 
 def _block_ratio(plane: NDArray[np.generic]) -> float:
-    """Return how much larger grey-value steps are at one in eight pixels, along rows and columns.
+    """Return the ratio of grey-value steps at the borders of 8 x 8 pixel compression blocks to those within blocks.
 
-    The ratio is about 1 if no compression has cut the image into blocks. It uses the median over all steps of a phase
-    of their mean sizes over up to 512 lines, so that stripes of the scene count little, and is the smaller of both
-    directions.
+    The ratio is about 1 if no compression has cut the image into blocks. It uses, for each of the eight positions
+    within a block, the median over all such steps of their mean sizes over up to 512 lines, so that stripes of the
+    scene count little, and is the smaller of both directions.
     """
     ratios = []
     for lines in (plane, plane.T):
@@ -195,7 +195,10 @@ def _block_ratio(plane: NDArray[np.generic]) -> float:
 def _without_steps(
     reason: NDArray[np.int8], silent: NDArray[np.bool_], chance: Array, power: Array, options: MatchOptions
 ) -> NDArray[np.int8]:
-    """Return the verdicts after the test for displacement steps within windows; silent windows are only counted."""
+    """Return the verdicts after the test for displacement steps within windows.
+
+    Verdicts of `silent` windows stay; they only count in the fraction of windows that fail.
+    """
     tested = reason == Reason.ACCEPTED
     # NaN compares false
     step = tested & ~(chance >= FALSE_ALARM)
@@ -206,7 +209,7 @@ def _without_steps(
 
 
 def _open(reason: NDArray[np.int8]) -> NDArray[np.bool_]:
-    """Return a mask of verdicts that a later test may replace: windows that were fitted or that a fit was tried for."""
+    """Return a mask of the windows for which a fit was tried, whose verdicts a later test may replace."""
     return (reason == Reason.ACCEPTED) | (reason >= Reason.BORDER)
 
 
@@ -230,7 +233,7 @@ _ROUNDS = 50
 
 @dataclass(frozen=True, eq=False)
 class DisplacementField:
-    """Polynomial displacement.
+    """Displacement in an image as a polynomial of row and column and, optionally, a linear function of height.
 
     Attributes
     ----------
@@ -277,11 +280,11 @@ class Consensus:
     field : DisplacementField
         Displacement fitted to the accepted matches, or the best candidate.
     distance : (n,) ndarray
-        Residual over its standard deviation; NaN where the match is not finite.
+        Distance of each match from the field, relative to its standard deviation; NaN where the match is not finite.
     scatter : float
         Scatter along each axis beyond the given covariances, in pixels; the total scatter without covariances.
     limit : float
-        Largest accepted distance.
+        Largest accepted `distance`, in standard deviations.
     text : str
         Description of the outcome.
     """
@@ -304,7 +307,7 @@ def consensus(
     false_alarm: float = 1e-3,
     largest_scatter: float = 2.0,
 ) -> Consensus:
-    """Reject wrong matches: keep those that follow one displacement which varies smoothly over the image.
+    """Reject wrong matches: those that do not follow one displacement field that is smooth over the image.
 
     The displacement is a polynomial of row and column, found by least median of squares.
 
@@ -315,13 +318,14 @@ def consensus(
     matched : (n, 2) array_like
         Matched rows and columns, in pixels; rows with NaN are ignored.
     covariance : (n, 2, 2) array_like, optional
-        Covariances of the matched positions, px^2. The scatter is then what the displacement needs beyond them.
+        Covariances of the matched positions, px^2. The resulting `scatter` is then that in addition to these
+        covariances.
     height : (n,) array_like, optional
         Heights of the points, in any unit. They add a term for the parallax that an unknown tilt leaves.
     degree : int
         Degree of the polynomial in row and column together, 0 to 3.
     false_alarm : float
-        Share of right matches that may be lost, for normal errors.
+        Fraction of correct matches that is rejected by chance, for normal errors.
     largest_scatter : float
         Largest scatter of a consensus, in pixels. Unrelated matches over a search window scatter by a third of its
         radius.
@@ -405,7 +409,7 @@ def _unfitted_field(positions: Array, height: Array | None, degree: int, terms: 
 
 
 def _terms(positions: Array, height: ArrayLike | None, field: DisplacementField) -> Array:
-    """Return the (n, terms) polynomial terms of a displacement field."""
+    """Return the polynomial terms of a displacement field at n points, (n, terms)."""
     row, column = ((positions - field.middle) / field.scale).T
     powers = [row ** (total - k) * column**k for total in range(field.degree + 1) for k in range(total + 1)]
     if field.heights is not None:
@@ -414,7 +418,7 @@ def _terms(positions: Array, height: ArrayLike | None, field: DisplacementField)
 
 
 def _best_candidate(design: Array, displacement: Array, rng: np.random.Generator) -> Array:
-    """Return the coefficients through the minimal sample with the least median distance of all points."""
+    """Return the coefficients fitted to the random minimal sample with the smallest median distance of all points."""
     count, terms = design.shape
     samples = min(_MOST_SAMPLES, math.ceil(math.log(_MISSED) / math.log1p(-((1.0 - _WRONG) ** terms))))
     best, least = np.zeros((terms, 2)), np.inf
@@ -436,7 +440,10 @@ def _best_candidate(design: Array, displacement: Array, rng: np.random.Generator
 def _converged(
     design: Array, displacement: Array, noise: Array, coefficients: Array, limit: float
 ) -> tuple[Mask, Array, float, Array]:
-    """Return accepted points, coefficients, scatter beyond noise and distances after convergence."""
+    """Iterate selection and weighted fit until the accepted points stay the same, and return the result.
+
+    Returned are the accepted points, coefficients, scatter beyond the noise in pixels, and normalised distances.
+    """
     inside = np.ones(len(displacement), bool)
     for round_number in range(_ROUNDS):
         residual = displacement - design @ coefficients
@@ -452,7 +459,7 @@ def _converged(
 
 
 def _square(residual: Array, noise: Array, scatter: float) -> Array:
-    """Return the (n,) squared distances normalised by noise and scatter."""
+    """Return the squared residuals of n points, normalised by the sum of noise covariance and scatter."""
     total = noise + scatter**2 * np.eye(2)
     a, b, c = total[:, 0, 0], total[:, 0, 1], total[:, 1, 1]
     row, column = residual.T
@@ -460,7 +467,10 @@ def _square(residual: Array, noise: Array, scatter: float) -> Array:
 
 
 def _scatter(residual: Array, noise: Array) -> float:
-    """Return the isotropic scatter beyond noise that brings the median squared distance to that of chi-square."""
+    """Return the isotropic scatter, in pixels, beyond the noise covariances, from the median squared residual.
+
+    It brings the median normalised square to that of a chi-square with two degrees of freedom.
+    """
     high = math.sqrt(max(float(np.median(np.sum(residual**2, axis=1))) / _MEDIAN, 1e-18))
     if np.median(_square(residual, noise, 1e-9)) <= _MEDIAN:
         return 1e-9

@@ -136,8 +136,9 @@ class SplineStack:
         Returns
         -------
         (3, 6, 10 or 15, m, p) ndarray
-            Value; derivatives by row, column; by row row, row column, column column; by row row row, row row column,
-            row column column, column column column; and so on.
+            Value; first derivatives with respect to row and column; second derivatives (row row, row column, column
+            column); third derivatives (row row row, row row column, row column column, column column column); and so
+            on, per pixel to the power of the order.
         """
         weights, base = [], np.broadcast_to(self._first[which][:, None], row.shape)
         for position, step in ((row, self._stride), (column, 1)):
@@ -159,7 +160,11 @@ class SplineStack:
 
 
 def _weights(fraction: Array, orders: int) -> Array:
-    """Return the (orders + 1, 6, ...) weights of the knots from -2 to +3 about a position, and their derivatives."""
+    """Return the weights of the six knots around a position between pixels, and their derivatives.
+
+    `fraction` is the part of the position beyond a whole pixel; the result is (orders + 1, 6, ...), for the knots from
+    -2 to +3.
+    """
     powers = np.ones((_DEGREE + 1, *fraction.shape))
     for k in range(_DEGREE):
         np.multiply(powers[k], fraction, out=powers[k + 1])
@@ -169,7 +174,10 @@ def _weights(fraction: Array, orders: int) -> Array:
 
 
 def _pieces() -> Array:
-    """Return the (5, 6, 6) coefficients of the basis and its derivatives: order, knot, power."""
+    """Return the polynomial coefficients of the quintic B-spline and its derivatives.
+
+    The axes of the (5, 6, 6) array are the order of the derivative, the knot, and the power of the fraction of a pixel.
+    """
     basis = PPoly.from_spline(BSpline.basis_element(np.arange(_DEGREE + 2.0), extrapolate=False))
     table = np.zeros((5, _DEGREE + 1, _DEGREE + 1))
     start = np.searchsorted(basis.x, np.arange(_DEGREE + 1.0), side="right") - 1
@@ -181,4 +189,4 @@ def _pieces() -> Array:
 
 
 _PIECES = _pieces()
-"""Coefficients of the spline basis and its derivatives, from `_pieces`."""
+"""Polynomial coefficients of the quintic B-spline and its derivatives: order of derivative, knot, power."""

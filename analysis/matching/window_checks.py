@@ -46,11 +46,11 @@ from scipy.stats import ncx2, norm
 from analysis.arrays import Array
 
 SPLITS = 4
-"""Number of ways to halve a window."""
+"""Number of ways to halve a window: along rows, columns and both diagonals."""
 FALSE_ALARM = 1e-3
 """False-alarm probability of the test for steps, per window."""
 _CRITICAL = 2.0 * math.log(SPLITS / FALSE_ALARM)
-"""Largest accepted chi-square of the splits, which have two degrees of freedom each."""
+"""Largest accepted chi-square, with two degrees of freedom, of the difference between the positions of two halves."""
 STEP = 1.0
 """Step between the halves for which the power is computed, in pixels: what a search of whole pixels takes for another
 position.
@@ -83,7 +83,7 @@ class WindowHalves:
         variance : (n,) ndarray
             Variance of the noise, including its correlation, in DN^2.
         relief : float
-            tau^2 of a typical window, in px^2.
+            Variance of the displacements within a typical window (tau^2 of the module), in px^2.
 
         Returns
         -------
@@ -103,7 +103,10 @@ class WindowHalves:
 
 
 def risk(share: float, power: Array) -> Array:
-    """Return the (n,) probability that a window that passed has a step, if a share of all windows fails (Bayes)."""
+    """Return the probability that a window that passed the test still has a displacement step, (n,), by Bayes' rule.
+
+    The prior probability is the fraction `share` of all windows that fail; `power` is the power of the test.
+    """
     return share * (1.0 - power) / (1.0 - share * power)
 
 
@@ -113,7 +116,8 @@ def window_halves(design: Array, residual: Array, side: int) -> WindowHalves:
     Parameters
     ----------
     design : (n, q, p) ndarray
-        Derivatives of the model, the first two with respect to position.
+        Derivatives of the p grey values of the model with respect to the q unknowns of n fits, the first two those of
+        position.
     residual : (n, p) ndarray
         Residuals, grey values; NaN where there is no fit.
     side : int
@@ -152,7 +156,7 @@ def window_halves(design: Array, residual: Array, side: int) -> WindowHalves:
 
 
 def _halves(side: int) -> list[NDArray[np.bool_]]:
-    """Return the mask (p,) of one half for each split; the middle line belongs to the other half."""
+    """Return, for each split, the mask of one half of a window's p pixels; the middle line is in the other half."""
     row, column = (g.ravel() for g in np.mgrid[:side, :side] - side // 2)
     return [row > 0, column > 0, row + column > 0, row - column > 0]
 
@@ -162,14 +166,14 @@ LAG = 3
 _LAGS = [(r, c) for r in range(LAG + 1) for c in range(-LAG, LAG + 1) if r > 0 or c > 0]
 """Half of the lags; the others follow by symmetry."""
 _LEAST = 0.5
-"""Smallest variance relative to that for white residuals: sums of noisy correlations must not improve a position beyond
-it.
+"""Smallest variance relative to that for white residuals: noisy estimates of the correlation must not reduce the
+variance of a position below it.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualCorrelation:
-    """Correlation of the residuals of n fits; lags are half of those within `LAG`.
+    """Correlation of the residuals of n fits between neighbouring pixels, at half of the lags up to `LAG` pixels.
 
     Attributes
     ----------
@@ -179,7 +183,7 @@ class ResidualCorrelation:
         Covariance of the position for white residuals of unit variance; NaN where most of the information is noise of
         the template.
     influence : (n, lags, 2, 2) ndarray
-        Increase of that covariance by a correlation of 1 at a lag and at its opposite.
+        Increase of that covariance due to a correlation of 1 at a lag and at its opposite.
     correlation : (n, lags) ndarray
         Correlation of the residuals, corrected for the effect of the fit on white noise.
     pixels, unknowns : (n,) ndarray of int
@@ -195,11 +199,14 @@ class ResidualCorrelation:
 
     @property
     def plain(self) -> Array:
-        """Covariance (n, 2, 2) for white residuals, in px^2."""
+        """Covariance (n, 2, 2) of the positions if residuals of different pixels are uncorrelated, in px^2."""
         return np.asarray(self.variance[:, None, None] * self.white)
 
     def covariance(self, good: NDArray[np.bool_]) -> Array:
-        """Return the (n, 2, 2) covariance, in px^2, with the median correlation of the points good (n,)."""
+        """Return the covariance of the n positions, in px^2, allowing for correlated residuals.
+
+        The correlation is the median over the points selected by the mask `good` (n,).
+        """
         correlations = self.correlation[good & np.isfinite(self.variance)]
         if not len(correlations):
             return self.plain
@@ -225,7 +232,8 @@ def residual_correlation(
     Parameters
     ----------
     design : (n, q, p) ndarray
-        Derivatives of the model, the first two with respect to position.
+        Derivatives of the p grey values of the model with respect to the q unknowns of n fits, the first two those of
+        position.
     residual : (n, p) ndarray
         Residuals, grey values; NaN where there is no fit.
     side : int
@@ -295,11 +303,13 @@ _COARSE = 2.0
 detector's pixels are fine.
 """
 _DISCORDANT = 2.0 * math.log(1e3)
-"""Squared distance of coarse from fine detail that chance exceeds in 1e-3 (chi-square of two degrees of freedom)."""
+"""Squared, normalised difference between the positions of coarse and of all detail that chance exceeds with a
+probability of 1e-3 (chi-square with two degrees of freedom).
+"""
 _SIGNIFICANT = 2.0
 """Significance, in standard deviations, from which a difference is shared by all points."""
 _CLIPPED = 3.0
-"""Distance, in medians of the distances, to which a point's weight is limited."""
+"""Largest normalised distance with which a point enters the common estimate, in units of the median distance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,7 +319,7 @@ class WindowScales:
     Attributes
     ----------
     apart : (n, 2) ndarray
-        Differences, in pixels.
+        Position from coarse detail minus that from all detail, in row and column, in pixels.
     spread : ResidualCorrelation
         Correlation of the residuals, which gives the covariance of the differences.
     """
@@ -318,12 +328,14 @@ class WindowScales:
     spread: ResidualCorrelation
 
     def excess(self, factor: Array, good: NDArray[np.bool_]) -> Array:
-        """Return the (n, 2, 2) covariance of differences beyond noise, in px^2; NaN for significant deviations.
+        """Return the covariance of differences between coarse and all detail beyond their noise, (n, 2, 2), in px^2.
+
+        It is NaN for points that deviate significantly from the others.
 
         Parameters
         ----------
         factor : (n,) ndarray
-            Factor on the noise.
+            Factor on the variance of the noise.
         good : (n,) ndarray of bool
             Points from which the common excess is estimated.
         """
@@ -352,13 +364,15 @@ class WindowScales:
 def window_scales(design: Array, residual: Array, side: int, spread: ResidualCorrelation) -> WindowScales:
     """Compute the differences between coarse and all detail of square windows.
 
-    A fit to the low-passed window differs by (D W D')^-1 D W r - (D D')^-1 D r, with W the low-pass applied twice: if
-    the model is right both see the same position, and the difference is noise (Hausman, Econometrica 46(6), 1978).
+    With the derivatives D (unknowns by pixel) and the residuals r, a fit to the low-passed window differs by (D W
+    D')^-1 D W r - (D D')^-1 D r, with W the low-pass applied twice: if the model is right both see the same position,
+    and the difference is noise (Hausman, Econometrica 46(6), 1978).
 
     Parameters
     ----------
     design : (n, q, p) ndarray
-        Derivatives of the model, the first two with respect to position.
+        Derivatives of the p grey values of the model with respect to the q unknowns of n fits, the first two those of
+        position.
     residual : (n, p) ndarray
         Residuals, grey values; NaN where there is no fit.
     side : int
@@ -393,7 +407,7 @@ def window_scales(design: Array, residual: Array, side: int, spread: ResidualCor
 
 
 def _square(apart: Array, covariance: Array) -> Array:
-    """Return the (n,) squared distances (n, 2) in units of covariances (n, 2, 2)."""
+    """Return the squared differences of n positions, (n, 2), normalised by their covariances (n, 2, 2)."""
     return np.asarray(np.einsum("ni,ni->n", apart, np.linalg.solve(covariance, apart[..., None])[..., 0]))
 
 
@@ -406,7 +420,7 @@ longer one follows it.
 _OWN = 4.0
 """Standard deviations of tau^2 without relief from which a point has its own; chance alone exceeds it in some 1e-3."""
 _HELD = 2.5
-"""Standard deviations to which a point's tau^2 is limited in the common mean."""
+"""Limit, in standard deviations, of a point's relief variance tau^2 in the common mean."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -416,15 +430,15 @@ class WindowRelief:
     Attributes
     ----------
     score : (n,) ndarray
-        Score q, in DN^2.
+        Score q of the module, a quadratic form of the residuals that grows with relief, in DN^2.
     first : (n,) ndarray
-        tr(K G), the score's expectation for white residuals of unit variance.
+        Expectation of the score for white residuals of unit variance: tr(K G) of the module.
     second : (n,) ndarray
-        tr(K G K G), the score's expectation for tau of 1 px, in DN^2 px^-2.
+        Expectation of the score for relief of 1 px standard deviation: tr(K G K G) of the module, in DN^2 px^-2.
     redundancy : (n,) ndarray
         Redundancy of the fit.
     effect : (n, 2, 2) ndarray
-        Covariance of the position for tau of 1 px.
+        Covariance of the position due to relief of 1 px standard deviation.
     """
 
     score: Array
@@ -434,7 +448,7 @@ class WindowRelief:
     effect: Array
 
     def square(self, variance: Array, coloured: Array, good: NDArray[np.bool_]) -> tuple[Array, float]:
-        """Return tau^2 of each point and of a typical point.
+        """Return the variance of the displacements within the window, tau^2, for each of n points and a typical one.
 
         Parameters
         ----------
@@ -484,7 +498,8 @@ def window_relief(design: Array, residual: Array, side: int) -> WindowRelief:
     Parameters
     ----------
     design : (n, q, p) ndarray
-        Derivatives of the model, the first two with respect to position.
+        Derivatives of the p grey values of the model with respect to the q unknowns of n fits, the first two those of
+        position.
     residual : (n, p) ndarray
         Residuals, grey values; NaN where there is no fit.
     side : int
@@ -525,9 +540,10 @@ def window_relief(design: Array, residual: Array, side: int) -> WindowRelief:
 
 
 def relief_field(side: int) -> tuple[Array, Array, Array]:
-    """Return the blocks of the pixels (p, b) and the correlations of the blocks and of the window's middle.
+    """Return the blocks of a window's pixels, and correlations of relief between blocks and with the middle.
 
-    The correlation of the blocks is (b, b), that of the window's middle with them (1, b).
+    For p pixels and b blocks, the assignment of pixels to blocks is (p, b), the correlation between blocks (b, b), and
+    that of the window's middle with the blocks (1, b).
     """
     line = np.arange(side) - side // 2
     block_of_line = np.arange(side) * _BLOCKS // side
