@@ -38,7 +38,7 @@ Force = Annotated[bool, typer.Option("--force", help="Replace the file if it exi
 
 @contextmanager
 def _explained(errors: Console) -> Iterator[None]:
-    """Print the errors that a user can cause as one sentence, and exit with their code."""
+    """Print the errors that a user can cause (bad input, missing backend) as one sentence, and exit with their code."""
     from optics.numerics.backend import BackendUnavailable
     from optics.numerics.llvm import LibraryMissing
 
@@ -91,14 +91,14 @@ def _write(out: Path, content: bytes) -> None:
 
 
 def read_prescription(path: Path, glasses: Sequence[Path] = (), wavelength: float | None = None) -> Prescription:
-    """Read a file of another program, whose format follows from its suffix.
+    """Read the prescription of another optical program; the suffix of the file selects the format.
 
     Parameters
     ----------
     path : Path
         A .zmx, .seq or .yaml file.
     glasses : sequence of Path
-        AGF catalogues.
+        Glass catalogues in AGF format.
     wavelength : float or None
         Wavelength for a batoid file, which names none, in metres.
 

@@ -50,7 +50,7 @@ _OF_OPTICS = frozenset(
 
 
 class _Reader:
-    """State of a batoid file while it is read."""
+    """Reader of one batoid file: the surfaces, media and notes collected so far."""
 
     def __init__(self, file: str, data: object, wavelength: float) -> None:
         self.file, self.data, self.wavelength = file, data, wavelength
@@ -77,7 +77,7 @@ class _Reader:
         return line
 
     def number(self, given: Mapping[str, Any], name: str, key: KeyPath, default: float | None = None) -> float:
-        """Return a finite number of a mapping. Raises InputError."""
+        """Return the finite number at a key of a mapping; raise InputError if it is none."""
         if name not in given and default is not None:
             return default
         value = given.get(name)
@@ -86,19 +86,19 @@ class _Reader:
         return float(value)
 
     def mapping(self, value: object, key: KeyPath) -> Mapping[str, Any]:
-        """Return a value that must be a mapping. Raises InputError."""
+        """Return the value unchanged if it is a mapping, else raise InputError."""
         if not isinstance(value, Mapping):
             raise self.error(key, "not a mapping", value, "a mapping with a type")
         return value
 
     def listed(self, value: object, key: KeyPath) -> list[Any]:
-        """Return a value that must be a list. Raises InputError."""
+        """Return the value unchanged if it is a list, else raise InputError."""
         if not isinstance(value, list):
             raise self.error(key, "not a list", value, "a list")
         return value
 
     def _only(self, given: Mapping[str, Any], key: KeyPath, known: Mapping[str, tuple[str, ...]]) -> None:
-        """Raise InputError for keys that a kind does not have, since their numbers would be ignored."""
+        """Raise InputError for keys that this type of item does not have, since their numbers would be ignored."""
         for name in given:
             names = known.get(str(given.get("type")), ("R", "items"))
             if name != "type" and name not in names:
@@ -147,7 +147,7 @@ class _Reader:
                 raise self.error((*key, "type"), "this type of optic is not supported", kind, known)
 
     def _add(self, given: Mapping[str, Any], key: KeyPath, pose: Pose, how: Interaction, index: float) -> None:
-        """Append a surface of an optic."""
+        """Append an optic's surface, with its pose, its interaction with light and the index behind it."""
         if len(self.surfaces) >= MOST_SURFACES:
             raise self.error(key, "too many surfaces", allowed=f"at most {MOST_SURFACES}")
         name = str(given.get("name", "")) or f"S{len(self.surfaces) + 1}"
@@ -180,7 +180,7 @@ class _Reader:
         self.surfaces.append(turned_over(LensSurface(**{**vars(surface), "pose": OVER @ pose})))
 
     def _placed(self, given: Mapping[str, Any], key: KeyPath, pose: Pose) -> Pose:
-        """Return the pose after a coordinate system's shifts and rotations, in order, each about the current axes."""
+        """Return a pose after the shifts and rotations of a ``coordSys``, each about the axes reached so far."""
         if "coordSys" not in given:
             return pose
         key = (*key, "coordSys")
@@ -201,7 +201,7 @@ class _Reader:
         return pose
 
     def shape(self, given: Mapping[str, Any], key: KeyPath, depth: int = 0) -> Surface:
-        """Return the shape of a surface."""
+        """Return the shape of an optical surface from its mapping in the file."""
         kind = given.get("type")
         self._only(given, key, {"Quadric": ("R", "conic"), "Asphere": ("R", "conic", "coefs", "imin"), "Plane": ()})
         match kind:
@@ -274,7 +274,7 @@ class _Reader:
         return index
 
     def _index(self, medium: Mapping[str, Any], key: KeyPath, kind: object, w: float) -> float:
-        """Return the index by the kind of the medium; NaN outside its range."""
+        """Return the refractive index of a medium of one type at the wavelength ``w``; NaN outside its range."""
         um = 1e6 * w
         numbers = {
             "ConstMedium": ("n",),
@@ -315,7 +315,10 @@ class _Reader:
                 raise self.error((*key, "type"), "this type of medium is not supported", kind, known)
 
     def _keep_sellmeier(self, index: float, b_and_c: list[float]) -> None:
-        """Store a Sellmeier glass by its index. The file states no range, so one well between the poles is assumed."""
+        """Store a Sellmeier glass under its index.
+
+        The file states no wavelength range, so one between the poles of the formula is assumed.
+        """
         b, c = b_and_c[:3], b_and_c[3:]
         poles = [math.sqrt(pole) for pole in c if pole > 0.0]
         below = [pole for pole in poles if pole < self.wavelength * 1e6]

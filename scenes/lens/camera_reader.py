@@ -210,7 +210,7 @@ def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = AS
 
 
 def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) -> ReadCamera:
-    """Make a camera with the field as the prescription has it."""
+    """Make a camera with the fields exactly as the prescription has them."""
     notes = list(lens.notes)
     sources = {name: getattr(glass, "source", "") for name, glass in lens.glasses.items()}
     taken_from = "the glass of {} is used; --glasses FILE.agf replaces it"
@@ -285,7 +285,7 @@ def _round_field(lens: Prescription) -> Prescription:
 
 
 def _by_angles(lens: Prescription, name: str, backend: Backend, width: Width) -> Prescription:
-    """Return the prescription with its fields' heights converted to directions of the light."""
+    """Return the prescription with fields given as object or image heights converted to directions of the light."""
     heights = np.array(lens.heights)
     if lens.field_kind == "object heights":
         if not FAR <= abs(lens.object_distance) < math.inf:
@@ -303,9 +303,25 @@ def _by_angles(lens: Prescription, name: str, backend: Backend, width: Width) ->
 
 
 def _tangents_at(model: CameraModel, lens: Prescription, heights: np.ndarray, backend: Backend) -> np.ndarray:
-    """Return the tangents (F, 2) of the directions whose chief rays meet the image at heights (F, 2), in metres.
+    """Return the field directions whose chief rays meet the image at given heights, as tangents of their angles.
 
     Paraxial heights are converted by the scale in the middle of the image.
+
+    Parameters
+    ----------
+    model : CameraModel
+        The traced camera.
+    lens : Prescription
+        The prescription.
+    heights : (F, 2) ndarray
+        Image heights (x, y) of F fields, in metres.
+    backend : Backend
+        Backend that traces the rays.
+
+    Returns
+    -------
+    (F, 2) ndarray
+        Tangents of the angles along x and y.
     """
     bare, names = model.bare_assembly(apertures=False), model.mirrors
     to_stop, imaging = assemble(bare, [names[: names.index(model.spec.stop) + 1]]), assemble(bare, ["imaging"])
@@ -369,7 +385,14 @@ def _image(lens: Prescription) -> tuple[float, float]:
 
 
 def _surfaces(lens: Prescription, notes: list[Note]) -> tuple[dict[str, Any], str, Prescription, dict[str, str]]:
-    """Return the surfaces of a camera's file, the stop's name, the prescription of the same surfaces, and names."""
+    """Return the surfaces for a camera's file, and how they correspond to the prescription's.
+
+    Returns
+    -------
+    tuple
+        Name -> content of each surface as in a camera's file; name of the stop; prescription of the same surfaces; name
+        in the camera -> name in the prescription.
+    """
     out: dict[str, Any] = {}
     names: dict[str, str] = {}
     stop, surfaces, count = "", [], dict.fromkeys(_LETTER.values(), 0)
@@ -400,7 +423,7 @@ def _surfaces(lens: Prescription, notes: list[Note]) -> tuple[dict[str, Any], st
 
 
 def _written(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
-    """Return a surface as a camera's file has it."""
+    """Return the keys and values of one surface as a camera's file has them."""
     shape = surface.surface
     x, y, z = (float(v) for v in surface.pose.translation)
     out: dict[str, Any] = {"z": written(z, LENGTH)}
@@ -429,7 +452,7 @@ def _written(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
 
 
 def _behind(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
-    """Return the glass behind a surface if its known dispersion agrees with the index, else the index alone."""
+    """Return the key ``glass`` if a known glass has the surface's index, else the key ``index`` alone."""
     known = lens.glasses.get(surface.glass)
     if known is None or abs(known(lens.wavelength) - surface.index) > _SAME_INDEX:
         return {"index": surface.index}
@@ -440,7 +463,7 @@ def _behind(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
 
 
 def _terms(lens: Prescription, surface: LensSurface, shape: Surface) -> dict[str, Any]:
-    """Return further terms of a sag as a camera's file has them."""
+    """Return the sag terms beyond the conic (even powers, polynomials, Zernike terms) as a camera's file has them."""
     terms = list(shape.terms)
     if isinstance(shape.figure, ZernikeFigure):
         last = max(shape.figure.terms, default=0)
@@ -500,7 +523,7 @@ def _field(lens: Prescription, surfaces: dict[str, Any], notes: list[Note]) -> t
 
 
 def _derived(lens: Prescription, plain: dict[str, Any], backend: Backend) -> CameraModel:
-    """Return the traced camera of a plain mapping."""
+    """Trace the camera whose file content is ``plain`` and return its model."""
     try:
         spec = CameraSpec.model_validate(plain)
     except ValueError as error:
@@ -534,7 +557,21 @@ def _pupil(lens: Prescription, narrow: CameraModel, plain: dict[str, Any], backe
 
 
 def _beams(model: CameraModel, lens: Prescription, stop: np.ndarray, fields: int, backend: Backend) -> Rays:
-    """Return rays of ``fields`` x ``fields`` directions through points (N, 2) of the stop, in its radii."""
+    """Trace rays of a grid of field directions through given points of the stop.
+
+    Parameters
+    ----------
+    model : CameraModel
+        The camera.
+    lens : Prescription
+        Its prescription.
+    stop : (N, 2) ndarray
+        Points of the stop, in units of its radius.
+    fields : int
+        Number of field directions along each axis.
+    backend : Backend
+        Backend that traces the rays.
+    """
     spec, names = model.spec, model.mirrors
     to_stop = assemble(model.bare_assembly(apertures=False), [names[: names.index(spec.stop) + 1]])
     shares = np.linspace(-1.0, 1.0, fields)
@@ -545,7 +582,7 @@ def _beams(model: CameraModel, lens: Prescription, stop: np.ndarray, fields: int
 
 
 def _met(model: CameraModel, lens: Prescription, stop: np.ndarray, fields: int, backend: Backend) -> list[np.ndarray]:
-    """Return the points (rays, 3) at which the rays of ``_beams`` meet each mirror, in its own frame."""
+    """Return the points, (rays, 3), at which the rays of ``_beams`` meet each surface, in the surface's own frame."""
     rays = _beams(model, lens, stop, fields, backend)
     mirrors = range(len(model.mirrors))
     traced = trace(backend, assemble(model.bare_assembly(apertures=False), ["imaging"]), rays, keep=mirrors)
@@ -555,7 +592,7 @@ def _met(model: CameraModel, lens: Prescription, stop: np.ndarray, fields: int, 
 def _compared(
     lens: Prescription, origin: Prescription, model: CameraModel, backend: Backend
 ) -> tuple[float, int] | None:
-    """Return the largest distance, in metres, at the image between rays of both, and the number of rays.
+    """Return the largest distance at the image between rays of camera and prescription, in metres, and the ray count.
 
     None if a field is fully vignetted.
     """

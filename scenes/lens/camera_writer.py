@@ -65,7 +65,7 @@ def prescription_of(model: CameraModel) -> Prescription:
 
 
 def _cut(model: CameraModel, name: str) -> tuple[Any, ...]:
-    """Return clear aperture, line and glass (none here), and further edges of a surface."""
+    """Return a surface's clear aperture, line number, glass (both empty here) and further edges."""
     edges = model.edges.get(name, ())
     if name == model.spec.stop or not edges:
         return model.apertures[name], 0, "", edges
@@ -77,7 +77,7 @@ def _cut(model: CameraModel, name: str) -> tuple[Any, ...]:
 
 
 def field_angles(model: CameraModel) -> tuple[tuple[float, float], ...]:
-    """Return centre, ends and corners of the field as angles, in radians, whose tangents are the light's."""
+    """Return centre, ends and corners of the field as angles (x, y), in radians, whose tangents are the direction's."""
     spec = model.spec
     sides = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]
     shares = [(0.0, 0.0), *sides, *product((1.0, -1.0), repeat=2)]
@@ -85,7 +85,7 @@ def field_angles(model: CameraModel) -> tuple[tuple[float, float], ...]:
 
 
 def perturbed_prescription(instrument: Instrument, camera: str, state: State) -> Prescription:
-    """Return a camera of an instrument in a perturbed state, in the frame in which it was designed.
+    """Return the prescription of a camera in a perturbed instrument, in the frame in which it was designed.
 
     Poses of the mirrors include the motions of all bodies that carry them, shapes include thermal expansion, and
     figures lie on the surfaces. Parts that do not belong to the camera, such as prisms, are omitted and listed in the
@@ -98,7 +98,7 @@ def perturbed_prescription(instrument: Instrument, camera: str, state: State) ->
     camera : str
         Name of the camera in it.
     state : State
-        Body path -> motion.
+        Path of each moved body -> its motion.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def _omitted_bodies(state: Mapping[str, object], root: str) -> list[Note]:
 
 
 def rounded(pose: Pose) -> Pose:
-    """Return a pose without the rounding errors of pose products, those below 1e-15 m and 1e-15 rad."""
+    """Return the pose with rounding errors of pose products, below 1e-15 m and 1e-15 rad, set to zero."""
     rotation = np.where(np.abs(pose.rotation) < 1e-15, 0.0, pose.rotation)
     if np.allclose(rotation, np.eye(3), rtol=0.0, atol=2e-16):
         rotation = np.eye(3)
@@ -224,7 +224,7 @@ def _plain(text: str) -> str:
 
 
 def _breaks(pose: Pose) -> tuple[list[str], list[str]]:
-    """Return the parameters of the coordinate breaks before and behind a surface; empty for one on the axis."""
+    """Return the Zemax parameters of the coordinate breaks before and behind a surface; empty if it is on the axis."""
     r, (x, y, _) = pose.rotation, pose.translation
     if np.array_equal(r, np.eye(3)) and x == 0.0 and y == 0.0:
         return [], []
@@ -289,7 +289,7 @@ def _shape(lens: Prescription, given: LensSurface) -> tuple[str, list[str]]:
 
 
 def _even(lens: Prescription, given: LensSurface, shape: Surface) -> list[str]:
-    """Return the statements of even powers of the radius."""
+    """Return the Zemax statements of a surface's even powers of the radius."""
     if 2 * len(shape.even) + 2 > LAST_EVEN:
         raise _cannot(lens, given, f"even powers beyond r^{LAST_EVEN}", f"A4 to A{LAST_EVEN}")
     terms = [0.0, *(a * MM ** (-2 * n - 3) for n, a in enumerate(shape.even))]
@@ -297,7 +297,7 @@ def _even(lens: Prescription, given: LensSurface, shape: Surface) -> list[str]:
 
 
 def _zernike(figure: ZernikeFigure) -> list[str]:
-    """Return the statements of Zernike terms."""
+    """Return the Zemax statements of a figure's Zernike terms."""
     last = max(figure.terms)
     lines = [f"PARM 9 {_number(figure.centre[0] * MM)}", f"PARM 10 {_number(figure.centre[1] * MM)}"]
     values = [float(last), figure.radius * MM, *(figure.terms.get(j, 0.0) * MM for j in range(1, last + 1))]
@@ -305,7 +305,7 @@ def _zernike(figure: ZernikeFigure) -> list[str]:
 
 
 def _polynomial(lens: Prescription, given: LensSurface, shape: Surface) -> list[str]:
-    """Return the statements of an xy polynomial."""
+    """Return the Zemax statements of a surface's polynomial in x and y."""
     if any(not isinstance(term, XYPolynomial) for term in shape.terms):
         raise _cannot(lens, given, "sag terms that the format does not have", "polynomial")
     radius = 0.1
@@ -373,7 +373,7 @@ def batoid_text(lens: prescription.Prescription) -> tuple[str, tuple[prescriptio
 
 
 def _place(pose: Pose) -> dict[str, float]:
-    """Return a pose as shifts, then rotations about x, y and z, each about the axes left by the one before."""
+    """Return a pose in batoid's keys: shifts along x, y, z, then rotations about the moved x, y and z."""
     out = {name: float(v) for name, v in zip("xyz", pose.translation, strict=True) if v}
     r = pose.rotation
     if not np.array_equal(r, np.eye(3)):
@@ -387,7 +387,7 @@ def _place(pose: Pose) -> dict[str, float]:
 
 
 def _surface(lens: prescription.Prescription, given: prescription.LensSurface) -> dict[str, Any]:
-    """Return the shape of a surface as batoid has it."""
+    """Return the keys and values of a surface's shape in a batoid file."""
     shape = given.surface
     freeform = prescription.polynomial_of(Surface(terms=shape.terms)) if shape.terms else {}
     radius = 0.0
@@ -424,7 +424,7 @@ def _surface(lens: prescription.Prescription, given: prescription.LensSurface) -
 
 
 def _obscuration(edge: Edge) -> dict[str, Any] | None:
-    """Return an edge as batoid has it; None for an unsupported kind."""
+    """Return the keys and values of an edge in a batoid file; None for a kind that batoid lacks."""
     way, shape = "Obsc" if edge.blocks else "Clear", edge.shape
     x, y = shape.centre
     turn = {"theta": edge.rotation} if edge.rotation else {}

@@ -6,8 +6,8 @@ rotation before. Rotations about x and y are left-handed, those about z right-ha
 | kind | effect |
 |---|---|
 | DEC (no keyword) | the surface and all that follow are in the new frame |
-| DAR | the surface alone; what follows stands as if it were not decentred |
-| BEN | the rotation before the surface and once more behind it: what follows stands about the reflected axis |
+| DAR | the surface alone; what follows is placed as if it were not decentred |
+| BEN | the rotation before the surface and once more behind it: what follows is placed about the reflected axis |
 | REV | the inverse of the same decentre, behind the surface: it undoes one |
 """
 
@@ -133,7 +133,7 @@ def statements(lines: list[str]) -> list[Statement]:
 
 
 def _cut(text: str, mark: str) -> list[str]:
-    """Return the pieces of a text between marks outside of quotes."""
+    """Return the parts of a text between marks, ignoring marks inside quotes."""
     parts, quote = [""], ""
     for k, c in enumerate(text):
         if quote:
@@ -148,7 +148,7 @@ def _cut(text: str, mark: str) -> list[str]:
 
 
 def take(system: CodevSystem, s: Statement) -> None:
-    """Process one statement."""
+    """Apply one statement of the file to the system that is being read."""
     source, command = system.source, s.command
     if command in ("SO", "S", "SI") or (command[0] == "S" and command[1:].isdigit()):
         _surface(system, s)
@@ -192,7 +192,7 @@ def _qualified(s: Statement) -> bool:
 
 
 def _take_system(system: CodevSystem, s: Statement) -> None:
-    """Process a statement about the system."""
+    """Apply a statement about the whole system: title, units, pupil, wavelengths, fields."""
     source = system.source
     match s.command:
         case "RDM":
@@ -432,7 +432,7 @@ def _prescription(system: CodevSystem, glasses: Glasses) -> Prescription:
 
 
 def _pairs(system: CodevSystem) -> tuple[tuple[float, float], ...]:
-    """Return the fields (x, y) of the file, missing numbers as 0."""
+    """Return the field coordinates (x, y) of the file; missing numbers are 0."""
     count = max(len(system.x), len(system.y))
     x, y = ([*given, *[0.0] * count][:count] for given in (system.x, system.y))
     return tuple(zip(x, y, strict=True))
@@ -463,7 +463,7 @@ def _behind(source: Source, surface: CodevSurface, wavelength: float, glasses: G
 
 
 def _shape(system: CodevSystem, surface: CodevSurface) -> Surface:
-    """Return the shape of a surface."""
+    """Return the optical shape of a surface from the statements read for it, in metres."""
     scale = system.scale
     powers = {n: a * scale ** (1 - n) for n, a in surface.powers.items()}
     if not surface.special:
@@ -484,7 +484,7 @@ def _shape(system: CodevSystem, surface: CodevSurface) -> Surface:
 
 
 def _edges_of(surface: CodevSurface) -> tuple[Aperture | None, tuple[Edge, ...]]:
-    """Return the clear aperture, and the hole in it where it is not round."""
+    """Return the clear aperture, and the hole in it as a separate edge if it is not round."""
     sizes = surface.sizes
     centre = (surface.centre.get("ADX", 0.0), surface.centre.get("ADY", 0.0))
     blocked = (Edge(Circle(surface.hole, centre), blocks=True),) if surface.hole else ()

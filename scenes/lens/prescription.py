@@ -1,4 +1,4 @@
-"""Sequential prescription of another optical program, and its shapes as the tracer has them."""
+"""Sequential prescription of another optical program, and conversion of its surfaces to those of the ray tracer."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _POLYNOMIAL = {(a, n - a): (f"x{a}" if a > 1 else "x" * a) + (f"y{n - a}" if n -
 
 
 def even_asphere(curvature: float, conic: float, powers: Mapping[int, float]) -> Surface:
-    """Return a conic with even powers of the radius, r^2 included.
+    """Return a conic surface with even powers of the radius r, r^2 included, added to its sag.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def polynomial(surface: Surface, coefficients: Mapping[tuple[int, int], float], 
     surface : Surface
         Surface without a figure or polynomial.
     coefficients : Mapping[tuple[int, int], float]
-        (a, b) -> c_ab of (x/radius)^a (y/radius)^b, in metres.
+        Powers (a, b) -> coefficient of (x/radius)^a (y/radius)^b, in metres.
     radius : float
         Normalisation radius of the coefficients, in metres.
 
@@ -95,7 +95,20 @@ def zernike_of(coefficients: Mapping[tuple[int, int], float]) -> dict[int, float
 def moved_polynomial(
     coefficients: Mapping[tuple[int, int], float], centre: tuple[float, float]
 ) -> dict[tuple[int, int], float]:
-    """Return a polynomial in x - cx and y - cy as one in x and y."""
+    """Return a polynomial about another centre.
+
+    Parameters
+    ----------
+    coefficients : Mapping[tuple[int, int], float]
+        Powers (a, b) -> coefficient of (x - cx)^a (y - cy)^b.
+    centre : tuple[float, float]
+        Coordinates cx and cy.
+
+    Returns
+    -------
+    dict[tuple[int, int], float]
+        Powers (a, b) -> coefficient of x^a y^b of the same polynomial.
+    """
     out: dict[tuple[int, int], float] = {}
     cx, cy = centre
     for (a, b), c in coefficients.items():
@@ -139,7 +152,13 @@ def joined(surface: Surface) -> Surface:
 
 
 def about_vertex(figure: ZernikeFigure) -> dict[tuple[int, int], float]:
-    """Return a figure as a polynomial in x and y: (a, b) -> c_ab, m^(1-a-b)."""
+    """Return a Zernike figure as a polynomial about the vertex.
+
+    Returns
+    -------
+    dict[tuple[int, int], float]
+        Powers (a, b) -> coefficient of x^a y^b, in m^(1-a-b).
+    """
     order = max(figure.order, 0)
     table = monomials(figure.terms, order, figure.radius)
     own = {(n - b, b): float(table[triangle_index(n - b, b)]) for n in range(order + 1) for b in range(n + 1)}
@@ -153,7 +172,7 @@ def clear(
     ellipse: tuple[float, float] | None = None,
     centre: tuple[float, float] = (0.0, 0.0),
 ) -> Aperture | None:
-    """Return the clear aperture of sizes in metres; None if there are none.
+    """Return the clear aperture that has the given sizes, in metres; None if no size is given.
 
     Raises
     ------
@@ -172,7 +191,7 @@ def clear(
 def facing(surface: LensSurface) -> LensSurface:
     """Return a surface in a frame whose z points along the prescription's, rotated by 180 deg about x if necessary.
 
-    The body is the same in both frames.
+    Only the frame changes; the surface in space is the same.
     """
     if surface.pose.rotation[2, 2] >= 0.0:
         return surface
@@ -180,7 +199,7 @@ def facing(surface: LensSurface) -> LensSurface:
 
 
 OVER = Pose(np.diag([1.0, -1.0, -1.0]))
-"""Rotation by 180 deg about x."""
+"""Pose of a rotation by 180 deg about x."""
 
 
 def turned_over(surface: LensSurface) -> LensSurface:
@@ -213,9 +232,14 @@ def turned_over(surface: LensSurface) -> LensSurface:
 
 
 def polynomial_of(shape: Surface) -> dict[tuple[int, int], float]:
-    """Return the polynomial of a surface beyond its conic, without its figure: (a, b) -> c_ab of x^a y^b, m^(1-a-b).
+    """Return the polynomial of a surface's sag beyond its conic, without its figure.
 
     All terms of the surface must be polynomials.
+
+    Returns
+    -------
+    dict[tuple[int, int], float]
+        Powers (a, b) -> coefficient of x^a y^b, in m^(1-a-b).
     """
     out: dict[tuple[int, int], float] = {}
     for term in shape.terms:
@@ -236,7 +260,7 @@ def without_rim(surface: LensSurface) -> LensSurface:
 
 
 def written(value: float, kind: Kind) -> str:
-    """Return a number of another program's file as text of a camera's file, without digits that unit conversions leave.
+    """Return a number as text of a camera's file, without digits that unit conversions leave.
 
     It gives 540 arcsec and not 539.9999999999999 arcsec.
 
@@ -258,12 +282,12 @@ _LARGEST_EDGE = 100.0
 
 
 def edge_entries(edges: Iterable[Edge]) -> list[dict[str, Any]]:
-    """Return edges as a camera's file has them, without those that are too large to vignette light."""
+    """Return edges as the list ``edges`` of a camera's file, without those that are too large to vignette light."""
     return [_entry(edge) for edge in edges if _size(edge) < _LARGEST_EDGE]
 
 
 def _size(edge: Edge) -> float:
-    """Return the largest number of an edge, in metres."""
+    """Return the largest dimension of an edge, in metres."""
     shape = edge.shape
     numbers = [*shape.centre]
     match shape:
@@ -279,7 +303,7 @@ def _size(edge: Edge) -> float:
 
 
 def _entry(edge: Edge) -> dict[str, Any]:
-    """Return an edge as a camera's file has it."""
+    """Return the keys and values of one edge in a camera's file."""
     shape = edge.shape
     kind = {Circle: "circle", Rectangle: "rectangle", Ellipse: "ellipse", Ray: "ray", Polygon: "polygon"}[type(shape)]
 
@@ -371,7 +395,7 @@ class LensSurface:
 
     @property
     def every_edge(self) -> tuple[Edge, ...]:
-        """All edges, the clear aperture first."""
+        """All edges that vignette light at the surface, the clear aperture first."""
         return (*(() if self.aperture is None else (Edge(self.aperture),)), *self.edges)
 
 

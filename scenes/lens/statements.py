@@ -61,7 +61,7 @@ class Statement:
 
 @dataclass
 class Source:
-    """State of a file while it is read.
+    """Prescription file while it is read: its path and the notes collected so far.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class Source:
         self.notes.append(Note(statement.line, whole, text))
 
     def numbers(self, statement: Statement, what: str = "a number") -> tuple[float, ...]:
-        """Return all words of a statement as finite numbers. Raises InputError as ``number``."""
+        """Return all words of a statement as finite numbers; raise InputError if a word is not one."""
         return tuple(self.finite(statement, k, what) for k in range(len(statement.words)))
 
     def number(self, statement: Statement, place: int, what: str, default: float | None = None) -> float:
@@ -110,7 +110,7 @@ class Source:
         return self.value(statement, statement.words[place], what)
 
     def value(self, statement: Statement, word: str, what: str) -> float:
-        """Return a word of a statement as a number. Raises InputError as ``number``."""
+        """Return a word of a statement as a number; raise InputError if it is not one or is too large."""
         if word.upper() in ("INFINITY", "INF"):
             return math.inf
         if not _NUMBER.fullmatch(word):
@@ -121,7 +121,7 @@ class Source:
         return value
 
     def finite(self, statement: Statement, place: int, what: str, default: float | None = None) -> float:
-        """Return one of the statement's words as a finite number, as ``number`` does."""
+        """Return one of the statement's words as a finite number; raise InputError if it is not one."""
         value = self.number(statement, place, what, default)
         if not math.isfinite(value):
             raise self.error(f"{what} of {statement.command} is infinite", statement.line, statement.text)
@@ -130,7 +130,7 @@ class Source:
     def whole(
         self, statement: Statement, place: int, what: str, least: int, most: int, default: int | None = None
     ) -> int:
-        """Return one of the statement's words as a whole number between limits. Raises InputError as ``number``."""
+        """Return one of the statement's words as an integer between two limits; raise InputError otherwise."""
         value = self.finite(statement, place, what, default)
         if value != int(value) or not least <= value <= most:
             allowed = f"whole numbers {least} to {most}"
@@ -230,7 +230,7 @@ MAKERS = ("SCHOTT", "OHARA", "HOYA", "CDGM")
 
 
 def of_makers(glasses: Glasses, makers: Sequence[str]) -> Glasses:
-    """Return the glasses without common ones of other manufacturers than those that a file names, if it names any."""
+    """Return the glasses without those of manufacturers that the file does not list; all if it lists none."""
     others = set(MAKERS).difference(makers) if set(MAKERS).intersection(makers) else set()
     dropped = {k for k, g in glasses.items() if getattr(g, "source", "").partition("'")[0].upper() in others}
     return FrozenMap({k: g for k, g in glasses.items() if k not in dropped}) if dropped else glasses
@@ -268,13 +268,13 @@ def index_of(source: Source, glasses: Glasses, name: str, wavelength: float, lin
 
 
 def named_glasses(glasses: Glasses, surfaces: Iterable[LensSurface]) -> Glasses:
-    """Return the glasses of surfaces with known dispersion, by the surfaces' names for them."""
+    """Return the glasses of surfaces whose dispersion is known, by the names that the surfaces use."""
     names = {surface.glass for surface in surfaces if surface.glass}
     return FrozenMap({name: glasses[glass_key(name)] for name in sorted(names) if glass_key(name) in glasses})
 
 
 def require_d_line(source: Source, what: str, name: str, wavelength: float, line: int) -> None:
-    """Raise InputError for a glass without a catalogue at a wavelength (metres) other than that of its index."""
+    """Raise InputError for a glass known only by its d-line index if the wavelength, in metres, is another one."""
     if abs(wavelength - D_LINE) > _D_WIDTH:
         problem = f"a {what} glass has an index at 587.56 nm only"
         raise source.error(problem, line, f"{name} at {wavelength * 1e9:.6g} nm", "a catalogue's glass")
@@ -321,7 +321,7 @@ class Chain:
         stop: bool,
         last: bool,
     ) -> None:
-        """Append the next surface, with a number added to a name that is taken; a dummy plane is omitted.
+        """Append the next surface to the chain; a dummy plane is omitted, and a repeated name gets a number.
 
         Parameters
         ----------
@@ -362,7 +362,7 @@ class Chain:
         self.surfaces.append(surface)
 
     def prescription(self, keyword: str, distance: float, name: str, **attributes: Any) -> Prescription:
-        """Return the prescription of the surfaces.
+        """Return the prescription made of the surfaces so far.
 
         Parameters
         ----------
@@ -371,8 +371,8 @@ class Chain:
         distance : float
             Distance of the object, in metres.
         name : str
-            Title of the file, empty for none.
-        attributes : Any
+            Title of the file; empty if it has none.
+        attributes : keyword arguments
             Further attributes of the prescription.
 
         Raises
@@ -403,7 +403,7 @@ _CONSTANTS = 6
 
 
 def own_glasses() -> Glasses:
-    """Return the twin's glasses and the common ones; fused silica also by its names in catalogues."""
+    """Return the built-in glasses, name -> index; some also by other names that prescriptions use."""
     glasses: dict[str, Callable[[float], float]] = {glass_key(name): glass for name, glass in common_glasses().items()}
     glasses |= {glass_key(name): glass.index for name, glass in GLASSES.items()}
     glasses |= dict.fromkeys(("SILICA", "FSILICA"), glasses[glass_key("fused silica")])

@@ -35,7 +35,7 @@ from scenes.lens.statements import (
 UNITS = {"MM": 1e-3, "CM": 1e-2, "IN": 25.4e-3, "INCH": 25.4e-3, "ME": 1.0, "M": 1.0, "METER": 1.0}
 
 SHAPES = ("STANDARD", "EVENASPH", "ODDASPHE", "XPOLYNOM", "SZERNSAG", "COORDBRK")
-"""Kinds of surfaces that are supported."""
+"""Zemax names of the surface types that are supported."""
 
 OF_NO_EFFECT = frozenset(
     # the program's version and windows, drawings, solves whose values stand in the file, optimisation, tolerances,
@@ -62,7 +62,7 @@ _EDGES = {
     "SQOB": "blocked rectangle",
     "ELOB": "blocked ellipse",
 }
-"""Statement -> kind of edge."""
+"""Zemax statement of an aperture -> kind of edge."""
 
 
 @dataclass
@@ -140,7 +140,7 @@ def read_zemax(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
 
 
 def _take(system: _System, s: Statement) -> None:
-    """Process one statement."""
+    """Apply one statement of the file to the system that is being read."""
     source = system.source
     if s.command == "SURF":
         number = source.whole(s, 0, "the surface's number", 0, MOST_SURFACES)
@@ -164,7 +164,7 @@ def _take(system: _System, s: Statement) -> None:
 
 
 def _take_system(system: _System, s: Statement) -> None:
-    """Process a statement about the system."""
+    """Apply a statement about the whole system: title, units, pupil, wavelengths, fields."""
     source = system.source
     match s.command:
         case "MODE":
@@ -221,14 +221,14 @@ def _positive(source: Source, s: Statement, what: str) -> float:
 
 
 def _wave(source: Source, s: Statement, micrometres: float) -> float:
-    """Return a wavelength in metres of one in micrometres."""
+    """Return a wavelength in metres from one in micrometres, after checking it."""
     if not 0.1 <= micrometres <= 100.0:
         raise source.error("no wavelength of light", s.line, s.text, "0.1 to 100 um")
     return micrometres / 1e6
 
 
 def _take_surface(system: _System, surface: _Surface, s: Statement) -> None:
-    """Process a statement about a surface."""
+    """Apply a statement about one surface: its type, curvature, thickness, glass, parameters or aperture."""
     source = system.source
     match s.command:
         case "TYPE":
@@ -319,14 +319,14 @@ def _prescription(system: _System, glasses: Glasses) -> Prescription:
 
 
 def _pairs(system: _System) -> tuple[tuple[float, float], ...]:
-    """Return the fields (x, y) of the file, missing numbers as 0."""
+    """Return the field coordinates (x, y) of the file; missing numbers are 0."""
     count = system.field_count or max(len(system.x), len(system.y))
     x, y = ([*given, *[0.0] * count][:count] for given in (system.x, system.y))
     return tuple(zip(x, y, strict=True))
 
 
 def _fields(system: _System) -> tuple[tuple[float, float], ...]:
-    """Return the field angles, in radians."""
+    """Return the field angles (x, y), in radians."""
     for value in (value for pair in _pairs(system) for value in pair):
         if not abs(value) < 89.0:
             raise system.source.error("a field beyond 89 deg", system.field_line, value)
@@ -334,7 +334,7 @@ def _fields(system: _System) -> tuple[tuple[float, float], ...]:
 
 
 def _break(source: Source, chain: Chain, surface: _Surface, scale: float) -> None:
-    """Apply a coordinate break."""
+    """Move the frame of the following surfaces by a coordinate break."""
     p = surface.parameters
     shift = (p.get(1, 0.0) * scale, p.get(2, 0.0) * scale, 0.0)
     turns = [about_axis(axis, math.radians(p.get(3 + axis, 0.0))) for axis in range(3)]

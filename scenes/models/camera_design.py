@@ -27,17 +27,17 @@ _ACROSS, _ALONG = (0.0, 0.5, 1.0), (-1.0, 0.0, 1.0)
 
 
 class CameraDesignSetup(ExperimentSetup[CameraDesignSpec]):
-    """Optimisation with the camera that it starts from."""
+    """Optimisation task of a file, with the camera from which it starts."""
 
     camera: CameraSpec
 
     @classmethod
     def parts(cls, test: CameraDesignSpec) -> dict[str, Any]:
-        """Return the camera."""
+        """Read the start camera that the file names; return field name -> content."""
         return {"camera": load_camera(test.camera, test, ("camera",))}
 
     def checked(self) -> Self:
-        """Check that the camera can be optimised, and has what ``vary`` names."""
+        """Check that the camera can be optimised and has the surfaces that ``vary`` names; return the set-up."""
         self.camera.require_mirrors("a camera that is optimised", on_axis=True)
         known = (*self.camera.mirrors, IMAGE)
         for name in self.test.vary:
@@ -55,13 +55,23 @@ def prescription_of(camera: CameraSpec) -> Prescription:
 
 
 def beams_of(camera: CameraSpec) -> Beams:
-    """Return nine fields of one half of the camera's field with their beams."""
+    """Return the beams of nine field points in one half of the camera's field; the other half follows by symmetry."""
     fields = [(x * camera.field.x, y * camera.field.y) for x in _ACROSS for y in _ALONG]
     return Beams(np.array(fields), camera.entrance_pupil, quadrature.disk(_RINGS))
 
 
 def operands_of(setup: CameraDesignSetup, principal_distance: float, envelope: float) -> Operands:
-    """Return the operands of the merit function, given principal distance and envelope of the start, in metres."""
+    """Return the operands (targets and constraints) of the optimisation's merit function.
+
+    Parameters
+    ----------
+    setup : CameraDesignSetup
+        The optimisation task.
+    principal_distance : float
+        Principal distance of the start camera along the line, in metres, to be kept.
+    envelope : float
+        Extent of the start camera along the parent axis, in metres.
+    """
     test, camera = setup.test, setup.camera
     largest = None if test.envelope is None else test.envelope * envelope
     asked = camera.wavelength, principal_distance, largest, test.clearance, camera.edge_margin
@@ -69,7 +79,7 @@ def operands_of(setup: CameraDesignSetup, principal_distance: float, envelope: f
 
 
 def variables_of(spec: CameraDesignSpec) -> tuple[Variable, ...]:
-    """Return the variables of an optimisation; radii vary as curvatures."""
+    """Return the numbers that the optimisation varies; radii of curvature vary as curvatures, in 1/m."""
     return tuple(
         Variable(name, "curvature" if quantity == "radius" else quantity)
         for name, quantities in spec.vary.items()
@@ -78,7 +88,7 @@ def variables_of(spec: CameraDesignSpec) -> tuple[Variable, ...]:
 
 
 def camera_of(start: CameraSpec, prescription: Prescription, name: str, description: str) -> CameraSpec:
-    """Return the camera of an optimised prescription; everything but its optics is that of the start.
+    """Return the camera with an optimised prescription; everything but its optics is that of the start camera.
 
     Raises
     ------

@@ -153,12 +153,12 @@ def check_entrance_pupil(spec: CameraSpec, traced: float) -> None:
 
 
 def _difference(traced: np.ndarray, stated: float) -> float:
-    """Return the relative difference from the specified focal length in the direction that is nearer to it."""
+    """Return the relative difference of the traced from the specified focal length, the smaller of both directions'."""
     return float(np.min(np.abs(traced / stated - 1.0)))
 
 
 def _cause(spec: CameraSpec, traced: float, focal_lengths: FocalLengths, place: bool) -> tuple[str, str | None]:
-    """Return the likely mistake, in words and as the corrected line of the file; empty if there is none."""
+    """Return the likely mistake, in words and as the corrected line of the file; an empty text if none is found."""
     for factor, what in _UNITS:
         if abs(factor * traced / spec.focal_length - 1.0) <= LARGEST_DIFFERENCE:
             right = format_quantity(spec.focal_length / factor, LENGTH)
@@ -182,7 +182,7 @@ def _cause(spec: CameraSpec, traced: float, focal_lengths: FocalLengths, place: 
 
 
 Candidates = Iterator[tuple[str, str, CameraSpec]]
-"""Possible mistakes: a description, the corrected line of the file, and the camera with the correction."""
+"""Possible mistakes in a camera's file: a description, the corrected line, and the camera with the correction."""
 
 
 def _single(spec: CameraSpec) -> Candidates:
@@ -202,7 +202,7 @@ def _together(spec: CameraSpec) -> Candidates:
 
 
 def _places(spec: CameraSpec) -> Candidates:
-    """Yield corrections of one number of the image or of the field."""
+    """Yield corrections of one number of the image plane or of the field."""
     image = spec.image
     changes: list[tuple[KeyPath, str, dict[str, Any]]] = []
     for z, words in _lengths("z", image.z):
@@ -325,7 +325,13 @@ def find_axis(
 def _along(
     spec: CameraSpec, backend: Backend, to_stop: SystemBatch, imaging: SystemBatch, direction: np.ndarray
 ) -> tuple[CameraAxis, float]:
-    """Return the axis along one direction and the radius of the stop. Raises AimError and BeamMissedError."""
+    """Return the camera's axis for light along a direction, and the stop's radius in metres.
+
+    Raises
+    ------
+    AimError, BeamMissedError
+        Light along this direction does not come through.
+    """
     start, on_axis = -LAUNCH_DISTANCE * direction, np.array_equal(direction, PARENT_AXIS)
     centre = aim_collimated(backend, to_stop, direction[None], start[None], np.zeros((1, 2)))[0][0, 0]
     optics = [mirror for mirror in spec.mirrors.values() if mirror.light != "passes"]
@@ -339,13 +345,30 @@ def _along(
 
 
 def _ring() -> np.ndarray:
-    """Return the points of the rim of a unit circle, (_RIM, 2)."""
+    """Return the ``_RIM`` points on the rim of a unit circle from which areas of beams are computed, (_RIM, 2)."""
     angle = 2.0 * np.pi * np.arange(_RIM) / _RIM
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def _require_light(backend: Backend, systems: SystemBatch, launch: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Return the points (N, 2) where rays from launch points (N, 3) end. Raises BeamMissedError."""
+    """Trace N rays to the last element and raise BeamMissedError if one is lost.
+
+    Parameters
+    ----------
+    backend : Backend
+        Backend that traces the rays.
+    systems : SystemBatch
+        One system.
+    launch : (N, 3) ndarray
+        Launch points, in metres.
+    direction : (3,) ndarray
+        Unit vector of all rays.
+
+    Returns
+    -------
+    (N, 2) ndarray
+        Points at which the rays meet the last element, in its x and y, in metres.
+    """
     position, _, _, valid = trace(backend, systems, make_rays(backend, launch, direction)).numpy()
     if not np.all(valid):
         raise BeamMissedError("the beam along the axis misses a surface")
@@ -465,7 +488,16 @@ def camera_elements(name: str, root: str, model: CameraModel) -> dict[str, Eleme
 
 
 def camera_sequences(name: str, model: CameraModel) -> dict[str, tuple[str, ...]]:
-    """Return the sequences of elements: scene to line CCD, scene to stop, image to stop, and image to scene."""
+    """Return the sequences in which light meets the elements.
+
+    They run from the scene to the line CCD, from the scene to the stop, from the image to the stop, and from the image
+    to the scene.
+
+    Returns
+    -------
+    dict[str, tuple[str, ...]]
+        Name of a sequence, such as ``NAME/imaging`` -> names of its elements.
+    """
     forward = tuple(f"{name}/{m}" for m in model.mirrors)
     backward = forward[::-1]
     stop = f"{name}/{model.spec.stop}"
@@ -507,7 +539,7 @@ ROOT = "camera"
 
 
 def camera_alone(model: CameraModel) -> Assembly:
-    """Return the assembly of one camera, with bodies ``camera/M1`` ... and sequences ``camera/imaging`` ..."""
+    """Return the assembly of a single camera, with bodies ``camera/M1`` ... and sequences ``camera/imaging`` ..."""
     tree = RigidTree(tuple(camera_bodies(ROOT, Pose(), model)))
     index = {f"{ROOT}/{lens}": n for lens, n in glass_indices(model.spec).items()}
     above_d = {f"{ROOT}/{lens}": step for lens, step in above_d_line(model.spec).items()}
@@ -534,7 +566,7 @@ class CameraUnderTest:
 
 
 def build_camera_under_test(test: CameraUnderTestSpec, camera: CameraSpec, backend: Backend) -> CameraUnderTest:
-    """Build the camera of a test and check the test's statements about it.
+    """Build the camera of a laboratory test and check that the test's ``as_built`` fits it.
 
     Raises
     ------
@@ -570,7 +602,9 @@ _RIM_POINTS = 24
 
 @dataclass(frozen=True, eq=False)
 class CameraModel:
-    """Derived numbers of a camera; poses and points are in the prescription frame, in metres and radians.
+    """Traced camera: its prescription with shapes, apertures, frames and paraxial data derived from it.
+
+    Poses and points are in the prescription frame, in metres and radians.
 
     Attributes
     ----------
@@ -587,7 +621,7 @@ class CameraModel:
     first_order : FirstOrder
         Parabasal quantities about the chief ray of the field's centre.
     image_direction : (3,) ndarray
-        Direction of that chief ray at the image.
+        Unit vector of that chief ray at the image.
     rear_node : (3,) ndarray
         Point one principal distance (along the line) upstream of the line's centre along that ray.
     axis : CameraAxis
@@ -617,7 +651,7 @@ class CameraModel:
 
     @cached_property
     def edges(self) -> Mapping[str, tuple[Edge, ...]]:
-        """Mirror name -> edges that vignette light at that surface beside the stop, for the surfaces that have any."""
+        """Mirror name -> edges other than the stop that vignette light there; only for surfaces that have any."""
         listed = {name: mirror.edges for name, mirror in self.spec.mirrors.items()}
         return {name: tuple(edge.to_edge() for edge in edges) for name, edges in listed.items() if edges}
 
@@ -633,8 +667,8 @@ class CameraModel:
         Parameters
         ----------
         hits : callable
-            Function from a mirror's name to the points (..., 2 or 3) at which rays meet it, in the mirror's own frame,
-            in metres of the nominal mirror.
+            Function from a mirror's name to the points at which rays meet it, (..., 2 or 3) array of x, y (and z) in
+            the mirror's own frame, in metres of the nominal mirror.
         """
         through: np.ndarray | bool = True
         for name, edges in self.edges.items():
@@ -645,7 +679,10 @@ class CameraModel:
 
     @property
     def line_principal_distance(self) -> float:
-        """Local principal distance along the line about the field's central chief ray, in metres (the papers' f)."""
+        """Principal distance along the line about the central chief ray, in metres: image shift per field angle.
+
+        It is f in the papers.
+        """
         return float(abs(self.first_order.scale[0, 0, 0]))
 
     def vertex(self, mirror: str) -> np.ndarray:
@@ -662,12 +699,17 @@ class CameraModel:
         return image_pose(self.spec)
 
     def toward_optics(self, focal_plane: np.ndarray) -> np.ndarray:
-        """Return the unit vector from the line's centre along its chief ray, upstream, in the world.
+        """Return the unit vector from the line's centre back along its chief ray, toward the optics, in the world.
 
         Parameters
         ----------
         focal_plane : (..., 3, 3) ndarray
-            Rotations of the focal plane in the world.
+            Rotation matrices of the focal plane in the world.
+
+        Returns
+        -------
+        (..., 3) ndarray
+            Unit vectors.
         """
         return matvec(focal_plane, matvec(self.focal_plane.rotation.T, -self.image_direction))
 
@@ -677,9 +719,14 @@ class CameraModel:
 
 
 def field_direction(spec: CameraSpec, x: float, y: float) -> np.ndarray:
-    """Return the direction in which light of field (x, y) travels, in the prescription frame.
+    """Return the unit vector in which light of a field point travels, in the prescription frame.
 
-    Angles are in radians; y counts from the biased centre of the field.
+    Parameters
+    ----------
+    spec : CameraSpec
+        The camera.
+    x, y : float
+        Field angles along and across the line, in radians; y counts from the biased centre of the field.
     """
     return direction_of((x, spec.field_bias + y))
 
@@ -698,7 +745,7 @@ def image_pose(spec: CameraSpec) -> Pose:
 
 
 def collimated(backend: Backend, to_stop: SystemBatch, directions: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Return launch points of collimated beams that meet the stop at given points.
+    """Return launch points of F collimated beams whose rays meet the stop at N given points.
 
     Parameters
     ----------
@@ -707,14 +754,14 @@ def collimated(backend: Backend, to_stop: SystemBatch, directions: np.ndarray, t
     to_stop : SystemBatch
         One system, from the scene to the stop.
     directions : (F, 3) ndarray
-        Directions of the beams.
+        Unit vectors of the beams.
     targets : (N, 2) ndarray
-        Stop coordinates, in metres, the same for every beam.
+        Points in the stop's x and y, in metres, the same for every beam.
 
     Returns
     -------
     (F, N, 3) ndarray
-        Points on a plane before the first mirror, in the prescription frame.
+        Points on a plane before the first mirror, in the prescription frame, in metres.
     """
     systems = to_stop.take(np.zeros(len(directions), dtype=int))
     return aim_collimated(backend, systems, directions, -LAUNCH_DISTANCE * directions, targets)[0]
@@ -751,7 +798,7 @@ def derive_camera(spec: CameraSpec, backend: Backend, check_stated: bool = True)
 
 
 def _focal_lengths(chief: RayMatrix, about_axis: Paraxial) -> TracedFocalLengths:
-    """Return the focal lengths about a chief ray together with the effective focal length about the axis."""
+    """Return the focal lengths about a chief ray and the effective focal length about the axis, in metres."""
     power = np.linalg.svd(chief.direction_by_position[0], compute_uv=False)
     with np.errstate(divide="ignore"):
         light = np.copysign([*1.0 / power, about_axis.focal_length], about_axis.back_focal_length)
@@ -759,7 +806,13 @@ def _focal_lengths(chief: RayMatrix, about_axis: Paraxial) -> TracedFocalLengths
 
 
 def _traced_focal_lengths(spec: CameraSpec, backend: Backend) -> TracedFocalLengths:
-    """Trace the focal lengths of a prescription. Raises AimError, BeamMissedError and AfocalError."""
+    """Trace the focal lengths of a prescription.
+
+    Raises
+    ------
+    AimError, BeamMissedError, AfocalError
+        Light does not come through, or parallel light leaves the system parallel.
+    """
     bare = _bare(spec, {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}, {})
     to_stop, imaging, _, matrix = _chief(spec, backend, bare)
     axis, _ = find_axis(spec, backend, to_stop, imaging, field_direction(spec, 0.0, 0.0))
@@ -769,7 +822,14 @@ def _traced_focal_lengths(spec: CameraSpec, backend: Backend) -> TracedFocalLeng
 def _chief(
     spec: CameraSpec, backend: Backend, bare: Assembly
 ) -> tuple[SystemBatch, SystemBatch, np.ndarray, RayMatrix]:
-    """Return the systems to stop and image, the launch point (1, 3) of the centre's chief ray, and its derivatives."""
+    """Trace the chief ray of the field's centre.
+
+    Returns
+    -------
+    tuple
+        System to the stop, system to the image, launch point of the ray, (1, 3) in metres, and its ray matrix: the
+        derivatives of position and direction at the image with respect to those at the launch.
+    """
     names = tuple(spec.mirrors)
     stop = names.index(spec.stop)
     centre = field_direction(spec, 0.0, 0.0)
@@ -780,7 +840,7 @@ def _chief(
 
 
 def _derived(spec: CameraSpec, backend: Backend, check_stated: bool) -> CameraModel:
-    """Return the model as `derive_camera` does. Raises AimError, BeamMissedError and AfocalError."""
+    """Return the model of a camera, as `derive_camera` does, but raise the errors of the ray trace unchanged."""
     surfaces = {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}
     names = tuple(spec.mirrors)
     bare = _bare(spec, surfaces, {})
@@ -829,7 +889,7 @@ LIGHT = {None: Interaction.REFLECT, "refracts": Interaction.REFRACT, "passes": I
 
 
 def lenses(spec: CameraSpec) -> dict[str, str]:
-    """Return the lens of each refracting face, named by the lens's first face."""
+    """Return name of each refracting face -> name of its lens, which is that of the lens's first face."""
     out, inside = {}, ""
     for name, mirror in spec.mirrors.items():
         if mirror.light == "refracts":
@@ -850,7 +910,7 @@ def glass_indices(spec: CameraSpec, wavelength: float | None = None) -> dict[str
 
 
 def above_d_line(spec: CameraSpec) -> dict[str, float]:
-    """Return index at the design wavelength minus index at the d line, of each lens with an Abbe number.
+    """Return the index at the design wavelength minus that at the d line, for each lens with an Abbe number.
 
     A glass has an Abbe number where its index is known at the lines d, F and C.
     """
@@ -865,7 +925,7 @@ def above_d_line(spec: CameraSpec) -> dict[str, float]:
 def coloured(spec: CameraSpec, root: str, state: State, wavelength: float) -> State:
     """Return a state for light of another wavelength than the design's, in which the lenses have other indices.
 
-    Changes of index in the state itself, such as those of heat, are added to the change by the wavelength.
+    Changes of index in the state itself, such as those due to heat, are added to the change due to the wavelength.
 
     Parameters
     ----------
@@ -874,7 +934,7 @@ def coloured(spec: CameraSpec, root: str, state: State, wavelength: float) -> St
     root : str
         Path of its body; empty for a bare camera.
     state : State
-        Body path -> motion.
+        Path of each moved body -> its motion.
     wavelength : float
         Wavelength of the light, in metres.
 
@@ -893,9 +953,26 @@ def coloured(spec: CameraSpec, root: str, state: State, wavelength: float) -> St
 
 
 def glass_steps(spec: CameraSpec, root: str, wavelength: float) -> dict[str, float]:
-    """Return the index of each lens at a wavelength minus that at the design wavelength, by the lens's body.
+    """Return path of each lens's body -> its index at a wavelength minus that at the design wavelength.
 
-    The result is empty if nothing changes. Arguments and exceptions are those of ``coloured``.
+    Parameters
+    ----------
+    spec : CameraSpec
+        The camera.
+    root : str
+        Path of its body; empty for a bare camera.
+    wavelength : float
+        Wavelength of the light, in metres.
+
+    Returns
+    -------
+    dict[str, float]
+        Empty if no index changes.
+
+    Raises
+    ------
+    ValueError
+        The glass of a lens is not named, or its index is not known at the wavelength.
     """
     if wavelength == spec.wavelength or not lenses(spec):
         return {}
@@ -905,16 +982,17 @@ def glass_steps(spec: CameraSpec, root: str, wavelength: float) -> dict[str, flo
 
 
 def in_glass(state: State, steps: Mapping[str, float]) -> State:
-    """Return a state with changes of the lenses' indices added to it.
+    """Return a state with changes of the lenses' refractive indices added to it.
 
-    A glass with another Abbe number disperses more or less than the catalogue's, by the state's ``dispersion``.
+    Each change is multiplied by 1 + ``dispersion``, the relative change of the glass's dispersion in the state, which a
+    changed Abbe number causes.
 
     Parameters
     ----------
     state : State
-        Body path -> motion.
+        Path of each moved body -> its motion.
     steps : Mapping[str, float]
-        Changes of index as ``glass_steps`` returns them.
+        Path of each lens's body -> change of its index, from ``glass_steps``.
     """
     if not steps:
         return state
@@ -981,7 +1059,19 @@ surface counts as centred on its own axis. Mirrors of on-axis telescopes are bel
 
 
 def _manufactured_outline(box: Rectangle, hits: np.ndarray, spec: CameraSpec, name: str) -> Aperture:
-    """Return the outline of a manufactured surface for beams whose rims meet it at (F, N, 2), NaN for lost rays."""
+    """Return the outline of a surface as it is manufactured: circle, ellipse or rectangle.
+
+    Parameters
+    ----------
+    box : Rectangle
+        Rectangle around all beams.
+    hits : (F, N, 2) ndarray
+        Points at which the N rim rays of F beams meet the surface, in its x and y, in metres; NaN for lost rays.
+    spec : CameraSpec
+        The camera.
+    name : str
+        Name of the surface.
+    """
     margin = spec.edge_margin
     if np.hypot(*box.centre) > _ABOUT_AXIS * min(box.half_x, box.half_y):
         return box

@@ -84,13 +84,15 @@ computed.
 """
 
 Cut = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Function that returns which rays bodies about a camera block, (F, N) of bool, for fields (F, 2) and points (N, 2) of
-the stop in units of its radius.
+"""Function that returns which rays are blocked by bodies about a camera.
+
+Its arguments are F fields, (F, 2), as fractions of the half field, and N points of the stop, (N, 2), in units of its
+radius; its result is a mask, (F, N).
 """
 
 
 def stop_nodes(model: CameraModel, rings: int, cut: bool = False) -> PupilNodes:
-    """Return the nodes of the stop at which a camera's light is evaluated.
+    """Return the points of the stop, with quadrature weights, at which a camera's light is evaluated.
 
     Where nothing but the stop limits a beam, these are Gauss' rule with ``rings`` rings, exact for smooth wavefronts.
     Where edges vignette it they are ``EVEN`` points regardless of the rings, so that all results of such a beam use the
@@ -220,9 +222,30 @@ class FieldBeams:
         rings: int,
         cut: Cut | None = None,
     ) -> np.ndarray:
-        """Return the rms wavefront errors at many fields (F, 2) on the specified image plane, (F,), in waves.
+        """Return the rms wavefront error at each of F field points on the image plane of the camera's file, in waves.
 
-        Exceptions are those of ``trace``.
+        Parameters
+        ----------
+        model : CameraModel
+            The camera.
+        backend : Backend
+            Backend that traces the rays.
+        fields : sequence of tuple[float, float]
+            F field points, as fractions of the half field.
+        rings : int
+            Number of rings of Gauss' rule over the stop.
+        cut : callable or None
+            Function that returns the rays that bodies about the camera block.
+
+        Returns
+        -------
+        (F,) ndarray
+            Errors in waves of the design wavelength.
+
+        Raises
+        ------
+        AimError, BeamMissedError, InputError
+            Light of a field does not come through, or edges block all of it.
         """
         # Fields are traced in parts, which limits the memory to some 100 MB.
         step = max(1, _MOST_RAYS // stop_nodes(model, rings, cut is not None).count)
@@ -232,14 +255,20 @@ class FieldBeams:
 
     @property
     def share(self) -> np.ndarray:
-        """Fraction of the transmitted light that each ray carries, (N,), or (F, N) where some rays are vignetted."""
+        """Fraction of the transmitted light that each of N rays carries, (N,), or (F, N) if F fields are vignetted."""
         if self.illuminated is None:
             return self.nodes.share
         share = self.nodes.share * self.illuminated
         return np.asarray(share / np.sum(share, axis=-1, keepdims=True))
 
     def _away(self, plane: FocalPlane) -> np.ndarray:
-        """Return the distance from the specified image plane along each ray to another plane, (F, 1 + N), in metres."""
+        """Return the distances along the rays from the image plane of the camera's file to another plane.
+
+        Returns
+        -------
+        (F, 1 + N) ndarray
+            Distances in metres, for F fields: the chief ray, then N rays.
+        """
         point = np.array([0.0, 0.0, plane.z])
         normal = np.array([0.0, -np.sin(plane.tilt), np.cos(plane.tilt)])
         return np.asarray(((point - self.position) @ normal) / (self.direction @ normal))
@@ -249,7 +278,13 @@ class FieldBeams:
         return bool(np.all(self.room + self._away(plane)[:, 0] > 0.0))
 
     def wavefronts(self, plane: FocalPlane) -> np.ndarray:
-        """Return wavefront errors (F, N), without piston and tilt, for a focal plane, in waves; 0 if vignetted."""
+        """Return the wavefront errors on a focal plane, without piston and tilt.
+
+        Returns
+        -------
+        (F, N) ndarray
+            Errors of N rays of F fields, in waves; 0 for vignetted rays.
+        """
         away = self._away(plane)
         position, path = self.position + away[..., None] * self.direction, self.path + away
         to_sphere = path_to_sphere(position, self.direction, path, position[:, :1], self.exit_pupil)
@@ -261,7 +296,7 @@ class FieldBeams:
         return np.asarray(error - (error * self.nodes.share) @ basis @ basis.T)
 
     def errors(self, plane: FocalPlane) -> np.ndarray:
-        """Return the rms wavefront error at each field, (F,), in waves."""
+        """Return the rms wavefront error of each of F fields on a focal plane, (F,), in waves."""
         squares = self.wavefronts(plane) ** 2
         if self.illuminated is not None:
             return np.asarray(np.sqrt(np.sum(squares * self.share, axis=-1)))
@@ -291,7 +326,17 @@ class FieldBeams:
 
 
 def _levelled(error: np.ndarray, basis: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Return errors (N,) minus their weighted least-squares fit by the basis (N, 3); 0 where the weight is 0."""
+    """Return errors of N rays without their best fit by piston and tilts.
+
+    Parameters
+    ----------
+    error : (N,) ndarray
+        Optical path differences.
+    basis : (N, 3) ndarray
+        Piston and the two tilts at the rays.
+    share : (N,) ndarray
+        Weights of the rays; the result is 0 where the weight is 0.
+    """
     illuminated = share > 0.0
     root = np.sqrt(share[illuminated])
     terms, *_ = np.linalg.lstsq(basis[illuminated] * root[:, None], error[illuminated] * root, rcond=None)
@@ -324,7 +369,9 @@ class Sharpness:
 
 @lru_cache(maxsize=64)
 def sharpness(camera: CameraSpec, backend: Backend) -> Sharpness:
-    """Return the sharpness of a camera from 222 rays; repeated calls return the stored result.
+    """Return the wavefront errors of a camera as designed, and its best focal plane, from 222 rays.
+
+    Repeated calls return the stored result.
 
     Raises
     ------
@@ -371,13 +418,14 @@ def blur_warnings(setup: Spec, backend: Backend) -> tuple[str, ...]:
 
 
 NO_CAMERA = 10.0
-"""Wavefront error at the best focus above which a prescription is not that of a camera, in waves rms. Its rays spread
-over some hundred Airy disks, and beams miss the parts behind it because of that.
+"""Wavefront error at the best focus, in waves rms, above which a prescription is reported as not forming an image.
+
+Its rays spread over some hundred Airy disks, and beams miss the parts behind it because of that.
 """
 
 
 def no_cameras(cameras: Iterable[CameraSpec], backend: Backend) -> tuple[Issue, ...]:
-    """Return an issue for each prescription that makes no image, wherever its image plane stands.
+    """Return an issue for each prescription that forms no image at any position of its image plane.
 
     It is the root cause of whatever its light misses afterwards.
 

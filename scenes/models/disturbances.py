@@ -1,7 +1,8 @@
-"""Prior of the disturbances of an instrument: components, correlations, laws of time, and states drawn from them.
+"""Prior of the disturbances of an instrument: components, correlations, time laws, and random states drawn from them.
 
-Each law of time is sampled exactly at arbitrary times, without intermediate steps, so that times may be far apart: a
-drift is an Ornstein-Uhlenbeck process, a periodic motion the real part of a rotating random phasor.
+A component is one motion or temperature of one body, such as ``M2 shift z``; a time law is the covariance of its
+changes over time. Each time law is sampled exactly at arbitrary times, without intermediate steps, so that times may be
+far apart: a drift is an Ornstein-Uhlenbeck process, a periodic motion the real part of a rotating random phasor.
 
 ``joint_disturbances`` goes the other way: it writes a covariance of components, such as that of an estimate of an
 instrument's state, as a file of disturbances.
@@ -60,11 +61,11 @@ UNITS: Mapping[str, tuple[str, float]] = {
     "gradient": ("mK/m", 1e-3),
     "index_gradient": ("ppm/m", 1e-6),
 }
-"""Kind of component -> the unit in which it is printed, and that unit in SI."""
+"""Kind of component -> the unit in which its amounts are printed, and the size of that unit in SI."""
 HEAT = ("temperature", "gradient")
 """Kinds of components that act through the thermal model."""
 SINGLE = ("scale", "radius", "conic", "index", "temperature")
-"""Kinds of which a body has a single component, without an axis."""
+"""Kinds of components without an axis, of which a body has only one, such as its scale."""
 _NEEDS = {"gradient": "temperature"}
 """Kind -> permission that a node must have for it, where the two have different names."""
 
@@ -113,29 +114,29 @@ class Component:
 
     @property
     def unit(self) -> str:
-        """Unit in which amounts are printed."""
+        """Unit in which amounts of the component are printed, such as ``um``."""
         return UNITS[self.kind][0]
 
     @property
     def unit_size(self) -> float:
-        """Size of that unit in SI."""
+        """Size in SI of the unit in which amounts of the component are printed."""
         return UNITS[self.kind][1]
 
 
 @dataclass(frozen=True, eq=False)
 class DisturbancePrior:
-    """Prior of the M disturbance components of an instrument.
+    """Prior of the M disturbance components of an instrument: a multivariate normal distribution of mean zero.
 
     Attributes
     ----------
     name : str
         Name of the disturbances file.
     components : tuple[Component, ...]
-        The components, cause by cause, body by body.
+        The M components, cause by cause, body by body.
     correlation : (M, M) ndarray
         Correlation matrix, positive semidefinite; zero between causes.
     laws : tuple[TimeLawSpec, ...]
-        Law of time of each component.
+        Time law of each component.
     jump_false_alarm : float or None
         Probability that a jump is reported in a series without one; None for the level of all other tests.
     """
@@ -148,17 +149,17 @@ class DisturbancePrior:
 
     @property
     def sigma(self) -> np.ndarray:
-        """Standard deviations of the components, (M,), SI."""
+        """Standard deviations of the M components, (M,), SI."""
         return np.array([c.sigma for c in self.components])
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance matrix of the components, (M, M), SI."""
+        """Covariance matrix of the M components, (M, M), SI."""
         sigma = self.sigma
         return np.asarray(sigma[:, None] * self.correlation * sigma)
 
     def of_causes(self, names: Sequence[str]) -> DisturbancePrior:
-        """Return the prior of some causes alone."""
+        """Return the prior that contains only the components of these causes."""
         selected = [k for k, c in enumerate(self.components) if c.cause in names]
         return DisturbancePrior(
             self.name,
@@ -169,14 +170,19 @@ class DisturbancePrior:
         )
 
     def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Return random amounts, (count, M), SI; numbers are drawn state by state, and component by component in each.
+        """Draw random amounts of the M components, SI.
 
         Parameters
         ----------
-        rng : Generator
+        rng : np.random.Generator
             Generator of the random numbers.
         count : int
             Number of states.
+
+        Returns
+        -------
+        (count, M) ndarray
+            Amounts in each state; numbers are drawn state by state, and component by component in each.
         """
         unit = rng.standard_normal((count, len(self.components)))
         return np.asarray(unit @ covariance_root(self.correlation) * self.sigma)
@@ -212,7 +218,8 @@ def prior_of_spec(spec: DisturbancesSpec, instrument: Instrument, issue: _Where 
     Raises
     ------
     InputError
-        The same faults as in ``disturbance_prior``.
+        The prior names a body that the instrument does not have or a motion that a body does not allow, or its
+        correlations are not positive semidefinite. There is one issue for each fault.
     """
     spec = spec.with_tables()
     issue_at = issue or (lambda cause, key, wrong: spec.issue(wrong, ("causes", cause, *key)))
@@ -244,7 +251,7 @@ def prior_of_spec(spec: DisturbancesSpec, instrument: Instrument, issue: _Where 
 
 
 def check_heat(resolved: ResolvedJob, prior: DisturbancePrior, thermal: ThermalModel) -> None:
-    """Check that the effect of the prior's temperatures can be computed: that the dn/dT of heated glasses is known.
+    """Check that the effect of the prior's temperature changes can be computed: dn/dT of heated glasses must be known.
 
     Parameters
     ----------
@@ -275,7 +282,7 @@ def check_heat(resolved: ResolvedJob, prior: DisturbancePrior, thermal: ThermalM
 def state_of(
     amounts: np.ndarray, components: Sequence[Component], thermal: ThermalModel, motions: State | None = None
 ) -> State:
-    """Return the state in which the components have given amounts.
+    """Return the state of the instrument in which M components have given amounts.
 
     Parameters
     ----------
@@ -294,9 +301,20 @@ def state_of(
 def states_of(
     amounts: np.ndarray, components: Sequence[Component], thermal: ThermalModel, motions: State | None = None
 ) -> list[State]:
-    """Return the S states in which components have amounts (S, M), as ``state_of`` does for one.
+    """Return the S states of the instrument in which M components have given amounts.
 
     In a batch of many, a state takes a third of the time that it takes alone.
+
+    Parameters
+    ----------
+    amounts : (S, M) ndarray
+        Amounts of the components in each state, SI.
+    components : sequence of Component
+        The M components.
+    thermal : ThermalModel
+        Thermal model of the instrument.
+    motions : State or None
+        Further motions, which act in every state on top of those of the same bodies.
     """
     heat: dict[str, Temperatures] = {}
     moves: list[list[State]] = [[] for _ in amounts]
@@ -314,7 +332,7 @@ def states_of(
 
 
 def _groups(components: Sequence[Component]) -> Iterator[tuple[tuple[str, str, str], list[int]]]:
-    """Yield (cause, body, pivot) with the indices of the components that share them."""
+    """Yield (cause, body, pivot) with the indices of the components that share these three."""
     groups: dict[tuple[str, str, str], list[int]] = {}
     for k, c in enumerate(components):
         groups.setdefault((c.cause, c.body, c.pivot), []).append(k)
@@ -326,7 +344,7 @@ _Values = Mapping[tuple[str, int], np.ndarray]
 
 
 def _three(values: _Values, kind: str) -> np.ndarray:
-    """Return the components of one kind along the three axes, (S, 3)."""
+    """Return the amounts of one kind of component along a body's three axes in S states, (S, 3), SI."""
     out = np.zeros((len(next(iter(values.values()))), 3))
     for axis in range(3):
         if (kind, axis) in values:
@@ -367,14 +385,24 @@ CAMERA = "<camera>"
 
 
 def _matches(pattern: str, path: str, cameras: Iterable[str]) -> bool:
-    """Return True if a path matches a pattern with ``*``, ``?`` (neither matches ``/``) and CAMERA for any camera."""
+    """Return True if a body's path matches a pattern.
+
+    Parameters
+    ----------
+    pattern : str
+        Path in which ``*`` and ``?`` are wildcards that do not match ``/``, and ``CAMERA`` stands for any camera.
+    path : str
+        Path of the body.
+    cameras : iterable of str
+        Names of the instrument's cameras.
+    """
     any_of = {"*": "[^/]*", "?": "[^/]", CAMERA: f"(?:{'|'.join(map(re.escape, cameras))})"}
     parts = re.split(f"({CAMERA}|[*?])", pattern)
     return re.fullmatch("".join(any_of.get(part, re.escape(part)) for part in parts), path) is not None
 
 
 def _issue_at(resolved: ResolvedJob, cause: str, key: KeyPath, wrong: Problem) -> Issue:
-    """Return an issue at the line that caused it.
+    """Return an issue at the line of the job or of the disturbances file that caused it.
 
     That is a line of the job where it changes the file or names the bodies to which the file's motions are applied,
     else a line of the disturbances file.
@@ -410,7 +438,7 @@ def _unmatched_patterns(spec: DisturbancesSpec, instrument: Instrument, where: _
 
 
 def _nearest(pattern: str, nodes: Iterable[str]) -> str | None:
-    """Return the most similar known pattern or path for a pattern without a body, with its stars if possible."""
+    """Return the known pattern or path most similar to a pattern that matches no body."""
     parts = pattern.split("/")
     alike = [path.split("/") for path in nodes if path.count("/") == pattern.count("/")]
     starred = ["/".join("*" if p == "*" else q for p, q in zip(parts, path, strict=True)) for path in alike]
@@ -426,7 +454,10 @@ def _of_cause(
     glass: set[str],
     where: _Where,
 ) -> tuple[list[Component], list[Issue]]:
-    """Return the components that a cause gives to bodies (zero sigmas included), and an issue per faulty key."""
+    """Return the components that a cause gives to its bodies, and an issue for each faulty key.
+
+    Components with a standard deviation of zero are included.
+    """
     components: list[Component] = []
     turned: list[str] = []
     refused: dict[KeyPath, list[str]] = {}
@@ -459,7 +490,7 @@ def default_pivot(info: NodeInfo) -> str:
 def _of_joint(
     spec: DisturbancesSpec, joint: JointSpec, instrument: Instrument, glass: set[str]
 ) -> tuple[list[Component], np.ndarray, list[Issue]]:
-    """Return the components of `joint` that move, their correlations, and the issues found."""
+    """Return the components of the key `joint` that move, their correlations, and the issues of faulty ones."""
     components: list[Component] = []
     issues: list[Issue] = []
     named: dict[tuple[str, str, int], str] = {}
@@ -568,7 +599,7 @@ def _correlation(
 
 
 def _first_impossible(cause: CauseSpec, known: Mapping[str, int]) -> int:
-    """Return the index of the first entry of ``correlations`` with which the matrix becomes indefinite."""
+    """Return the index of the first entry of ``correlations`` with which the correlation matrix becomes indefinite."""
     matrix, last = np.eye(len(known)), len(cause.correlations) - 1
     for n, group in enumerate(cause.correlations[:last]):
         at = [known[text] for text in group.between]
@@ -587,17 +618,22 @@ Array = NDArray[np.float64]
 
 
 def drawn_motions(prior: DisturbancePrior, seconds: Array, source: Callable[[int], np.random.Generator]) -> Array:
-    """Return random amounts (T, M) of all components over time, SI, without jumps.
+    """Draw random amounts of all M components at T times, without jumps.
 
     Parameters
     ----------
     prior : DisturbancePrior
-        Prior of the components with their laws of time.
+        Prior of the components with their time laws.
     seconds : (T,) ndarray
-        Increasing times in seconds, counted as the laws count them.
+        Increasing times in seconds, from the zero of the time laws.
     source : callable
-        Function from the number of a cause to its random generator, so that the draws of one cause do not depend on the
-        others.
+        Function from the number of a cause to its random generator, so that the random numbers of one cause do not
+        depend on the other causes.
+
+    Returns
+    -------
+    (T, M) ndarray
+        Amounts in SI.
     """
     out = np.zeros((len(seconds), len(prior.components)))
     for number, where in enumerate(causes_of(prior).values()):
@@ -607,18 +643,23 @@ def drawn_motions(prior: DisturbancePrior, seconds: Array, source: Callable[[int
 
 
 def drawn_course(law: TimeLawSpec, seconds: Array, rng: np.random.Generator, count: int) -> Array:
-    """Return independent random courses (T, count) of unit standard deviation with the covariance of a law of time.
+    """Draw independent random time series of unit standard deviation with the covariance of a time law.
 
     Parameters
     ----------
     law : TimeLawSpec
-        Law of time of all courses. A jump has no effect here: its times are drawn per body.
+        Time law of all series. A jump has no effect here: its times are drawn per body.
     seconds : (T,) ndarray
         Increasing times, in seconds.
-    rng : Generator
+    rng : np.random.Generator
         Generator of the random numbers.
     count : int
-        Number of courses.
+        Number of series.
+
+    Returns
+    -------
+    (T, count) ndarray
+        Values at the T times.
     """
     each = (len(seconds), count)
     if law.kind == "white":
@@ -643,7 +684,24 @@ def drawn_course(law: TimeLawSpec, seconds: Array, rng: np.random.Generator, cou
 
 
 def _drifting(drift: float | None, seconds: Array, rng: np.random.Generator, count: int) -> Array:
-    """Return unit-variance processes (T, count) of correlation time ``drift``, in seconds; constant if None."""
+    """Draw Ornstein-Uhlenbeck processes of unit variance at T times.
+
+    Parameters
+    ----------
+    drift : float or None
+        Correlation time, in seconds; None for values that are constant in time.
+    seconds : (T,) ndarray
+        Increasing times, in seconds.
+    rng : np.random.Generator
+        Generator of the random numbers.
+    count : int
+        Number of processes.
+
+    Returns
+    -------
+    (T, count) ndarray
+        Values at the T times.
+    """
     unit = rng.standard_normal((len(seconds), count))
     if drift is None:
         return np.broadcast_to(unit[:1], unit.shape)
@@ -655,7 +713,7 @@ def _drifting(drift: float | None, seconds: Array, rng: np.random.Generator, cou
 
 
 def causes_of(prior: DisturbancePrior) -> dict[str, list[int]]:
-    """Return the indices of the components of each cause."""
+    """Return name of each cause -> indices of its components in the prior."""
     out: dict[str, list[int]] = {}
     for k, component in enumerate(prior.components):
         out.setdefault(component.cause, []).append(k)
@@ -663,7 +721,7 @@ def causes_of(prior: DisturbancePrior) -> dict[str, list[int]]:
 
 
 ABOUT = ("shift", "rotate", "scale")
-"""Kinds of components that have a pivot."""
+"""Kinds of components whose written name may contain a pivot: ``NODE shift z about PIVOT``."""
 DIGITS = 12
 """Decimals of written correlations: enough that eigenvalues stay above ``INDEFINITE``."""
 FEW = 12

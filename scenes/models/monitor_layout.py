@@ -390,6 +390,11 @@ class ImagingBeams:
 
 
 def pupil_share(taken: np.ndarray) -> float:
-    """Return the largest blocked fraction of a camera's pupil along its line, from the mask of ``ImagingBeams.taken``.
+    """Return the largest fraction of a camera's pupil that prisms block along its line.
+
+    Parameters
+    ----------
+    taken : (cameras, 3, RAYS) ndarray of bool
+        Blocked rays, from ``ImagingBeams.taken``.
     """
     return float(taken.mean(axis=-1).max())

@@ -132,8 +132,7 @@ def load_disturbances(reference: str | Path, owner: Spec | None = None, key: Key
 
 
 def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesSpec | None:
-    """Return the disturbances of a job: its own file or its instrument's, with the job's changes; None if there is
-    none.
+    """Return the disturbances of a job, its own or its instrument's, with the job's changes; None if it has none.
 
     Raises
     ------

@@ -207,7 +207,7 @@ def expected_fits(data: xr.Dataset, cards: Sequence[Card]) -> bytes:
 
 
 def _times(name: str, counted: str, times: Sequence[float]) -> Any:
-    """Return a table of the times of frames or planes."""
+    """Return a FITS table of the times of frames or image planes, in seconds."""
     from astropy.io import fits
 
     columns = [
@@ -221,7 +221,7 @@ def _times(name: str, counted: str, times: Sequence[float]) -> Any:
 
 
 def _put_cards(unit: Any, cards: Sequence[Card]) -> None:
-    """Write cards, and for images the pixel convention, into a header."""
+    """Write header cards into a FITS header-data unit, and for images also the pixel convention."""
     for keyword, value, about in cards:
         unit.header[keyword] = (value, about)
     if unit.data is not None:
@@ -230,7 +230,7 @@ def _put_cards(unit: Any, cards: Sequence[Card]) -> None:
 
 
 def _bytes(units: Sequence[Any]) -> bytes:
-    """Return the bytes of a FITS file."""
+    """Return the bytes of a FITS file made of these header-data units."""
     from astropy.io import fits
 
     for unit in units:
@@ -244,7 +244,7 @@ def _bytes(units: Sequence[Any]) -> bytes:
 KIND = "files"
 NONE = "none"
 FRAMES = ("fits", NONE)
-"""Formats of frames."""
+"""Formats of exported frames: FITS, or none."""
 EXPECTED = {"irradiance.nc": "expected_photons", "course.nc": "expected_photons_course"}
 """File of expected images in a run -> stem of the exported file."""
 _IMAGES = "images/"
@@ -320,7 +320,7 @@ class Exported:
 
 
 def read_source(folder: Path) -> Manifest:
-    """Return the manifest of a run folder after checking that its files exist.
+    """Return the manifest (list of files and settings) of a run folder after checking that its files exist.
 
     Raises
     ------
@@ -335,7 +335,7 @@ def read_source(folder: Path) -> Manifest:
 
 
 def export(source: Path, manifest: Manifest, frames: str, tables: str, folder: RunFolder, advance: Advance) -> Exported:
-    """Write everything that is requested.
+    """Write the frames and tables of a run that the user requested, in the requested formats.
 
     Parameters
     ----------
@@ -355,7 +355,7 @@ def export(source: Path, manifest: Manifest, frames: str, tables: str, folder: R
     Raises
     ------
     InputError
-        The run has nothing of what is requested, a file of it cannot be read, or a package is missing.
+        The run has no frames or tables to export, a file of it cannot be read, or a package is missing.
     """
     changed = tuple(altered(source, manifest))
     files: list[ExportedFile] = []
@@ -423,12 +423,12 @@ def _frames(source: Path, manifest: Manifest, folder: RunFolder, advance: Advanc
 
 
 def _what(page: Mapping[str, Any]) -> str:
-    """Return a description of frames from the metadata of a page."""
+    """Return a description of frames, camera and note, from the metadata of a TIFF page."""
     return ", ".join(filter(None, (page.get("camera"), page.get("note")))) or "recorded frames"
 
 
 def _detector(source: Path, manifest: Manifest) -> list[Card]:
-    """Return FITS cards of the monitor's area CCDs if the run is a job of the monitor, else none."""
+    """Return FITS cards of the monitor's area CCDs if the run is a job with a monitor, else an empty list."""
     config = source / "config.yaml"
     if manifest.program != "twin.render" or "config.yaml" not in manifest.sha256:
         return []

@@ -1,7 +1,7 @@
 """Tables of a run's results, every column with its unit and description.
 
-They are spots, readings and truth by camera, matched points, every number of the JSON files, and every table that the
-run itself stores as CSV.
+They are spot positions, estimated and true changes of each camera, matched points, every number of the JSON files, and
+every table that the run itself stores as CSV.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def result_tables(folder: Path, files: Sequence[str]) -> list[DataTable]:
 
 
 def _frames_of(data: Any) -> dict[str, str]:
-    """Return the reference frames that a file states for its numbers."""
+    """Return "frame of QUANTITY" -> its reference frame, as a JSON file lists them for its numbers."""
     frames = data.get("reference_frames", {}) if isinstance(data, Mapping) else {}
     return {f"frame of {quantity}": str(text) for quantity, text in frames.items()}
 
@@ -167,7 +167,7 @@ def _frames_of(data: Any) -> dict[str, str]:
 
 
 def _numbers(data: Mapping[str, Any]) -> DataTable | None:
-    """Return a table of every number and text of the JSON files, with key and sigma."""
+    """Return a table of every number and text of the JSON files: file, key, value, sigma, unit and text."""
     rows: list[tuple[str, str, float | None, float | None, str, str | None]] = []
     for file, content in data.items():
         for key, sigma, value in _leaves(content):
@@ -196,14 +196,16 @@ def _numbers(data: Mapping[str, Any]) -> DataTable | None:
 
 
 def _typed(name: str, values: list[Any], about: str, numbers: bool) -> DataColumn:
-    """Return a column, an empty one of numbers as NaN."""
+    """Return a table column from cells; empty cells of a column of numbers become NaN."""
     if numbers and all(value is None for value in values):
         values = [float("nan")] * len(values)
     return DataColumn.of(name, values, "", about)
 
 
 def _leaves(data: Any, key: str = "") -> Iterator[tuple[str, float | None, Any]]:
-    """Yield (key, sigma, value) of everything in nested data; a sigma beside its number gets no row."""
+    """Yield (key, sigma, value) of every number or text in nested data; a sigma beside its number gets no row of its
+    own.
+    """
     if isinstance(data, Mapping):
         for name, value in data.items():
             number = name.removesuffix("_sigma")
@@ -242,7 +244,7 @@ def _nested(nested: Nested, content: Mapping[str, Any]) -> DataTable | None:
 
 
 def _rows(data: Any, depth: int, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], dict[str, Any]]]:
-    """Yield (names, numbers) of the innermost mappings."""
+    """Yield (names of the enclosing levels, numbers) of each innermost mapping in nested data."""
     if not isinstance(data, Mapping):
         return
     if depth == 0:
@@ -289,7 +291,7 @@ def _kept(name: str, file: str, text: str, named: Mapping[str, str]) -> DataTabl
 
 
 def _free(name: str, taken: Sequence[str]) -> str:
-    """Return the name, with a number behind it if it is taken."""
+    """Return a table name that is not in ``taken``: the name itself, or with a number appended."""
     names = (name, *(f"{name} ({k})" for k in range(2, len(taken) + 2)))
     return next(candidate for candidate in names if candidate not in taken)
 

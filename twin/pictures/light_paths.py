@@ -72,7 +72,7 @@ class LightPaths:
     placed: PlacedBodies
 
     def of(self, camera: str, monitor: bool) -> tuple[Beam, ...]:
-        """Return the imaging or monitor beams of one camera."""
+        """Return the beams of one camera: those of its monitor, or its imaging beams."""
         return tuple(b for b in self.beams if b.camera == camera and b.is_monitor == monitor)
 
 
@@ -111,14 +111,14 @@ def _length(instrument: Instrument, placed: PlacedBodies) -> float:
 
 
 def _circle(radius: float) -> np.ndarray:
-    """Return the centre and points along the edge of a circle, (1 + RIM, 2)."""
+    """Return the centre and ``RIM`` points along the edge of a circle, (1 + RIM, 2), in the unit of the radius."""
     angle = 2.0 * np.pi * np.arange(RIM) / RIM
     edge = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return np.concatenate([np.zeros((1, 2)), radius * edge])
 
 
 def _radius(aperture: Aperture | None) -> float:
-    """Return the inscribed radius of an aperture."""
+    """Return the radius of the circle inscribed in an aperture, metres."""
     assert aperture is not None
     return aperture.inscribed
 
@@ -187,7 +187,20 @@ def _monitor(instrument: Instrument, backend: Backend, state: State, placed: Pla
 def _aimed(
     backend: Backend, systems: SystemBatch, points: np.ndarray, guess: np.ndarray, target: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Aim rays from points (B, N or 1, 3) at targets (B, N, 2) of the last element.
+    """Aim rays of B systems from N points each at given points of the last element.
+
+    Parameters
+    ----------
+    backend : Backend
+        Array backend of the trace.
+    systems : SystemBatch
+        B optical systems.
+    points : (B, N or 1, 3) ndarray
+        Start points, metres.
+    guess : ndarray
+        Approximate directions.
+    target : (B, N, 2) ndarray
+        Points to hit in the last element's x, y, metres.
 
     Returns
     -------

@@ -41,7 +41,7 @@ SOFT = 0.75
 
 
 class PictureError(RuntimeError):
-    """Error in rendering the pictures; the message says why."""
+    """Error in rendering the pictures; the message names the cause."""
 
 
 @contextmanager
@@ -79,15 +79,15 @@ def _set_variant(mi: Any, variant: str) -> None:
 
 
 class Studio:
-    """Scene and camera in Mitsuba.
+    """Scene and camera in Mitsuba, ready to be rendered.
 
     Parameters
     ----------
-    mi
+    mi : module
         Mitsuba with its colour variant set.
-    parts
+    parts : list of Part
         Parts of the scene.
-    view
+    view : View
         Camera.
     """
 
@@ -102,18 +102,18 @@ class Studio:
         self._part_of[numbers] = np.arange(len(parts))
 
     def chunks(self, pixels: np.ndarray, samples: int) -> Iterator[np.ndarray]:
-        """Yield pixels in groups that are rendered quickly."""
+        """Yield pixels in groups of at most ``AT_ONCE`` light paths, between which the program can be interrupted."""
         size = max(1, AT_ONCE // samples)
         for start in range(0, len(pixels), size):
             yield pixels[start : start + size]
 
     def light(self, pixels: np.ndarray, samples: int, seed: int) -> np.ndarray:
-        """Return the mean radiance of pixels, (N, 3).
+        """Return the mean radiance of N pixels, (N, 3): red, green, blue in the units of the lamps.
 
         Parameters
         ----------
         pixels : (N,) ndarray of int
-            Row times width plus column.
+            Numbers of the pixels: row times width plus column.
         samples : int
             Samples per pixel.
         seed : int
@@ -131,12 +131,17 @@ class Studio:
         return np.asarray(values.reshape(3, len(pixels), samples).mean(axis=2, dtype=float).T)
 
     def first_hits(self, x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the number of the part that each pixel shows first, -1 for none (H, W), and its normal, (H, W, 3).
+        """Find the part that each pixel of the H x W picture shows first, and the direction of its surface.
 
         Parameters
         ----------
         x, y : float
             Position within the pixel, pixels from its middle.
+
+        Returns
+        -------
+        tuple of ndarray
+            Number of the part, (H, W), -1 where there is none; and unit normal of its surface, (H, W, 3).
         """
         import drjit as dr
 
@@ -147,7 +152,7 @@ class Studio:
         return self._part_of[shape.numpy()].reshape(size), hit.sh_frame.n.numpy().T.reshape(*size, 3)
 
     def _rays(self, pixels: np.ndarray, x: Any, y: Any) -> Any:
-        """Return rays through pixels, displaced from their middle by x, y."""
+        """Return rays through pixels, displaced from the pixels' middles by x, y, in pixels."""
         mi, view = self._mi, self._view
         row, column = np.divmod(pixels, view.width)
         place = mi.Point2f(
@@ -185,7 +190,7 @@ SHOULDER = 0.75
 
 
 def uniform_patches(seen: Sequence[tuple[np.ndarray, np.ndarray]], matt: Sequence[bool]) -> np.ndarray:
-    """Return the numbers of flat patches of matt surfaces, (H, W); -1 on their borders and elsewhere.
+    """Number the flat patches of matt surfaces in an H x W picture.
 
     Parameters
     ----------
@@ -193,6 +198,11 @@ def uniform_patches(seen: Sequence[tuple[np.ndarray, np.ndarray]], matt: Sequenc
         First hits at several positions in the pixels: number of the part (H, W), -1 for none, and normal (H, W, 3).
     matt : sequence of bool
         True for each part on which the light varies slowly.
+
+    Returns
+    -------
+    (H, W) ndarray of int
+        Number of the patch of each pixel; -1 on the borders of patches and elsewhere.
     """
     first, square = _patches(*seen[0]), np.ones((3, 3), np.uint8)
     still = np.array([*matt, False])[seen[0][0]]
@@ -203,12 +213,12 @@ def uniform_patches(seen: Sequence[tuple[np.ndarray, np.ndarray]], matt: Sequenc
 
 
 def denoised(image: np.ndarray, patches: np.ndarray) -> np.ndarray:
-    """Average the light over each patch; pixels of no patch remain unchanged.
+    """Average the light over each patch; pixels outside all patches remain unchanged.
 
     Parameters
     ----------
     image : (H, W, 3) ndarray
-        Rendered light.
+        Rendered light of H rows and W columns: red, green, blue.
     patches : (H, W) ndarray of int
         Numbers of the patches, -1 for none.
     """
@@ -236,7 +246,7 @@ def displayed(light: np.ndarray) -> np.ndarray:
 
 
 def _patches(part: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Return a number for every part and direction of its surface, float32 (H, W); exact for up to 16000 parts."""
+    """Return a number for every combination of part and surface direction, float32 (H, W); exact up to 16 000 parts."""
     steps = np.rint(4.0 * normal).astype(int) + 5
     return (part * 1000 + steps @ np.array([1, 10, 100])).astype(np.float32)
 
@@ -252,7 +262,7 @@ Advance = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Shot:
-    """Settings of one picture.
+    """Settings of one rendered picture.
 
     Attributes
     ----------
@@ -263,7 +273,7 @@ class Shot:
     coarse, fine : int
         Samples per pixel of matt surfaces, which are denoised, and of all other pixels.
     shows : str
-        ``instrument``, ``prisms`` or ``focal_plane``.
+        Content of the picture: ``instrument``, ``prisms`` or ``focal_plane``.
     """
 
     name: str

@@ -192,7 +192,7 @@ class Part:
 
 
 def studio_parts(instrument: Instrument, paths: LightPaths, pixel: float) -> list[Part]:
-    """Return all parts of the studio.
+    """Return all meshes of a picture: the instrument's bodies, edges of glass, light beams and the floor.
 
     Parameters
     ----------
@@ -246,18 +246,18 @@ def points_in_world(scene: trimesh.Scene) -> dict[str, np.ndarray]:
 
 
 def _paint(material: Any) -> dict[str, Any]:
-    """Return Mitsuba's description of a material of ``scene.glb``."""
+    """Return Mitsuba's description of a glTF material of ``scene.glb``."""
     metallic, roughness = float(material.metallicFactor), float(material.roughnessFactor)
     return _coloured(_linear(material.baseColorFactor[:3]).tolist(), metallic=metallic, roughness=roughness)
 
 
 def _part_of(mesh: trimesh.Trimesh, faces: np.ndarray) -> trimesh.Trimesh:
-    """Return some faces of a mesh."""
+    """Return a mesh of the selected faces alone."""
     return trimesh.Trimesh(mesh.vertices, mesh.faces[faces], process=False)
 
 
 def _edges(mesh: trimesh.Trimesh, radius: float) -> trimesh.Trimesh:
-    """Return the sharp edges of a body as thin rods."""
+    """Return the sharp edges of a body as thin rods of this radius, metres."""
     sharp = mesh.face_adjacency_edges[mesh.face_adjacency_angles > SMOOTH]
     rods = [
         trimesh.creation.cylinder(radius=radius, segment=mesh.vertices[ends], sections=6)

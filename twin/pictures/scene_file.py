@@ -92,7 +92,8 @@ def scene_bytes(instrument: Instrument, state: State, paths: LightPaths) -> byte
 
 
 def motions(instrument: Instrument, state: State, placed: PlacedBodies) -> dict[str, dict[str, Any]]:
-    """Return body -> its motion relative to its parent, as in the scene's ``extras``, without bodies at rest.
+    """Return path of a body -> its motion relative to its parent, as in the scene's ``extras``; unmoved bodies are
+    omitted.
 
     Parameters
     ----------
@@ -120,7 +121,7 @@ def motions(instrument: Instrument, state: State, placed: PlacedBodies) -> dict[
 
 
 def _all_in_parents(bodies: Sequence[Body], placed: PlacedBodies) -> np.ndarray:
-    """Return the matrices of all bodies relative to their parents, or to the world, (B, 4, 4)."""
+    """Return the pose of each of B bodies relative to its parent, or to the world, as 4 x 4 matrices, (B, 4, 4)."""
     body_rows = np.array([placed.index[body.path] for body in bodies])
     matrix = np.zeros((len(body_rows), 4, 4))
     matrix[:, :3, :3], matrix[:, :3, 3] = placed.rotation[0, body_rows].real, placed.translation[0, body_rows].real
@@ -161,7 +162,7 @@ def build_scene(instrument: Instrument, paths: LightPaths, tube: float = TUBE) -
 
 
 def _body_meshes(instrument: Instrument, paths: LightPaths) -> dict[str, trimesh.Trimesh]:
-    """Return body path -> mesh in the body's frame, metres, unscaled."""
+    """Return path of each body -> mesh in the body's frame, metres, without thermal expansion."""
     out: dict[str, trimesh.Trimesh] = {}
     for camera, model in instrument.cameras.items():
         for mirror in model.mirrors:
@@ -192,7 +193,7 @@ def is_mirror(solid: Solid) -> bool:
 
 
 def _material(solid: Solid) -> PBRMaterial:
-    """Return the drawing material of a solid."""
+    """Return the glTF material with which a solid is drawn."""
     return GLASS if solid.transparent else MIRROR if is_mirror(solid) else BLOCK
 
 
@@ -236,7 +237,7 @@ def _channel_meshes(instrument: Instrument, channel: Channel) -> dict[str, trime
 
 
 def _box(size: tuple[float, float, float], z: float) -> trimesh.Trimesh:
-    """Return a box centred on (0, 0, z)."""
+    """Return a box of a size along x, y and z, metres, centred on (0, 0, z)."""
     box = trimesh.creation.box(extents=size)
     box.apply_translation([0.0, 0.0, z])
     return box
@@ -312,5 +313,5 @@ def viewer_scripts(scene: bytes) -> Markup:
 
 
 def _packed(data: bytes) -> str:
-    """Return data compressed reproducibly, as base64."""
+    """Return data compressed and encoded as base64; equal data give equal text."""
     return base64.b64encode(gzip.compress(data, 9, mtime=0)).decode("ascii")

@@ -50,14 +50,16 @@ class Twin(Protocol):
 
     @property
     def experiment(self) -> MonitorExperiment:
-        """Modelled instrument."""
+        """Model of the instrument and its monitor that renders and analyses images."""
 
     @property
     def state(self) -> State:
-        """Body -> motion."""
+        """Path of each moved body -> its motion in SI units (metres, radians)."""
 
     def perturbed(self, *perturb: Mapping[str, Mapping[str, Any]] | str) -> Self:
-        """Return the instrument with these bodies perturbed. Raises InputError if that is impossible."""
+        """Return the instrument with these bodies perturbed; raise InputError for an unknown body or a motion not
+        allowed.
+        """
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -98,18 +100,22 @@ class CameraTwin(CameraView):
     def perturbed(self, *perturb: Mapping[str, Mapping[str, Any]] | str) -> CameraTwin:
         """Return the same camera with bodies of its instrument perturbed.
 
-        Arguments and errors are those of `InstrumentTwin.perturbed`.
-
         Parameters
         ----------
         perturb : Mapping[str, Mapping[str, Any]] or str
-            Motions in words, such as ``"M2 shift z 20 um"``, or node -> keys of `perturb:` in a job's YAML.
+            Motions in words, such as ``"M2 shift z 20 um"``, or path of a body -> keys of `perturb:` in a job's YAML,
+            such as ``{"base/gf7/M2": {"shift": "0 0 20 um"}}``.
+
+        Raises
+        ------
+        InputError
+            No such body, or a motion that it does not allow.
         """
         return CameraTwin.of(self.twin.perturbed(*perturb), self.name, self.obstruction)
 
 
 class _Bench:
-    """Instrument that is built once and shared by its perturbed copies."""
+    """Traceable model of an instrument, built once and shared by the instrument's perturbed copies."""
 
     def __init__(self, resolved: ResolvedJob, backend: str, like: _Bench | None = None) -> None:
         self._resolved, self._name, self._like = resolved, backend, like
@@ -121,13 +127,13 @@ class _Bench:
 
     @cached_property
     def experiment(self) -> MonitorExperiment:
-        """Modelled instrument."""
+        """Model of the instrument and its monitor that renders and analyses images."""
         if self._like is not None:
             return self._like.experiment.stating(self._resolved)
         return MonitorExperiment(self._resolved, self.backend)
 
     def stating(self, resolved: ResolvedJob) -> _Bench:
-        """Return the bench of the same instrument with another prior."""
+        """Return the model of the same instrument with another disturbance prior."""
         return _Bench(resolved, self._name, self)
 
 
@@ -179,7 +185,7 @@ class InstrumentTwin:
 
     @property
     def perturbations(self) -> Mapping[str, Any]:
-        """Node -> its perturbation, with the keys and unit strings of the YAML."""
+        """Path of each perturbed body -> its perturbation, with the keys and unit strings of the YAML."""
         plain = self._plain.get("perturb", {})
         return {
             node: {key: plain[node][key] for key in (*what.uses(), *_pivot(what.uses(), plain[node]))}
@@ -197,17 +203,17 @@ class InstrumentTwin:
 
     @property
     def _nodes(self) -> Mapping[str, NodeInfo]:
-        """Path -> properties of each node."""
+        """Path of each body -> motions and pivots that the body allows."""
         return self._bench.experiment.instrument.nodes
 
     @property
     def experiment(self) -> MonitorExperiment:
-        """Modelled instrument. for what this class does not offer."""
+        """Model of the instrument and its monitor, for computations that this class does not offer."""
         return self._bench.experiment
 
     @cached_property
     def state(self) -> State:
-        """Motion of each body, SI, by all perturbations, thermal deformations included.
+        """Path of each moved body -> its motion in SI units, due to all perturbations and the thermal deformations.
 
         Raises
         ------
@@ -238,7 +244,7 @@ class InstrumentTwin:
         return InstrumentTwin(twin.resolved.with_job(job), twin._bench)
 
     def _given(self, perturb: Sequence[Mapping[str, Mapping[str, Any]] | str]) -> dict[str, Any]:
-        """Return the requested perturbations by the nodes' paths; unknown names stay and are reported later."""
+        """Return the requested perturbations by the bodies' full paths; unknown names stay and are reported later."""
         try:
             asked: dict[str, Any] = perturbation_in_words(one for one in perturb if isinstance(one, str))
             for one in perturb:
@@ -254,6 +260,8 @@ class InstrumentTwin:
 
     def with_disturbances(self, disturbances: str | Mapping[str, Any]) -> InstrumentTwin:
         """Return this instrument with another disturbance prior, on which `posterior` and all total sigmas are based.
+
+        The prior is the expected covariance of the bodies' motions and temperatures between two measurements.
 
         Parameters
         ----------
@@ -301,17 +309,18 @@ class InstrumentTwin:
         return _shot_of(render_job(job, backend, experiment=self._bench.experiment), backend, started)
 
     def recover(self, before: Any, after: Any, centroid: str | None = None) -> Found:
-        """Return the readings of all estimators from images.
+        """Estimate the changes of the cameras from images, by every estimator.
 
-        They use the calibration of the unperturbed instrument and its disturbance prior.
+        The changes are rotations d_alpha, d_beta, d_gamma and the change d_f of the principal distance of each camera.
+        The estimators use the calibration of the unperturbed instrument and its disturbance prior.
 
         Parameters
         ----------
-        before : Any
+        before : DataArray or ndarray
             Frames of the unperturbed instrument, grey values, (channel, frame, row, column) in the order of
-            ``shot.before.channel``; a DataArray or an array.
-        after : Any
-            Frames of the perturbed one.
+            ``shot.before.channel``.
+        after : DataArray or ndarray
+            Frames of the perturbed instrument, likewise.
         centroid : str or None
             Name of a method of `analysis.spots.CENTROIDS`; by default that of the job.
 
@@ -347,7 +356,9 @@ class InstrumentTwin:
         return found_table(reading, warnings)
 
     def jacobian(self, motions: Sequence[str]) -> xr.Dataset:
-        """Return exact derivatives with respect to elementary motions, about the unperturbed instrument.
+        """Return exact derivatives of spots and camera parameters with respect to elementary motions of bodies.
+
+        They are taken at the unperturbed instrument.
 
         Parameters
         ----------
@@ -358,10 +369,10 @@ class InstrumentTwin:
         Returns
         -------
         xr.Dataset
-            Derivatives per um, arcsec, ppm or nm of each motion (coordinate ``per``): ``spots`` (channel, axis,
-            motion), px; ``true`` (camera, parameter, motion), the traced change; ``readings`` (camera, estimator,
-            parameter, motion), the estimators' response to the spots. Parameters are in arcsec and um, as their names
-            end.
+            Derivatives with respect to each motion, per um, arcsec, ppm or nm of it (coordinate ``per``): ``spots``
+            (channel, axis, motion), spot positions in px; ``true`` (camera, parameter, motion), the camera parameters
+            by exact tracing; ``readings`` (camera, estimator, parameter, motion), the parameters that each estimator
+            computes from the spots. Parameters are in arcsec and um, as their names end.
 
         Raises
         ------
@@ -427,11 +438,11 @@ class InstrumentTwin:
 
     @cached_property
     def _plain(self) -> Mapping[str, Any]:
-        """Job as its file has it."""
+        """Content of the job's file: keys and values as plain data."""
         return self.resolved.job.plain()
 
     def _with_job(self, plain: Mapping[str, Any]) -> InstrumentTwin:
-        """Return the same instrument with another job, from its plain data."""
+        """Return the same instrument with another job, from the content of the job's file as plain data."""
         source = self.resolved.job.source
         job = validate(JobSpec, YamlFile("", dict(plain), {})).with_source(source)
         assert isinstance(job, JobSpec)
@@ -449,7 +460,7 @@ class InstrumentTwin:
 
 
 def _pivot(uses: Sequence[str], plain: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the pivot's key if a perturbation uses it."""
+    """Return ``("pivot",)`` if a perturbation has a rotation or a scale and names its pivot; else an empty tuple."""
     return ("pivot",) if {"rotate", "scale"} & set(uses) and "pivot" in plain else ()
 
 
@@ -466,7 +477,8 @@ def load(
     backend : str
         Backend that traces the rays, ``llvm`` or ``cuda``.
     disturbances : str or Mapping[str, Any] or None
-        Disturbance prior, as for `InstrumentTwin.with_disturbances`; by default that of the job or the instrument.
+        Disturbance prior: name or path of a file, ``none``, or the mapping of `disturbances:` in a job's YAML; by
+        default that of the job or the instrument.
 
     Raises
     ------
@@ -480,7 +492,7 @@ def load(
 
 
 def _load(what: str | Path, backend: str) -> InstrumentTwin:
-    """Load an instrument with its own prior."""
+    """Load an instrument with the disturbance prior that its own file names."""
     text = str(what)
     if text not in library_names(INSTRUMENTS) or isinstance(what, Path):
         data = read_yaml(what).data if isinstance(what, Path) or "/" in text or text.endswith((".yaml", ".yml")) else {}
@@ -513,7 +525,7 @@ def load_camera(what: str | Path, backend: str = "llvm") -> CameraTwin:
 
 
 RIGID = ("shift", "rotate", "scale", "figure")
-"""Kinds of motions with derivatives."""
+"""Kinds of motions of a body for which ``InstrumentTwin.jacobian`` has derivatives."""
 _FORMS = "NODE shift x|y|z, NODE rotate x|y|z, NODE scale, NODE figure Z5; rotate and scale may end in 'about PIVOT'"
 
 
@@ -556,5 +568,5 @@ def _motion_named(text: str, nodes: Mapping[str, NodeInfo]) -> ElementaryMotion:
 
 
 def _wrong(problem: str, found: str, allowed: str, suggestion: str | None = None) -> InputError:
-    """Return an error about a motion's text."""
+    """Return an error about a motion's text: the problem, the text found, what is allowed, and the nearest valid name."""
     return InputError(Issue(problem, found=repr(found), allowed=allowed, suggestion=suggestion))

@@ -1,4 +1,4 @@
-"""Commands run from a script, with their numbers as Python objects."""
+"""Commands of the twin run from a Python script, with their results as Python objects."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from twin.framework.run_folder import RunFolder
 @shows("name", "report.verdict", "report.warnings")
 @dataclass(frozen=True, eq=False)
 class TestResult:
-    """Result of a finished test.
+    """Result of a finished test or procedure that ``perform`` has run.
 
     Attributes
     ----------
     name : str
         Name as called, such as ``lab focus``.
     numbers : Mapping[str, Any]
-        Content of KIND.json of a run folder; keys end in their unit.
+        Content of the result file of a run folder, such as ``focus.json``; keys end in their unit.
     report : Report
         Verdict, tables and figures.
     setup : Spec
-        The test with all it refers to.
-    run : Any
+        The test with the content of all files that it refers to.
+    run : object
         All computed results; the class depends on the test.
     """
 
@@ -87,7 +87,7 @@ class TestResult:
 def perform(
     name: str, file: str | Path, *, seed: int | None = None, backend: str = "llvm", **changes: Any
 ) -> TestResult:
-    """Run the procedure of a command on its file.
+    """Run the procedure of a command, such as ``lab focus``, on its input file.
 
     Parameters
     ----------
@@ -100,14 +100,14 @@ def perform(
         Seed of all random numbers; by default that of the file.
     backend : str
         Backend that traces the rays, ``llvm`` or ``cuda``.
-    changes : Any
+    changes : keyword arguments
         Keys of the test's file with other values, for ``camera`` and ``uncertainty`` those of the run's config.yaml; a
         mapping replaces single keys of a mapping.
 
     Raises
     ------
     InputError
-        No such test, file or key; or the test failed on its bench, with the key to be changed.
+        No such test, file or key; or the simulated test failed, with the key to be changed.
     """
     if name not in PROCEDURES:
         raise InputError(unknown("no such test", name, PROCEDURES).at())
@@ -132,7 +132,7 @@ def perform(
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return plain data with some values replaced, mapping by mapping."""
+    """Return nested mappings with some values replaced; keys that ``changes`` does not have stay."""
     out = dict(base)
     for key, value in changes.items():
         inner = out.get(key)

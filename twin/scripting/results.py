@@ -1,4 +1,4 @@
-"""Results of scripts: frames and truth of an exposure, and the estimators' readings of them."""
+"""Results of scripts: frames and true changes of an exposure, and the changes that the estimators compute from frames."""
 
 from __future__ import annotations
 
@@ -135,34 +135,34 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Readings of all estimators from images.
+    """Changes of the cameras that every estimator computes from images ("readings").
 
     Attributes
     ----------
     values : xr.DataArray
         Readings, (camera, estimator, parameter), in arcsec and um as the parameters' names end.
     covariance : xr.DataArray
-        Covariance of the total error, (camera, estimator, parameter, parameter_2), in products of these units: from
-        noise and from the prior's disturbances; without a prior from noise alone.
+        Covariance of the total error, (camera, estimator, parameter, parameter_2), in products of these units: due to
+        noise and to the disturbances of the prior; without a prior due to noise alone.
     covariance_noise : xr.DataArray
-        Part of that covariance from the noise of the images.
+        Part of that covariance due to the noise of the images.
     angle : xr.Dataset
-        For two cameras, ``change_arcsec`` with ``change_arcsec_sigma`` (total) and ``change_arcsec_sigma_noise`` by
-        estimator; empty otherwise.
+        For two cameras, the change of the angle between their lines of sight: ``change_arcsec`` with
+        ``change_arcsec_sigma`` (total) and ``change_arcsec_sigma_noise`` by estimator; empty otherwise.
     ground : xr.Dataset
-        For two cameras of known altitude, ``along_m``, ``across_m``, ``height_m`` with their sigmas, by estimator;
-        empty otherwise.
+        For two cameras of known altitude, the errors of located ground points that the changes cause: ``along_m``,
+        ``across_m``, ``height_m`` with their sigmas, by estimator; empty otherwise.
     spots : xr.Dataset
-        ``before`` and ``after`` (channel, axis), px, with ``before_sigma`` and ``after_sigma``.
+        Spot positions ``before`` and ``after`` (channel, axis), px, with ``before_sigma`` and ``after_sigma``.
     disturbances : str
-        Name of the disturbance prior on which the total sigmas are based; empty for none.
+        Name of the disturbance prior on which the total sigmas are based; empty if there is none.
     sigma_holds : bool
         Whether all measurements are consistent with the sigmas.
     warnings : tuple[str, ...]
         Reasons why they are not, and other warnings to read before using the numbers.
     from_statement : pd.Series
-        Fraction of the ``posterior``'s variance of each reading that the spots do not reduce: this part of sigma comes
-        from the prior, not from the spots; (row) with levels camera and parameter, empty without a prior.
+        Fraction of each reading's variance, for the estimator ``posterior``, that would remain without image noise: due
+        to the prior alone, not to the spots; (row) with levels camera and parameter, empty without a prior.
     """
 
     values: xr.DataArray
@@ -178,12 +178,12 @@ class Found:
 
     @property
     def sigma(self) -> xr.DataArray:
-        """Standard deviations of the total errors of ``values``; see ``covariance``."""
+        """Standard deviations of the total errors of ``values``, due to noise and the prior's disturbances; same units."""
         return self._root(self.covariance).rename("sigma")
 
     @property
     def sigma_noise(self) -> xr.DataArray:
-        """Standard deviations from the noise of the images alone."""
+        """Standard deviations of ``values`` due to the noise of the images alone, in the same units."""
         return self._root(self.covariance_noise).rename("sigma_noise")
 
     @property
@@ -192,7 +192,7 @@ class Found:
         return preferred_estimator(self.values.estimator.values.tolist())
 
     def _root(self, covariance: xr.DataArray) -> xr.DataArray:
-        """Return the standard deviations of a covariance, labelled like ``values``."""
+        """Return the standard deviations, roots of the diagonals of a covariance, labelled like ``values``."""
         return self.values.copy(data=np.sqrt(np.diagonal(covariance.values, axis1=-2, axis2=-1)))
 
     def compare(self, truth: xr.Dataset) -> pd.DataFrame:
@@ -229,7 +229,7 @@ class Found:
         return table
 
     def _row(self, true: float, readings: xr.DataArray, sigma: xr.DataArray, noise: xr.DataArray) -> dict[str, float]:
-        """Return a row of ``compare``."""
+        """Return one row of ``compare``: true value, readings, sigmas, error and error in sigmas of one quantity."""
         values = {str(name): float(readings.sel(estimator=name)) for name in readings.estimator.values}
         spread, error = float(sigma.sel(estimator=self.judged)), values[self.judged] - true
         noise_sigma = float(noise.sel(estimator=self.judged))
@@ -246,7 +246,7 @@ class Found:
 
 
 def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:
-    """Return a row of ``Shot.mtf``."""
+    """Return one row of ``Shot.mtf``: MTF of a knife edge before and after at one place, with sigma and true value."""
     out: dict[str, float] = {}
     for when, shots in place.shots.items():
         edge = shots.edges[direction]
@@ -256,7 +256,7 @@ def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:
 
 
 def _reading_frame(found: Found) -> pd.DataFrame:
-    """Return readings by camera and parameter, a column for each estimator, with sigmas of the judged one."""
+    """Return readings by camera and parameter: a column per estimator, and the sigmas of ``Found.judged``."""
     values = found.values.stack(row=("camera", "parameter")).transpose("row", "estimator").to_pandas()
     values.columns.name = None
     sigmas = {"sigma": found.sigma, "sigma_noise": found.sigma_noise}
@@ -265,12 +265,12 @@ def _reading_frame(found: Found) -> pd.DataFrame:
 
 
 def _truth_frame(truth: xr.Dataset) -> pd.DataFrame:
-    """Return the true parameters, a row for each camera."""
+    """Return a table of the true parameters, one row per camera."""
     return truth[[one.key for one in parameters.CAMERA_PARAMETERS.values()]].to_dataframe()
 
 
 def shot_of(run: JobRun, backend: Backend, started: float) -> Shot:
-    """Return the exposure of a run, traced on a backend and started at a time in seconds since the epoch."""
+    """Return the frames and truth of a finished run; ``started`` is its start in seconds since the epoch (1970)."""
     keys = [channel.key for channel in run.experiment.instrument.channels]
     attributes: dict[str, Any] = {"units": "DN", "instrument": run.resolved.instrument.name}
     before = after = np.zeros((0, run.frames, 0, 0), np.uint16)
@@ -299,7 +299,7 @@ def shot_of(run: JobRun, backend: Backend, started: float) -> Shot:
 
 
 def _truth(run: JobRun) -> xr.Dataset:
-    """Return the true changes of a run."""
+    """Return the true changes of the cameras in a run, as the dataset ``Shot.truth``."""
     truth = run.truth_dict()
     cameras = truth["cameras"]
     keys = list(next(iter(cameras.values())))
@@ -311,12 +311,12 @@ def _truth(run: JobRun) -> xr.Dataset:
 
 
 def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
-    """Return the readings of one state for a script.
+    """Convert the reading of one perturbed state to the labelled arrays that a script gets.
 
     Parameters
     ----------
     reading : MonitorReading
-        Reading of the state.
+        Values and covariances of all estimators in that state.
     warnings : sequence of str
         Warnings about the instrument; those of the reading are appended.
     """
@@ -342,7 +342,7 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
     about = {"reference_frames": frames_text("recovered")}
 
     def spread(of: Callable[[CameraParameters], np.ndarray]) -> xr.DataArray:
-        """Return covariances of all cameras and estimators in the units of the readings."""
+        """Return covariances (camera, estimator, parameter, parameter_2) in the units of the readings."""
         rows = {camera: parameters.rows_of(calibrated) for camera, calibrated in reading.cameras.items()}
         blocks = [
             [matrix @ of(recovery.parameters[c][e])[0] @ matrix.T for e in estimators] for c, matrix in rows.items()
@@ -351,7 +351,7 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
         return xr.DataArray(np.array(blocks), dims=(*dims, "parameter_2"), coords=both)
 
     def by_estimator(group: str) -> xr.Dataset:
-        """Return the rows of a group, with sigmas, by estimator."""
+        """Return the quantities of a group (angle or ground) with their sigmas, by estimator."""
         data: dict[str, list[float]] = {}
         for row in table:
             if row.group == group:
@@ -380,7 +380,7 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
 
 
 def as_frames(given: Any, name: str, channels: Sequence[str], shape: tuple[int, int]) -> np.ndarray:
-    """Return frames for the analysis, (C, frames, rows, columns), with the channels in the instrument's order.
+    """Return a script's frames as (channels, frames, rows, columns), with the channels in the instrument's order.
 
     Raises
     ------
