@@ -28,7 +28,8 @@ from twin.tolerance.tolerance_bench import ToleranceBench
 STEP = 0.05
 """Step of the central differences with respect to a parameter, in standard deviations of its prior.
 
-The relative error of a derivative is the step squared, times the curvature per standard deviation, over the slope.
+The relative error of a derivative is the square of this step times the relative curvature of the derivative per
+standard deviation squared.
 """
 
 _SHARE = 1e-2
@@ -161,18 +162,18 @@ class AsBuiltBench(Site):
     def slope(
         self, values: np.ndarray, kinds: Sequence[MeasuredKind] | None = None, afters: Sequence[str | None] = ()
     ) -> np.ndarray:
-        """Return the derivatives (D, K) of the predicted readings with respect to the parameters, by central
-        differences.
+        """Return the derivatives (D, K) of the predicted readings with respect to the parameters, at ``values``.
 
-        Array dimensions: D readings, K parameters.
+        They are central differences. Array dimensions: D readings, K parameters.
         """
         kinds, afters = (self.kinds, self.afters) if kinds is None else (kinds, afters)
         return self._by_parameters(values, lambda moved: self._predicted(moved, kinds, afters))
 
     def _by_parameters(self, values: np.ndarray, work: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """Return the derivatives (D, K) of a function of the parameters, which maps (S, K) to (S, D), by differences.
+        """Return the derivatives (D, K) of a function of the parameters at ``values``, by central differences.
 
-        Array dimensions: D readings, K parameters, S states.
+        The function maps S sets of parameters (S, K) to readings (S, D). Array dimensions: D readings, K parameters, S
+        states.
         """
         steps = STEP * self.parameters.prior.sigma
         outputs = work(np.concatenate([values + np.diag(steps), values - np.diag(steps)]))
@@ -203,7 +204,7 @@ class AsBuiltBench(Site):
         data : sequence of ndarray
             Readings of each measurement, SI.
         start : ndarray, optional
-            Parameters at which the iteration starts; by default the prior mean.
+            Parameters at which the iteration starts.
 
         Raises
         ------

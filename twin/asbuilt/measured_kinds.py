@@ -1,5 +1,4 @@
-"""Kinds of measurements on an instrument: predicted readings for a state of the instrument, error model, and data
-files.
+"""Kinds of measurements on an instrument: predicted readings for a state, error model and data files.
 
 A new kind is a class here, an entry of ``KINDS`` and its keys in ``scenes.specs.asbuilt.MeasurementsSpec``.
 """

@@ -10,7 +10,7 @@ from analysis.instrument_state.state_estimate import NextMove, StateEstimate, be
 from twin.asbuilt.asbuilt_bench import AsBuiltBench, nan_where_lost, selected_moves
 
 MOST_ROUNDS = 3
-"""Largest number of times that the optimum move is computed again, linearised about the state after the last one."""
+"""Largest number of times that the optimum move is computed, linearised about the state after the last one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,8 @@ class Advice:
         Expected merit without and with the move: the posterior mean of the sum of squares of all merits in units of
         their requirements, by exact traces.
     ignorance : float
-        Part of the expected merit after the move that a move could still correct if the state were known exactly.
+        Part of the expected merit that is due to the uncertain state and that a move could correct if the state were
+        known.
     worth : dict
         Name of a possible measurement -> expected reduction of the merit after the move, if the measurement is made
         before it.

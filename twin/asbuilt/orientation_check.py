@@ -1,4 +1,4 @@
-"""Command ``camtwin asbuilt check``: orientation and sign of measured wavefronts, as far as the data determine them."""
+"""Command ``camtwin asbuilt check``: orientation and sign of measured wavefronts, tested against the data."""
 
 from __future__ import annotations
 

@@ -57,10 +57,10 @@ Sums in a different order, as those of stray light, change numbers by a relative
 arcsec by a relative 1e-11.
 """
 RELATIVE_ELSEWHERE = 1e-6
-"""Largest relative difference that counts as rounding on another processor, whose linear algebra rounds otherwise.
+"""Largest relative difference that counts as rounding on a different processor.
 
-Fits with a condition number of 1e8 and more change by a relative 1e-8 (orthonormal Zernike terms by 4e-8). No number
-here is known to a millionth.
+Its linear algebra rounds otherwise. Fits with a condition number of 1e8 and more change by a relative 1e-8 (orthonormal
+Zernike terms by 4e-8). No number here is known to a millionth.
 """
 SIGMA_SHARE = 1e-3
 """Largest difference that counts as rounding, as a share of the number's standard deviation.

@@ -1,6 +1,7 @@
 """Daily report of an instrument in operation: one self-contained page, to be stored or sent by mail.
 
-Its figures show the time series of the quantities with their bands, and the innovations against their limit.
+Its figures show the time series of the quantities with their confidence bands, and the chi-square of the innovations
+(readings minus predictions) against its limit.
 """
 
 from __future__ import annotations
@@ -44,11 +45,14 @@ if TYPE_CHECKING:
     pass
 
 BANDS = ((1.9600, 0.22, "95 %"), (0.9945, 0.42, "68 %"))
-"""Multiple of sigma, opacity and name of the bands, the wide one first."""
+"""Confidence bands of a figure: multiple of sigma, opacity and name of each, the wide one first."""
 _MOST_ERROR_BARS = 60
 """Largest number of single readings drawn with error bars; more would hide the curve."""
 _LIMIT_EXTENTS = 3.0
-"""A limit is drawn within this multiple of the extent of the time series; a larger one would flatten the curve."""
+"""Ratio of a requirement's limit to the extent of the time series, up to which the limit is drawn.
+
+A larger limit would flatten the curve.
+"""
 
 
 def dates(times: np.ndarray) -> np.ndarray:
@@ -71,7 +75,7 @@ def courses_svg(name: str, overview: Overview, trend: Trend, quantities: Sequenc
     name : str
         Name of the figure.
     overview : Overview
-        Overview of the operation, for requirements, jumps and events.
+        Overview of the operation, with its requirements, jumps and events.
     trend : Trend
         Time series of all quantities.
     quantities : Sequence[Quantity]
@@ -155,7 +159,7 @@ def _dated(axes: Axes) -> None:
 
 
 def innovations_svg(overview: Overview) -> str:
-    """Draw chi-square of the newest innovations with its limit."""
+    """Draw chi-square of the newest innovations (readings minus their predictions) with its limit."""
     with svg.look("operate-innovations"):
         innovations = overview.filter_result.innovations
         times = np.array([one[0] for one in innovations], np.int64)
@@ -180,13 +184,13 @@ def innovations_svg(overview: Overview) -> str:
 
 
 RECENT = 30 * DAY
-"""Span before the newest reading that the second figure of courses shows, in microseconds."""
+"""Span before the newest reading that the second figure of time series shows, in microseconds."""
 MOST_EXPLAINED = 4
-"""Largest number of quantities whose explained scatter is stated in the lead."""
+"""Largest number of quantities in the lead whose scatter explained by temperatures is given."""
 MOST_MOTIONS = 12
 """Number of motions of bodies listed."""
 MOST_SHOWN = 40
-"""Number of rows shown of a table of the newest; its CSV has all rows."""
+"""Number of rows shown in the report of a table that lists the newest first; its CSV has all rows."""
 _NOT = "\N{EM DASH}"
 _JUMP_HEADS = ("log likelihood ratio", "false-alarm probability", "other candidates")
 
@@ -365,7 +369,7 @@ def _motion_section(overview: Overview) -> Section | None:
 
 
 def _prediction_section(overview: Overview) -> Section:
-    """Return the section on the quality of the predictions."""
+    """Return the section on how well the predictions, made before each reading, agreed with the readings."""
     result = overview.filter_result
     rows: list[list[Cell]] = []
     for coverage in overview.coverages:
@@ -404,7 +408,7 @@ def _prediction_section(overview: Overview) -> Section:
 
 
 def _explained_sentence(overview: Overview) -> str:
-    """Return the sentence on the scatter that temperatures explain; empty if it is unknown."""
+    """Return the sentence on the share of the scatter that temperatures explain; empty if it is unknown."""
     known = {name: share for name, share in overview.filter_result.explained.items() if math.isfinite(share)}
     if not known:
         return ""
@@ -456,7 +460,7 @@ def _jump_section(overview: Overview) -> Section | None:
 
 
 def _newest(name: str, title: str, caption: str, heads: Sequence[str], rows: list[list[Cell]]) -> Table:
-    """Return a table of the first rows, which are the newest, with a CSV of all rows."""
+    """Return a table whose rows are the newest first: the report shows the first ones, a CSV has all."""
     if len(rows) <= MOST_SHOWN:
         return Table(name, title, caption, heads, rows, within="")
     full = Table(name, title, "", heads, rows, within="")

@@ -4,8 +4,8 @@ The files are the job of the estimated state for `twin.render`, and its uncertai
 for `twin.asbuilt`.
 
 Two causes may move the same body in the same way about different points. A job and a file of disturbances state each
-component once: amounts add up, and a rotation theta or a scale s about another point q than the component's pivot p
-equals one about p with the shift theta x (p - q), or s (p - q), to first order in the motion.
+component once: amounts add up, and a rotation (vector theta) or a relative expansion s about a point q equals, to first
+order, the same about the component's pivot p with an additional shift theta x (p - q), or s (p - q).
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from scenes.specs.job_tables import TableTemperatureSpec
 from scenes.yaml.yaml_file import dump_yaml
 
 UNSUPPORTED = ("index_gradient",)
-"""Kinds of components for which `perturb` of a job has no key."""
+"""Kinds of disturbance components that `perturb` of a job has no key for."""
 PIVOTED = ("rotate", "scale")
-"""Kinds of components that depend on a pivot."""
+"""Kinds of disturbance components whose effect depends on a pivot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class EstimatedMotions:
 
 @dataclass(frozen=True)
 class OmittedComponent:
-    """Component that a file omits.
+    """Disturbance component that a written file has to omit.
 
     Attributes
     ----------
@@ -99,7 +99,8 @@ class OmittedComponent:
     unit_size : float
         The display unit in SI units.
     share : float | None
-        For a prior, the largest share of the variance of a spot or a parameter that the component contributes.
+        For a prior, the largest share of the variance of a spot or a parameter that the component contributes; None for
+        a state.
     """
 
     name: str
@@ -190,9 +191,9 @@ def _short(perturb: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, o
 
 
 def merge_components(motions: EstimatedMotions, instrument: Instrument) -> tuple[tuple[Component, ...], Array]:
-    """Merge components of the same body, kind and axis, and return the (J, M) matrix from motions to merged components.
+    """Merge components of the same body, kind and axis; return them and the matrix (J, M) from the motions to them.
 
-    Array dimensions: J components of the file.
+    Array dimensions: J merged components.
 
     Parameters
     ----------
@@ -230,7 +231,7 @@ def merge_components(motions: EstimatedMotions, instrument: Instrument) -> tuple
 
 
 def _pivot_shift(body: Body, component: Component, pivot: str) -> Array:
-    """Return the shift (3,), per unit, between a rotation or scale about its own pivot and one about another pivot."""
+    """Return the shift of a body, (3,), metres per unit, that moving a rotation's or scale's pivot is equivalent to."""
     apart = np.array(body.pivots[pivot]) - np.array(body.pivots[component.pivot])
     return np.asarray(np.cross(np.eye(3)[component.axis], apart) if component.kind == "rotate" else apart)
 
@@ -244,7 +245,7 @@ class Prior:
     Attributes
     ----------
     files : Mapping[str, str]
-        Name -> text; a table of correlations is a file of its own where there are many components.
+        File name -> text; with many components the table of correlations is a separate file.
     components : tuple[Component, ...]
         The J components of the file.
     table : (J, M) ndarray
@@ -315,7 +316,7 @@ def largest_shares(motions: EstimatedMotions, stated: Disturbances) -> Array:
     motions : EstimatedMotions
         The M motions at one time.
     stated : Disturbances
-        Effects of one standard deviation of each.
+        Effects on spots and camera parameters of one standard deviation of each motion.
     """
     size = np.array([component.unit_size for component in motions.components]) * stated.sigmas
     rows = np.concatenate([stated.spots, stated.parameters]) / np.where(size > 0.0, size, np.inf)

@@ -113,7 +113,7 @@ class JudgedLife:
 
 
 def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance: Advance) -> JudgedLife:
-    """Estimate a life reading by reading in a temporary record.
+    """Estimate a simulated life reading by reading in a temporary record, and compare it with the truth.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance:
     files : Path
         YAML file that describes the tables of the life.
     truth : Mapping[str, Any]
-        Truth of the life, plain data of its file.
+        Truth of the life: the content of its truth file as nested mappings and lists.
     advance : Advance
         Callback that receives the progress.
     """
@@ -168,7 +168,7 @@ def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance:
 
 
 def _prior(operation: Operation, times: NDArray[np.int64]) -> Estimate:
-    """Return the estimate without any reading: no change, with the uncertainty of the prior."""
+    """Return the estimate without any reading: zero change, with the standard deviations of the prior."""
     series_filter, rows = operation.model.series_filter, operation.model.rows
     seconds = ((times - times[0]) / MICRO).tolist()
     start = series_filter.start(seconds[0])
@@ -232,7 +232,7 @@ def true_changes(truth: Mapping[str, Any], quantities: Sequence[Quantity], times
     Parameters
     ----------
     truth : Mapping[str, Any]
-        Truth of the life, plain data of its file.
+        Truth of the life: the content of its truth file as nested mappings and lists.
     quantities : Sequence[Quantity]
         The Q quantities.
     times : (T,) ndarray of int64
@@ -285,16 +285,17 @@ def rms(error: Array) -> float:
 SHARES = {1.0: math.erf(math.sqrt(0.5)), 2.0: math.erf(math.sqrt(2.0))}
 """Multiple of sigma -> share of normal errors within it."""
 CHANCE = 1e-3
-"""Probability that a share of independent normal numbers lies outside the reported limits."""
+"""Probability that a share of independent normal numbers lies outside the limits that the report gives for it."""
 SHOWN = ((ANGLE_GROUP, "change_arcsec"), (GROUND_GROUP, "height_m"))
-"""Group and key of the quantities in the figure, where the instrument has them, beside a camera's change of focal
-length.
+"""Group and key of the quantities in the figure, where the instrument has them.
+
+A camera's change of focal length is shown beside them.
 """
 _DAY = 86_400 * MICRO
 _YEAR = 365.25 * _DAY
 FORECAST = "forecast"
 _COVERED = ("filtered", FORECAST)
-"""Estimates whose coverage the table contains."""
+"""Estimates for which the table gives the share of errors within one and two sigmas."""
 
 
 def judged_numbers(life: JudgedLife) -> dict[str, Any]:
@@ -342,7 +343,7 @@ def judged_numbers(life: JudgedLife) -> dict[str, Any]:
 
 
 def _error_summary(error: Any, sigma: Any) -> dict[str, Any]:
-    """Return RMS and coverage of errors, ignoring NaN."""
+    """Return the RMS of errors and the shares of them within one and two sigmas, ignoring NaN."""
     value = rms(error)
     out: dict[str, Any] = {"rms": value if math.isfinite(value) else None}
     out |= {"errors": _rounded(error), "sigmas": _rounded(sigma)}
@@ -468,7 +469,7 @@ def _short(value: float | None) -> str:
 
 
 def judged_svg(life: JudgedLife, quantities: Sequence[tuple[str, str]]) -> str:
-    """Draw the errors of quantities over the years for each estimate, with one and two sigmas.
+    """Draw the errors of quantities over time for each estimate, with bands of one and two sigmas, as SVG text.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
 """Block adjustment of scenes whose cameras a monitor observes in operation.
 
-The record's estimate at several times, with the covariance between times, gives the cameras' prior in every pass.
-Between two readings nearly all of an error is common to the times of a pass; the rest is what moves meanwhile by the
-specified time laws. An adjustment of images that uses the estimate as readings of the cameras needs both. The code of
-the block adjustment itself does not depend on records.
+The record's estimate at several times, with the covariance between times, gives the prior of the cameras' parameters in
+every pass over the scene. Between two readings nearly all of an error is common to the times of a pass; the rest is
+what moves meanwhile by the specified time laws. An adjustment of images that uses the estimate as readings of the
+cameras needs both. The code of the block adjustment itself does not depend on records.
 """
 
 from __future__ import annotations
@@ -120,8 +120,9 @@ KEYS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
 UNITS = np.array([ARCSEC, ARCSEC, ARCSEC, 1e-6])
 """Units of these keys in rad and m."""
 _NEAR = 0.02
-"""Largest difference between a camera of the record and the block's line: relative for focal lengths, in radians for
-look angles.
+"""Largest difference between a camera of the record and the block's line.
+
+It is relative for focal lengths, and in radians for look angles.
 """
 
 
@@ -135,7 +136,7 @@ def run_operated_block(
     setup : AnyAdjust
         Setup read from the file.
     backend : Backend | None
-        Not used.
+        Not used; the block is adjusted without tracing rays.
     seed : int
         Seed of all random numbers.
     advance : Advance
@@ -212,9 +213,9 @@ def camera_prior(estimate: Posterior, cameras: Sequence[str], passes: Sequence[i
     Parameters
     ----------
     estimate : Posterior
-        d_alpha, d_beta, d_gamma and d_f of one camera after the other.
+        Estimated changes: rotations d_alpha, d_beta, d_gamma and principal distance d_f of one camera after the other.
     cameras : Sequence[str]
-        The C names.
+        Names of the cameras.
     passes : (P,) sequence of int
         Index of the time of each pass.
     """

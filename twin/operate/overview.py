@@ -38,7 +38,7 @@ _BATCH = 400
 
 
 def _rows() -> Select[Any]:
-    """Return the query for readings of the monitor with their files."""
+    """Return the database query for readings of the monitor, joined with the files they came from."""
     return select(*ENTRY.c, SOURCE.c.file).join(SOURCE, ENTRY.c.source_id == SOURCE.c.id).where(ENTRY.c.kind == KIND)
 
 
@@ -90,13 +90,13 @@ DAY = 86_400 * MICRO
 CONFIDENCE = 0.95
 """Confidence level of the intervals of the shares of predictions."""
 WITHIN: Mapping[int, float] = FrozenMap({k: float(2.0 * norm.cdf(k) - 1.0) for k in (1, 2)})
-"""Multiple of sigma -> expected share of components within it."""
+"""Multiple of sigma -> expected share of normally distributed components within it."""
 _ESTIMATORS = ("posterior", "model")
-"""Estimators whose values represent a single reading, in order of preference."""
+"""Estimators whose values represent a single monitor reading in figures, in order of preference."""
 
 
 def group_name(group: str) -> str:
-    """Return the name of a quantity's group in words."""
+    """Return the name of a quantity's group (a camera, the intersection angle or the ground) in words."""
     return {ANGLE_GROUP: "angle between the cameras", GROUND_GROUP: "ground"}.get(group, group)
 
 
@@ -119,7 +119,7 @@ class Coverage:
     sigmas : int
         Multiple of sigma, 1 or 2.
     expected : float
-        Expected share.
+        Expected share, for normal errors.
     count : int
         Number of components.
     share : float
@@ -274,7 +274,7 @@ class Overview:
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """The estimated quantities."""
+        """Quantities that the operation estimates."""
         return tuple(self.operation.quantities)
 
     def required(self, quantity: Quantity) -> RequirementStatus | None:

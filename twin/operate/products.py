@@ -7,9 +7,9 @@ orbits. No reading determines them for an image taken at another moment, and an 
 not corrected for them, and their specified sizes make ERR_RAND, the error that images do not share. All other motions
 are corrected as estimated, and their uncertainty makes ERR_BIAS.
 
-The products have a period of validity. The estimate p(t) of a time t, used at another time t', has the error p(t) -
-P(t'), where P is the truth. p(t') is the mean of P(t') given the same readings, and p(t) depends on these readings, so
-that the mean square error is exactly
+The products have a period of validity. The estimate p(t) of a quantity at a time t, used at a different time t', has
+the error p(t) - P(t'), where P is the true value. p(t') is the mean of P(t') given the same readings, with the standard
+deviation sigma(t'), and p(t) depends on these readings alone, so that the mean square error is exactly
 
     sigma(t')^2 + (p(t') - p(t))^2.
 
@@ -54,12 +54,13 @@ if TYPE_CHECKING:
     from twin.orbit.export.export_run import ExportSource
 
 SHARE = 0.2
-"""Relative growth of the error that ends the validity of an estimate."""
+"""Relative growth of the root mean square error of an estimate that ends its validity."""
 _FIRST = MICRO
-"""Shortest time from the estimate that is examined, in microseconds."""
+"""Shortest distance from the time of the estimate at which its validity is examined, in microseconds."""
 _STEPS = 48
-"""Number of times examined on either side, in geometric progression; then as many evenly spaced times between the last
-valid one and the first invalid one.
+"""Number of times examined on either side of the estimate, in geometric progression.
+
+As many evenly spaced times are then examined between the last valid one and the first invalid one.
 """
 
 
@@ -139,7 +140,7 @@ def validity(
 
 
 def _distances(good: int, end: int, evenly: bool = False) -> NDArray[np.int64]:
-    """Return increasing distances, in microseconds, from one at which an estimate is valid to an end."""
+    """Return increasing distances in time, in microseconds, from one at which an estimate is valid to an end."""
     if end <= good:
         return np.empty(0, np.int64)
     if evenly:
@@ -155,7 +156,7 @@ def _limits_of_validity(
     time: int,
     sides: Mapping[int, tuple[int, NDArray[np.int64]]],
 ) -> dict[int, tuple[int, int, str]]:
-    """Return the ends of the validity by the sign of the side; sides without an end are missing.
+    """Return the ends of the validity before (-1) and after (+1) the estimate; sides without an end are missing.
 
     Each is the last valid distance and the first invalid one, in microseconds, and the reason.
 
@@ -273,7 +274,7 @@ def scene_time(scene: ExportSource) -> int:
 def make_products(
     operation: Operation, history: History, time: int, scene: ExportSource | None, backend: Backend
 ) -> Products:
-    """Return the products for a time.
+    """Return the camera models, instrument state and uncertainty estimated for one time, and their validity.
 
     Parameters
     ----------
@@ -284,7 +285,7 @@ def make_products(
     time : int
         Microseconds of TAI since 2000.
     scene : ExportSource | None
-        Scene whose camera models are wanted; None for none.
+        Scene for whose images camera models are made; None to make none.
     backend : Backend
         Backend that traces the cameras' lines.
 
@@ -387,7 +388,7 @@ def _validity_limits(result: FilterResult) -> list[ValidityLimit]:
 
 
 def _version(operation: Operation, history: History) -> str:
-    """Return the version of the products."""
+    """Return the version of the products: a digest of the record's last entry, the plan and the program."""
     query = select(ENTRY.c.sha256).order_by(ENTRY.c.id.desc()).limit(1)
     with history.reading() as connection:
         last = connection.execute(query).scalar()
@@ -398,7 +399,7 @@ def _version(operation: Operation, history: History) -> str:
 def _changes(
     operation: Operation, course: Course, motions: EstimatedMotions, notes: tuple[str, ...]
 ) -> dict[str, EstimatedChange]:
-    """Return each camera's change at the only time of the estimate, without white motions."""
+    """Return the estimated change of each camera, without motions that differ in every image (white time law)."""
     stated = operation.model.series_filter.stated
     white = np.array([law.white for law in stated.laws])
     size = np.array([component.unit_size for component in motions.components]) * stated.sigmas
@@ -592,7 +593,7 @@ def product_files(products: Products) -> tuple[dict[str, bytes], dict[str, Any]]
 
 
 def summary(products: Products) -> str:
-    """Return the products in words, for the terminal."""
+    """Return a summary of the products in words, for the terminal."""
     lines = [
         f"{products.history.name} at {utc_text(products.time)}, from {products.filter_result.readings} readings up to "
         f"{utc_text(products.filter_result.time)}",

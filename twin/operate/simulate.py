@@ -42,7 +42,10 @@ Moments = NDArray[np.int64]
 _MOTIONS, _JUMPS, _EVENTS, _DATES, _COEFFICIENTS = 10, 11, 12, 13, 14
 """Random streams of a seed; the detectors' exposures use the first ones (`MonitorExperiment.frames_after`)."""
 _MARGIN = 0.1
-"""Share of a life at its beginning and its end without random dates of events, so that their effect can be observed."""
+"""Share of a life, at its beginning and its end, without random dates of events.
+
+So the effect of each event can be observed.
+"""
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,7 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Life:
-    """Course of every specified motion of an instrument at T times.
+    """Amount of every specified motion of an instrument at T times.
 
     Attributes
     ----------
@@ -83,13 +86,14 @@ class Life:
     components : tuple[Component, ...]
         The M components.
     drawn : (T, M) ndarray
-        Amounts by the time laws, without steps, in SI units.
+        Amounts according to the time laws of the disturbances, without steps, in SI units.
     steps : tuple[Step, ...]
         Steps in the order of time.
     dates : tuple[tuple[int, str], ...]
         (time in microseconds, name) of every event.
     coefficients : Mapping[str, float]
-        Body with a temperature -> relative excess of the effect of its temperature on light over the computed one.
+        Body with a temperature -> relative error of its thermal coefficient: true effect of its temperature on light
+        over the computed one, minus 1.
     """
 
     times: Moments
@@ -101,7 +105,7 @@ class Life:
 
     @cached_property
     def amounts(self) -> Array:
-        """(T, M) amounts including steps, in SI units.
+        """Amounts of the motions at all times including steps, (T, M), in SI units.
 
         Array dimensions: T times, M motions.
         """
@@ -112,16 +116,17 @@ class Life:
 
     @cached_property
     def acting(self) -> Array:
-        """(T, M) amounts as they act on light, in SI units: temperatures are scaled by their body's coefficient.
+        """Amounts of the motions as they act on light, (T, M), in SI units.
 
-        Array dimensions: T times, M motions.
+        Temperatures are multiplied by their body's true over its computed effect on light. Array dimensions: T times, M
+        motions.
         """
         factor = [1.0 + self.coefficients.get(c.body, 0.0) * (c.kind == "temperature") for c in self.components]
         return np.asarray(self.amounts * np.array(factor))
 
     @cached_property
     def temperatures(self) -> dict[str, Array]:
-        """Body -> (T,) change of its temperature against the instrument's, in kelvin.
+        """Temperature of each body minus the instrument's, (T,), in kelvin, by the body's path.
 
         Array dimensions: T times.
         """
@@ -212,7 +217,7 @@ def _drawn_dates(events: Sequence[str], times: Moments, seed: int) -> tuple[tupl
 
 
 def _when(step: Step) -> tuple[int, str, str]:
-    """Return the sort key of a step."""
+    """Return the key by which steps are sorted: time, cause and body."""
     return step.time, step.cause, step.body
 
 
@@ -275,7 +280,7 @@ class Simulation:
 
     @property
     def times(self) -> np.ndarray:
-        """(T,) times of the readings within the life, in microseconds of TAI since 2000.
+        """Times of the readings within the life, (T,), in microseconds of TAI since 2000.
 
         Array dimensions: T times.
         """
@@ -367,7 +372,7 @@ def simulate_record(
 def _readings(
     experiment: MonitorExperiment, observation: Observation, frames: int, suspects: Mapping[str, CameraCrosstalk]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the content of recovered.json for each state."""
+    """Yield the recovered values of the monitor for each state, as the content of recovered.json."""
     channels = tuple((channel.camera, channel.name) for channel in experiment.path.channels)
     common = channels, experiment.cameras, experiment.ground, experiment.disturbances
     centroid = experiment.resolved.job.analysis.centroid
@@ -420,7 +425,7 @@ def write_simulated(
 
 
 def sensed_temperatures(reference: float, what: Simulation, life: Life) -> dict[str, np.ndarray]:
-    """Return body -> (T,) readings of its sensor in kelvin; NaN where it gives none.
+    """Return the readings of each body's temperature sensor, (T,), in kelvin; NaN where it gives none.
 
     Array dimensions: T times.
 

@@ -121,7 +121,7 @@ def _require_name(option: str, name: str, names: Collection[str]) -> None:
 
 
 class _Options:
-    """Options of the command, as the source of a memory error."""
+    """Command-line options of the simulation, to which an error about too little memory refers."""
 
     def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> InputErrorText:
         return InputErrorText(f"{key[0]}: {problem}; {found} readings, allowed: {allowed}")
@@ -232,7 +232,7 @@ def simulate_into(
 
 
 def _again(truth: Path | None, what: Simulation, backend: Backend) -> Iterator[str]:
-    """Yield the words of the command that repeats the files in their folder."""
+    """Yield the words of the command line that makes the same files again, run in their folder."""
     yield from (PROGRAM, "simulate", CONFIG, *what.words, "--seed", str(what.seed), "--backend", backend.name)
     if truth is not None:  # a repetition writes no files outside its folder
         yield from ("--truth", NO_TRUTH)
@@ -265,7 +265,7 @@ def _require_empty(history: History) -> None:
 
 
 def _require_known_sensors(experiment: MonitorExperiment, what: Simulation) -> None:
-    """Raise InputErrorText for a sensor on a body without a specified temperature, or a faulty sensor not simulated."""
+    """Raise InputErrorText for a sensor on a body without a temperature in the prior, or a faulty one not simulated."""
     assert experiment.stated is not None  # a plan states something
     warm = {component.body for component in experiment.stated.components if component.kind == "temperature"}
     for body in what.sensors or ():

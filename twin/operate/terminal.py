@@ -1,4 +1,4 @@
-"""Functions shared by the commands of `twin.operate`: the record, the estimate under its plan, errors and output."""
+"""Functions shared by the commands of `twin.operate`: record, estimate under its plan, errors and output."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ NewFolder = Annotated[Path, typer.Option(readable=False, help="Folder for them; 
 
 @contextmanager
 def errors_reported() -> Iterator[Console]:
-    """Report errors as one sentence, and end the command with their exit code."""
+    """Catch errors of a command, print each as one sentence, and end the command with its exit code."""
     errors = Console(stderr=True)
     with cli.explained(errors):
         try:
@@ -57,7 +57,7 @@ def errors_reported() -> Iterator[Console]:
 
 @contextmanager
 def input_errors(what: str = "") -> Iterator[None]:
-    """Raise a Problem as InputErrorText about an option (with its dashes) or a path."""
+    """Raise a Problem as InputErrorText about ``what``, an option (with its dashes) or a path."""
     try:
         yield
     except Problem as problem:
@@ -95,7 +95,7 @@ def print_result(errors: Console, options: cli.Options, data: Any, show: Callabl
         Console for the error that standard output is closed.
     options : cli.Options
         Options that choose JSON, words or nothing.
-    data : Any
+    data : dict, list, number, str or None
         Plain data of the result.
     show : Callable[[Console], None]
         Function that prints the result in words.
@@ -124,7 +124,7 @@ def show_table(console: Console, heads: Sequence[str], rows: Iterable[Sequence[s
 
 @dataclass(frozen=True)
 class Call:
-    """Running command on a record.
+    """Command in progress on a record, with what its functions share.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class Call:
     errors : Console
         Console for errors and progress.
     options : cli.Options
-        Options ``as_json`` and ``quiet``.
+        Options of the command: output as JSON (``as_json``), no output (``quiet``).
     """
 
     location: str
@@ -144,7 +144,7 @@ class Call:
     options: cli.Options
 
     def print_result(self, data: Any, show: Callable[[Console], None]) -> None:
-        """Print a result; see the function `print_result`."""
+        """Print the result of the command, as JSON or, by the function ``show``, in words."""
         print_result(self.errors, self.options, data, show)
 
     def resolve_plan(self, plan: Path | None) -> OperationSetup:
@@ -209,7 +209,7 @@ class Call:
         Parameters
         ----------
         out : Path
-            The folder, see `require_new`.
+            Folder to be created.
         files : Mapping[str, bytes]
             Path in the folder -> content.
         what : str

@@ -39,11 +39,11 @@ _STEP = 1e-5
 _SETTLED = 0.1
 """Change of the natural logarithms of the limits, largest over the limits, below which no further round is made."""
 _LAST = 4
-"""Largest number of final rounds that tighten all limits together while the exact traces miss the required yield."""
+"""Largest number of final rounds that tighten all limits together while exact traces miss the required yield."""
 _NEAR = 0.02
 """Share of all cameras, on either side of the quantile of the worst margin, whose gradients are averaged."""
 _SAFE = 1.0
-"""Number of standard deviations of the sampled yield by which the chosen limits are to exceed the required yield."""
+"""Number of standard deviations of the sampled yield by which the chosen limits exceed the required yield."""
 
 
 @dataclass(frozen=True, eq=False)

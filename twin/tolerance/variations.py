@@ -88,7 +88,7 @@ class VariedParameter:
 def tolerance_parameters(
     setup: ToleranceSetup, instrument: Instrument, thermal: ThermalModel
 ) -> tuple[VariedParameter, ...]:
-    """Return the parameters of all tolerances in the order of the file; a figure error has one for each of its terms.
+    """Return the varied parameters of all tolerances; a figure error has one for each of its Zernike terms.
 
     Raises
     ------

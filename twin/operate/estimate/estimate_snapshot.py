@@ -38,7 +38,7 @@ _PARAMETERS = ChainMap(CAMERA_PARAMETERS, {one.key: one for one in (ANGLE, *GROU
 
 
 def packed(value: Any) -> bytes:
-    """Return a value of frozen data classes, sequences, mappings, arrays, numbers and texts as bytes."""
+    """Serialise a value of frozen data classes, sequences, mappings, arrays, numbers and texts as bytes."""
     arrays: dict[str, np.ndarray] = {}
 
     def plain(one: Any) -> Any:
@@ -88,7 +88,7 @@ def unpacked(content: bytes, *classes: type) -> Any:
 
 
 SPANS = (1, 3, 10)
-"""Numbers of consecutive readings whose chi-square is tested together against the predictions."""
+"""Numbers of consecutive readings whose summed chi-square is tested against the predictions."""
 HISTORY_LENGTH = 200
 """Number of the latest innovations, and of the latest excluded entries, that the state keeps."""
 OUTLIER_SIGMAS = 6.0
@@ -96,15 +96,16 @@ OUTLIER_SIGMAS = 6.0
 SENSOR_WINDOW = 10
 """Number of a sensor's latest readings from which its condition is judged."""
 INFLATION_SIGMAS = 3.0
-"""Residual, in standard deviations, beyond which a reading inflates the prior of the temperatures, where several
-sensors disagree with it.
+"""Residual of a reading, in standard deviations, beyond which it inflates the prior of the temperatures.
+
+It does so where several sensors disagree with the prior.
 """
 DOUBTFUL_OUTLIERS = 3
 """Number of outliers within `SENSOR_WINDOW` readings that makes a sensor doubtful."""
 SILENT_INTERVALS = 10.0
 """Time without a reading, in mean intervals of the sensor, after which the sensor is considered dead."""
 STUCK_PROBABILITY = 1e-4
-"""Probability that a working sensor repeats its value as often, below which the sensor is considered stuck."""
+"""Probability, for a working sensor, of as many equal readings, below which the sensor is considered stuck."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,7 @@ class Sensor:
         )
 
     def with_residual(self, white: float) -> Sensor:
-        """Return the sensor with the residual of its newest reading, in standard deviations, added to `recent`."""
+        """Return the sensor with the residual ``white`` of its newest reading, in standard deviations, added."""
         return replace(self, recent=(*self.recent, white)[-SENSOR_WINDOW:])
 
     @property
@@ -220,13 +221,14 @@ class Scores:
     readings : int
         Number of readings of the monitor.
     components : int
-        Number of independent components of these readings.
+        Number of statistically independent (decorrelated) components of these readings, summed over the readings.
     within_one, within_two : int
         Number of components within one and within two standard deviations of the prediction.
     log_score : float
-        Mean over the readings of the logarithm of the predicted probability density at the reading, px^-D.
+        Mean over the readings of the natural logarithm of the predicted probability density at the reading; the density
+        is per px^D for D spot coordinates.
     chi_square : float
-        Sum of squares of all normalised components.
+        Sum of squares of all components, each in standard deviations of its prediction.
     """
 
     readings: int = 0
@@ -237,7 +239,15 @@ class Scores:
     chi_square: float = 0.0
 
     def updated(self, white: Array, log_score: float) -> Scores:
-        """Return the scores with one more reading, given its normalised components and its log score."""
+        """Return the scores with one more reading.
+
+        Parameters
+        ----------
+        white : ndarray
+            Decorrelated components of the reading minus its prediction, in standard deviations.
+        log_score : float
+            Logarithm of the predicted probability density at the reading.
+        """
         count = self.readings + 1
         return Scores(
             count,
@@ -273,7 +283,7 @@ class EstimatorState:
     scores : Scores
         Quality of the predictions so far.
     innovations : tuple[tuple[int, float, int], ...]
-        (time_us, chi-square, degrees of freedom) of the latest readings.
+        (time_us, chi-square, degrees of freedom) of the latest readings' innovations (reading minus prediction).
     jumps : tuple[JumpDetection, ...]
         Jumps detected so far.
     sensors : Mapping[str, Sensor]
@@ -281,16 +291,17 @@ class EstimatorState:
     excluded : tuple[tuple[int, str, str, str], ...]
         (time_us, kind, subject, reason) of the latest entries that were not used.
     scatter_sums : (4, Q) ndarray
-        Sums over the readings of every quantity, of its square, of the quantity without the part that temperatures
-        explain, and of the square of that; see `explained`.
+        Four sums over the readings, for every quantity: of the quantity, of its square, of the quantity without the
+        part that temperatures explain, and of the square of that. `explained` is computed from them.
     basis : (D + P, n) ndarray
-        Outputs of the filter's states. They identify the state basis that this computer's linear algebra gives.
+        Spot coordinates and camera parameters due to one unit of each filter state. They identify the basis of the
+        state space, which depends on this computer's linear algebra.
     used : (U,) ndarray of int64
         Ids of the entries used since the last permanent checkpoint, in their order.
     undetected_shares : (U, m) ndarray
-        Share of the mean square of jumps that could not be detected before each of these entries.
+        Share of the mean square of each motion's jumps that could not be detected, before each of these entries.
     new_innovations : tuple[tuple[int, float, int], ...]
-        Innovations since the last permanent checkpoint, as `innovations`.
+        Innovations since the last permanent checkpoint, in the form of `innovations`.
     stuck_sensors : tuple[tuple[str, int], ...]
         (body, time_us) of sensors that repeat their value, with the time of the first equal reading; none of their
         readings from that time on is used.
@@ -300,7 +311,7 @@ class EstimatorState:
     bad_readings : tuple[tuple[int, str], ...]
         (time_us, reason) of the latest readings of the monitor that were rejected as outliers, and of a pending one.
     first_innovations : tuple[tuple[int, float, int], ...]
-        Innovations of the first readings of the record, as `innovations`.
+        Innovations of the first readings of the record, in the form of `innovations`.
     disagreeing : tuple[str, ...]
         Bodies whose sensors have disagreed with the prior at the same time as other sensors.
     """
@@ -325,7 +336,7 @@ class EstimatorState:
 
     @property
     def explained(self) -> Array:
-        """(Q,) share of the scatter of every quantity that the measured temperatures explain.
+        """Share of the variance of every quantity over the readings that the measured temperatures explain, (Q,).
 
         NaN before there are two readings.
 
@@ -340,7 +351,7 @@ class EstimatorState:
         return np.where(whole > 0.0, 1.0 - rest / np.where(whole > 0.0, whole, 1.0), np.nan)
 
     def excluding(self, time: int, kind: str, subject: str, reason: str) -> EstimatorState:
-        """Return the state with one more entry that is not used."""
+        """Return the state with one more entry, described by its arguments, in the list of those not used."""
         return replace(
             self, time=max(self.time, time), excluded=(*self.excluded, (time, kind, subject, reason))[-HISTORY_LENGTH:]
         )
@@ -372,9 +383,9 @@ class EstimatorState:
 
     @property
     def newly_stuck(self) -> tuple[tuple[str, int], ...]:
-        """Sensors found to repeat their value whose first equal readings have been used already.
+        """Sensors recognised as repeating their value, some of whose repeated readings have been used already.
 
-        (body, time_us of the first equal reading) of each.
+        Each is (body, time_us of the first equal reading).
         """
         stuck = ((sensor.body, sensor.since_us) for sensor in self.sensors.values() if sensor.stuck)
         return tuple(one for one in stuck if one not in self.stuck_sensors)
@@ -383,13 +394,14 @@ class EstimatorState:
     def jointly_disagreeing(self) -> tuple[str, ...]:
         """Bodies whose sensors disagree with the prior, if there are several; empty otherwise.
 
-        Where several sensors disagree at the same time, the prior is wrong and not all of these sensors.
+        If several sensors disagree at the same time, it is more likely that the prior is wrong than that all these
+        sensors are.
         """
         bodies = tuple(sorted(sensor.body for sensor in self.sensors.values() if sensor.disagrees))
         return bodies if len(bodies) > 1 else ()
 
     def with_innovation(self, time: int, found: Innovation) -> EstimatorState:
-        """Return the state with the innovation of a reading of the monitor that was used."""
+        """Return the state with the innovation (reading minus prediction) of a monitor reading that was used."""
         innovation = (time, found.chi_square, len(found.white))
         scores = self.scores.updated(found.white, found.log_score)
         innovations = (*self.innovations, innovation)[-HISTORY_LENGTH:]
@@ -403,7 +415,7 @@ class EstimatorState:
         )
 
     def with_counters_reset(self) -> EstimatorState:
-        """Return the state with empty lists of what was used since the last permanent checkpoint."""
+        """Return the state with empty lists of the entries and innovations since the last permanent checkpoint."""
         return replace(self, used=self.used[:0], undetected_shares=self.undetected_shares[:0], new_innovations=())
 
     @classmethod
@@ -423,7 +435,7 @@ class EntryFilter:
     model : OperationModel
         Traced model of the instrument and its disturbances.
     series_filter : SeriesFilter
-        Filter of this model, with the events of the record as steps.
+        Kalman filter of this model, in which the record's events are steps of the motions.
     epoch : int
         Origin of the filter's seconds, in microseconds of TAI since 2000.
     reference : (C, 2) ndarray
@@ -450,7 +462,7 @@ class EntryFilter:
         time : int
             Time of the first entry, in microseconds of TAI since 2000.
         stuck_sensors : tuple[tuple[str, int], ...]
-            Sensors that are known to repeat their value, as in `EstimatorState`.
+            (body, time_us of the first equal reading) of sensors that are known to repeat their value.
         """
         spread = np.zeros((4, len(self.model.quantities)))
         filter_state, basis = self.series_filter.start(self.seconds(time)), self.series_filter.space.basis

@@ -55,7 +55,10 @@ DAY = 86_400 * MICRO
 CHECKPOINT_READINGS = 1000
 """Number of readings between two permanent checkpoints of the estimator's state."""
 HEAD_READINGS = 16
-"""Number of new readings after which the newest state is saved: filtering as many again is as fast as writing it."""
+"""Number of new readings after which the newest state is saved.
+
+Filtering as many again is as fast as writing it.
+"""
 _MODEL, _HEAD = -1, 0
 """Numbers of the checkpoints that hold the traced model, and the newest state of the estimator."""
 
@@ -72,7 +75,8 @@ class Operation:
     advance
         Called with the number of readings that were filtered, and their total.
     previous
-        The same estimate before the newest readings came, see `updated`; None if there is none.
+        Estimate of the same record before the newest readings came, from which this one continues; None if there is
+        none.
 
     Attributes
     ----------
@@ -130,7 +134,7 @@ class Operation:
 
     @cached_property
     def experiment(self) -> MonitorExperiment:
-        """The monitored instrument."""
+        """Monitored instrument with its monitor, ready to be traced."""
         return MonitorExperiment(self.plan.model, load_backend())
 
     @cached_property
@@ -146,19 +150,19 @@ class Operation:
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """All estimated quantities."""
+        """All estimated quantities (changes of the cameras, of their angle and of ground positions)."""
         return self.model.quantities
 
     @cached_property
     def events(self) -> tuple[tuple[int, str, tuple[str, ...]], ...]:
-        """(time_us, name, causes) of the record's events that step motions under the plan."""
+        """Events of the record that step motions under the plan, each as (time_us, name, causes)."""
         events = ((int(entry["time_us"]), str(entry["subject"])) for entry in self.history.entries("event"))
         known = self.plan.operation.events
         return tuple((time, name, tuple(known[name])) for time, name in events if known.get(name))
 
     @cached_property
     def _entry_filter(self) -> EntryFilter:
-        """Filter with the record's events as steps."""
+        """Kalman filter in which the record's events are steps of the motions."""
         causes = self.model.series_filter.stated.causes
         steps = []
         for time, _, stepping in self.events:
@@ -179,7 +183,7 @@ class Operation:
 
     @cached_property
     def _decisions(self) -> dict[int, tuple[bool, str]]:
-        """Id of an entry about which a person has decided -> whether it is included, and why."""
+        """Decision of a person about an entry, by the entry's id: whether it is included, and why."""
         decisions = (content_of(entry) for entry in self.history.entries(DECISION))
         return {int(decision["entry"]): (bool(decision["included"]), str(decision["why"])) for decision in decisions}
 
@@ -220,7 +224,7 @@ class Operation:
         return state
 
     def _rewind(self, state: EstimatorState) -> EstimatorState | None:
-        """Return the newest checkpoint before a sensor got stuck; its readings from there on are not used."""
+        """Return the newest checkpoint before a sensor got stuck, or None; its later readings are not used."""
         self._stuck_sensors = (*state.stuck_sensors, *state.newly_stuck)
         since = min(time for _, time in state.newly_stuck)
         self.history.drop_checkpoints(self.key, since)
@@ -315,7 +319,7 @@ class Operation:
         return tuple(dict.fromkeys(stated.causes[k] for k in lasting))
 
     def _detected_jump(self, detected_us: int, jump: Jump) -> DetectedJump:
-        """Return a jump with its sizes and its effect on every quantity, as it is reported."""
+        """Return a jump of the filter with its sizes and its effect on every quantity, in reporting units."""
         sizes = tuple(zip(jump.labels, jump.units, jump.sizes, jump.sigmas, strict=True))
         after, until = (self.epoch + round(time * MICRO) for time in (jump.after, jump.until))
         change, spread, rows = np.array(jump.change), np.array(jump.spread), self.model.rows
@@ -382,20 +386,21 @@ class Operation:
 
     @cached_property
     def _now(self) -> FilterState:
-        """Filter state after all readings, with undetected jumps weighted by their probabilities."""
+        """Filter state after all readings, with possible undetected jumps weighted by their probabilities."""
         return self._entry_filter.series_filter.mixture(self.estimator_state.filter_state)
 
     @cached_property
     def _sigma_inflation(self) -> float:
-        """Factor of the present sigmas where the latest readings contradict the prior; 1 if they do not."""
+        """Factor by which present sigmas are inflated if the latest readings contradict the prior; 1 if they do not."""
         squares = self._unexplained(self.estimator_state.innovations)
         times = [time for time, _, _ in self.estimator_state.innovations]
         return float(inflation_factors(squares, [len(squares)], False, self._lasting(times))[0])
 
     def _lasting(self, times: Sequence[int]) -> list[tuple[int, Array]]:
-        """Return contradictions that inflate sigma permanently, each with the number of readings before it.
+        """Return contradictions between readings and prior that inflate sigma permanently.
 
-        They are those of the first readings, and the residuals that a detected jump leaves unexplained.
+        Each is (number of readings before it, array of chi-square and degrees of freedom). They are those of the first
+        readings, and the residuals that a detected jump leaves unexplained.
         """
         out = [(0, self._unexplained(self.estimator_state.first_innovations))]
         jumps = [] if self.too_many_jumps else self.estimator_state.jumps
@@ -414,7 +419,7 @@ class Operation:
         return bool(count > 1 and pdtrc(count - 1, mean) < FALSE_ALARM)
 
     def _unexplained(self, innovations: Sequence[tuple[int, float, int]]) -> Array:
-        """Return chi-square and degrees of freedom (N, 2) of readings, zero for readings that detected jumps explain.
+        """Return chi-square and degrees of freedom (N, 2) of readings; zero where a detected jump explains the reading.
 
         If more jumps were detected than the plan specifies, none is taken as an explanation.
 
@@ -434,7 +439,7 @@ class Operation:
     def _course(
         self, times: NDArray[np.int64], estimates: Sequence[tuple[Array, Array]], sigma_inflation: Array
     ) -> Course:
-        """Return the time series of all quantities from parameters and covariances at the times."""
+        """Return the estimate of all quantities at the times, from camera parameters and their covariances."""
         rows = self.model.rows
         changes = np.array([one for one, _ in estimates]).reshape(len(times), rows.shape[1])
         covariance = np.array([one for _, one in estimates]).reshape(len(times), rows.shape[1], rows.shape[1])
@@ -463,9 +468,9 @@ class Operation:
         return self._course(times, estimates, self._sigma_inflation_at(times))
 
     def _sigma_inflation_at(self, times: NDArray[np.int64]) -> Array:
-        """Return the factors (T,) of sigmas at past times; after the newest reading the present factor.
+        """Return the factors (T,) by which sigmas at given times are inflated where readings contradict the prior.
 
-        Array dimensions: T times.
+        After the newest reading it is the present factor. Array dimensions: T times.
         """
         innovations = [one for span in self._segments(None) for one in span.new_innovations]
         squares = self._unexplained(innovations)
@@ -511,7 +516,7 @@ class Operation:
     def _states_at(
         self, times: NDArray[np.int64], each: Callable[[Array, Array, float], tuple[Array, Array]]
     ) -> list[tuple[Array, Array]]:
-        """Evaluate a function of the state at given times, from all readings; later times are forecast."""
+        """Evaluate a function of the filter's state at given times, from all readings; later times are forecast."""
         entry_filter, last = self._entry_filter, self.estimator_state
         if len(times) and times.max() >= last.time:
             with one_blas_thread():
@@ -592,7 +597,10 @@ class Operation:
         return knowing, filter_state, observed, with_hints
 
     def _used_entries(self, after_us: int | None) -> tuple[NDArray[np.int64], Array]:
-        """Return the ids of the entries used after a checkpoint's time, and the undetected shares before each."""
+        """Return the ids of the entries used after a checkpoint, and the undetected shares of jumps before each.
+
+        An undetected share is the share of the mean square of a motion's jumps that could not have been detected.
+        """
         spans = self._segments(after_us)
         width = len(self._entry_filter.series_filter.walking)
         left = np.concatenate([one.undetected_shares.reshape(len(one.used), width) for one in spans])

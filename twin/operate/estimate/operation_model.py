@@ -33,8 +33,9 @@ from twin.operate.record.entries import digest_of_data, digest_of_job
 from twin.operate.record.history import History
 
 BEFORE = 0.01
-"""Time between the calibration and the first reading, as a share of the mission. The probability of a jump in that
-time, and its part of the false-alarm probability, are proportional to it.
+"""Time between the calibration and the first reading, as a share of the mission.
+
+The probability of a jump in that time, and its part of the false-alarm probability, are proportional to it.
 """
 
 
@@ -47,14 +48,14 @@ class OperationModel:
     Attributes
     ----------
     series_filter : SeriesFilter
-        Filter of the model, without the record's events.
+        Kalman filter of the model, without the record's events.
     spots : tuple[tuple[str, str], ...]
-        (camera, channel) of each spot, in the order of the shifts.
+        (camera, channel) of each spot, in the order of the spot shifts.
     quantities : tuple[Quantity, ...]
         The Q estimated quantities.
     reading : (4 K, D) ndarray
-        Parameters per pixel of spot shift (rad and m) by the estimator `model`, for which every camera moves as a
-        whole.
+        Camera parameters per pixel of spot shift (rad/px and m/px) by the estimator `model`, which assumes that every
+        camera moves as a whole.
     """
 
     series_filter: SeriesFilter
@@ -64,7 +65,7 @@ class OperationModel:
 
     @cached_property
     def rows(self) -> Array:
-        """(Q, 4 K) derivatives of the quantities with respect to the parameters.
+        """Derivatives (Q, 4 K) of the quantities with respect to the cameras' parameters.
 
         Numerators are in the quantities' units; denominators are rad and m of one camera after the other.
 
@@ -125,10 +126,10 @@ def traced_model(
 def heat_inputs(
     stated: DisturbancePrior, thermal: ThermalModel, sensors: Sequence[str], sigma: float
 ) -> HeatInputs | None:
-    """Return the model of the temperature sensors' readings in terms of the prior's temperatures; None without sensors.
+    """Return the model of the temperature sensors' readings as functions of the prior's temperatures.
 
-    None is also returned if no sensor reads a temperature of the prior. A sensor is located at its body's origin. A
-    body without a specified temperature has that of the body that carries it.
+    None is returned if no sensor reads a temperature of the prior. A sensor is located at its body's origin. A body
+    without a specified temperature has that of the body that carries it.
 
     Parameters
     ----------
@@ -195,7 +196,10 @@ def read_plan(path: Path, history: History) -> OperationSetup:
 
 
 def quantity_names(instrument: InstrumentSpec) -> tuple[str, ...]:
-    """Return group and key of all quantities of an instrument, in the order of `analysis.monitor.limits.quantities`."""
+    """Return group and key of all quantities of an instrument, such as ``forward`` and ``d_alpha_arcsec``.
+
+    Their order is that of `analysis.monitor.limits.quantities`.
+    """
     cameras = tuple(instrument.cameras)
     names = [f"{camera} {one.key}" for camera in cameras for one in CAMERA_PARAMETERS.values()]
     if len(cameras) == 2:
@@ -232,4 +236,4 @@ def plan_digest(setup: OperationSetup) -> str:
 
 
 _NO_PART = ("instrument", "disturbances", "horizon", "requirements")
-"""Keys of a plan that do not change the estimate of the present and the past."""
+"""Keys of a plan that do not change the estimate of the present and past, and so not its digest."""

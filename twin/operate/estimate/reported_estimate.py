@@ -1,4 +1,4 @@
-"""Reported estimate of an instrument in operation: courses with sigmas, jumps, sensors, requirements and alarms.
+"""Reported estimate of an instrument in operation: values with sigmas over time, jumps, sensors and alarms.
 
 An alarm tells a person that a requirement is violated or will be, that a body jumped, that a sensor fails, or that
 readings contradict the prior. Each alarm is raised once, and stays open in the record until somebody acknowledges it. A
@@ -28,7 +28,10 @@ from twin.operate.record.entries import MICRO, Alarm, utc_text
 from twin.operate.record.history import History
 
 MOST_BAD = 2
-"""Number of rejected readings above which a warning is given: 3 of 200 occur by chance once in a thousand times."""
+"""Number of outlier readings among the latest 200 above which a warning is given.
+
+Three of 200 are rejected by chance once in a thousand times.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,13 +106,13 @@ class DetectedJump(_Dated):
     log_ratio : float
         Log likelihood ratio of the readings with and without the jump, when it was detected.
     false_alarm : float
-        Upper bound of the probability of so large a ratio anywhere in a life without a jump.
+        Upper bound of the probability that so large a ratio occurs at any time in a mission without jumps.
     rivals : Mapping[str, float]
         Other bodies that could have jumped -> their log likelihood ratio.
     line_changes : Mapping[str, tuple[float, float, float]]
-        Quantity -> (read, changed, sigma): the change that the spots alone indicate for a camera that moves as a whole,
-        the true change of the line of sight averaged over the bodies that can have jumped, and its standard deviation.
-        A part that moves the spots need not move the line as much.
+        Quantity -> (read, changed, sigma): the change that the spots indicate if every camera moves as a whole; the
+        estimated change of the line of sight, averaged over the bodies that can have jumped; and its standard
+        deviation. The first two differ because a part that moves the spots need not move the line of sight as much.
     """
 
     body: str
@@ -246,7 +249,7 @@ class FilterResult:
     scores : Scores
         Quality of the predictions made before each reading came.
     innovations : tuple[tuple[int, float, int], ...]
-        (time_us, chi-square, degrees of freedom) of the latest readings.
+        (time_us, chi-square, degrees of freedom) of the latest readings' innovations (reading minus prediction).
     jumps : tuple[DetectedJump, ...]
         Detected jumps.
     events : tuple[tuple[int, str, tuple[str, ...]], ...]
@@ -256,7 +259,7 @@ class FilterResult:
     excluded : tuple[tuple[int, str, str, str], ...]
         (time_us, kind, subject, reason) of the latest entries that were not used.
     explained : Mapping[str, float]
-        Quantity -> share of its scatter that temperatures explain.
+        Quantity -> share of its variance over the readings that measured temperatures explain.
     sigma_inflation : float
         Factor by which present sigmas are inflated because the latest readings contradict the prior; 1 if they do not.
     too_many_jumps : bool
@@ -266,7 +269,7 @@ class FilterResult:
     bad_readings : tuple[tuple[int, str], ...]
         (time_us, reason) of the latest readings of the monitor that were rejected as outliers.
     undecided : bool
-        Whether the newest of these may be the first reading after a jump; the sigmas then allow for both cases.
+        Whether the newest rejected reading may be the first one after a jump; the sigmas then allow for both cases.
     understated_causes : tuple[str, ...]
         Causes of the prior with which the sensors of several bodies jointly disagree.
     """
@@ -334,7 +337,7 @@ class FilterResult:
 
 
 def _rows(keys: str, rows: Sequence[tuple[Any, ...]]) -> list[dict[str, Any]]:
-    """Return tuples that begin with their time as plain data with the given keys."""
+    """Return tuples, each beginning with a time, as a list of mappings with the given keys, times as UTC."""
     return [dict(zip(("time_utc", *keys.split()), (utc_text(t), *rest), strict=True)) for t, *rest in rows]
 
 
@@ -357,7 +360,7 @@ def beyond(value: Array, sigma: Array, limit: float) -> Array:
 def inflation_factors(
     squares: Array, now: Sequence[int] | NDArray[np.intp], centred: bool, lasting: Sequence[tuple[int, Array]] = ()
 ) -> Array:
-    """Return the factors (T,) by which readings that contradict the prior inflate the sigmas.
+    """Return the factors (T,) by which the sigmas are inflated because readings contradict the prior.
 
     The factor is the root of chi-square over its degrees of freedom, of the last reading or of several consecutive
     ones, whichever is larger; it is 1 if chance explains them. A contradiction of the first readings, or of a jump,
@@ -368,13 +371,15 @@ def inflation_factors(
     Parameters
     ----------
     squares : (N, 2) ndarray
-        Chi-square and degrees of freedom of the innovation of each reading, in the order of time.
+        Chi-square and degrees of freedom of the innovation (reading minus prediction) of each reading, in the order of
+        time.
     now : (T,) sequence of int
         Number of readings up to each time.
     centred : bool
-        Whether readings after the time count as well.
+        Whether readings after the time count as well as those before it.
     lasting : Sequence[tuple[int, ndarray]]
-        Lasting contradictions: number of readings from which on each counts, and its (n, 2) array as `squares`.
+        Lasting contradictions: number of readings from which on each counts, and an (n, 2) array in the form of
+        `squares`.
     """
     sums = np.concatenate([np.zeros((1, 2)), np.cumsum(squares, axis=0)])
     out, number = np.ones(len(now)), np.asarray(now, int)
@@ -393,9 +398,9 @@ def inflation_factors(
 
 
 AGAIN = 30 * 86_400 * MICRO
-"""Time after which a continuing condition raises its alarm again once it is acknowledged, in microseconds (30 days)."""
+"""Time after which a continuing condition raises its alarm again, once acknowledged, in microseconds."""
 LEAST = 1e-6
-"""Probability below which only a bound is printed."""
+"""Probability below which reports print "less than" this bound instead of a number."""
 _CLOSE = 3.0
 """Difference of log likelihood ratios (a factor of 20) below which another body explains a jump nearly as well."""
 BROKEN, BREAKS, JUMP, SENSOR, CONTRADICTION = "broken", "breaks", "jump", "sensor", "contradiction"
@@ -424,7 +429,7 @@ def raise_alarms(history: History, plan: OperationSpec, result: FilterResult) ->
 
 
 def alarms_of(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
-    """Yield all alarms of an estimate, whether they have been raised before or not."""
+    """Yield all alarms that the estimate gives rise to, whether they have been raised before or not."""
     for requirement in result.requirements:
         if not requirement.holds_now or requirement.breaks_us is not None:
             yield _of_requirement(requirement, result.time, result.now.quantities)
@@ -505,14 +510,14 @@ def with_sigma(value: float, sigma: float, unit: str, sign: bool = False) -> str
 
 
 def _of_bad(bad: tuple[int, str]) -> Alarm:
-    """Return the alarm of a reading that was rejected as an outlier."""
+    """Return the alarm of a monitor reading that was rejected as an outlier; ``bad`` is its time and reason."""
     time, reason = bad
     text = f"the reading of {utc_text(time)} was rejected as an outlier: {reason}; exclude --include uses it anyway"
     return Alarm(CONTRADICTION, "monitor", time, text, {"time_utc": utc_text(time), "reason": reason})
 
 
 def _contradictions(plan: OperationSpec, result: FilterResult) -> Iterator[Alarm]:
-    """Yield alarms of readings too far from their predictions; those at which a jump was detected are explained by it.
+    """Yield alarms of readings too far from their predictions and not explained by a detected jump.
 
     The false-alarm probability of the whole life is shared out by time: each reading has the share of the interval
     before it.

@@ -53,7 +53,7 @@ from twin.operate.record.schema import (
 from twin.operate.record.taking import Ingest, IngestResult
 
 USED = ("monitor", "temperature")
-"""Kinds of entries that are observations of the estimate; events act on it by their steps."""
+"""Kinds of entries that are observations of the estimate; events act on it as steps of the motions."""
 
 
 class History:
@@ -306,7 +306,7 @@ class History:
         return None if row is None else {**row, "content": content_of(dict(row))}
 
     def first(self, kind: str) -> dict[str, Any] | None:
-        """Return the earliest entry of a kind, as from `entries`; None if there is none."""
+        """Return the earliest entry of a kind, with the keys that `entries` yields; None if there is none."""
         c = ENTRY.c
         with self.reading() as connection:
             # query each subject by the index, which orders by subject before time
@@ -351,7 +351,7 @@ class History:
         Parameters
         ----------
         plan : str
-            Digest of the estimate, as for `save_checkpoint`.
+            Digest of everything that the estimate depends on besides the readings.
         number : int | None
             Return the checkpoint of this number only. Without it checkpoints of negative numbers are ignored, and where
             a time is given also number 0, which is not permanent.
@@ -384,7 +384,7 @@ class History:
             return list(connection.execute(query.order_by(c.time_us, c.number)))
 
     def save_checkpoint(self, plan: str, number: int, time_us: int, entry_id: int, content: bytes) -> bool:
-        """Save the state of an estimate, instead of an earlier one of the same number.
+        """Save the state of an estimate; it replaces an earlier one of the same number.
 
         Parameters
         ----------
@@ -424,7 +424,7 @@ class History:
         return int(gone.rowcount)
 
     def raise_alarm(self, alarm: Alarm) -> bool:
-        """Add an alarm, unless the record has it.
+        """Add an alarm to the record, unless the record has it already.
 
         Returns
         -------
@@ -514,7 +514,7 @@ def _numbered(number: int | None, before_us: int | None) -> Any:
 
 
 def _streams(connection: Connection) -> Iterator[tuple[str, str]]:
-    """Yield kind and subject of all readings in order, by lookups in the index instead of a scan."""
+    """Yield kind and subject of all readings in order, by index look-ups instead of a scan of the table."""
     c = ENTRY.c
     in_order = select(c.kind, c.subject).order_by(c.kind, c.subject).limit(1)
     stream = connection.execute(in_order).first()
@@ -529,7 +529,7 @@ def _subjects(connection: Connection, kind: str) -> list[str]:
 
 
 def _stream_extent(connection: Connection, kind: str, subject: str) -> tuple[int, int, int]:
-    """Return the number of readings of a stream, and its first and last time.
+    """Return the number of readings of one kind and subject, and the first and last of their times.
 
     Each is one query that the index answers.
     """
@@ -541,7 +541,7 @@ def _stream_extent(connection: Connection, kind: str, subject: str) -> tuple[int
 
 
 def content_of(row: Mapping[str, Any]) -> Any:
-    """Return the content of a row of `History.entries` as plain data."""
+    """Return the content of a row of `History.entries`, which is JSON text, as nested mappings and lists."""
     return parse_json(row["content"], "the record")
 
 

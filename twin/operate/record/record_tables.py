@@ -126,7 +126,7 @@ TABLES: Mapping[str, Record[Row]] = {
 
 
 def tables(history: History) -> list[DataTable]:
-    """Return all tables of a record that have rows."""
+    """Return all tables of a record that have rows, one for each kind of reading."""
     rows: dict[str, list[Row]] = {name: [] for name in TABLES}
     for entry in history.entries():
         row = {**entry, "content": content_of(entry)}
@@ -138,7 +138,7 @@ def tables(history: History) -> list[DataTable]:
 
 
 def _rows(row: Row) -> Iterator[tuple[str, Row]]:
-    """Yield the table rows of an entry."""
+    """Yield the rows of the output tables for one entry, each with the name of its table."""
     kind = row["kind"]
     if kind != "monitor":
         yield ("run" if kind in RUNS else kind), row

@@ -42,12 +42,12 @@ from twin.operate.record import NotARecord, RecordFailed, file_of, require_file
 from twin.operate.record.entries import digest_of_data, utc_text
 
 VERSION = 4
-"""Version of the tables."""
+"""Version of the database tables, raised with each change of their columns."""
 LAST_CHECKED = 500
 """Number of the newest entries whose digests are checked at every status; checking all of them takes too long."""
 _METADATA = MetaData()
 _NUMBER = BigInteger().with_variant(Integer(), "sqlite")
-"""Type of ids: SQLite numbers rows by itself only where their type is INTEGER."""
+"""Column type of ids; SQLite numbers rows automatically only if their type is INTEGER."""
 
 
 def _table(name: str, *columns: Any) -> Table:
@@ -106,7 +106,7 @@ ENTRY = _table(
     Index("entry_origin", "origin"),
     Index("entry_time", "time_us", "id"),
 )
-"""One row for each reading or event, as `twin.operate.record.entries.Entry`."""
+"""One row for each reading or event, with the fields of `twin.operate.record.entries.Entry`."""
 REFUSED = _table(
     "refused",
     _digest("sha256", nullable=False, unique=True),
@@ -137,7 +137,7 @@ ALARM = _table(
     Column("content", Text, nullable=False),
     Index("alarm_stream", "kind", "subject", "time_us"),
 )
-"""One row for each alarm, as `twin.operate.record.entries.Alarm`."""
+"""One row for each alarm, with the fields of `twin.operate.record.entries.Alarm`."""
 ACKNOWLEDGEMENT = _table(
     "acknowledgement",
     Column("alarm_id", _NUMBER, ForeignKey("alarm.id"), nullable=False, unique=True),
@@ -193,7 +193,7 @@ def _guard(connection: Connection, table: Table) -> None:
 
 
 def guarded(connection: Connection) -> bool:
-    """Return whether the database itself refuses to alter the record."""
+    """Return whether the database itself refuses to alter rows of the record."""
     if connection.dialect.name == "sqlite":
         rows = connection.execute(text("SELECT name, sql FROM sqlite_master WHERE type = 'trigger'"))
         there = {name: " ".join(sql.split()) for name, sql in rows}
@@ -284,7 +284,7 @@ def url_of(place: str) -> URL:
 
 
 def engine_of(url: URL) -> Engine:
-    """Return the engine of a database.
+    """Return the SQLAlchemy engine that connects to a database.
 
     Raises
     ------
@@ -324,7 +324,7 @@ def _on_begin(connection: Connection) -> None:
 
 
 def opened(url: URL) -> Engine:
-    """Return the engine of an existing record."""
+    """Return the SQLAlchemy engine of an existing record, after a check of its version."""
     if url.get_backend_name() == "sqlite":
         require_file(Path(str(url.database)))
     return engine_of(url)
@@ -332,7 +332,7 @@ def opened(url: URL) -> Engine:
 
 @contextmanager
 def writing(engine: Engine) -> Iterator[Connection]:
-    """Open the transaction of the record's only writer."""
+    """Open a transaction that writes to the record and excludes all other writers."""
     with database_errors(), engine.connect().execution_options(writing=True) as connection, connection.begin():
         if engine.dialect.name == "postgresql":
             connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_LOCK})")

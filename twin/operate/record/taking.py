@@ -14,15 +14,15 @@ from twin.operate.record.entries import MICRO, Entry, FileContent, Refusal, cano
 from twin.operate.record.schema import CHECKPOINT, ENTRY, FRAME, REFUSED, SOURCE
 
 SAME_IMAGES = 0.2
-"""Largest root mean square of the differences of spots in the same images, in sigmas.
+"""Root mean square difference of spots, in sigmas, up to which two readings come from the same images.
 
-Spots in other images of the same state differ by 1.4, and with eight coordinates by less than this once in a million;
-spots in the same images differ where other pixels are excluded.
+Spots in different images of the same state differ by 1.4 sigmas, and with eight coordinates by less than this once in a
+million; spots in the same images differ only where different pixels are excluded.
 """
 _BATCH = 500
 """Number of rows in one query or insert."""
 AHEAD = 24 * 3600 * MICRO
-"""Time after the computer's clock, in microseconds, beyond which a reading comes from a wrong clock."""
+"""Time by which a reading may be later than the computer's clock, in microseconds; beyond it its clock is wrong."""
 
 
 Before = Mapping[tuple[str, str, str], tuple[float, float]]
@@ -40,7 +40,7 @@ class IngestResult:
     new : int
         Number of readings and events added to the record.
     known : int
-        Number that the record had already.
+        Number of readings and events that the record had already.
     refused : tuple[tuple[int | None, str], ...]
         Line and reason of every refusal.
     before : bool

@@ -60,7 +60,7 @@ _STATE_KEYS = (
     "centroid",
     "frames",
 )
-"""Keys of a monitor's result that belong to one state."""
+"""Keys of a monitor's result that belong to one state (one moment) of the instrument."""
 _IMAGES = (".tiff", ".tif", ".fits", ".fit", ".fts", ".png")
 CONFIG = "config.yaml"
 LARGEST_READING = 4_000_000
@@ -292,7 +292,7 @@ def _items(table: ReadingTableSpec, path: Path, history: History) -> tuple[list[
 def _keyword_items(
     table: ReadingTableSpec, rows: Sequence[tuple[int, list[str] | str]], history: History
 ) -> list[Entry | Refusal]:
-    """Return the entries of lines ``KEYWORD = TIME NUMBER``.
+    """Return the readings in lines of the form ``KEYWORD = TIME NUMBER``, or refusals.
 
     Other keywords are not readings.
     """
