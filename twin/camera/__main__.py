@@ -18,7 +18,7 @@ from twin.framework import cli
 from twin.framework.command import run_test
 
 TILT = "tilt"
-"""Name of the option that also tilts the focal plane."""
+"""Name of the command's option that also tilts the focal plane."""
 
 app = cli.program()
 

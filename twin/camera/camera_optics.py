@@ -174,11 +174,11 @@ class CameraOptics:
         return lambda fields, points: covered(self.path.shadow_pieces({}, self._designed(fields)), points, SMALLEST)
 
     def _designed(self, fields: np.ndarray) -> np.ndarray:
-        """Return ``directions`` of the camera in its nominal state."""
+        """Return the directions of the light of F fields for the camera in its nominal state, (F, 3)."""
         return replace(self, state=FrozenMap()).directions(fields)
 
     def directions(self, fields: Sequence[Field] | np.ndarray) -> np.ndarray:
-        """Return the directions of the light of fields (F, 2) in the world frame, (F, 3).
+        """Return the directions of the light of F fields, (F, 2), in the world frame, unit vectors (F, 3).
 
         Raises
         ------
@@ -197,7 +197,9 @@ class CameraOptics:
         return np.asarray(light @ self.model.camera_frame.rotation @ root.rotation.T)
 
     def rays(self, fields: Sequence[Field] | np.ndarray, points: np.ndarray) -> LineRays:
-        """Trace rays of fields (F, 2) through points (N, 2) of the stop, in units of its radius, to the line CCD.
+        """Trace rays of F fields, (F, 2), through N points of the stop, (N, 2), to the line CCD.
+
+        Points are in units of the stop's radius.
 
         Raises
         ------
@@ -210,12 +212,12 @@ class CameraOptics:
     def wavefronts(
         self, fields: Sequence[Field] | np.ndarray, points: int = MAP_POINTS, terms: int = TERMS
     ) -> tuple[Wavefront, ...]:
-        """Compute wavefront errors at fields (F, 2), with maps of ``points`` on each axis.
+        """Compute wavefront errors at F fields, (F, 2), with maps of ``points`` by ``points``.
 
         Raises
         ------
         AimError, BeamMissedError
-            The conditions of ``rays``.
+            In this state the light misses the stop or the plane of the line CCD.
         """
         nodes = stop_nodes(self.model, RINGS, self.cut is not None)
         axis = np.linspace(-1.0, 1.0, points)
@@ -270,16 +272,16 @@ class CameraOptics:
         return tuple(out)
 
     def wavefront(self, field: Field = (0.0, 0.0), points: int = MAP_POINTS) -> Wavefront:
-        """Compute the wavefront error at one field, as ``wavefronts``."""
+        """Compute the wavefront error at one field, with a map of ``points`` by ``points``."""
         return self.wavefronts([field], points)[0]
 
     def spots(self, fields: Sequence[Field] | np.ndarray, defocus: float = 0.0) -> tuple[Spot, ...]:
-        """Compute spots at fields (F, 2) on the line CCD moved by ``defocus`` metres downstream.
+        """Compute spots at F fields, (F, 2), on the line CCD moved by ``defocus`` metres downstream.
 
         Raises
         ------
         AimError, BeamMissedError
-            The conditions of ``rays``.
+            In this state the light misses the stop or the plane of the line CCD.
         """
         nodes = stop_nodes(self.model, RINGS, self.cut is not None)
         rings = [r / SPOT_RINGS * rim(6 * r) for r in range(1, SPOT_RINGS + 1)]
@@ -314,11 +316,11 @@ class CameraOptics:
         return tuple(out)
 
     def spot(self, field: Field = (0.0, 0.0), defocus: float = 0.0) -> Spot:
-        """Compute the spot at one field, as ``spots``."""
+        """Compute the spot at one field on the line CCD moved by ``defocus`` metres downstream."""
         return self.spots([field], defocus)[0]
 
     def beams(self, fields: Sequence[Field] | np.ndarray, rings: int = RINGS) -> FieldBeams:
-        """Trace beams of fields (F, 2) near the image, in the prescription's frame.
+        """Trace the beams of F fields near the image, in the prescription's frame.
 
         In a perturbed state the beams have their true position relative to the moved line CCD, which is drawn where it
         was designed to be.
@@ -326,14 +328,14 @@ class CameraOptics:
         Parameters
         ----------
         fields : (F, 2) array_like
-            Fields.
+            The F fields.
         rings : int
             Rings of the quadrature over the stop.
 
         Raises
         ------
         AimError, BeamMissedError
-            The conditions of ``rays``.
+            In this state the light misses the stop or the plane of the line CCD.
         InputError
             Edges block all of a field's light.
         """
@@ -361,14 +363,14 @@ class CameraOptics:
 
     @one_blas_thread()
     def errors(self, fields: Sequence[Field] | np.ndarray) -> np.ndarray:
-        """Compute rms wavefront errors without maps at fields (F, 2), in waves of the design wavelength, (F,).
+        """Compute rms wavefront errors at F fields, (F, 2), in waves of the design wavelength, (F,).
 
         Piston and tilt are removed.
 
         Raises
         ------
         AimError, BeamMissedError
-            The conditions of ``rays``.
+            In this state the light misses the stop or the plane of the line CCD.
         """
         all_fields, plane = np.asarray(fields, dtype=np.float64), FocalPlane.of(self.model.spec)
         step = max(1, MAX_RAYS // stop_nodes(self.model, RINGS, self.cut is not None).count)
@@ -376,7 +378,9 @@ class CameraOptics:
         return np.concatenate([self.beams(part).errors(plane) for part in parts])
 
     def pupils(self, fields: Sequence[Field] | np.ndarray) -> tuple[PupilFunction, ...]:
-        """Compute exit pupils seen from the images of fields (F, 2), with axes along the line and along the track.
+        """Compute the exit pupils of F fields, (F, 2), with axes along the line and along the track.
+
+        Each is seen from the image of its field.
 
         The pupils are centred on the design wavelength's chief rays, whatever the wavelength of the light, so that they
         include lateral colour.
@@ -384,7 +388,7 @@ class CameraOptics:
         Raises
         ------
         AimError, BeamMissedError
-            The conditions of ``rays``.
+            In this state the light misses the stop or the plane of the line CCD.
         ValueError
             Edges cut a pupil into too many pieces, or a wavefront is too irregular for its polynomials.
         """
@@ -409,14 +413,14 @@ class CameraOptics:
         wavelengths: np.ndarray | None = None,
         weights: np.ndarray | None = None,
     ) -> tuple[Mtf, ...]:
-        """Compute the MTF at fields (F, 2).
+        """Compute the MTF at F fields for M spatial frequencies, as a mean over K wavelengths.
 
         Parameters
         ----------
         fields : (F, 2) array_like
-            Fields.
+            The F fields.
         frequency : (M,) ndarray, optional
-            Spatial frequencies, cycles/m; by default 65 from 0 to the cut-off or twice Nyquist, whichever is less.
+            Spatial frequencies, cycles/m; by default 65 from 0 to the cut-off or twice Nyquist, whichever is smaller.
         wavelengths : (K,) ndarray, optional
             Wavelengths of the light, metres; by default the design wavelength.
         weights : (K,) ndarray, optional
@@ -425,7 +429,7 @@ class CameraOptics:
         Raises
         ------
         AimError, BeamMissedError, ValueError
-            The conditions of ``pupils``.
+            The light is lost, edges cut a pupil into too many pieces, or a wavefront is too irregular.
         """
         colours = np.array([self.wavelength]) if wavelengths is None else np.asarray(wavelengths, float)
         shares = np.ones(len(colours)) if weights is None else np.asarray(weights, float)
@@ -464,7 +468,7 @@ class CameraOptics:
         colours: np.ndarray,
         shares: np.ndarray,
     ) -> tuple[Mtf, ...]:
-        """Compute ``mtfs`` of pupils with edges, at evenly spaced frequencies."""
+        """Compute the MTF of vignetted pupils at evenly spaced frequencies, line by line over the pupil."""
         light = self.directions(fields)
         places = self.path.places(self.state, light)
         used = colours if lenses(self.model.spec) else [np.min(colours)]
@@ -492,37 +496,40 @@ class CameraOptics:
     def colour_pupils(
         self, fields: Sequence[Field] | np.ndarray, wavelengths: np.ndarray
     ) -> list[tuple[PupilFunction, ...]]:
-        """Return the pupils of every field (F, 2) for wavelengths (K,), metres.
+        """Return the pupils of each of F fields, (F, 2), for K wavelengths, (K,), in metres.
 
         Each field has one pupil per wavelength, or a single one for all wavelengths if the camera has no lenses.
 
         Raises
         ------
         AimError, BeamMissedError, ValueError
-            The conditions of ``pupils``.
+            The light is lost, edges cut a pupil into too many pieces, or a wavefront is too irregular.
         """
         if not lenses(self.model.spec):
             return [(pupil,) for pupil in self.at(float(np.min(wavelengths))).pupils(fields)]
         return list(zip(*(self.at(float(colour)).pupils(fields) for colour in wavelengths), strict=True))
 
     def mtf(self, field: Field = (0.0, 0.0), frequency: np.ndarray | None = None) -> Mtf:
-        """Compute the MTF at one field and the wavelength of the light, as ``mtfs``."""
+        """Compute the MTF at one field and the wavelength of the light, over frequencies in cycles/m."""
         return self.mtfs([field], frequency)[0]
 
     def _path(self, rays: LineRays) -> np.ndarray:
-        """Return optical paths to the reference spheres minus those of the chief rays, (F, N), metres."""
+        """Return optical paths to the reference spheres minus the chief rays', for F fields and N rays, (F, N).
+
+        The unit is metres.
+        """
         radius = float(self.model.first_order.exit_pupil_distance[0])
         path = path_to_sphere(rays.position, rays.direction, rays.path, rays.position[:, :1], radius)
         return path - path[:, :1]
 
     def _place(self, rays: LineRays, k: int) -> tuple[float, float]:
-        """Return the position of the chief ray of a field, (along the line, along the track), metres."""
+        """Return where the chief ray of a field meets the line CCD, (along the line, along the track), metres."""
         x, y = rays.position[k, 0, :2] / rays.size
         return float(y), float(x)
 
 
 def even_step(frequency: np.ndarray) -> bool:
-    """Return True if frequencies (M,) increase from 0 in equal steps."""
+    """Return True if M frequencies, (M,), increase from 0 in equal steps."""
     return (
         len(frequency) > 1 and frequency[1] > 0.0 and np.allclose(frequency, frequency[1] * np.arange(len(frequency)))
     )

@@ -178,7 +178,7 @@ def axial_figure(run: CameraRun) -> Figure:
 
 
 def _mark(wavelengths: np.ndarray) -> str:
-    """Return a marker for curves with few wavelengths."""
+    """Return the marker of points on curves over few wavelengths; empty for many wavelengths."""
     return "o" if len(wavelengths) < 12 else ""
 
 
@@ -291,7 +291,7 @@ def distortion_figure(run: CameraRun) -> Figure:
 
 
 def _lines(axes: Axes, run: CameraRun) -> None:
-    """Draw the distortion along the line."""
+    """Draw the distortion of points along the line CCD, in the axes given."""
     d = run.distortion
     axes.plot(1e3 * d.position, 1e6 * d.residual, color=INK, lw=1.4, label="L \N{MINUS SIGN} f tan W")
     if np.max(np.abs(d.residual_with_point - d.residual)) > 1e-9:

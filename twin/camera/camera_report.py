@@ -50,7 +50,7 @@ def camera_report(run: CameraRun) -> Report:
 
 
 def _new_name(run: CameraRun) -> str:
-    """Return the name of the refocused camera, which its file has as well."""
+    """Return the name of the refocused camera, which is also the name of its file."""
     return f"{run.setup.camera.name}_refocused"
 
 
@@ -75,7 +75,7 @@ def _first_order_text(run: CameraRun) -> str:
 
 
 def _facts(run: CameraRun) -> tuple[tuple[str, str], ...]:
-    """Return the facts about the camera, as pairs of label and text."""
+    """Return the facts about the camera for the head of the report, as pairs of label and text."""
     spec = run.camera
     facts = [("Camera", spec.name)]
     if spec.description:
@@ -148,7 +148,7 @@ def _before(distance: float | None) -> str:
 
 
 def _layout(run: CameraRun) -> Section:
-    """Return the section on the layout."""
+    """Return the section with drawings of the mirrors, lenses and rays."""
     model, backend = run.optics.model, run.optics.path.backend
     caption = "To scale, in the prescription's frame; mirrors with their clear apertures; dash-dotted: the parent axis."
     figure = _figure("layout", "Layout with rays", caption, layout_figure, model, backend)
@@ -156,7 +156,7 @@ def _layout(run: CameraRun) -> Section:
 
 
 def _refocus(run: CameraRun) -> Section:
-    """Return the section on the refocused camera."""
+    """Return the section that compares the focal plane and wavefront errors before and after refocusing."""
     assert run.refocus is not None
     refocused = run.refocus
     rows: list[list[Cell]] = [

@@ -16,10 +16,13 @@ if TYPE_CHECKING:  # takes half a second with pandas, and only who asks for a da
     import xarray as xr
 
 Field = tuple[float, float]
-"""Fractions of the half angles of view: along the line, along the track."""
+"""Position in the field: fractions, from -1 to 1, of the half angles of view along the line and along the track."""
 
 TERMS = 37
-"""Number of Zernike terms (Noll's order) of a wavefront: all to seventh order, and the spherical term of eighth."""
+"""Number of Zernike terms of a wavefront in Noll's order.
+
+They are all terms to the seventh radial order, and the spherical term of the eighth.
+"""
 
 ROUNDING = 1e-6
 """Tolerance by which fractions of light and Strehl ratios may leave 0 to 1: the accuracy of quadratures over pieces of
@@ -46,8 +49,8 @@ class Wavefront:
     wavelength : float
         Wavelength, metres, the unit of waves.
     x, y : (n,) ndarray
-        Coordinates of the map's columns and rows on the stop, in units of its radius; x runs along the line, y along
-        the track.
+        Coordinates of the map's n columns and n rows on the stop, in units of its radius; x runs along the line, y
+        along the track.
     map : (n, n) ndarray
         Wavefront error, waves; NaN where there is no light.
     coefficients : (TERMS,) ndarray
@@ -111,12 +114,12 @@ class Wavefront:
 
     @property
     def orthonormal_terms(self) -> dict[str, float]:
-        """Name of each term -> waves rms of its part, of ``polynomials``."""
+        """Name of each orthonormal polynomial -> its contribution to the rms wavefront error, in waves."""
         return {zernike.name(j): float(c) for j, c in enumerate(self.parts, start=1)}
 
     @property
     def terms(self) -> dict[str, float]:
-        """Name of each Zernike term -> waves rms."""
+        """Name of each Zernike circle term -> its coefficient, in waves rms."""
         return {zernike.name(j): float(c) for j, c in enumerate(self.coefficients, start=1)}
 
     def to_xarray(self) -> xr.Dataset:
@@ -158,8 +161,8 @@ class Spot:
     field : Field
         Field of the beam.
     rays : (N, 2) ndarray
-        Ray positions relative to the chief ray, (along the line, along the track), metres; hexapolar on the stop, the
-        chief ray first, without vignetted rays.
+        Positions of N rays relative to the chief ray, (along the line, along the track), metres; hexapolar on the stop,
+        the chief ray first, without vignetted rays.
     centroid : (2,) ndarray
         Centroid of all light relative to the chief ray, metres.
     rms : float
@@ -203,13 +206,13 @@ class Mtf:
     field : Field
         Field of the beam.
     frequency : (M,) ndarray
-        Spatial frequencies, cycles/m.
+        The M spatial frequencies, cycles/m.
     values : (2, M) ndarray
         MTF along the line and along the track.
     limit : (2, M) ndarray
         MTF of the same pupil without wavefront error, the diffraction limit.
     wavelengths : (K,) ndarray
-        Wavelengths of the light, metres.
+        The K wavelengths of the light, metres.
     nyquist : float
         Nyquist frequency of the pixels, cycles/m.
     weights : (K,) ndarray
@@ -233,12 +236,15 @@ class Mtf:
 
     @property
     def at_nyquist(self) -> np.ndarray:
-        """MTF along the line and along the track at the pixels' Nyquist frequency, (2,); NaN beyond the table."""
+        """MTF along the line and along the track at the Nyquist frequency, (2,); NaN if not tabulated."""
         ends = {"left": np.nan, "right": np.nan}
         return np.array([np.interp(self.nyquist, self.frequency, row, **ends) for row in self.values])
 
     def at(self, frequency: float) -> np.ndarray:
-        """Return the MTF along the line and along the track at a frequency within the table, cycles/m, (2,)."""
+        """Return the MTF along the line and along the track, (2,), at a frequency in cycles/m.
+
+        The frequency is within the range of the tabulated ones.
+        """
         return np.array([np.interp(frequency, self.frequency, row) for row in self.values])
 
     def to_xarray(self) -> xr.Dataset:

@@ -48,7 +48,7 @@ GRID: tuple[Field, ...] = tuple((x, y) for y in (1.0, 0.0, -1.0) for x in (-1.0,
 """Fields of wavefront maps and spot diagrams, row by row."""
 
 MTF_FIELDS: tuple[Field, ...] = ((0.0, 0.0), (0.7, 0.0), (1.0, 0.0), (1.0, 1.0), (1.0, -1.0))
-"""Fields of MTF curves and through focus."""
+"""Fields at which MTF curves and the image quality through focus are computed."""
 
 ERROR_GRID = (25, 9)
 """Number of fields along the line and along the track of the map of wavefront errors."""
@@ -93,10 +93,10 @@ class Perturbed:
     change : LineChange
         Change of the camera's geometry, of one state.
     errors : (A, B) ndarray
-        Rms wavefront error before the perturbation at the fields of the run's map, waves.
+        Rms wavefront error before the perturbation, waves, at the map's A fields along and B fields across the line.
     mtf : (F, 2) ndarray
-        MTF at Nyquist before the perturbation at MTF_FIELDS, along the line and along the track; empty where there is
-        none.
+        MTF at Nyquist before the perturbation at the F fields MTF_FIELDS, along the line and along the track; empty
+        where there is none.
     """
 
     job: JobSpec
@@ -134,7 +134,7 @@ class CameraRun:
     without_mtf : str
         Reason why there is no MTF; empty where there is one.
     field : (A, B, 2) ndarray
-        Fields of the map of wavefront errors.
+        Fields of the map of wavefront errors, A along the line and B along the track.
     errors : (A, B) ndarray
         Rms wavefront errors of the map, waves.
     distortion : Distortion
@@ -192,7 +192,7 @@ class CameraRun:
 
 
 def aberration_name(index: int) -> str:
-    """Return the name of a Zernike term without its orientation."""
+    """Return the name of the aberration of a Zernike term, such as coma, without its orientation."""
     words = zernike.name(index).split()
     return " ".join(words if zernike.noll_to_nm(index)[1] == 0 else words[: -1 if words[-1] in ("x", "y") else -2])
 
@@ -305,7 +305,7 @@ def run_camera(
 
 
 def _nyquist(optics: CameraOptics) -> np.ndarray:
-    """Return the MTF at Nyquist at MTF_FIELDS, (F, 2); empty if it cannot be computed."""
+    """Return the MTF at Nyquist at the F fields MTF_FIELDS, along line and track, (F, 2); empty if not computable."""
     try:
         return np.array([mtf.at(optics.nyquist) for mtf in optics.mtfs(MTF_FIELDS)])
     except UnphysicalError:
@@ -313,7 +313,7 @@ def _nyquist(optics: CameraOptics) -> np.ndarray:
 
 
 def find_focus(camera: CameraSpec, backend: Backend, tilt: bool) -> Refocus:
-    """Find the focal plane with the least mean square wavefront error over ``FIELDS``.
+    """Find the focal plane with the smallest mean square wavefront error over ``FIELDS``.
 
     Raises
     ------
@@ -488,7 +488,7 @@ def _field_numbers(run: CameraRun) -> list[dict[str, Any]]:
 
 
 def _cut_numbers(wave: Wavefront) -> dict[str, Any]:
-    """Return the additional results of a vignetted beam; none for a whole one."""
+    """Return the numbers that only a vignetted beam has, for optics.json; empty for a whole one."""
     if not wave.is_vignetted:
         return {}
     return {

@@ -86,7 +86,7 @@ def draw_spot(axes: Axes, spot: Spot, half: float | None = None) -> None:
 
 
 def draw_mtf(axes: Axes, mtf: Mtf, label: bool = True) -> None:
-    """Both directions over cycles/mm, with the limit of diffraction and Nyquist's frequency."""
+    """Draw the MTF along line and track over cycles/mm, with the diffraction limit and the Nyquist frequency."""
     frequency = 1e-3 * mtf.frequency
     for values, limit, colour, name in zip(
         mtf.values, mtf.limit, (LINE, TRACK), ("along the line", "along the track"), strict=True
@@ -109,7 +109,7 @@ class Plottable:
     """Mixin for results that a notebook shows as their text and their figure."""
 
     def plot(self) -> Figure:
-        """Return the figure."""
+        """Return the figure of the result."""
         raise NotImplementedError
 
     def _repr_html_(self) -> str:
@@ -195,7 +195,7 @@ class CameraView(CameraOptics, Plottable):
         Raises
         ------
         AimError, BeamMissedError
-            The conditions of ``CameraOptics.rays``.
+            In this state the light misses the stop or the plane of the line CCD.
         """
         return _shown(WavefrontView, super().wavefront(field, points))
 
@@ -205,7 +205,7 @@ class CameraView(CameraOptics, Plottable):
         Raises
         ------
         AimError, BeamMissedError
-            The conditions of ``CameraOptics.rays``.
+            In this state the light misses the stop or the plane of the line CCD.
         """
         return _shown(SpotView, super().spot(field, defocus))
 
@@ -215,7 +215,7 @@ class CameraView(CameraOptics, Plottable):
         Raises
         ------
         AimError, BeamMissedError, ValueError
-            The conditions of ``CameraOptics.pupils``.
+            The light is lost, edges cut a pupil into too many pieces, or a wavefront is too irregular.
         """
         return _shown(MtfView, super().mtf(field, frequency))
 
@@ -224,5 +224,5 @@ Shown = TypeVar("Shown")
 
 
 def _shown(kind: type[Shown], value: Any) -> Shown:
-    """Convert a result to its class with a plot."""
+    """Convert a wavefront, spot or MTF to the subclass that has a ``plot`` method."""
     return kind(**{field.name: getattr(value, field.name) for field in fields(value)})

@@ -1,7 +1,7 @@
 """Polychromatic analysis of a camera: lateral and axial colour, MTF and point images over its spectrum.
 
 **Lateral colour** is the position of a wavelength's chief ray on the focal plane, **axial colour** the position of its
-least rms wavefront error along the light; both relative to the reference wavelength. **Primary** colour is the
+smallest rms wavefront error along the light; both relative to the reference wavelength. **Primary** colour is the
 difference between the shortest and the longest wavelength, **secondary** colour that between the reference wavelength
 and the mean of these two.
 
@@ -31,7 +31,7 @@ from twin.framework.record import Quantity, Record
 from twin.targets.target_images import wavelengths_enough
 
 FIRST_RULE = 5
-"""Number of wavelengths of the first rule."""
+"""Number of wavelengths of the first quadrature over the spectrum, which is refined if the MTF changes."""
 
 CURVE_POINTS = 21
 """Number of wavelengths of curves over the spectrum, odd."""
@@ -52,8 +52,8 @@ class Psf:
     field : Field
         Field of the point.
     position : (N,) ndarray
-        Coordinates of columns (along the line) and rows (along the track) from the design wavelength's chief ray,
-        metres.
+        Coordinates of the N columns (along the line) and the N rows (along the track) from the design wavelength's
+        chief ray, metres.
     values : (N, N) ndarray
         Irradiance for unit light, 1/m^2.
     strehl : float
@@ -77,9 +77,9 @@ class Colours:
     reference : float
         Reference wavelength of colour: that of the design if the spectrum contains it, else the mean, metres.
     wavelengths : (K,) ndarray
-        Ascending wavelengths, first and last those of the spectrum, metres.
+        The K wavelengths, ascending, first and last those of the spectrum, metres.
     fields : tuple of Field
-        F fields.
+        The F fields.
     lateral : (F, K, 2) ndarray, or None
         Chief rays relative to the reference's, along the line and along the track, metres; None for a camera without
         lenses, which has no lateral colour.
@@ -108,22 +108,25 @@ class Colours:
 
     @property
     def lateral_primary(self) -> np.ndarray | None:
-        """Chief-ray position of the shortest wavelength minus that of the longest, metres, (F, 2)."""
+        """Chief-ray position of the shortest minus the longest wavelength at F fields, metres, (F, 2)."""
         return None if self.lateral is None else np.asarray(self.lateral[:, 0] - self.lateral[:, -1])
 
     @property
     def lateral_secondary(self) -> np.ndarray | None:
-        """Chief-ray position of the reference wavelength minus the mean of shortest and longest, metres, (F, 2)."""
+        """Chief-ray position of the reference wavelength minus the mean of shortest and longest, metres.
+
+        An (F, 2) array for F fields, along the line and along the track.
+        """
         return None if self.lateral is None else np.asarray(-0.5 * (self.lateral[:, 0] + self.lateral[:, -1]))
 
     @property
     def axial_primary(self) -> np.ndarray | None:
-        """Focus of the shortest wavelength minus that of the longest, metres, (F,)."""
+        """Best focus of the shortest wavelength minus that of the longest at F fields, metres, (F,)."""
         return None if self.axial is None else np.asarray(self.axial[:, 0] - self.axial[:, -1])
 
     @property
     def axial_secondary(self) -> np.ndarray | None:
-        """Focus of the reference wavelength minus the mean of shortest and longest, metres, (F,)."""
+        """Best focus of the reference wavelength minus the mean of shortest and longest at F fields, metres, (F,)."""
         if self.axial is None or self.axial_reference is None:
             return None
         return np.asarray(self.axial_reference - 0.5 * (self.axial[:, 0] + self.axial[:, -1]))
@@ -143,12 +146,12 @@ def reference_wavelength(optics: CameraOptics, spectrum: SpectrumSpec) -> float:
 def lateral_colour(
     optics: CameraOptics, fields: Sequence[Field] | np.ndarray, wavelengths: np.ndarray, reference: float
 ) -> np.ndarray:
-    """Compute chief-ray positions of wavelengths (K,) relative to a reference wavelength, metres.
+    """Compute chief-ray positions at K wavelengths, (K,), relative to a reference wavelength, metres.
 
     Returns
     -------
     (F, K, 2) ndarray
-        Positions along the line and along the track.
+        Positions along the line and along the track at F fields and K wavelengths.
 
     Raises
     ------
@@ -167,7 +170,7 @@ def lateral_colour(
 
 
 def axial_colour(optics: CameraOptics, fields: Sequence[Field], wavelengths: np.ndarray) -> np.ndarray:
-    """Compute best focus of each single field at each wavelength (K,), from the focal plane, metres.
+    """Compute the best focus of each of F fields at each of K wavelengths, from the focal plane, metres.
 
     It is along the prescription's z, positive downstream, on a plane with the focal plane's tilt; in a perturbed state
     relative to the moved focal plane.
@@ -175,7 +178,7 @@ def axial_colour(optics: CameraOptics, fields: Sequence[Field], wavelengths: np.
     Returns
     -------
     (F, K) ndarray
-        Best focus.
+        Best focus, metres.
 
     Raises
     ------
@@ -200,18 +203,18 @@ def spectral_mtfs(
     spectrum: SpectrumSpec,
     frequency: np.ndarray | None = None,
 ) -> tuple[Mtf, ...]:
-    """Compute the polychromatic MTF at fields (F, 2), with as many wavelengths as are needed.
+    """Compute the polychromatic MTF at F fields, with as many wavelengths as are needed.
 
     Parameters
     ----------
     optics : CameraOptics
         Camera.
     fields : (F, 2) array_like
-        Fields.
+        The F fields.
     spectrum : SpectrumSpec
         Spectrum of the light.
     frequency : (M,) ndarray, optional
-        Spatial frequencies, as for ``CameraOptics.mtfs``.
+        M spatial frequencies, cycles/m; by default from 0 to the cut-off or twice Nyquist.
 
     Returns
     -------
@@ -221,8 +224,8 @@ def spectral_mtfs(
     Raises
     ------
     AimError, BeamMissedError, ValueError
-        The conditions of ``CameraOptics.pupils``; also an MTF that still changes by more than ``WORST_CHANGE`` at
-        ``LARGEST_RULE`` wavelengths.
+        The light is lost, or a pupil or wavefront is too irregular; also an MTF that still changes by more than
+        ``WORST_CHANGE`` at ``LARGEST_RULE`` wavelengths.
     """
     if frequency is None:
         # up to the cut-off of the shortest wavelength, for any rule
@@ -243,12 +246,12 @@ def spectral_mtfs(
 def spectral_psfs(
     optics: CameraOptics, fields: Sequence[Field] | np.ndarray, wavelengths: np.ndarray, weights: np.ndarray
 ) -> tuple[Psf, ...]:
-    """Compute point images over wavelengths (K,) with weights (K,) at fields (F, 2), ``PSF_POINTS`` square.
+    """Compute point images of K weighted wavelengths at F fields, (F, 2), with ``PSF_POINTS`` on each side.
 
     Raises
     ------
     AimError, BeamMissedError, ValueError
-        The conditions of ``CameraOptics.pupils``.
+        The light is lost, edges cut a pupil into too many pieces, or a wavefront is too irregular.
     """
     colours, shares = np.asarray(wavelengths, float), np.asarray(weights, float) / np.sum(weights)
     ends = (int(np.argmin(colours)), int(np.argmax(colours)))
@@ -337,7 +340,7 @@ class _AtField:
     number: int
 
     def of(self, values: np.ndarray | None) -> Any:
-        """Return the entry of this field in an array (F, ...); None for none."""
+        """Return the entry of this field in an array (F, ...) over F fields; None if there is no array."""
         return None if values is None else values[self.number]
 
     @property

@@ -84,9 +84,9 @@ def fit_illuminated(
     rings : int
         Rings of the quadrature over the whole stop.
     light : float
-        Fraction of the stop's light that passes by traced rays.
+        Fraction of the stop's light that passes, counted by traced rays.
     to_sphere : callable
-        Function from rays to their optical paths to the reference spheres, (1, N), metres.
+        Function from N rays to their optical paths to the reference spheres, (1, N), metres.
     terms : int
         Number of Zernike terms.
 
@@ -135,7 +135,7 @@ def fit_illuminated(
 
 
 def _tamed(stop: IlluminatedStop, pieces: np.ndarray, rings: int, wave: np.ndarray) -> np.ndarray:
-    """Return the wavefront (N,) with a smooth continuation where rays in the shadow depart far from it.
+    """Return the wavefront at N nodes, (N,), with a smooth continuation where rays in the shadow depart far from it.
 
     Such rays pass outside the rims of lenses; the quadrature subtracts their contribution again.
     """
@@ -158,7 +158,7 @@ def fit_by_rays(nodes: PupilNodes, weight: np.ndarray, flat: np.ndarray, terms: 
     Parameters
     ----------
     nodes : PupilNodes
-        Quadrature nodes of the stop, N.
+        The N quadrature nodes of the stop.
     weight : (N,) ndarray
         Weights of the nodes, 0 where no light passes.
     flat : (N,) ndarray

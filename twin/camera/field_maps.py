@@ -38,7 +38,7 @@ class Distortion:
     Attributes
     ----------
     fields : (A, B, 2) ndarray
-        Fractions of the half field, along the line and then along the track.
+        Grid of A fields along the line and B along the track, as fractions of the half field.
     places : (A, B, 2) ndarray
         Chief rays on the focal plane, along the line and along the track, metres.
     ideal : (A, B, 2) ndarray
@@ -48,7 +48,7 @@ class Distortion:
     point : (2,) ndarray
         Principal point c of that camera, metres from the line's centre.
     angle : (M,) ndarray
-        Field angles W of points along the line, from the line of sight, radians.
+        Field angles W of M points along the line, from the line of sight, radians.
     position : (M,) ndarray
         Positions L of these points, metres.
     line_distance : float
@@ -75,12 +75,12 @@ class Distortion:
 
     @property
     def rms(self) -> float:
-        """Rms distance of the grid from that of the distortion-free camera, metres."""
+        """Rms distance between chief rays and the distortion-free camera's image points over the field, metres."""
         return float(np.sqrt(np.mean(np.sum((self.places - self.ideal) ** 2, axis=-1))))
 
     @property
     def largest(self) -> float:
-        """Largest distance of the grid from that of the distortion-free camera, metres."""
+        """Largest distance between a chief ray and the distortion-free camera's image point over the field, metres."""
         return float(np.max(np.linalg.norm(self.places - self.ideal, axis=-1)))
 
     @property
@@ -95,7 +95,7 @@ class Distortion:
 
 
 def field_grid(count: tuple[int, int] = GRID) -> np.ndarray:
-    """Return fields (A, B, 2) evenly spaced over the whole field."""
+    """Return fields evenly spaced over the whole field, (A, B, 2): A along the line, B along the track."""
     along, across = (np.linspace(-1.0, 1.0, n) for n in count)
     return np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1)
 
@@ -147,7 +147,9 @@ def distortion(optics: CameraOptics) -> Distortion:
 @shows("share", "focus [um]", "illumination", "vignetted", "mtf")
 @dataclass(frozen=True, eq=False)
 class FieldCurves:
-    """Curves along the line, in the middle of the field along the track.
+    """Focus, wavefront error, illumination and MTF at M fields along the line.
+
+    Along the track, the fields are in the middle.
 
     Attributes
     ----------
@@ -157,7 +159,7 @@ class FieldCurves:
         Best focus of the ray fans along the line and along the track, from the focal plane, positive downstream,
         metres.
     focus : (M,) ndarray
-        Focus of the whole beam with the least rms wavefront error, metres.
+        Focus of the whole beam with the smallest rms wavefront error, metres.
     error : (M,) ndarray
         Rms wavefront error on the focal plane, waves.
     illumination : (M,) ndarray
@@ -179,7 +181,10 @@ class FieldCurves:
 
 
 def field_curves(optics: CameraOptics, sharp: bool, count: int = 21) -> FieldCurves:
-    """Compute the curves for ``count`` fields along the line, without MTF if the camera is not ``sharp``."""
+    """Compute focus, error, illumination and MTF at ``count`` fields along the line.
+
+    The MTF is omitted if the camera is not ``sharp``.
+    """
     share = np.linspace(-1.0, 1.0, count)
     fields = np.stack([share, np.zeros(count)], axis=-1)
     waves = optics.wavefronts(fields, points=3, terms=28)
@@ -214,7 +219,7 @@ def field_curves(optics: CameraOptics, sharp: bool, count: int = 21) -> FieldCur
 @shows("fields", "defocus [um]", "best [um]", "error [waves]")
 @dataclass(frozen=True, eq=False)
 class ThroughFocus:
-    """Image quality through focus at F fields.
+    """Image quality through focus at F fields, with Z positions of the detector.
 
     Attributes
     ----------
@@ -227,7 +232,7 @@ class ThroughFocus:
     mtf : (F, 2, Z) ndarray
         MTF at Nyquist, along the line and along the track; NaN where there is none.
     best : float
-        Defocus with the least mean square error over the fields, metres; NaN where the light has no focus.
+        Defocus with the smallest mean square error over the fields, metres; NaN where the light has no focus.
     """
 
     fields: tuple[Field, ...]
@@ -255,7 +260,7 @@ def through_focus(optics: CameraOptics, fields: tuple[Field, ...], sharp: bool) 
 
 
 def _mtf_through_focus(optics: CameraOptics, fields: tuple[Field, ...], defocus: np.ndarray, sharp: bool) -> np.ndarray:
-    """Return the MTF at Nyquist, (F, 2, Z); NaN for a camera that is not sharp."""
+    """Return the MTF at Nyquist, (F, 2, Z), at F fields, in two directions, for Z defoci; NaN if not sharp."""
     mtf = np.full((len(fields), 2, len(defocus)), np.nan)
     if sharp:
         wavelength = np.array([optics.model.spec.wavelength])

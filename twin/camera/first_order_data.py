@@ -52,9 +52,9 @@ class RayPaths:
     Attributes
     ----------
     names : tuple of str
-        Surfaces that the rays meet, the image last, K.
+        The K surfaces that the rays meet, the image last.
     points : (1 + K, F, N, 3) ndarray
-        Starting points and intersections with the surfaces, metres.
+        Starting point and K intersections of N rays of each of F fields, metres.
     """
 
     names: tuple[str, ...]
@@ -64,7 +64,9 @@ class RayPaths:
 def ray_paths(
     model: CameraModel, backend: Backend, fields: Sequence[tuple[float, float]], stop: np.ndarray, earlier: float = 0.0
 ) -> RayPaths:
-    """Trace rays of fields (fractions of the half field) through points (N, 2) of the stop, in units of its radius.
+    """Trace rays of fields (fractions of the half field) through N points, (N, 2), of the stop.
+
+    Points are in units of the stop's radius.
 
     The rays begin ``earlier`` metres before their launch points. No aperture limits them.
     """
@@ -137,8 +139,8 @@ class ObscurationData:
     shares : mapping
         Body -> largest fraction of a beam over the field that it blocks; bodies that block nothing are omitted.
     holes : mapping
-        Mirror -> least radius, metres, of a central hole that the light needs: for mirrors whose file specifies no hole
-        and that reflect no light there.
+        Mirror -> smallest radius, metres, of a central hole that the light needs: for mirrors whose file specifies no
+        hole and that reflect no light there.
     """
 
     shares: Mapping[str, float]
@@ -228,7 +230,7 @@ def _holes(
 
 
 def _passed_edges(model: CameraModel, bare: Assembly, paths: RayPaths) -> np.ndarray:
-    """Return which rays pass the edges of all surfaces, (F, N)."""
+    """Return a mask of the rays that pass the edges of all surfaces, (F, N) for N rays of each of F fields."""
     passed = np.ones(paths.points.shape[1:3], dtype=bool)
     if not model.edges:
         return passed
@@ -240,7 +242,9 @@ def _passed_edges(model: CameraModel, bare: Assembly, paths: RayPaths) -> np.nda
 def _intersections(
     backend: Backend, bare: Assembly, body: str, edge: Aperture, start: np.ndarray, end: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return which of the segments start..end, (F, N, 3), meet the clear area of a body, and where.
+    """Return which ray segments from ``start`` to ``end`` meet the clear area of a body, and where.
+
+    Both ends are (F, N, 3) for N rays of each of F fields.
 
     Returns
     -------
@@ -310,7 +314,7 @@ class FirstOrderData:
 
     @property
     def working_f_number_line(self) -> float:
-        """F-number along the line by the beam at the image, 1 / (2 NA)."""
+        """F-number along the line of the beam at the image, 1 / (2 NA) with its numerical aperture NA."""
         return 0.5 / self.aperture[0]
 
 

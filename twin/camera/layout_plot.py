@@ -49,14 +49,14 @@ def _fields(axis: int) -> list[tuple[float, float]]:
 
 
 def _rays(model: CameraModel, backend: Backend, axis: int) -> np.ndarray:
-    """Trace chief, lower and upper marginal ray of three fields, (1 + K, 3, 3, 3)."""
+    """Trace chief, lower and upper marginal ray of three fields to K surfaces, (1 + K, 3, 3, 3), metres."""
     stop = np.zeros((3, 2))
     stop[1:, axis] = -INSIDE, INSIDE
     return ray_paths(model, backend, _fields(axis), stop).points
 
 
 def _extent(model: CameraModel, backend: Backend, axis: int) -> tuple[float, float, float, float]:
-    """Return the least and largest z and transverse coordinate of a view, with a margin."""
+    """Return the smallest and largest z and transverse coordinate of a view, with a margin, metres."""
     rays = _rays(model, backend, axis)
     points = rays[1:]
     z = points[..., 2]
@@ -68,14 +68,14 @@ def _extent(model: CameraModel, backend: Backend, axis: int) -> tuple[float, flo
 
 
 def _begun(points: np.ndarray, first: float) -> np.ndarray:
-    """Return rays (1 + K, ..., 3) extended to begin at z = first."""
+    """Return rays, (1 + K, ..., 3) points on K surfaces, extended to begin at z = ``first`` metres."""
     start, then = points[0], points[1]
     share = (first - start[..., 2:]) / (then - start)[..., 2:]
     return np.concatenate([(start + share * (then - start))[None], points[1:]])
 
 
 def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: float) -> None:
-    """Draw one view."""
+    """Draw the side view or the top view of the layout with its rays."""
     points = _begun(_rays(model, backend, axis), first)
     half = np.degrees((model.spec.field.x, model.spec.field.y)[axis])
     for share, colour in zip((-1.0, 0.0, 1.0), _END_COLOURS, strict=True):

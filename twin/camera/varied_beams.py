@@ -53,7 +53,7 @@ class RoughWavefrontError(UnphysicalError):
 
 
 class BeamLight(NamedTuple):
-    """Light of S states at the line CCD.
+    """Light of F fields and K wavelengths at the line CCD in S states, by N rays per beam.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class VariedBeams:
     degree
         Degree of the polynomials in the pupil that represent wavefronts.
     solve
-        Matrix from values at the nodes to polynomial coefficients, (T, N).
+        Matrix from values at the N nodes to T polynomial coefficients, (T, N).
     designed
         Light of the nominal camera, of one state.
     cosines
@@ -110,7 +110,7 @@ class VariedBeams:
     residual
         Rms that the polynomials leave of its wavefronts, waves.
     pieces
-        Polygons on the stop's unit disk where its beams are shadowed, (F, P, V, 2).
+        Polygons on the stop's unit disk where its beams are shadowed, (F, P, V, 2): P polygons of V corners per field.
 
     Raises
     ------
@@ -185,7 +185,9 @@ class VariedBeams:
         self._aimed = aim(self.backend, systems, self._fan_for(1), self._target, near, slopes, AIM_TOLERANCE)
 
     def _aimed_at_stop(self, states: Sequence[State], placed: PlacedBodies) -> np.ndarray:
-        """Return starting points of rays to their points of the stop, per state and wavelength, (S * K * F, 1 + N, 3).
+        """Return starting points of rays that meet their points of the stop, (S * K * F, 1 + N, 3), metres.
+
+        There are S states, K wavelengths and F fields, with a chief ray and N rays in each beam.
 
         Raises
         ------
@@ -201,7 +203,7 @@ class VariedBeams:
     def _rays(
         self, states: Sequence[State], aimed: np.ndarray | None = None
     ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
-        """Trace the beams to the line CCD.
+        """Trace the beams of S states, K wavelengths and F fields to the line CCD.
 
         Returns
         -------
@@ -227,11 +229,11 @@ class VariedBeams:
         return reshaped, aimed.reshape(*shape, 3)  # type: ignore[return-value]
 
     def _coloured(self, states: Sequence[State]) -> list[State]:
-        """Return the states with the glasses' indices at each traced wavelength, state by state, S * K."""
+        """Return the S states with the glasses' indices at each of K wavelengths, S * K in all, state by state."""
         return [in_glass(state, steps) for state in states for steps in self._glass]
 
     def _owners(self, count: int) -> np.ndarray:
-        """Return the number of the state and wavelength of each beam for ``count`` states, (S * K * F,)."""
+        """Return the index of the state and wavelength of each beam for S = ``count`` states, (S * K * F,)."""
         return np.repeat(np.arange(count * len(self._glass)), len(self.fields))
 
     def _fan_for(self, count: int) -> RayFan:
@@ -244,7 +246,9 @@ class VariedBeams:
         return RayFan(tiled(self._fan.position), tiled(self._fan.direction), tiled(self._fan.axes), True)
 
     def _to_sphere(self, position: np.ndarray, direction: np.ndarray, paths: np.ndarray, radius: float) -> np.ndarray:
-        """Return optical paths to spheres about the chief rays' images, minus those of the chief rays, (S, F, K N).
+        """Return optical paths to spheres about the chief rays' images, minus those of the chief rays, metres.
+
+        The array is (S, F, K N) for S states, F fields, K wavelengths and N rays.
 
         The spheres of all wavelengths are about the weighted mean of their images.
         """
@@ -292,7 +296,10 @@ class VariedBeams:
         return not self.pieces.shape[1] or not bool(np.any(area(self.pieces) > SMALLEST))
 
     def illuminated_nodes(self) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Return nodes x, y and weights of a quadrature over the light of every field, (N',) each; weights sum to 1."""
+        """Return nodes x, y and weights of a quadrature over the light of every field; weights sum to 1.
+
+        The arrays of a field have one entry per node; x and y are in units of the stop's radius.
+        """
         if self.free:
             nodes = quadrature.disk(self.degree)
             return [(nodes.x, nodes.y, nodes.share)] * len(self.fields)
@@ -304,7 +311,7 @@ class VariedBeams:
 
     @one_blas_thread()
     def zernike_rows(self, last: int) -> np.ndarray:
-        """Return the matrix from optical paths at the nodes (N,) to Zernike terms Z1 to Z``last``, (F, last, N).
+        """Return the matrix from optical paths at N nodes to Zernike terms 1 to ``last`` for F fields, (F, last, N).
 
         The terms are in metres rms, Noll's order, positive where the wavefront is ahead, with the axes of the stop. For
         a vignetted pupil they are made orthonormal over its light one after the other: annular terms for a ring.
@@ -328,13 +335,16 @@ class VariedBeams:
 
     @cached_property
     def defocus(self) -> np.ndarray:
-        """Change of the optical paths as the image point moves downstream along the chief ray, (F, N), per metre."""
+        """Change of the optical paths at N nodes of F fields, (F, N), per metre of shift of the image point.
+
+        The image point moves downstream along the chief ray.
+        """
         direction = self._rays([{}])[0][1][0, 0]
         return np.asarray(np.einsum("fni,fi->fn", direction[:, 1:], direction[:, 0]) - 1.0)
 
     @one_blas_thread()
     def focus_rows(self) -> np.ndarray:
-        """Return the matrix from optical paths at the nodes (N,) to the focus of least rms error, (F, N).
+        """Return the matrix from optical paths at N nodes to the focus of smallest rms error for F fields, (F, N).
 
         The focus is along the chief ray of the nominal camera, metres downstream of the line CCD.
         """
@@ -348,7 +358,7 @@ class VariedBeams:
 
 
 def _without_tilt(x: np.ndarray, y: np.ndarray, share: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return values (N, ...) at nodes without piston and tilt over the light."""
+    """Return values at N nodes, (N, ...), without piston and tilt, which are fitted with the weights of the light."""
     level = np.stack([np.ones_like(x), x, y], axis=-1)
     weighted = level * share[:, None]
     return np.asarray(values - level @ np.linalg.solve(level.T @ weighted, weighted.T @ values))
