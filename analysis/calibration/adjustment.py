@@ -44,12 +44,12 @@ FALSE_ALARM = 5e-5
 run.
 """
 _WAVES = 4
-"""Largest number of cosines for each of x and y of a line."""
+"""Largest number of cosines that describe slow variations of x, and of y, along a line."""
 _POINTS_PER_WAVE = 4
 """Number of image points that each cosine requires."""
 _RANK = 1e-9
-"""Smallest eigenvalue of S, relative to the largest, of a term that residuals can show. A term that the unknowns
-imitate has none.
+"""Smallest eigenvalue of the gradient's covariance S, relative to the largest, of a combination of omitted terms that
+residuals can show. A term that the estimated unknowns imitate exactly has the eigenvalue zero.
 """
 
 
@@ -73,11 +73,11 @@ class Rates:
 
     @property
     def size(self) -> int:
-        """Number of terms."""
+        """Number of omitted terms: three rates for each field."""
         return 3 * len(self.middles)
 
     def columns(self, field: calibration_parameters.CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
-        """Return the (n, 2, size) derivatives of the misclosures with respect to the terms.
+        """Return the derivatives of n image points' misclosures (x, y) with respect to the rates, (n, 2, size).
 
         Parameters
         ----------
@@ -88,7 +88,7 @@ class Rates:
         rays : Rays
             Image points of the line, n of them.
         by : Partials
-            Derivatives of their misclosures.
+            Derivatives of the misclosures of these image points with respect to the model's parameters.
         """
         derivatives = np.zeros((len(rays.point), 2, self.size))
         if rays.time is not None and field.name in self.middles:
@@ -134,7 +134,7 @@ class SlowVariations:
         return sum(2 * count for *_, count in self.waves.values())
 
     def columns(self, field: calibration_parameters.CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
-        """Return the (n, 2, size) derivatives of the misclosures with respect to the terms; see `Rates.columns`."""
+        """Return the derivatives of n image points' misclosures (x, y) with respect to the cosines, (n, 2, size)."""
         derivatives = np.zeros((len(rays.point), 2, self.size))
         if (field.name, line) in self.waves and rays.time is not None:
             begin, span, first, count = self.waves[field.name, line]
@@ -162,7 +162,7 @@ class Steps:
         return 2 * len(self.places)
 
     def columns(self, field: calibration_parameters.CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
-        """Return the (n, 2, size) derivatives of the misclosures with respect to the terms; see `Rates.columns`.
+        """Return the derivatives of n image points' misclosures (x, y) with respect to the steps, (n, 2, size).
 
         The misclosure of an image point that is displaced by 1 m is 1 m larger.
         """
@@ -183,14 +183,14 @@ class OmittedTermsTest:
 
     Attributes
     ----------
-    terms : Rates, Courses or Steps
-        The G omitted terms.
+    terms : Rates, SlowVariations or Steps
+        The omitted terms, G in number.
     score : (G,) ndarray
-        Gradient at zero terms.
+        Gradient of half the sum of squares with respect to the terms, where they are zero.
     cofactor : (G, G) ndarray
         Covariance S of the gradient.
     bias : (P, G) ndarray
-        Bias of the estimates caused by a term of one unit.
+        Bias of the P estimates due to a term of one unit.
     """
 
     terms: OmittedTerms
@@ -204,8 +204,8 @@ class OmittedTermsTest:
 
         Parameters
         ----------
-        terms : Rates, Courses or Steps
-            The G omitted terms.
+        terms : Rates, SlowVariations or Steps
+            The omitted terms, G in number.
         wide : Equations
             Equations of P unknowns and the G terms, which are zero.
         covariance : (P, P) ndarray
@@ -229,7 +229,7 @@ class OmittedTermsTest:
 
     @property
     def sigma_alone(self) -> Array:
-        """Standard deviation (G,) of each term if there is no other."""
+        """Standard deviation of each of the G omitted terms, if it is the only one that is not zero."""
         diagonal = np.diag(self.cofactor)
         determined = diagonal > _RANK * self._largest
         return np.asarray(np.where(determined, 1.0 / np.sqrt(np.where(determined, diagonal, 1.0)), np.inf))
@@ -256,7 +256,7 @@ class OmittedTermsTest:
 
     @property
     def _size(self) -> Array:
-        """Square roots (G,) of the cofactor matrix's diagonal."""
+        """Standard deviations of the G gradient components, the scale of the cofactor matrix."""
         return np.asarray(np.sqrt(np.maximum(np.diag(self.cofactor), 1e-300)))
 
     @property
@@ -276,7 +276,9 @@ FARTHEST = 2e3
 no datum moves half of the points farther: an arc minute is 150 m, one second of a clock 7 km.
 """
 _EXPECTED = 20.0
-"""Distance, in sigmas of the start values, from which on points are not those in the image."""
+"""Distance between points and the rays of their image points, in sigmas due to the start values, above which the points
+are not those in the image.
+"""
 
 
 class FarPointsError(calibration_parameters.CalibrationError):
@@ -302,7 +304,7 @@ def single_ray(
     cameras: Mapping[str, LineModel],
     noise: calibration_parameters.Noise,
 ) -> dict[str, float]:
-    """Return the median standard deviation of one image point in x or y by each source of noise alone, in metres.
+    """Return the median standard deviation of one image point in x or y due to each noise source alone, in metres.
 
     Parameters
     ----------
@@ -349,7 +351,8 @@ def check_places(
     Raises
     ------
     FarPointsError
-        Half of a field's control points lie farther off than `FARTHEST`, and than 20 sigmas of the start values.
+        Half of a field's control points lie farther than `FARTHEST` from their rays, and farther than 20 sigmas of the
+        start values.
     """
     for site in fields:
         distances, expected = [], []
@@ -381,7 +384,7 @@ def _mean_square(covariance: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Adjustment:
-    """Solution of a calibration.
+    """Solution of a simultaneous calibration of line cameras on test fields.
 
     Attributes
     ----------
@@ -391,7 +394,7 @@ class Adjustment:
         Estimates, in metres and radians.
     covariance : (P, P) ndarray
         Covariance from the a-priori sigmas times `factors`, and from the start values where these fix undetermined
-        combinations. Fixed unknowns count as exact: zero rows.
+        combinations. Fixed unknowns count as exact: their rows and columns are zero.
     gauge : Gauge
         Gauge of the adjustment.
     open : tuple of Combination
@@ -399,9 +402,9 @@ class Adjustment:
     weak : tuple of Combination
         Combinations of low strength that were estimated nevertheless.
     prior_share : (P,) ndarray
-        Share of each variance that comes from the start values and not from the points, 0 to 1.
+        Fraction, 0 to 1, of each variance that is due to the sigmas of the start values and not to the measurements.
     follow : (P, H) ndarray
-        Derivatives of the values with respect to the start values of the H fixed unknowns.
+        Derivatives of the P estimates with respect to the start values of the H fixed unknowns.
     cameras : mapping of str to LineModel
         Cameras with the adjusted interior orientation, in the reference state.
     ground : mapping of str to (m, 3) ndarray
@@ -466,7 +469,7 @@ class Adjustment:
         return self.omitted_terms_test(SlowVariations.of(self.fields))
 
     def sigma_with(self, start: Mapping[str, float]) -> dict[str, float]:
-        """Return the standard deviation of each unknown with uncertain start values of fixed unknowns.
+        """Return the standard deviations of the unknowns if the start values of fixed ones have errors.
 
         Parameters
         ----------
@@ -624,7 +627,7 @@ def _adjusted(
 
 @dataclass(frozen=True, eq=False)
 class _Iteration:
-    """State of the iteration: weights, Gauss-Newton steps so far, and points that are rejected permanently."""
+    """State of the adjustment: current solution, weights, number of steps, and permanently rejected points."""
 
     state: State
     weights: Weights
@@ -642,14 +645,14 @@ class _Iteration:
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """Equations at a solution, and the covariance (P, P) of the unknowns."""
+    """Linearised equations at a solution, and the covariance (P, P) of the P unknowns."""
 
     equations: Equations
     covariance: Array
 
     @cached_property
     def cofactors(self) -> Array:
-        """Cofactors (M, 2, 2) of the adjusted image points."""
+        """Covariances (M, 2, 2) of the M adjusted image points, whitened by the a-priori covariances."""
         return self.equations.image_cofactors(self.covariance)
 
 
@@ -669,12 +672,12 @@ class _Problem:
 
     @cached_property
     def place(self) -> NDArray[np.intp]:
-        """Index (M,), among the points of all fields, of the point that each image point shows."""
+        """Index, among the ground points of all fields, of the point that each of M image points shows."""
         first = np.concatenate([[0], np.cumsum([len(f.ground) for f in self.fields])])
         return np.concatenate([a + r.point for a, f in zip(first, self.fields, strict=False) for r in f.rays.values()])
 
     def judged(self, state: _Iteration, solution: _Solved) -> tuple[Array, ...]:
-        """Return the (M, 2) standardised residuals of the image points."""
+        """Return the standardised residuals of the M image points, (M, 2)."""
         image = solution.equations.residuals.image
         return (
             reweighting.standardised_packets(image, solution.cofactors, state.weights.image, state.factor["image"]),
@@ -707,7 +710,7 @@ class _Problem:
 
     @cached_property
     def ray(self) -> dict[str, float]:
-        """Standard deviation of a single image point by each source of noise, in metres."""
+        """Median standard deviation of a single image point due to each source of noise, in metres."""
         return single_ray(self.fields, self.cameras, self.noise)
 
     def solve(self, state: _Iteration, screening: bool = False) -> tuple[_Iteration, _Solved]:
@@ -747,10 +750,10 @@ class _Problem:
         return state, _Solved(equations, 0.5 * (spread + spread.T))
 
     def freedom(self, state: _Iteration, equations: Equations) -> calibration_parameters.Freedom:
-        """Return what may be estimated, with the robust weights and the a-priori sigmas.
+        """Return the estimable part of the unknowns, from the robust weights and the a-priori sigmas.
 
-        With estimated factors, poorly fitting measurements would open combinations that they determine, and the factors
-        could not decrease again.
+        With estimated variance factors, poorly fitting measurements would make combinations undetermined that they
+        determine, and the factors could not decrease again.
         """
         if any(v != 1.0 for v in state.weights.factor.values()):
             weights = replace(state.weights, factor=dict.fromkeys(state.weights.factor, 1.0))
@@ -778,7 +781,10 @@ class _Problem:
         )
 
     def followed(self, equations: Equations, covariance: Array, held: Array) -> Array:
-        """Return the (P, k) derivatives of the values by start values of fixed unknowns, `held` (P, k) unit columns."""
+        """Return the derivatives of the P estimates with respect to start values of k fixed unknowns, (P, k).
+
+        `held` holds a unit column for each fixed unknown, (P, k).
+        """
         return np.asarray(held - covariance @ (equations.reduced @ held))
 
     def result(self, state: _Iteration, solution: _Solved, robust: reweighting.Robust | None) -> Adjustment:
@@ -845,14 +851,14 @@ class _Problem:
         )
 
     def _by_line(self, rows: Array) -> dict[str, dict[str, Array]]:
-        """Return rows of all image points as a mapping by field and line."""
+        """Return an array of all image points as a mapping by field and line camera."""
         sizes = [len(r.point) for f in self.fields for r in f.rays.values()]
         pieces = iter(np.split(rows, np.cumsum(sizes)[:-1]))
         return {f.name: {line: next(pieces) for line in f.rays} for f in self.fields}
 
 
 def _scores(equations: Equations, standard: Array, weights: Weights) -> Array:
-    """Return the (P, P) difference of the right side's variance from the normal matrix, for Huber's weights.
+    """Return the correction of the normal matrix to the covariance of its right side, for Huber's weights, (P, P).
 
     An image point of weight w counts with the variance w in the normal matrix, as if it had that uncertainty. The
     actual variance of a gross error is the square of the limit, whatever its size (Huber 1981, asymptotic covariance).

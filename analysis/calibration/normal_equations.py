@@ -48,15 +48,16 @@ class SharedNoise:
     Attributes
     ----------
     parts : mapping of str to tuple of Part
-        Error models of each field. Station corrections are along the axes of the ITRS.
+        Error models of the attitude and station readings of each field. Station corrections are along the axes of the
+        ITRS.
     met : mapping of (str, str) to Corrections
         Corrections of the rays of each (field, line); lines without times have none.
     spans : tuple of (int, int)
-        First and last + 1 unknown of each field.
+        Index of the first unknown of each field, and one beyond its last.
     groups : mapping of str to ndarray of int
-        Unknowns of each variance group.
+        Indices of the unknowns of each variance group.
     precision : (K, K) csr_matrix
-        A-priori precision of all unknowns.
+        A-priori precision (inverse covariance) of all K unknowns.
     """
 
     parts: Mapping[str, tuple[Part, ...]]
@@ -95,7 +96,7 @@ class SharedNoise:
         return self.precision.shape[0]
 
     def corrected(self, name: str, line: str, rays: Rays, shared: Array) -> Rays:
-        """Return the rays of a line of a field with corrected attitude and station.
+        """Return a line's rays in a field with attitude and station corrected by the shared noise.
 
         Parameters
         ----------
@@ -106,12 +107,12 @@ class SharedNoise:
         rays : Rays
             Rays of that line.
         shared : (K,) ndarray
-            Unknowns of the shared noise.
+            Values of the K unknowns of the shared noise.
         """
         return _moved(rays, self.met.get((name, line)), shared)
 
     def corrected_at(self, name: str, rays: Rays, shared: Array) -> Rays:
-        """Return other rays of a field with corrected attitude and station.
+        """Return any rays of a field with attitude and station corrected by the shared noise.
 
         Parameters
         ----------
@@ -120,13 +121,13 @@ class SharedNoise:
         rays : Rays
             Rays with times.
         shared : (K,) ndarray
-            Unknowns of the shared noise.
+            Values of the K unknowns of the shared noise.
         """
         assert rays.time is not None
         return _moved(rays, Corrections(self.parts[name], np.eye(3), rays.time), shared)
 
     def rows(self, name: str, line: str, white: Array, by: Partials) -> sparse.csr_matrix:
-        """Return the whitened equations (2n, K) of the rays of a line of a field.
+        """Return the whitened Jacobian of a line's n rays with respect to the K shared-noise unknowns, (2n, K).
 
         Parameters
         ----------
@@ -154,7 +155,7 @@ def _law(term: NoiseTerm, interval: float) -> Law:
 
 
 def _moved(rays: Rays, met: Corrections | None, shared: Array) -> Rays:
-    """Return rays with corrected attitude and station."""
+    """Return rays with attitude and station corrected by the shared noise; unchanged without corrections."""
     if met is None or not met.parts:
         return rays
     rotation, shift = met.at(shared)
@@ -184,16 +185,16 @@ class Weights:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """State of an iteration.
+    """State of the iteration: values of unknowns, ground points and shared noise.
 
     Attributes
     ----------
     values : (P,) ndarray
-        Unknowns.
+        Values of the P unknowns, in metres and radians.
     grounds : tuple of (m, 3) ndarray
-        Points of each field.
+        Coordinates of the m points of each field, ITRS, in metres.
     shared : (S,) ndarray
-        Unknowns of the shared noise.
+        Values of the S unknowns of the shared noise.
     """
 
     values: Array
@@ -201,7 +202,7 @@ class State:
     shared: Array
 
     def moved(self, equations: Equations, step: Array) -> State:
-        """Return the state after a step (P,) of the unknowns and the corresponding steps of points and noise."""
+        """Return the state after a step of the P unknowns and the steps of points and noise that follow from it."""
         cuts = np.cumsum([len(g) for g in self.grounds])[:-1]
         points = np.split(equations.point_step(step), cuts)
         grounds = tuple(g + d for g, d in zip(self.grounds, points, strict=True))
@@ -215,13 +216,13 @@ class Residuals:
     Attributes
     ----------
     image : (M, 2) ndarray
-        Residuals of the image points.
+        Residuals of the M image points in x and y.
     control : (m, 3) ndarray
-        Residuals of the control coordinates.
+        Residuals of the coordinates of the m points; zero for tie points.
     prior : (K,) ndarray
-        Residuals of the priors.
+        Residuals of the K priors.
     shared : mapping of str to float
-        Sum of squares of the readings' corrections of each group.
+        Sum of squares of the corrections of attitude and station readings, by variance group.
     """
 
     image: Array
@@ -239,11 +240,11 @@ class Equations:
     design : (2M, P) csr_matrix
         Whitened, unweighted derivatives with respect to x.
     design_shared : (2M, S) csr_matrix
-        Derivatives with respect to z.
+        Whitened, unweighted derivatives with respect to z.
     design_point : (2M, 3m) csr_matrix
-        Derivatives with respect to p.
+        Whitened, unweighted derivatives with respect to p.
     row_weight : (2M,) ndarray
-        Weight of each row.
+        Robust weight, with variance factor, of each row of the design matrices.
     design_prior : (K, P) ndarray
         Whitened design of the priors.
     prior_weight : (K,) ndarray
@@ -271,9 +272,9 @@ class Equations:
     point_inverse : (3m, 3m) bsr_matrix
         Inverse of the points' normal blocks.
     cross : (3m, P + S) csr_matrix
-        Normal block N_py.
+        Block of the normal matrix that couples the points p with the unknowns x and z.
     right_point : (3m,) ndarray
-        Right side of the points.
+        Right side of the points' normal equations.
     movable : (m,) ndarray of bool
         True for points that are unknown.
     row_spans, point_spans : tuple of (int, int)
@@ -304,27 +305,30 @@ class Equations:
     point_spans: tuple[tuple[int, int], ...]
 
     def shared_step(self, step: Array) -> Array:
-        """Return the (S,) step of the shared noise for a step (P,) of the unknowns."""
+        """Return the step of the S shared-noise unknowns that follows from a step of the P unknowns."""
         return np.asarray(self.shared_start + self.follow @ step)
 
     def point_step(self, step: Array) -> Array:
-        """Return the (m, 3) step of the ground points for a step (P,) of the unknowns."""
+        """Return the step of the m ground points, (m, 3), in metres, that follows from a step of the P unknowns."""
         change = np.concatenate([step, self.shared_step(step)])
         return np.asarray(-self.point_inverse @ (self.right_point + self.cross @ change)).reshape(-1, 3)
 
     def through_points(self) -> Array:
-        """Return the (2M, P) derivatives by the unknowns with shared noise and ground points eliminated."""
+        """Return the Jacobian (2M, P) of the M image points with shared noise and ground points eliminated.
+
+        It holds the total derivatives with respect to the P unknowns, while noise and points follow them.
+        """
         by_x, by_z = self._carried
         fixed = (self.design - self.design_point @ by_x).toarray()
         return np.asarray(fixed + (self.design_shared - self.design_point @ by_z) @ self.follow)
 
     @cached_property
     def shared_inverse(self) -> tuple[Array, ...]:
-        """Covariance (s, s) of the z of each field for known x."""
+        """Covariance (s, s) of the s shared-noise unknowns of each field, for known other unknowns."""
         return tuple(_inverse(self.shared_normal[a:b, a:b].toarray()) for a, b in self.shared.spans)
 
     def image_cofactors(self, covariance: Array) -> Array:
-        """Return the (M, 2, 2) covariance of the adjusted, whitened image points, given that (P, P) of the unknowns."""
+        """Return the covariance of the M adjusted, whitened image points, from that of the P unknowns."""
         derivatives = self.through_points().reshape(len(self.row_weight) // 2, 2, covariance.shape[0])
         cofactors = derivatives @ covariance @ np.swapaxes(derivatives, 1, 2)
         cofactors += _products((self.design_point @ self.point_inverse).tocsr(), self.design_point, 2)
@@ -396,9 +400,9 @@ class Equations:
         return both[:, :count].tocsr(), both[:, count:].tocsr()
 
     def _of_shared(self, rows: sparse.csr_matrix, spans: Sequence[tuple[int, int]], size: int) -> Array:
-        """Return the diagonal blocks (n, size, size) of A C A' for rows A (n size, S), C the covariance of z.
+        """Return the diagonal blocks (n, size, size) of A C A', with C the covariance of the shared-noise unknowns.
 
-        C holds at known x.
+        A is the matrix `rows`, (n size, S). C is for known other unknowns.
         """
         blocks = np.zeros((rows.shape[0] // size, size, size))
         for (first, last), (a, b), inverse in zip(spans, self.shared.spans, self.shared_inverse, strict=True):
@@ -480,7 +484,7 @@ class OmittedTermsModel(Protocol):
         """Number of terms."""
 
     def columns(self, field: CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
-        """Return the (n, 2, size) derivatives of the misclosures with respect to the terms.
+        """Return the derivatives of n image points' misclosures (x, y) with respect to the terms, (n, 2, size).
 
         Parameters
         ----------
@@ -491,20 +495,20 @@ class OmittedTermsModel(Protocol):
         rays : Rays
             Image points of the line, n of them.
         by : Partials
-            Derivatives of their misclosures.
+            Derivatives of the misclosures of these image points with respect to the model's parameters.
         """
 
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Whitened equations of all image points.
+    """Whitened, linearised equations of all M image points, before weighting.
 
     Attributes
     ----------
     design : (2M, P) csr_matrix
-        Derivatives with respect to x.
+        Derivatives with respect to the P unknowns.
     design_shared : (2M, S) csr_matrix
-        Derivatives with respect to z.
+        Derivatives with respect to the S unknowns of the shared noise.
     point : (M, 2, 3) ndarray
         Derivatives with respect to the ground point.
     miss : (M, 2) ndarray
@@ -610,7 +614,7 @@ def _reduce(
 def _priors(
     parameters: Parameters, values: Array, priors: Sequence[Prior], weights: Weights
 ) -> tuple[Array, Array, Array]:
-    """Return whitened rows (K, P), residuals (K,) and weights (K,) of the pseudo-observations."""
+    """Return the whitened Jacobian (K, P), residuals (K,) and weights (K,) of the K priors of P unknowns."""
     rows = np.zeros((len(priors), len(values)))
     for row, prior in zip(rows, priors, strict=True):
         if not (np.isfinite(prior.value) and np.isfinite(prior.sigma) and prior.sigma > 0):
@@ -623,7 +627,7 @@ def _priors(
 
 
 def _root(inverse: Array, used: NDArray[np.bool_]) -> Array:
-    """Return the (m, 3, 3) lower Cholesky factors of weights, zero where unused."""
+    """Return the lower Cholesky factors of the weight matrices of m points, (m, 3, 3), zero for unused points."""
     root = np.zeros_like(inverse)
     root[used] = np.linalg.cholesky(inverse[used])
     return root
@@ -648,7 +652,7 @@ def _inverse(matrix: Array) -> Array:
 
 
 def _point_blocks(point: Array, place: NDArray[np.intp], weight: Array, count: int) -> Array:
-    """Return the (m, 3, 3) normal matrices of the points from the (M, 2, 3) blocks of their image points."""
+    """Return the normal matrices of m ground points, (m, 3, 3), from the derivatives (M, 2, 3) of M image points."""
     blocks = np.zeros((count, 3, 3))
     np.add.at(blocks, place, weight[:, None, None] * (np.swapaxes(point, 1, 2) @ point))
     return blocks
@@ -669,7 +673,7 @@ def _padded(rows: sparse.coo_matrix, size: int) -> tuple[Array, NDArray[np.intp]
 
 
 def _products(left: sparse.csr_matrix, right: sparse.csr_matrix, size: int) -> Array:
-    """Return the diagonal blocks (n, size, size) of left right', both (n size, K)."""
+    """Return the n diagonal blocks of the product left right', (n, size, size), of two sparse matrices (n size, K)."""
     blocks = np.empty((left.shape[0] // size, size, size))
     for i in range(size):
         for j in range(size):

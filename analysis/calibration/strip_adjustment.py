@@ -80,7 +80,7 @@ class Datum:
 
 @dataclass(frozen=True, eq=False)
 class StripAdjustment:
-    """Solution of a pass.
+    """Adjusted ground points and attitude errors of one pass.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class StripAdjustment:
     covariance : (m, 3, 3) ndarray
         Covariance of the points, including the remaining errors of attitude and station, in m^2.
     datum : tuple of Datum
-        Common rotations and their rates, from all rays.
+        Sigmas of the rotation that all rays of the pass have in common, and of its rate, about each axis.
     chi_square : float
         Chi-square of the rays of tie points and of the readings' corrections.
     degrees_of_freedom : int
@@ -111,7 +111,7 @@ class StripAdjustment:
         return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
     def corrected(self, rays: Rays) -> Rays:
-        """Return any rays of the pass, with times, with corrected attitude and station.
+        """Return rays of the pass with attitude and station corrected by the adjustment; the rays need times.
 
         Raises
         ------
@@ -217,9 +217,11 @@ def _datum(rays: Mapping[str, Rays], shared: SharedNoise, inverse: Array) -> tup
 
 
 _OPEN = 1.0 - 1e-6
-"""Squared correlation above which a combination of both blocks is undetermined: it would need a million rounds."""
+"""Squared correlation between a combination of interior orientation and one of attitude bias above which both together
+are undetermined: the stepwise iteration would need a million rounds.
+"""
 _RELINEARISED = 3
-"""Number of first rounds that are linearised again."""
+"""Number of rounds at the start of the stepwise iteration that are each linearised anew."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,9 +237,10 @@ class Stepwise:
     converged : bool
         True if the steps fell below the tolerance.
     steps : (rounds,) ndarray
-        Largest change of any unknown in each round, in conditional sigmas.
+        Largest change of any unknown in each round, in conditional sigmas (those for known other unknowns).
     rate : float
-        Theoretical fraction of the slowest error that remains after a round, without undetermined combinations.
+        Theoretical fraction of the most slowly decreasing error that remains after a round, without undetermined
+        combinations.
     """
 
     names: tuple[str, ...]
@@ -264,7 +267,7 @@ def stepwise(
     tolerance: float = 1e-3,
     rounds: int = 100_000,
 ) -> Stepwise:
-    """Alternate between both blocks until all steps are below `tolerance` of their conditional sigmas.
+    """Estimate attitude bias and interior orientation alternately, as paper 003 does, until both converge.
 
     The remaining error is about the last step times rate / (1 - rate). The first rounds are linearised again, later
     ones only after all steps have become small.
@@ -286,7 +289,7 @@ def stepwise(
     held : sequence of str
         Unknowns that are fixed at their start values.
     tolerance : float
-        Largest step at convergence, in conditional sigmas.
+        Largest step at convergence, in conditional sigmas (those for known other unknowns).
     rounds : int
         Largest number of rounds.
 
@@ -368,7 +371,7 @@ def _alternate(
 
 
 def _canonical_squares(normal: Array, first: NDArray[np.intp], second: NDArray[np.intp]) -> Array:
-    """Return the squared canonical correlations of two blocks of a normal matrix."""
+    """Return the squared canonical correlations between two groups of unknowns of a normal matrix."""
     roots = [np.linalg.cholesky(normal[np.ix_(b, b)]) for b in (first, second)]
     mixed = np.linalg.solve(roots[0], np.linalg.solve(roots[1], normal[np.ix_(second, first)]).T)
     return np.asarray(np.linalg.svd(mixed, compute_uv=False) ** 2)

@@ -31,8 +31,9 @@ from analysis.matching.window_checks import FALSE_ALARM, risk
 # Side of a JPEG block in pixels, and number of image lines in which blocks are sought.
 _BLOCK, _BLOCK_LINES = 8, 512
 _BLOCKY = 2.2
-"""Ratio of steps between blocks to those within from which positions are those of the blocks. JPEG of quality 30 to 95
-gives 1.0 to 2.0 if the texture passes and sigmas are right, 2.3 to 4.3 if positions lock to whole pixels.
+"""Ratio of grey-value steps at the borders of 8 x 8 compression blocks to those within blocks, above which matched
+positions follow the blocks and not the scene. JPEG of quality 30 to 95 gives 1.0 to 2.0 if the texture passes and
+sigmas are right, 2.3 to 4.3 if positions lock to whole pixels.
 """
 
 
@@ -89,7 +90,7 @@ def match_windows(
     search_radius: int,
     options: MatchOptions | None = None,
 ) -> Matches:
-    """Match windows of one image in another by cross-correlation and least squares, each near its predicted position.
+    """Match windows of one image in another by cross-correlation and least squares, near predicted positions.
 
     Parameters
     ----------
@@ -107,7 +108,7 @@ def match_windows(
     Returns
     -------
     Matches
-        Positions `place` (n, 2), their `covariance` (n, 2, 2), `accepted` (n,) and the reasons in `texts`.
+        Positions `position` (n, 2), their `covariance` (n, 2, 2), `accepted` (n,) and the reasons in `texts`.
 
     Raises
     ------

@@ -59,7 +59,7 @@ position.
 
 @dataclass(frozen=True, eq=False)
 class WindowHalves:
-    """Differences between the positions of the halves of n fitted windows, in four splits; NaN where there is no fit.
+    """Differences between the positions of the halves of n fitted windows, in four splits; NaN without a fit.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class WindowHalves:
     white : (n, 4, 2, 2) ndarray
         Covariance of the difference for white residuals of unit variance.
     effect : (n, 4, 2, 2) ndarray
-        Covariance of the difference for relief of tau = 1 px.
+        Covariance of the difference due to relief, that is displacements within the window, of 1 px standard deviation.
     """
 
     apart: Array
@@ -286,9 +286,10 @@ def _overlap(side: int, row: int, column: int) -> tuple[_Cut, _Cut]:
 
 
 def _lagged(influence: Array) -> Array:
-    """Return the (n, lags, 2, 2) increase of the covariance of B r by a correlation of 1 at both signs of a lag.
+    """Return the increase of the position covariance due to residuals correlated at a lag, (n, lags, 2, 2).
 
-    B is (n, 2, side, side).
+    The correlation is 1 at the lag and its opposite. `influence`, (n, 2, side, side), is the derivative of row and
+    column with respect to the grey values of the window.
     """
     out = np.empty((len(influence), len(_LAGS), 2, 2))
     for k, (r, c) in enumerate(_LAGS):
@@ -418,7 +419,9 @@ _LENGTH = 1.0
 longer one follows it.
 """
 _OWN = 4.0
-"""Standard deviations of tau^2 without relief from which a point has its own; chance alone exceeds it in some 1e-3."""
+"""Significance of a point's relief variance tau^2, in standard deviations without relief, above which the point uses
+its own value and not the common one; chance exceeds it with a probability of about 1e-3.
+"""
 _HELD = 2.5
 """Limit, in standard deviations, of a point's relief variance tau^2 in the common mean."""
 
