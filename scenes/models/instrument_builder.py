@@ -46,16 +46,16 @@ from scenes.yaml.spec import Spec
 
 
 def as_built(drawn: Instrument) -> Instrument:
-    """Return an instrument with the departures from the drawing that its file's `as_built` lists, if any.
+    """Return an instrument with the departures from the design that its file's `as_built` lists, if any.
 
     Poses of bodies, shapes of surfaces and indices of lenses include them, so that the state {} is the instrument as
-    built, and a perturbed state acts on top. What was derived from the drawing (frames, apertures, first-order numbers,
-    orientations of the central prism's facets) stays that of the drawing.
+    built, and a perturbed state acts on top. What was derived from the design (frames, apertures, first-order numbers,
+    orientations of the central prism's facets) stays that of the design.
 
     Parameters
     ----------
     drawn : Instrument
-        The instrument of the drawing.
+        The instrument as designed.
 
     Raises
     ------
@@ -76,8 +76,8 @@ def as_built(drawn: Instrument) -> Instrument:
 def facet_alignment(instrument: Instrument, backend: Backend) -> State:
     """Return the rotations of the central prism's facets that return the beams to the middles of the area CCDs.
 
-    On a drawing they are zero. The facets of a built instrument are rotated by them when its monitor is mounted, after
-    its cameras were aligned: ``compose`` them with ``as_built`` for the file of such an instrument.
+    In the instrument as designed they are zero. The facets of a built instrument are rotated by them when its monitor
+    is mounted, after its cameras were aligned: ``compose`` them with ``as_built`` for the file of such an instrument.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def build_instrument(
 
 @dataclass(frozen=True)
 class _BuildArguments:
-    """Arguments of ``build_instrument`` in a form that can be looked up in a cache.
+    """Arguments of ``build_instrument`` in a hashable form, used as key of a cache.
 
     Attributes
     ----------
@@ -186,7 +186,7 @@ def _built(built: _BuildArguments) -> Instrument:
 
 
 def _no_cameras(camera_specs: Mapping[str, object], backend: Backend) -> tuple[Issue, ...]:
-    """Return issues of the cameras of a refused instrument that make no image."""
+    """Return an issue for each camera of an instrument that forms no image, which explains why the build failed."""
     return no_cameras([one for one in camera_specs.values() if isinstance(one, CameraSpec)], backend)
 
 
@@ -279,7 +279,7 @@ def _build(
 
 
 def _check_room(instrument: Instrument, backend: Backend, free_beams: bool, free_bodies: bool) -> None:
-    """Raise an error if bodies overlap or block beams, as far as these checks are requested."""
+    """Raise an error if bodies overlap or block monitor beams; the two flags select these checks."""
     if free_bodies:
         check_solids(instrument.assembly, instrument.solids)
         check_clearance(instrument)
@@ -288,7 +288,7 @@ def _check_room(instrument: Instrument, backend: Backend, free_beams: bool, free
 
 
 def _collision_issue(spec: InstrumentSpec, error: MisplacedError | InputError) -> Issue:
-    """Return the issue of an instrument that collides as built, though not as drawn."""
+    """Return the issue of an instrument whose bodies collide as built but not as designed."""
     problem = error.issues[0].problem if isinstance(error, InputError) else str(error)
     first = next(iter((spec.as_built or {}).values()))
     return first.issue(
@@ -327,7 +327,10 @@ def _check_alike(spec: InstrumentSpec, assembly: Assembly) -> None:
 
 
 def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Channel]:
-    """Return the channels of a camera; reticles and area CCDs stand at f tan(field) along the line.
+    """Return the monitor channels of a camera.
+
+    Their reticles and area CCDs are placed at f tan(field) along the line CCD, with the principal distance f and the
+    field angle of the file.
 
     Raises
     ------
@@ -376,7 +379,7 @@ def _monitor_bodies(plane_root: str, channels: list[Channel]) -> list[Body]:
 
 
 def _ccd_elements(channels: list[Channel]) -> dict[str, Element]:
-    """Return the optical elements of the area CCDs, by name."""
+    """Return name -> optical element of each channel's area CCD."""
     keys = {channel: f"{channel.key}/area_ccd" for channel in channels}
     return {key: Element(key, channel.ccd_body, plane(), Interaction.PASS) for channel, key in keys.items()}
 
@@ -398,7 +401,10 @@ def _baffles(spec: InstrumentSpec, tree: RigidTree) -> tuple[Plate, ...]:
 
 
 def _nodes(assembly: Assembly, cameras: Mapping[str, CameraModel], solids: tuple[Solid, ...]) -> dict[str, NodeInfo]:
-    """Return the motions and changes that each body allows; the base is the reference frame and does not move."""
+    """Return path of each body -> motions and changes that it allows.
+
+    The base is the reference frame and does not move.
+    """
     # A figure belongs to the element's own body: a face that the beam meets twice has one for each passage.
     shaped = {e.body for e in assembly.elements.values() if e.interaction is not Interaction.PASS}
     roots = {f"{BASE}/{name}" for name in cameras}
@@ -424,7 +430,7 @@ def _nodes(assembly: Assembly, cameras: Mapping[str, CameraModel], solids: tuple
 
 
 def _without_heat(cameras: Mapping[str, CameraModel]) -> dict[str, str]:
-    """Return the bodies that have no temperature of their own, each with the reason.
+    """Return path of each body without a temperature of its own -> the reason, in words.
 
     These are further faces of a lens, which have the temperature of the first; planes that light passes, which belong
     to the structure; lenses whose glass has no thermal data; and the bodies that carry such a lens.

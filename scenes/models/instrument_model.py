@@ -61,18 +61,30 @@ class Instrument:
         return self.assembly.nominal_pose(f"{BASE}/{camera}").rotation
 
     def toward_optics(self, placed: PlacedBodies, camera: str) -> np.ndarray:
-        """Return unit vectors (S, 3) in the world from the line's centre along its chief ray, upstream, in each state.
+        """Return unit vectors from the line's centre back along its chief ray, in each of S states.
 
-        Rays that start at the focal plane are first sent along it; it moves with the focal plane.
+        Rays that start at the focal plane are first sent along them; they rotate with the focal plane.
+
+        Parameters
+        ----------
+        placed : PlacedBodies
+            Poses of the bodies in S states.
+        camera : str
+            Name of the camera.
+
+        Returns
+        -------
+        (S, 3) ndarray
+            Unit vectors in the world.
         """
         model = self.cameras[camera]
         return model.toward_optics(placed.rotation[:, placed.index[f"{BASE}/{camera}/focal_plane"]].real)
 
     @property
     def separation(self) -> Mapping[str, float]:
-        """Distance of each camera's pair of area CCDs (the papers' L), in metres; without a pair, the largest distance.
+        """Camera -> distance between its left and right area CCD (the papers' L), in metres.
 
-        Empty without a monitor.
+        It is the largest distance between its area CCDs if it has no such pair. Empty without a monitor.
         """
         out: dict[str, float] = {}
         for name in self.cameras if self.channels else ():
@@ -86,20 +98,20 @@ class Instrument:
         return tuple(i for i, channel in enumerate(self.channels) if channel.camera == camera)
 
     def coordinates_of(self, camera: str) -> list[int]:
-        """Return the indices of a camera's spot coordinates, row and column of each, among those of all spots."""
+        """Return the indices of a camera's spot coordinates in the vector of all spots' rows and columns."""
         return [2 * i + axis for i in self.channels_of(camera) for axis in (0, 1)]
 
 
 class MisplacedError(PhysicalError, ValueError):
-    """Error of a monitor part that cannot stand as the instrument's file says.
+    """Error of a monitor part that cannot be placed as the instrument's file says.
 
     Attributes
     ----------
-    key
+    key : KeyPath
         Key of the file to change, in its form for all channels.
-    remedy
-        What to choose there.
-    channel
+    remedy : str
+        Value to choose there, in words.
+    channel : tuple[str, str] or None
         Camera and name of the channel concerned, whose own key takes precedence; None if no single channel is.
     """
 

@@ -56,12 +56,12 @@ INDEX_WAVES = 0.01
 
 @dataclass(frozen=True, eq=False)
 class HeatedFace:
-    """Change of an optical face by the nonlinear part of a temperature table.
+    """Change of an optical face due to the nonlinear part of a table of temperatures.
 
     Attributes
     ----------
     motion : Motion
-        Motion of the face's body: rigid, Zernike terms and, for a mirror, a grid with the rest.
+        Motion of the face's body: rigid, Zernike terms and, for a mirror, a grid with the residual sag.
     lost : float
         Part of the change that the motion does not represent, in metres rms of sag.
     unmeshed : float
@@ -74,7 +74,7 @@ class HeatedFace:
 
     @property
     def figure_rms(self) -> float:
-        """Figure from Z4 on, in metres rms over the disk of the terms."""
+        """Rms of the figure's Zernike terms from Z4 on, in metres, over the disk on which they are defined."""
         return float(np.sqrt(sum(a * a for j, a in self.motion.figure.items() if j > 3)))
 
 
@@ -113,7 +113,9 @@ class HeatedBody:
     index_path: float
 
     def state(self, gridded: State | None = None) -> State:
-        """Return the state that the residual causes, beyond the linear field.
+        """Return the motions of the body's faces that the residual temperatures cause.
+
+        They are in addition to those that the linear field causes.
 
         Parameters
         ----------
@@ -208,7 +210,10 @@ def heated_body(thermal: ThermalModel, job: JobSpec, path: str, spec: TableTempe
 
 
 def _heated(thermal: ThermalModel, path: str, nodes: NodalTemperature) -> HeatedBody:
-    """Split a temperature table of a body. Raises NodesError."""
+    """Split a table of temperatures of a body into linear field and residual, and solve for the residual's effects.
+
+    Raises NodesError if the nodes do not describe the body.
+    """
     if nodes.flat:
         allowed = "nodes throughout the body: a plane of nodes does not determine the gradient across it"
         raise NodesError("the nodes lie in a plane or on a line", allowed)
@@ -273,7 +278,7 @@ def _at_nodes(thermal: ThermalModel, path: str, moved: Displacement) -> NodalDef
 
 
 def _elastic(thermal: ThermalModel, path: str) -> tuple[Held | None, Held | None]:
-    """Return coarse and fine finite elements of a body with their supports."""
+    """Return coarse and fine finite elements of a body with their supports; None for a body without them."""
     if path in thermal.mirrors:
         return thermal.elastic(path, cells=COARSE_CELLS), thermal.elastic(path, cells=FINE_CELLS)
     if path not in thermal.solids:
@@ -284,7 +289,7 @@ def _elastic(thermal: ThermalModel, path: str) -> tuple[Held | None, Held | None
 
 
 def _apart(one: FaceChange, other: FaceChange, radius: float) -> float:
-    """Return the difference of two changes of a face, in metres rms of sag over the disk of their terms."""
+    """Return the rms difference in sag of two changes of a face, in metres, over the disk of their Zernike terms."""
     piston = one.shift[2] - other.shift[2]
     # a tilt t of a disk of radius R is t R / 2 rms
     tilts = [0.5 * radius * (a - b) for a, b in zip(one.rotate[:2], other.rotate[:2], strict=True)]
@@ -299,7 +304,7 @@ def _in_words(field: Temperature) -> str:
 
 
 def heated_bodies(job: JobSpec, thermal: ThermalModel) -> dict[str, HeatedBody]:
-    """Return the temperature tables of a job by the body that they heat.
+    """Return path of each body that a job heats by a table -> the table's linear field and its further effects.
 
     Raises
     ------
@@ -311,7 +316,7 @@ def heated_bodies(job: JobSpec, thermal: ThermalModel) -> dict[str, HeatedBody]:
 
 
 def with_heat(fields: Mapping[str, Temperature], heated: Mapping[str, HeatedBody]) -> dict[str, Temperature]:
-    """Return the linear fields of bodies plus the linear parts of their tables."""
+    """Return path of each body -> its linear temperature field, the linear part of its table included."""
     return {**fields, **{path: fields.get(path, Temperature()) + body.linear for path, body in heated.items()}}
 
 
@@ -418,7 +423,7 @@ def job_state(
 
 
 def deformations_of(job: JobSpec, instrument: Instrument) -> dict[str, NodalDeformation]:
-    """Return the deformations by tables of nodes that a job lists, by body.
+    """Return path of each body with a table of displaced nodes in the job -> its deformation.
 
     Raises
     ------
@@ -435,9 +440,20 @@ def on_deformed(
     moved: State,
     heated: Mapping[str, HeatedBody] | None = None,
 ) -> State:
-    """Return the motions of a state on top of its bodies' deformations.
+    """Return the state in which the motions of a state act on bodies deformed by tables of nodes.
 
-    The deformations are those of tables of nodes and of the residuals of temperature tables.
+    The deformations are those of tables of displaced nodes and of the residuals of tables of temperatures.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    deformed : Mapping[str, NodalDeformation]
+        Path of each body with a table of displaced nodes -> its deformation.
+    moved : State
+        Motions of the bodies.
+    heated : Mapping[str, HeatedBody] or None
+        Path of each body with a table of temperatures -> its effects.
     """
     bodies = {body.path: body for body in instrument.assembly.tree.bodies}
     own = {path: face.motion() for path, face in deformed.items()}
@@ -522,7 +538,7 @@ def beyond_prior(resolved: ResolvedJob, prior: DisturbancePrior | None) -> tuple
 
 
 def _variances(prior: DisturbancePrior | None) -> Mapping[tuple[str, str], float]:
-    """Return the prior variance of each component, by body and name."""
+    """Return (body, name of the component) -> its variance in the prior, SI."""
     out: dict[tuple[str, str], float] = {}
     for c in prior.components if prior is not None else ():
         out[c.body, c.what] = out.get((c.body, c.what), 0.0) + c.sigma**2
@@ -530,7 +546,7 @@ def _variances(prior: DisturbancePrior | None) -> Mapping[tuple[str, str], float
 
 
 def _excesses(job: JobSpec, variance: Mapping[tuple[str, str], float]) -> Iterator[Excess]:
-    """Yield the components that exceed the prior."""
+    """Yield the components of a job's perturbation that exceed `LIKELY` standard deviations of the prior."""
     for body, what in job.perturb.items():
         for kind, name, amount in _components(what):
             sigma = variance.get((body, name), 0.0) ** 0.5

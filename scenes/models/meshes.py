@@ -34,7 +34,7 @@ CHIP = 0.0005
 
 
 def mirror_mesh(surface: Surface, aperture: Aperture, back: float) -> trimesh.Trimesh:
-    """Return the watertight mesh of ``mirror_triangles`` as a trimesh object, for drawing."""
+    """Return a mirror as a watertight trimesh object, for drawing: optical surface, flat back and edge."""
     import trimesh
 
     return trimesh.Trimesh(*mirror_triangles(surface, aperture, back), process=False)
@@ -43,7 +43,7 @@ def mirror_mesh(surface: Surface, aperture: Aperture, back: float) -> trimesh.Tr
 def mirror_triangles(
     surface: Surface, aperture: Aperture, back: float, cells: int = GRID
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a mirror as a closed surface: its optical surface over the clear aperture, a flat back and an edge.
+    """Return a mirror as a closed mesh: its optical surface over the clear aperture, a flat back and an edge.
 
     Parameters
     ----------
@@ -59,9 +59,9 @@ def mirror_triangles(
     Returns
     -------
     vertices : (V, 3) ndarray
-        Vertices in the mirror's frame, in metres.
+        V vertices in the mirror's frame, in metres.
     triangles : (T, 3) ndarray of int
-        Vertex numbers, with outward winding.
+        Vertex numbers of T triangles, with outward winding.
     """
     x0, x1, y0, y1 = aperture.bounds
     x, y, face = _grid(aperture, 0.5 * (x1 - x0), 0.5 * (y1 - y0), cells)
@@ -82,9 +82,14 @@ def mirror_triangles(
 
 
 def _grid(aperture: Aperture, half_x: float, half_y: float, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return points x, y of a grid about the middle of an aperture, and the triangles between them, (T, 3).
+    """Return a grid of points about the middle of an aperture, and the T triangles between them.
 
     The grid has the outline of the aperture's mesh: a disk, ring by ring, or a box.
+
+    Returns
+    -------
+    tuple of ndarray
+        x and y of the points, in metres; and vertex numbers of the triangles, (T, 3).
     """
     x0, x1, y0, y1 = aperture.bounds
     s, n = np.linspace(-1.0, 1.0, cells + 1), cells + 1
@@ -176,6 +181,6 @@ def sheet_mesh(surface: Surface, aperture: Aperture) -> tuple[np.ndarray, np.nda
 
 
 def polygon_mesh(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a convex polygon (K, 3) as a fan of triangles: vertices and vertex numbers."""
+    """Return a convex polygon of K corners, (K, 3), as a fan of triangles: vertices and vertex numbers."""
     k = np.arange(1, len(corners) - 1)
     return np.asarray(corners), np.stack([np.zeros_like(k), k, k + 1], axis=1)

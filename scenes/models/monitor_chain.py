@@ -120,7 +120,10 @@ def leaving_beams(
 def _leaving(
     model: CameraModel, channels: Sequence[Channel], distance: float, to_base: Pose, backend: Backend
 ) -> list[LeavingBeam]:
-    """Return the beams of channels with windows at one distance, in metres; an error names the first without one."""
+    """Return the beams of channels whose prisms' windows have one distance from the camera, in metres.
+
+    An error names the first channel without a beam.
+    """
     try:
         return _traced_out(model, channels, distance, to_base, backend)
     except MisplacedError:
@@ -135,7 +138,7 @@ def _leaving(
 def _traced_out(
     model: CameraModel, channels: Sequence[Channel], distance: float, to_base: Pose, backend: Backend
 ) -> list[LeavingBeam]:
-    """Trace the beams of ``_leaving`` together; an error names all channels."""
+    """Trace the beams of channels with windows at one distance together; an error names all of them."""
     frame = model.camera_frame
     reference = Pose(frame.rotation, frame.apply(np.array([0.0, 0.0, distance])))
     bare = model.bare_assembly(apertures=False)
@@ -309,13 +312,13 @@ def _made(
 
 
 def _turn(tilt: tuple[float, float], about: tuple[float, float, float]) -> Pose:
-    """Return a rotation about x and y that leaves a point in place."""
+    """Return the rotation by small angles about x and y, in radians, that leaves the point ``about`` in place."""
     turn = rotation_matrix(np.array([*tilt, 0.0]))
     return Pose(turn, np.array(about) - matvec(turn, np.array(about)))
 
 
 def check_prisms(spec: InstrumentSpec) -> None:
-    """Check the monitor's prisms.
+    """Check that the monitor's prisms can be made and suit the beam.
 
     Their glasses must have an index at the monitor's wavelength, they must be wide enough for the beam, and all
     channels must have the same kinds.
@@ -408,7 +411,10 @@ def _aimed(
     key: KeyPath,
     start: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the ray parameters of ``aim``. Raises MisplacedError at ``key`` if there is no such ray."""
+    """Return the parameters, from ``aim``, of the rays that meet a target.
+
+    Raises MisplacedError at ``key`` if there is no such ray.
+    """
     try:
         return aim(backend, systems, fan, target, start)[0]
     except (AimError, np.linalg.LinAlgError) as error:
@@ -420,7 +426,19 @@ def _aimed(
 def _missed(
     assembly: Assembly, channel: Channel, backend: Backend, position: np.ndarray, direction: np.ndarray
 ) -> MisplacedError:
-    """Return an error that names the first element of a channel's outgoing sequence that rays (1, N, 3) miss."""
+    """Return an error that names the first element that a channel's outgoing rays miss.
+
+    Parameters
+    ----------
+    assembly : Assembly
+        Assembly with the elements.
+    channel : Channel
+        The channel.
+    backend : Backend
+        Backend that traces the rays.
+    position, direction : (1, N, 3) ndarray
+        Start points, in metres, and unit vectors of N rays in the world.
+    """
     names = assembly.sequences[f"{channel.key}/outgoing"]
     for count, (element, alive) in enumerate(surviving_rays(backend, assembly, names, position, direction), 1):
         if alive.all():
@@ -447,7 +465,9 @@ def beside(
     direction: np.ndarray,
     lost: np.ndarray,
 ) -> float | None:
-    """Return the largest distance of lost rays outside the clear aperture of the last of some elements, in metres.
+    """Return by how much lost rays miss the clear aperture of the last of some elements, in metres.
+
+    It is the largest distance of N rays outside the edge.
 
     Parameters
     ----------
@@ -479,11 +499,11 @@ def beside(
 
 
 def _columns(x: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Return the rotation with these x and z axes."""
+    """Return the rotation matrix whose columns are the unit vector x, z cross x, and the unit vector z."""
     return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
 def _facet_axes(normal: np.ndarray) -> np.ndarray:
-    """Return the frame of a facet: z along its normal, x along the line (against the camera's Y)."""
+    """Return the rotation matrix of a facet's frame: z along its normal, x along the line (against Y)."""
     x_axis = transverse_axes(normal, np.array([0.0, -1.0, 0.0]))[0]
     return _columns(x_axis, normal)

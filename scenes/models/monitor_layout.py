@@ -1,7 +1,8 @@
 """Layouts of a monitor: the beams of a design, the instrument that has them, and their mass, pupil share and glass.
 
-Each beam exists four times in a pair, mirrored: at both ends of both cameras' lines. Its pupil offset counts toward the
-central prism, and along the line toward the beam's own end.
+A design is a search for the best layout; it starts from an existing instrument, "the start". Each beam exists four
+times in a pair of cameras, mirrored: at both ends of both cameras' lines. Its pupil offset counts toward the central
+prism, and along the line toward the beam's own end.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
 
     @classmethod
     def parts(cls, test: MonitorDesignSpec) -> dict[str, Any]:
-        """Return the instrument with all that belongs to it, and the parts that the design may choose from."""
+        """Read the start instrument with its cameras, and the parts that the design may choose, by field."""
         start = load.load_instrument(test.instrument, test, ("instrument",))
         if start.as_built:
             problem = f"{start.name} is an instrument as built; a layout starts from a drawing"
@@ -88,7 +89,7 @@ class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
         }
 
     def checked(self) -> Self:
-        """Check that the design can start from this instrument."""
+        """Check that the design can start from this instrument; return the set-up."""
         test, start = self.test, self.instrument
         if len(start.cameras) != 2:
             raise test.error("a layout is designed for a pair", ("instrument",), found=f"{len(start.cameras)} cameras")
@@ -178,7 +179,10 @@ def start_beams(setup: MonitorDesignSetup) -> Layout:
 
 
 def _prisms_of(setup: MonitorDesignSetup, channel: instruments.ChannelParts) -> str:
-    """Return the design's name for the prisms of a channel of the start."""
+    """Return the name in the design for the prisms of a channel of the start instrument.
+
+    Raises InputError if the design names no such prisms.
+    """
     monitor = setup.instrument.autocollimator
     has = [(prism.material, prism.kind) for prism in (channel.prism_180, channel.prism_0)]
     known = {AS_STARTED: [(prism.material, prism.kind) for prism in (monitor.prism_180, monitor.prism_0)]}
@@ -193,7 +197,7 @@ def _prisms_of(setup: MonitorDesignSetup, channel: instruments.ChannelParts) -> 
 
 
 def _ccd_of(setup: MonitorDesignSetup) -> str:
-    """Return the design's name for the area CCD of the start."""
+    """Return the name in the design for the area CCD of the start instrument."""
     ccd = setup.instrument.autocollimator.area_ccd
     for name, sheet in (setup.test.area_ccds or {}).items():
         if (sheet.detector, sheet.pitch, sheet.rows, sheet.columns) == (ccd.detector, ccd.pitch, ccd.rows, ccd.columns):
@@ -202,7 +206,7 @@ def _ccd_of(setup: MonitorDesignSetup) -> str:
 
 
 def _flat(places: Sequence[tuple[float, tuple[float, float], tuple[float, float]]]) -> np.ndarray:
-    """Return fields, offsets and spreads of channels as one array, a row each."""
+    """Return fields, pupil offsets and facet positions of channels as one array, with a row per channel."""
     return np.array([[field, *offset, *spread] for field, offset, spread in places])
 
 
@@ -212,10 +216,10 @@ def _toward(spec: instruments.InstrumentSpec, site: instruments.MountedCameraSpe
 
 
 def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> instruments.InstrumentSpec:
-    """Return the instrument that has these beams.
+    """Return the instrument whose monitor has these beams.
 
-    Everything else is that of the start, except name, light, number of frames, area CCDs and the central prism's
-    material.
+    Everything else is that of the start instrument, except name, light, number of frames, area CCDs and the central
+    prism's material.
 
     Parameters
     ----------
@@ -254,7 +258,7 @@ def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> instruments.Instrum
 
 
 def _light(setup: MonitorDesignSetup) -> float:
-    """Return the photons per spot and frame of beams that have no number of their own."""
+    """Return the number of photons per spot and frame for beams that specify none."""
     return setup.test.photons_per_frame or setup.instrument.autocollimator.reticle.photons_per_frame
 
 
@@ -285,27 +289,27 @@ def _channel(
 
 
 def _parts(chosen: PrismChoiceSpec | None) -> Iterator[Mapping[str, object]]:
-    """Yield material and kind of both prisms, as updates of their specifications."""
+    """Yield material and kind of both prisms, as changed keys of their specifications."""
     for one in (None, None) if chosen is None else (chosen.prism_180, chosen.prism_0):
         yield {} if one is None else {"material": one.material, "kind": one.kind}
 
 
 def kinds_of(setup: MonitorDesignSetup, beam: Beam) -> tuple[str | None, str | None]:
-    """Return the kinds of a beam's two reflectors; None for a glass prism."""
+    """Return the kinds of the two reflectors of a beam, such as ``periscope``; None for a glass prism."""
     monitor, chosen = setup.instrument.autocollimator, (setup.test.prisms or {}).get(beam.prisms)
     kinds = (monitor.prism_180.kind, monitor.prism_0.kind)
     return kinds if chosen is None else (chosen.prism_180.kind, chosen.prism_0.kind)
 
 
 def drawn_beam(setup: MonitorDesignSetup, rng: np.random.Generator) -> Beam:
-    """Return a random beam, uniform in all numbers that may vary."""
+    """Return a random beam whose varying numbers are uniformly distributed over their ranges."""
     start = start_beams(setup)[0]
     numbers = {name: float(rng.uniform(*ends)) for name, ends in ranges(setup).items()}
     return replace(start.changed(numbers), prisms=_chosen(setup, rng), area_ccd=_chosen_ccd(setup, start, rng))
 
 
 def changed_beam(setup: MonitorDesignSetup, beam: Beam, step: float, rng: np.random.Generator) -> Beam:
-    """Return a random beam near another one.
+    """Return a beam with random changes of some of its numbers.
 
     Parameters
     ----------
@@ -315,7 +319,7 @@ def changed_beam(setup: MonitorDesignSetup, beam: Beam, step: float, rng: np.ran
         Beam to change.
     step : float
         Standard deviation of the change of each number, relative to its range; numbers are reflected at the ends of it.
-    rng : Generator
+    rng : np.random.Generator
         Generator of the random numbers. About half of the numbers stay, so that changes of single ones are tried, too.
     """
     numbers = {}
@@ -329,7 +333,7 @@ def changed_beam(setup: MonitorDesignSetup, beam: Beam, step: float, rng: np.ran
 
 
 def number_of(setup: MonitorDesignSetup, beam: Beam, name: str) -> float:
-    """Return one of a beam's continuous numbers."""
+    """Return one of a beam's continuous numbers, SI, by its name in ``CONTINUOUS``."""
     value = getattr(beam, name)
     return _light(setup) if value is None else float(value)
 
@@ -340,13 +344,13 @@ def ranges(setup: MonitorDesignSetup) -> dict[str, tuple[float, float]]:
 
 
 def _chosen(setup: MonitorDesignSetup, rng: np.random.Generator) -> str:
-    """Return the name of random prisms of the design."""
+    """Return the name of prisms chosen at random among those of the design."""
     names = tuple(setup.test.prisms or (AS_STARTED,))
     return names[int(rng.integers(len(names)))]
 
 
 def _chosen_ccd(setup: MonitorDesignSetup, start: Beam, rng: np.random.Generator) -> str:
-    """Return the name of a random area CCD of the design."""
+    """Return the name of an area CCD chosen at random among those of the design."""
     names = tuple(setup.test.area_ccds or ())
     return names[int(rng.integers(len(names)))] if names else start.area_ccd
 
@@ -362,12 +366,13 @@ def prism_mass(instrument: Instrument) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ImagingBeams:
-    """Imaging beams of an instrument's cameras, for the share that prisms block.
+    """Imaging beams of an instrument's cameras, for the fraction that prisms block.
 
     Attributes
     ----------
     segments : Mapping[str, Sequence[ndarray]]
-        Camera -> rays to both ends and the middle of the line, three of (RAYS, K, 2, 3), in the base frame, in metres.
+        Camera -> segments of the rays to both ends and the middle of its line: three arrays (RAYS, K, 2, 3) of the
+        start and end points of K segments, in the base frame, in metres.
     """
 
     segments: Mapping[str, Sequence[np.ndarray]]
@@ -378,7 +383,13 @@ class ImagingBeams:
         return cls({name: imaging_segments(instrument, backend, name, RAYS) for name in instrument.cameras})
 
     def taken(self, instrument: Instrument) -> np.ndarray:
-        """Return a mask of the rays that prisms of an instrument block, (cameras, 3, RAYS)."""
+        """Return a mask of the imaging rays that prisms of an instrument block.
+
+        Returns
+        -------
+        (cameras, 3, RAYS) ndarray of bool
+            For each camera: rays to one end, the middle or the other end of its line.
+        """
         placed, blocked = instrument.assembly.place(), np.zeros((len(self.segments), 3, RAYS), dtype=bool)
         for solid in instrument.solids:
             corners = placed.pose(solid.path).apply(solid_mesh(solid, placed).vertices)

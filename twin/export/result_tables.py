@@ -203,8 +203,9 @@ def _typed(name: str, values: list[Any], about: str, numbers: bool) -> DataColum
 
 
 def _leaves(data: Any, key: str = "") -> Iterator[tuple[str, float | None, Any]]:
-    """Yield (key, sigma, value) of every number or text in nested data; a sigma beside its number gets no row of its
-    own.
+    """Yield (key, sigma, value) of every number or text in nested data.
+
+    A sigma stored beside its number is yielded with it and not on its own.
     """
     if isinstance(data, Mapping):
         for name, value in data.items():

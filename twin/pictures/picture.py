@@ -190,7 +190,7 @@ SHOULDER = 0.75
 
 
 def uniform_patches(seen: Sequence[tuple[np.ndarray, np.ndarray]], matt: Sequence[bool]) -> np.ndarray:
-    """Number the flat patches of matt surfaces in an H x W picture.
+    """Return the number of the flat matt patch that each pixel of an H x W picture shows.
 
     Parameters
     ----------

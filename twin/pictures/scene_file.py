@@ -92,8 +92,7 @@ def scene_bytes(instrument: Instrument, state: State, paths: LightPaths) -> byte
 
 
 def motions(instrument: Instrument, state: State, placed: PlacedBodies) -> dict[str, dict[str, Any]]:
-    """Return path of a body -> its motion relative to its parent, as in the scene's ``extras``; unmoved bodies are
-    omitted.
+    """Return path of each moved body -> its motion relative to its parent, as in the scene's ``extras``.
 
     Parameters
     ----------

@@ -57,8 +57,9 @@ class Twin(Protocol):
         """Path of each moved body -> its motion in SI units (metres, radians)."""
 
     def perturbed(self, *perturb: Mapping[str, Mapping[str, Any]] | str) -> Self:
-        """Return the instrument with these bodies perturbed; raise InputError for an unknown body or a motion not
-        allowed.
+        """Return the instrument with these bodies perturbed.
+
+        Raises InputError for an unknown body or a motion that it does not allow.
         """
 
 
@@ -568,5 +569,5 @@ def _motion_named(text: str, nodes: Mapping[str, NodeInfo]) -> ElementaryMotion:
 
 
 def _wrong(problem: str, found: str, allowed: str, suggestion: str | None = None) -> InputError:
-    """Return an error about a motion's text: the problem, the text found, what is allowed, and the nearest valid name."""
+    """Return an error about a motion's text, with the nearest valid name as suggestion."""
     return InputError(Issue(problem, found=repr(found), allowed=allowed, suggestion=suggestion))

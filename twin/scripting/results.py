@@ -1,4 +1,4 @@
-"""Results of scripts: frames and true changes of an exposure, and the changes that the estimators compute from frames."""
+"""Results of scripts: frames and true changes of an exposure, and the changes estimated from frames."""
 
 from __future__ import annotations
 
@@ -178,7 +178,10 @@ class Found:
 
     @property
     def sigma(self) -> xr.DataArray:
-        """Standard deviations of the total errors of ``values``, due to noise and the prior's disturbances; same units."""
+        """Standard deviations of the total errors of ``values``, due to noise and the prior's disturbances.
+
+        Their units are those of ``values``.
+        """
         return self._root(self.covariance).rename("sigma")
 
     @property
@@ -246,7 +249,7 @@ class Found:
 
 
 def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:
-    """Return one row of ``Shot.mtf``: MTF of a knife edge before and after at one place, with sigma and true value."""
+    """Return one row of ``Shot.mtf``: MTF of a knife edge before and after, with sigma and true value."""
     out: dict[str, float] = {}
     for when, shots in place.shots.items():
         edge = shots.edges[direction]
@@ -256,7 +259,7 @@ def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:
 
 
 def _reading_frame(found: Found) -> pd.DataFrame:
-    """Return readings by camera and parameter: a column per estimator, and the sigmas of ``Found.judged``."""
+    """Return readings by camera and parameter, a column per estimator, with the sigmas of ``Found.judged``."""
     values = found.values.stack(row=("camera", "parameter")).transpose("row", "estimator").to_pandas()
     values.columns.name = None
     sigmas = {"sigma": found.sigma, "sigma_noise": found.sigma_noise}
