@@ -508,7 +508,7 @@ def without_effects(
 
 
 def _spread(camera: LineCamera, pixel: np.ndarray) -> np.ndarray:
-    """Return the (N,) positions on flat ground that N pixels see, along the line, in units of the satellite's height."""
+    """Return the positions on flat ground that N pixels see, along the line, in units of the flying height, (N,)."""
     look = camera.look(pixel)
     return np.asarray(look[:, 1] / look[:, 2])
 

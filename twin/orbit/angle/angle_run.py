@@ -306,9 +306,10 @@ class SimulatedAngleRun(AngleRun):
 
     @property
     def difference(self) -> np.ndarray:
-        """Angles from planes (total least squares) minus those from the resection, (m,) for m angles, radians.
+        """Angles from planes (total least squares) minus those from the resection, (m,), in radians.
 
-        Dihedral angles are compared; where angles are `narrow`, the angles along the track are compared instead.
+        For each of the m angles, dihedral angles are compared; where angles are `narrow`, the angles along the track
+        are compared instead.
         """
         estimate = self.estimate
         dihedral = estimate.angles["tls"].values - np.abs(estimate.resection_angles.values)

@@ -74,7 +74,7 @@ class LightRow:
     p_value: float
 
     def most(self, names: tuple[str, ...]) -> tuple[str, float]:
-        """Return the unknown of `names`, not held by the gauge, with the largest change in sigmas, and that change."""
+        """Return the unknown of `names`, not held by the gauge, that changes by the most sigmas, and the change."""
         size = {n: self.shift[n] / self.sigma[n] for n in names if self.sigma[n] > 0.0}
         worst = max(size, key=lambda n: abs(size[n]))
         return worst, size[worst]
@@ -126,7 +126,7 @@ class DatumRow:
 
     @property
     def most_sigmas(self) -> tuple[str, float]:
-        """Element of the interior orientation with the largest change in units of its sigma, and that change in sigmas."""
+        """Element of the interior orientation that changes by the most sigmas, and that change in sigmas."""
         ratio = {n: abs(v) / self.sigma[n] for n, v in self.interior.items() if self.sigma[n] > 0.0}
         worst = max(ratio, key=lambda n: ratio[n])
         return worst, ratio[worst]
@@ -362,7 +362,7 @@ class AttitudeDrift:
 
     @property
     def most(self) -> tuple[str, float]:
-        """Unknown that a drift changes most in units of its sigma, and that change; ("", 0) where rates are unknowns."""
+        """Unknown that a drift changes by the most sigmas, and that change; ("", 0) where rates are unknowns."""
         if not self.sigmas_per_arcsec:
             return "", 0.0
         return max(self.sigmas_per_arcsec.items(), key=lambda item: item[1])

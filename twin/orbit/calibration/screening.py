@@ -57,7 +57,7 @@ _Accepted = dict[str, dict[str, np.ndarray]]
 
 
 def mislabelled_points(campaign: Campaign, flight: FieldPass) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Return masks of the image points of a pass that do not show the ground point of their name.
+    """Return masks of the image points that do not show the ground point of their name.
 
     Errors of camera and platform move the image points of a line alike, slightly rotated and scaled: a straight line in
     the pixel through the medians of misclosures, a fit that tolerates up to half of the points being wrong.
@@ -123,7 +123,7 @@ def _without_mislabelled(campaign: Campaign) -> tuple[Campaign, dict[str, Reject
 
 
 def _with_light(campaign: Campaign, passes: tuple[FieldPass, ...]) -> Campaign:
-    """Return the campaign with the image points of `passes`, from which effects on the light are taken out as before."""
+    """Return the campaign with the image points of `passes`, less the same effects on the light as before."""
     removed = campaign.effects if campaign.spec.effects.corrected else NO_EFFECTS
     return replace(campaign, passes=passes).without_effects(removed)
 

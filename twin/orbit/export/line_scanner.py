@@ -229,7 +229,7 @@ def _ephemeris_time(epoch: str) -> tuple[int, float]:
 
 
 def _nodes(sensor: Sensor, count: int, epoch: str) -> Array:
-    """Return the (N,) times of N nodes, in seconds of the trajectory, evenly spaced at whole ticks of ephemeris time."""
+    """Return the times of N nodes, evenly spaced at whole ticks of ephemeris time, in seconds of the trajectory."""
     ends = sensor.time(np.array([-0.5, sensor.lines - 0.5]))
     step = max(np.ceil((ends[1] - ends[0]) / count / _TICK), 1.0) * _TICK
     fraction = _ephemeris_time(epoch)[1]
@@ -478,9 +478,7 @@ def _rotation_record(number: int, nodes: list[float], quaternion: Array, rate: A
 
 
 def _angular_velocity(camera: EffectiveCamera) -> Array:
-    """Return the (N, 3) angular velocity of the camera's axes relative to the Earth-fixed ones, in the latter, in
-    rad/s.
-    """
+    """Return the angular velocity of the camera's axes against Earth-fixed ones, in the latter, (N, 3), in rad/s."""
     step = camera.seconds[1] - camera.seconds[0]
     rate = (camera.rotation[1:] * camera.rotation[:-1].inv()).as_rotvec() / step
     return np.concatenate([rate[:1], 0.5 * (rate[1:] + rate[:-1]), rate[-1:]])

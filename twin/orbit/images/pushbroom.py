@@ -129,7 +129,7 @@ class LookMap:
         return self._met(east, north)
 
     def _met(self, east: list[np.ndarray], north: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the intersections of looks with the terrain, in metres; looks are polynomials in the scaled height x."""
+        """Return where looks, polynomials in the scaled height x, meet the terrain: east, north, height in m."""
         low, high = self.span[2]
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
 
@@ -283,7 +283,7 @@ class Window:
         )
 
     def sample(self, sensor: Sensor, height: float) -> tuple[float, float]:
-        """Return the ground distance of two pixels along the line, and of two lines, at the window's middle, in metres."""
+        """Return the ground distance of two pixels, and of two lines, at the window's middle, in metres."""
         line, pixel = self.middle
         steps = np.array([-0.5, 0.5, 0.0, 0.0])
         points = sensor.ground(line + steps, pixel + np.roll(steps, 2), height)

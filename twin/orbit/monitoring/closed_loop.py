@@ -1,13 +1,14 @@
-"""Closed loop of a monitor and correcting mechanisms on their instrument, simulated over a course.
+"""Closed loop of a monitor and correcting mechanisms on their instrument, simulated over time.
 
 At every moment, spots are rendered and recovered with the mechanisms at their positions, the filter processes them,
-commands are sent, mechanisms move, and images are taken. The filter knows the prior of the motions with its laws in
-time, the readings, and the commanded positions of the mechanisms; it never uses the true state. All effects come from
-exact traces: those of the prior's motions and of every mechanism on spots, cameras and foci, and the truth of the state
-that the mechanisms have corrected.
+commands are sent, mechanisms move, and images are taken. The filter knows the prior of the motions, with the laws by
+which they vary in time, the readings, and the commanded positions of the mechanisms; it never uses the true state. All
+effects come from exact traces: those of the prior's motions and of every mechanism on spots, cameras and foci, and the
+truth of the state that the mechanisms have corrected.
 
-The quantities of a loop are P = 5 K numbers for the instrument's K cameras: d_alpha, d_beta, d_gamma, d_f of each, in
-the order of all estimators, followed by the defocus of each: best focus less line CCD, mean over `FOCUS_FIELDS`.
+The quantities of a loop are P = 5 K numbers for the instrument's K cameras: rotations d_alpha, d_beta, d_gamma (rad)
+and change of principal distance d_f (m) of each, in the order of all estimators, followed by the defocus of each: best
+focus minus position of the line CCD, in metres, mean over `FOCUS_FIELDS`.
 """
 
 from __future__ import annotations
@@ -57,11 +58,13 @@ FOCUS_FIELDS = (0.7, 0.0, -0.7)
 _READ = 1e-3
 """Approximate standard deviation of a spot coordinate in one reading, in pixels."""
 _SMALL = 1e-6
-"""Effect of a mechanism on its quantity, for 1 rad or 1 m, below which it counts as none, in rad or m."""
+"""Effect of a mechanism on its quantity, for 1 rad or 1 m, below which it counts as zero, in rad or m."""
 _DISTANCE: Mapping[str, float] = FrozenMap({"shift": 1e-5, "rotate": 5e-6})
-"""Steps of mechanisms over which a focus is differentiated, in m and rad; foci are accurate to 1e-8 m."""
+"""Steps of the difference quotients of a focus with respect to a mechanism's position, in m for shifts and rad for
+rotations; foci are accurate to 1e-8 m.
+"""
 _DRAWN = 20
-"""Random stream of the motions; the detectors use the first ones."""
+"""Number of the random stream of the motions; the detectors use the first ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,10 +80,10 @@ class Corrector:
     motion : ElementaryMotion or None
         Motion of its mechanism; None for a correction on the ground.
     row : int
-        Index of its quantity among the P quantities.
-    effect : (P,) ndarray
+        Index of its quantity among the P quantities of the loop.
+    effect : (P,) ndarray for P quantities
         Effect of 1 rad or 1 m of the correction on the quantities.
-    spots : (D,) ndarray
+    spots : (D,) ndarray for D spot coordinates
         Effect of 1 rad or 1 m of the correction on the spots, in px.
     """
 
@@ -105,14 +108,14 @@ class Corrector:
 
 @dataclass(frozen=True, eq=False)
 class LoopModel:
-    """Linear model of a loop on its instrument.
+    """Linear model of a loop of monitor and mechanisms on its instrument.
 
     Attributes
     ----------
     experiment : MonitorExperiment
         Instrument with its monitor.
     prior : Disturbances
-        Prior of the motions, with all P quantities in place of the parameters.
+        Prior of the motions, with all P quantities instead of the cameras' parameters alone.
     correctors : tuple of Corrector
         Corrections sorted by name, so that their order in the file does not matter.
     """
@@ -127,15 +130,15 @@ class LoopModel:
         return tuple(self.experiment.instrument.cameras)
 
     def row(self, camera: str, quantity: str) -> int:
-        """Return the index of a camera's quantity."""
+        """Return the index of a camera's quantity, such as d_alpha or defocus, among the P quantities."""
         return _row(self.cameras, camera, quantity)
 
     def unit(self, camera: str, quantity: str) -> np.ndarray:
-        """Return the (P,) unit vector of a camera's quantity."""
+        """Return the vector (P,) that is 1 for one quantity of a camera and 0 for all other P quantities."""
         return np.eye(len(self.prior.parameters))[self.row(camera, quantity)]
 
     def moved(self, state: State, positions: np.ndarray) -> State:
-        """Return a state with the mechanisms at positions, with their true response.
+        """Return a state of the instrument with the mechanisms at given positions, with their true response.
 
         Parameters
         ----------
@@ -151,7 +154,7 @@ class LoopModel:
         return state
 
     def on_ground(self, camera: str, positions: np.ndarray) -> np.ndarray:
-        """Return the (4,) change of a camera that the processing on the ground corrects."""
+        """Return the change (4,) of a camera that the ground processing corrects, in rad (three angles) and m (d_f)."""
         change = np.zeros(4)
         for corrector, position in zip(self.correctors, positions.tolist(), strict=True):
             if corrector.motion is None and corrector.spec.camera == camera:
@@ -160,17 +163,20 @@ class LoopModel:
 
     @cached_property
     def effects(self) -> np.ndarray:
-        """Effects (P, n) of the corrections on the quantities."""
+        """Effects (P, n) of 1 rad or 1 m of each of n corrections on the P quantities, in rad and m."""
         return np.stack([corrector.effect for corrector in self.correctors], axis=1)
 
     @cached_property
     def spots(self) -> np.ndarray:
-        """Effects (D, n) of the corrections on the spots, in px."""
+        """Effects (D, n) of 1 rad or 1 m of each of n corrections on the D spot coordinates, in px."""
         return np.stack([corrector.spots for corrector in self.correctors], axis=1)
 
     @cached_property
     def coupling(self) -> np.ndarray:
-        """Effect (n, n) of each mechanism (column) on each correction's quantity (row), over that correction's own."""
+        """Effect of each mechanism (column) on each correction's quantity (row), relative to that correction's own.
+
+        It is an (n, n) array for n corrections, with a diagonal of ones.
+        """
         rows = [corrector.row for corrector in self.correctors]
         return np.asarray(
             self.effects[rows] / np.array([corrector.sensitivity for corrector in self.correctors])[:, None]
@@ -178,7 +184,7 @@ class LoopModel:
 
     @cached_property
     def observed_share(self) -> np.ndarray:
-        """Share (n,) of a mechanism's unmodelled response that one reading of the spots reveals."""
+        """Share of each mechanism's unmodelled response that one reading of the spots reveals, (n,), 0 to 1."""
         gain = self.prior.best_gain(_READ**2 * np.eye(len(self.spots)))
         estimate = gain @ self.spots
         return np.array(
@@ -238,7 +244,7 @@ def loop_model(setup: MonitorSetup, experiment: MonitorExperiment) -> LoopModel:
 
 
 def defocus(quality: ImageQuality) -> np.ndarray:
-    """Return (K, S) best focus less line CCD of every camera and state, in metres; NaN where it is not known."""
+    """Return best focus minus line CCD of K cameras in S states, (K, S), in metres; NaN where it is not known."""
     return np.stack([camera.defocus.mean(axis=1) for camera in quality.cameras.values()])
 
 
@@ -271,7 +277,7 @@ def _mechanism(
 
 @dataclass(frozen=True, eq=False)
 class LoopCourse:
-    """Course over T moments with the loop closed or open.
+    """States and commands over T moments with the loop closed or open.
 
     Attributes
     ----------
@@ -279,11 +285,11 @@ class LoopCourse:
         Model of the loop.
     times : (T,) ndarray
         Seconds from the orbit's epoch.
-    positions : (T, n) ndarray
+    positions : (T, n) ndarray for n mechanisms
         Commanded positions of the mechanisms when images are taken, in rad or m.
     held : (T, n) ndarray of bool
         True where a command was limited by the end of a range.
-    expected : (T, P) ndarray
+    expected : (T, P) ndarray for P quantities
         Posterior mean of the quantities when images are taken.
     covariance : (T, P, P) ndarray
         Posterior covariance of the quantities.
@@ -310,12 +316,12 @@ class LoopCourse:
 
     @property
     def sigma(self) -> np.ndarray:
-        """Standard deviations (T, P) of ``expected``."""
+        """Posterior standard deviations of the P quantities at T moments, (T, P), in rad and m."""
         return np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0))
 
     @property
     def degrees(self) -> int:
-        """Degrees of freedom of all chi-squares together."""
+        """Number of degrees of freedom of the sum of all readings' chi-squares."""
         return int(len(self.times) * self.model.prior.spots.shape[0])
 
     @property
@@ -337,9 +343,9 @@ class LoopCourse:
 
 
 def drifting_states(spec: OrbitMonitorSpec, experiment: MonitorExperiment, seed: int) -> Sequence[State]:
-    """Return the states of the moments without any mechanism, with the motions of the file.
+    """Return the instrument's states at all moments without mechanisms, with the motions of the file.
 
-    They follow the file's course, or motions drawn by their laws in time.
+    The motions are those that the file tabulates over time, or random ones that follow the file's laws in time.
 
     Raises
     ------
@@ -362,7 +368,7 @@ Read: TypeAlias = Callable[[State, int], Recovery]
 
 
 def reader(model: LoopModel, spec: OrbitMonitorSpec, seed: int) -> Read:
-    """Return the function that renders a state at a moment and recovers its spots.
+    """Return the function that renders the monitor's images of a state at a moment and measures their spots.
 
     The function raises BenchError where light is lost or a spot cannot be measured.
 
@@ -424,7 +430,7 @@ def simulate_course(
     read : Read
         Function that reads the spots, from `reader`.
     open_loop : bool
-        True to leave all mechanisms at rest.
+        True to leave all mechanisms at their initial positions.
     advance : Callable[[int], None]
         Callback with the number of moments done.
     """
@@ -495,7 +501,7 @@ class Commands:
 
     @property
     def positions_now(self) -> np.ndarray:
-        """Positions (n,) of the mechanisms now, by the commands, their delay and their steps."""
+        """Present positions (n,) of the n mechanisms, in rad or m, from the commands, their delay and their steps."""
         positions = np.zeros(len(self.model.correctors))
         for k, corrector in enumerate(self.model.correctors):
             if corrector.spec.delay < len(self.history):
@@ -504,11 +510,11 @@ class Commands:
         return positions
 
     def after_reading(self, mean: np.ndarray) -> Commands:
-        """Return the commands after a reading.
+        """Return the commands that follow a reading of the monitor.
 
         Parameters
         ----------
-        mean : (P,) ndarray
+        mean : (P,) ndarray for P quantities
             Posterior mean of the quantities without mechanisms.
         """
         remaining = mean + self.model.effects @ self.positions_now

@@ -1,13 +1,13 @@
 """Closed and open loop along one orbit: remaining errors of pointing and focus, and heights of ground points.
 
-Heights come from forward intersection of exact lines of sight with the stated errors of image points, orbit and
+Heights come from forward intersection of exact lines of sight with the specified errors of image points, orbit and
 attitude. The lines are traced through the state that the mechanisms have corrected; the intersection uses the lines as
 calibrated, with the corrections of the processing. The truth enters only where errors are computed.
 
-At some moments, pairs of line images can be rendered, matched and intersected. The lens of a line is then round and
-evenly illuminated, with the camera's f-number and the moment's traced defocus as its wavefront; detector and band are
-those of the camera. Points of the second camera's image are matched in the first one's and intersected with the lines
-that the user knows, on the measured trajectory.
+At moments that the file names, pairs of line images can be rendered, matched and intersected. The lens of a line is
+then round and evenly illuminated, with the camera's f-number and the moment's traced defocus as its wavefront; detector
+and band are those of the camera. Points of the second camera's image are matched in the first one's and intersected
+with the lines that the user knows, on the measured trajectory.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class ImagedPair:
     ----------
     moment : int
         Index of the reading after which the images are taken.
-    errors : (n, 3) ndarray
+    errors : (n, 3) ndarray for n points
         Intersected minus true coordinates of the matched points: east, north, up, in metres.
     misplaced : (n, 2) ndarray
         Matched minus true position in the first camera's image, in lines and pixels.
@@ -92,7 +92,7 @@ class ImagedPair:
 
     @property
     def matching(self) -> np.ndarray:
-        """RMS (2,) of ``misplaced``, in lines and pixels."""
+        """RMS error of the matched positions in the first camera's image, in lines and pixels, (2,)."""
         return np.sqrt(np.mean(self.misplaced**2, axis=0))
 
 
@@ -174,7 +174,7 @@ def imaged_pair(
 
 
 _FEWEST = 8
-"""Least number of points from which a mean height and its scatter are computed."""
+"""Smallest number of points from which a mean height and its scatter are computed."""
 _TRANSMISSION = 0.8
 """Transmission of a lens, mean over the spectrum: the default of payloads."""
 
@@ -206,11 +206,11 @@ GAIN_MARGIN, PHASE_MARGIN_DEG = 1.5, 30.0
 with a delay the two are the same limit (Astrom, Hagglund, PID Controllers, 1995, sec. 4.4).
 """
 WORSE = 0.01
-"""Relative increase of an error by the loop, with the same draws, above which the loop is reported to make it worse:
-half of the last of two digits that reports show.
+"""Relative increase of an error due to the loop, with the same random errors, above which the loop is reported to make
+it worse: half of the last of two digits that reports show.
 """
 _NOTHING = 1e-9
-"""Errors in rad, m or MTF below which there is none: a fraction of a milliarcsecond, a nanometre."""
+"""Errors in rad, m or MTF below which an error counts as zero: a fraction of a milliarcsecond, a nanometre."""
 FOCUS_SCALE = 10e-6
 """Defocus, in metres, that weighs as much as a metre of height in the search for unobservable modes: a tenth of what
 blurs an image.
@@ -219,7 +219,7 @@ blurs an image.
 
 @dataclass(frozen=True, eq=False)
 class LoopOutcome:
-    """Course with the true errors that it leaves.
+    """States over time with the loop closed or open, with the true errors that remain.
 
     Attributes
     ----------
@@ -227,14 +227,15 @@ class LoopOutcome:
         Simulated course.
     flight : PairFlight
         Lines and check points.
-    truth : (T, P) ndarray
-        True quantities when images are taken, less the corrections of the processing.
+    truth : (T, P) ndarray for T moments and P quantities
+        True quantities when images are taken, minus the corrections of the ground processing.
     heights : CaseErrors
         Errors at the check points.
     slopes : (T, P) ndarray
-        Derivatives of the mean height error by the quantities, in m/rad and m/m.
+        Derivatives of the mean height error with respect to the quantities, in m/rad and m/m.
     angle : (P,) ndarray
-        Coefficients of the angle between the pair's lines of sight, opening positive.
+        Derivatives of the angle between the pair's lines of sight with respect to the quantities; positive where the
+        angle increases.
     mtf : Mapping[str, (T, 2) ndarray]
         Camera -> MTF at Nyquist along the line and along the track, mean over the fields.
     images : tuple of ImagedPair
@@ -251,12 +252,12 @@ class LoopOutcome:
     images: tuple[ImagedPair, ...] = ()
 
     def posterior(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return posterior mean (T,) and standard deviation (T,) of a linear combination of the quantities.
+        """Return posterior mean and sigma of a linear combination of the P quantities at T moments, (T,) each.
 
         Parameters
         ----------
         rows : (P,) or (T, P) ndarray
-            Coefficients of the combination.
+            Coefficients of the combination, the same at all moments or one row for each.
         """
         each = np.broadcast_to(rows, self.truth.shape)
         value = np.einsum("tp,tp->t", each, self.course.expected)
@@ -264,11 +265,23 @@ class LoopOutcome:
         return value, np.sqrt(np.maximum(variance, 0.0))
 
     def true(self, rows: np.ndarray) -> np.ndarray:
-        """Return the true values (T,) of a combination from the traced states; argument as in `posterior`."""
+        """Return the true values of a linear combination of the P quantities at T moments, (T,).
+
+        Parameters
+        ----------
+        rows : (P,) or (T, P) ndarray
+            Coefficients of the combination, the same at all moments or one row for each.
+        """
         return np.einsum("tp,tp->t", np.broadcast_to(rows, self.truth.shape), self.truth)
 
     def ratio(self, rows: np.ndarray) -> float:
-        """Return the largest error of a combination's posterior over its sigma; argument as in `posterior`."""
+        """Return the largest error of a linear combination's posterior mean, divided by its sigma.
+
+        Parameters
+        ----------
+        rows : (P,) or (T, P) ndarray
+            Coefficients of the combination, the same at all moments or one row for each.
+        """
         value, sigma = self.posterior(rows)
         positive = sigma > 0.0
         return float(np.max(np.abs(value - self.true(rows))[positive] / sigma[positive], initial=0.0))
@@ -281,13 +294,13 @@ class LoopAnalysis:
     Attributes
     ----------
     corrector : Corrector
-        Correction.
+        Correction that the loop makes.
     loop_gain : float
-        Gain, times the share of the mechanism's response that acts in the loop.
+        Gain of the file, times the share of the mechanism's response that acts in the loop.
     margins : Margins
-        Margins of this gain with the delay.
+        Gain and phase margin of a loop with this gain and the file's delay.
     cycle : LimitCycle or None
-        Limit cycle of a mechanism with discrete steps; None for another one.
+        Limit cycle of a mechanism with discrete steps; None for a mechanism without steps.
     ends : tuple of int
         Indices of the moments at which the end of the range limited the command.
     """
@@ -316,12 +329,12 @@ class LoopRun:
     loops : Mapping[str, LoopAnalysis]
         Stability of each correction, by name.
     radius : float
-        Spectral radius of all loops together.
+        Spectral radius of all loops together, below 1 for a stable system.
     margin : float
         Factor by which all gains together may be increased before the loop is unstable.
     modes : tuple of UnobservableMode
         Unobservable modes; their quantities are height (m) and the defocus (m) of the pair.
-    unobservable_sigma : (3, T) ndarray
+    unobservable_sigma : (3, T) ndarray for T moments
         Lower limits of the standard deviations of these quantities for any estimate from the spots.
     """
 
@@ -348,7 +361,7 @@ class LoopRun:
 
     @property
     def worse(self) -> dict[str, tuple[float, float]]:
-        """Errors that the loop increases: RMS over the moments with the loop open and closed.
+        """Errors that the loop increases: name -> RMS over the moments with the loop open and closed.
 
         Angle and quantities are in rad and m, height in m; of the MTF at Nyquist, its difference from 1.
         """
@@ -372,7 +385,7 @@ class LoopRun:
 
     @property
     def ratios(self) -> dict[str, float]:
-        """Largest error of the posterior over its sigma, of each quantity, over both courses."""
+        """Largest error of each quantity's posterior mean divided by its sigma, with the loop closed and open."""
         rows = {f"defocus of {name}": self.model.unit(name, "defocus") for name in self.pair}
         rows_of = {"angle": (self.open.angle,) * 2, "height": (self.closed.slopes, self.open.slopes)}
         rows_of |= {name: (row, row) for name, row in rows.items()}
@@ -383,12 +396,12 @@ class LoopRun:
 
     @property
     def ratio_limit(self) -> float:
-        """Limit of `ratios`, exceeded with a probability of at most `FALSE_ALARM` for any correlations."""
+        """Limit of `ratios`, exceeded with a probability of at most `FALSE_ALARM` however the errors correlate."""
         return float(norm.isf(0.5 * FALSE_ALARM / (2 * len(self.closed.course.times) * len(self.ratios))))
 
     @property
     def phase_deg(self) -> float:
-        """Smallest phase margin of the loops, in degrees; NaN where none has one."""
+        """Smallest phase margin of the loops, in degrees; NaN where no loop has one."""
         margins = [
             analysis.margins.phase_deg for analysis in self.loops.values() if math.isfinite(analysis.margins.phase_deg)
         ]
@@ -482,7 +495,7 @@ def _outcome_of(
     seed: np.random.SeedSequence,
     advance: Advance,
 ) -> LoopOutcome:
-    """Compute the true errors and the heights of a course."""
+    """Compute the true errors and the heights that result from simulated states."""
     model, pair, experiment, test = course.model, setup.pair, course.model.experiment, setup.test
     axes, distance = experiment.sight.axes, experiment.nominal_truth.principal_distance
     lines = tuple(traced_pair(experiment, state, pair) for state in course.states)
@@ -525,5 +538,5 @@ def _outcome_of(
 
 
 def height_rms(outcome: LoopOutcome) -> float:
-    """Return the RMS over the moments of the mean height error by the cameras alone, in metres."""
+    """Return the RMS over the moments of the mean height error due to the cameras alone, in metres."""
     return rms(outcome.heights.camera)

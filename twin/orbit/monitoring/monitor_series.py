@@ -1,4 +1,4 @@
-"""Readings of the monitor of a stereo pair over a course, relative to its reference images."""
+"""Readings of the monitor of a stereo pair over time, relative to its reference images."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def states_of(
     numbers: Sequence[int] | None = None,
     only: tuple[str, str] | None = None,
 ) -> list[State]:
-    """Return the states of the instrument at times of the course.
+    """Return the states of the instrument at the times of the test.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ class Readings:
         return slice(at, at + 4)
 
     def __getitem__(self, camera: str) -> CameraParameters:
-        """Return the changes of one camera."""
+        """Return the changes (T, 4) of one camera: d_alpha, d_beta, d_gamma (rad) and d_f (m) at T times."""
         part = self._part(camera)
         total = None if self.total is None else self.total[:, part, part]
         return CameraParameters.from_vector(self.values[:, part], self.noise[:, part, part], total)
@@ -125,7 +125,7 @@ class SmoothedReadings:
     Attributes
     ----------
     readings : Readings
-        Smoothed changes at all times of the course.
+        Smoothed changes at all times of the test.
     consistency : Consistency
         Chi-square test of the measurements.
     jumps : tuple of Jump or None
@@ -148,7 +148,7 @@ class Measured:
     covariance : (S, 2 C, 2 C) ndarray
         Covariance of each state's shifts, in px^2.
     noise : SeriesNoise or None
-        Joint noise of the shifts of all states; None where the states are not a series.
+        Joint noise of the shifts of all states; None where the states are not a time series.
     evidence : SpotEvidence
         Test of the spots' sigmas by their fits.
     truth : tuple of Truth
@@ -170,7 +170,7 @@ class Measured:
         return cls(np.concatenate(positions, axis=1), spread, noise, evidence, tuple(truth))
 
     def doubts(self, times: Sequence[float], spots: Sequence[str]) -> tuple[str, ...]:
-        """Return a warning if the spots' sigmas do not hold, for the worst of the states.
+        """Return a warning about the worst of the states if the spots' fits contradict their sigmas.
 
         Parameters
         ----------
@@ -184,13 +184,13 @@ class Measured:
 
     @property
     def shifts(self) -> np.ndarray:
-        """Shifts (S, 2 C), in px."""
+        """Shifts of C spots since the reference images in S states, (S, 2 C), in px."""
         return (self.positions[1] - self.positions[0]).reshape(len(self.covariance), -1)
 
 
 @dataclass(frozen=True, eq=False)
 class _NoiseSubset:
-    """Noise of some measurements of a series."""
+    """Joint noise of a selection of the measurements of a time series."""
 
     noise: SeriesNoise
     at: np.ndarray
@@ -200,7 +200,7 @@ class _NoiseSubset:
 
 
 class MonitorSeries:
-    """Monitor with its reference images, which reads the states of a course.
+    """Monitor with its reference images, which measures the changes of the cameras in a series of states.
 
     With a prior of disturbances each state is estimated by `posterior`, with the changes expected since the reference;
     otherwise by `model`.
@@ -252,7 +252,15 @@ class MonitorSeries:
         return Measured.of(*exposed), Measured.of(*expected)
 
     def clean(self, states: Sequence[State]) -> Measured:
-        """Measure the states from expected images without noise; raises as `measured`."""
+        """Measure the states from expected images without noise.
+
+        Raises
+        ------
+        BenchError
+            A spot cannot be measured.
+        AimError, BeamMissedError
+            Light is lost.
+        """
         return Measured.of(*self._observed(states, (self._expected,))[0])
 
     def prism_shifts(self) -> np.ndarray:
@@ -340,7 +348,7 @@ class MonitorSeries:
         Parameters
         ----------
         measured : Measured
-            Shifts at all times of the course.
+            Shifts at all times of the test.
         interval : float
             Interval between measurements, in seconds.
         """
@@ -367,12 +375,12 @@ class MonitorSeries:
         )
 
     def estimates_by_camera(self, gains: np.ndarray, shifts: np.ndarray) -> Mapping[str, np.ndarray]:
-        """Return the (S, 4) estimates of each camera from shifts.
+        """Return each camera's estimated changes in S states from the shifts of C spots, (S, 4), in rad and m.
 
         Parameters
         ----------
         gains : (S, 8, 2 C) or (8, 2 C) ndarray
-            Gains of the estimator.
+            Gains of the estimator, in rad or m per px.
         shifts : (S, 2 C) ndarray
             Shifts of the spots, in px.
         """
@@ -383,7 +391,7 @@ class MonitorSeries:
         return mean_frames(self.experiment.frames_after(photons, self.frames, seed, numbers))
 
     def _expected(self, photons: np.ndarray, numbers: np.ndarray) -> tuple[MeasuredSpots, np.ndarray]:
-        """Return the reference spots and the expected images, as a `Record`."""
+        """Return the reference spots and the images without noise, in the form of a function that records images."""
         return self._clean_reference, self.experiment.expected_frames(photons)
 
     def _reference_spots(self, images: np.ndarray) -> MeasuredSpots:
@@ -395,7 +403,7 @@ class MonitorSeries:
     def _observed(
         self, states: Sequence[State], records: Sequence[Record], numbers: Sequence[int] = (), series: bool = False
     ) -> list[tuple[list[Recovery], SeriesNoise | None, list[Truth]]]:
-        """Observe the same states with several ways of recording images, in groups, as `Measured.of` takes them.
+        """Measure the same states with several functions that record images, in groups for `Measured.of`.
 
         Parameters
         ----------
@@ -404,9 +412,9 @@ class MonitorSeries:
         records : sequence of Record
             Functions that record images.
         numbers : sequence of int
-            Indices of the states' times; by default those of the course.
+            Indices of the states' times; by default those of the test.
         series : bool
-            True if the states are those of the course and their joint noise is needed.
+            True if the states are those of all times and their joint noise is needed.
         """
         experiment, spots = self.experiment, self.experiment.calibration.spots
         series = series and experiment.disturbances is not None
@@ -437,7 +445,7 @@ class MonitorSeries:
 
     @contextmanager
     def _reporting_spot_errors(self, numbers: Sequence[int]) -> Iterator[None]:
-        """Convert errors of spots that cannot be measured to errors of the file, with the time of the state.
+        """Convert errors about spots that cannot be measured to errors of the file that name the state's time.
 
         Parameters
         ----------

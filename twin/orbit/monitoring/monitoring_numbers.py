@@ -32,7 +32,7 @@ MOST_MOTIONS = 8
 
 
 def _unsigned(values: Array | None) -> Array | None:
-    """Return the values with plain zeros in place of negative ones; None stays None."""
+    """Return the values with negative zeros replaced by positive ones; None stays None."""
     return None if values is None else np.asarray(values + 0.0)
 
 
@@ -305,7 +305,7 @@ PASS: Record[tuple[LoopRun, LoopOutcome]] = Record(
 
 
 def positions(run: LoopRun, name: str) -> Array:
-    """Return the (T,) commanded positions of a mechanism when images are taken, in its unit."""
+    """Return the commanded positions of a mechanism when images are taken, (T,) for T moments, in its unit."""
     k = [corrector.name for corrector in run.model.correctors].index(name)
     return np.asarray(run.closed.course.positions[:, k] / run.model.correctors[k].unit[1] + 0.0)
 
@@ -348,7 +348,7 @@ def _observed_share(run: LoopRun, name: str, facts: LoopAnalysis) -> float | Non
 
 
 def motions_of(run: LoopRun, mode: UnobservableMode) -> list[dict[str, Any]]:
-    """Return the largest motions of a mode, with their amounts for one standard deviation of it."""
+    """Return the largest motions of an unobservable mode, with their sizes for one standard deviation of the mode."""
     prior = run.model.prior
     order = np.argsort(-np.abs(mode.motions), kind="stable")[:MOST_MOTIONS]
     return [
@@ -370,7 +370,7 @@ MODE: Record[tuple[LoopRun, UnobservableMode]] = Record(
 
 
 def angle_of(run: LoopRun, mode: UnobservableMode) -> float:
-    """Return the change of the angle by a mode, in radians."""
+    """Return the change of the intersection angle for one standard deviation of a mode, in radians."""
     return float(run.open.angle @ run.model.prior.parameters @ mode.motions)
 
 

@@ -42,7 +42,7 @@ PARTS = {
     "beyond_parameters": ("beyond the four parameters", svg.SKY),
     "interpolation": ("interpolation over the interval", svg.GREEN),
 }
-"""Part of the height error -> its name in reports, and its colour."""
+"""Name in reports and colour of each part of the height error."""
 _DRAWN_PART = 5e-3
 """Size below which a part of the height error is not drawn, in metres, if it is smaller at all times."""
 _COLOURS = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.PURPLE, svg.ORANGE, svg.SKY)
@@ -51,7 +51,7 @@ _BESIDE = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
 _BODIES, _MOTIONS = 3, 3
 """Bodies and motions of a mode that are named in words."""
 _LEAST = 1e-6
-"""Size below which numbers of a mode are rounding errors."""
+"""Size below which numbers of an unobservable mode are rounding errors and are not reported."""
 
 
 def _figure(name: str, title: str, caption: str, draw: Callable[..., Figure], run: Any) -> SvgFigure:
@@ -59,7 +59,7 @@ def _figure(name: str, title: str, caption: str, draw: Callable[..., Figure], ru
 
 
 def _panels(height: float, rows: int, zero: bool = True, label: str = "time [min]", **options: Any) -> Any:
-    """Return a figure of panels below each other with a common axis of time, and a line at zero error."""
+    """Return a figure of vertically stacked panels with a common axis of time, and a line at zero error."""
     figure = svg.new_figure(height)
     panels = list(np.ravel(figure.subplots(rows, 1, sharex=True, **options)))
     panels[-1].set_xlabel(label)
@@ -91,7 +91,7 @@ def _angle_figure(run: MonitorRun) -> Figure:
 
 
 def _height_figure(run: MonitorRun) -> Figure:
-    """Draw the mean height error by the cameras alone and the points' RMS over the orbit."""
+    """Draw the mean height error due to the cameras alone and the points' RMS over the orbit."""
     minutes, cases = run.times / 60.0, run.cases
     figure, (above, below) = _panels(5.2, 2)
     for name, colour, style, label in (
@@ -239,7 +239,7 @@ def _loop_figure(run: LoopRun) -> Figure:
 
 
 def monitor_report(run: MonitorRun | LoopRun) -> Report:
-    """Return the report of a monitored orbit."""
+    """Return the report of a monitored orbit: heights with and without monitoring, their errors and warnings."""
     if isinstance(run, LoopRun):
         return Report(
             "A monitor in the loop",
@@ -313,7 +313,7 @@ def _verdict(run: MonitorRun) -> tuple[str, tuple[str, ...]]:
 
 
 def _times(factor: float, less: str) -> str:
-    """Return in words the factor by which an error is smaller or larger."""
+    """Return the factor by which an error is smaller or larger, in words."""
     if factor >= 1.0:
         return f"{factor:.2f} times {less}"
     return f"{1.0 / factor:.2f} times {'more' if less == 'less' else 'larger'}"
@@ -531,7 +531,7 @@ def _margin(run: LoopRun) -> str:
 
 
 def _focus_words(run: LoopRun) -> str:
-    """Return a sentence on the share of the focus's standard deviation that the spots do not reduce."""
+    """Return a sentence on the share of the prior sigma of focus that no reading of the spots can reduce."""
     shares, model_prior = [], run.model.prior
     for name, unobservable in zip(run.pair, run.unobservable_sigma[1:], strict=True):
         effect = model_prior.parameters[run.model.row(name, "defocus")]

@@ -1,4 +1,4 @@
-"""Heights with and without on-board monitoring, from points intersected at every time of a course.
+"""Heights with and without on-board monitoring, from points intersected at a series of times.
 
 The cameras are used as calibrated, corrected by the monitor, corrected by values interpolated over an interval, and as
 they truly are. The analysis has the calibrated lines, measured orbit and attitude, image points and the monitor's
@@ -48,12 +48,12 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import MonitorSetup
 
 FALSE_ALARM = 1e-4
-"""Probability, both sides together, that right sigmas are reported as wrong."""
+"""Probability, both sides together, with which correct sigmas are reported as wrong."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """Effect of one temperature or motion of the file alone.
+    """Effect of a single temperature or motion of the file on the two cameras and on the monitor's reading.
 
     Attributes
     ----------
@@ -62,9 +62,9 @@ class Cause:
     path : str
         Path of the node.
     truth : Mapping[str, (4,) ndarray]
-        Camera -> true changes since the reference.
+        Camera -> true changes since the reference, in rad (three angles) and m (principal distance).
     error : Mapping[str, (4,) ndarray]
-        Camera -> reading of the monitor without noise, minus the truth.
+        Camera -> reading of the monitor without noise, minus the truth, in rad and m.
     """
 
     what: str
@@ -82,10 +82,10 @@ class Conversion:
     traced : Mapping[str, float]
         Camera -> height change, by ray trace, when this camera alone is rotated by 1 arcsec about its Y, in m.
     theory : Mapping[str, float]
-        Camera -> the same from base to height, in m: slant range x 1 arcsec / cos(incidence) over the difference of the
-        tangents of both incidences.
+        Camera -> the same from base to height, in m: slant range x 1 arcsec / cos(incidence), divided by the difference
+        of the tangents of both angles of incidence.
     base_to_height : float
-        That difference.
+        Base-to-height ratio: the difference of these tangents.
     """
 
     traced: Mapping[str, float]
@@ -110,7 +110,7 @@ class Scatter:
 
     Attributes
     ----------
-    heights : (R,) ndarray
+    heights : (R,) ndarray for R repeats
         Mean height error from the monitor's values alone, in metres.
     sigma : float
         Standard deviation propagated from the predicted covariance, mean over the repeats, in metres.
@@ -126,7 +126,7 @@ class Scatter:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Limits of spread / sigma, exceeded with a probability of `FALSE_ALARM`."""
+        """Limits of the ratio spread / sigma, exceeded with a probability of `FALSE_ALARM` where sigma is right."""
         degrees = len(self.heights) - 1
         low, high = chi2.ppf([0.5 * FALSE_ALARM, 1.0 - 0.5 * FALSE_ALARM], degrees)
         return float(np.sqrt(low / degrees)), float(np.sqrt(high / degrees))
@@ -148,12 +148,12 @@ class Smoothing:
         Errors with the smoothed values.
     interpolated : CaseErrors
         Errors with values interpolated between the same measurements.
-    error : (T,) ndarray
-        Mean height error by the errors of the smoothed values, to first order, in metres.
+    error : (T,) ndarray for T times
+        Mean height error due to the errors of the smoothed values, to first order, in metres.
     sigma : (T,) ndarray
-        Standard deviation of that error by the smoother, in metres; 0 at the reference.
+        Standard deviation of that error according to the smoother, in metres; 0 at the reference.
     consistency : Consistency
-        Chi-square test of the measured shifts under the prior.
+        Chi-square test of the measured shifts against the prior.
     """
 
     case: CaseErrors
@@ -164,28 +164,28 @@ class Smoothing:
 
     @property
     def factor(self) -> float:
-        """Height error of the cameras with interpolation over that with smoothing."""
+        """RMS height error due to the cameras with interpolated values, divided by that with smoothed values."""
         return self.interpolated.camera_height_rms / self.case.camera_height_rms
 
     @property
     def ratios(self) -> np.ndarray:
-        """Errors over their sigma, at the times with a sigma above zero."""
+        """Height errors divided by their sigma, at the times with a sigma above zero."""
         positive = self.sigma > 0.0
         return np.asarray(self.error[positive] / self.sigma[positive])
 
     @property
     def largest_ratio(self) -> float:
-        """Largest absolute ratio."""
+        """Largest absolute height error divided by its sigma."""
         return float(np.max(np.abs(self.ratios), initial=0.0))
 
     @property
     def limit(self) -> float:
-        """Limit of the largest ratio, exceeded with a probability of at most `FALSE_ALARM` for any correlations."""
+        """Limit of the largest ratio, exceeded with a probability of at most `FALSE_ALARM` however errors correlate."""
         return float(norm.isf(0.5 * FALSE_ALARM / max(len(self.ratios), 1)))
 
     @property
     def agrees(self) -> bool:
-        """True if no ratio is beyond the limit."""
+        """True if no height error divided by its sigma is beyond the limit."""
         return self.largest_ratio <= self.limit
 
 
@@ -216,7 +216,7 @@ class MonitorRun(PairFlight):
     clean : Mapping[str, (T, 4) ndarray]
         Camera -> readings from expected images without noise.
     prisms : Mapping[str, (T, 4) ndarray]
-        Camera -> readings without noise by the temperatures that the file gives to prisms alone.
+        Camera -> readings without noise, due only to the temperatures that the file gives to the monitor's prisms.
     repeated : Readings
         Repeated readings of the monitor at time index `worst`.
     worst : int
@@ -252,7 +252,7 @@ class MonitorRun(PairFlight):
 
     @property
     def mask(self) -> np.ndarray:
-        """Mask (4,): 1 for parameters that are applied, 0 for the others."""
+        """Mask over d_alpha, d_beta, d_gamma, d_f, (4,): 1 for parameters that are applied, 0 for the others."""
         return np.array([float(name in self.spec.apply) for name in PARAMETERS])
 
     def height(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -261,21 +261,21 @@ class MonitorRun(PairFlight):
         return np.asarray(np.sum(heights, axis=0))
 
     def variance(self, covariance: np.ndarray, at: int | None = None) -> np.ndarray:
-        """Return the variance (S,) of the mean height by the pair's values, in m^2.
+        """Return the variance of the mean height due to the pair's parameters, for S covariances, (S,), in m^2.
 
         Parameters
         ----------
         covariance : (S, 8, 8) ndarray
-            Covariance of the pair's values.
+            Covariances of the 8 parameters of the pair, in rad and m.
         at : int, optional
-            Index of the time to which all of them belong; None for one at each time.
+            Index of the time to which all covariances belong; None for one covariance at each time.
         """
         both = np.concatenate([self.slopes[n] * self.mask for n in self.pair], axis=1)
         slope = both if at is None else both[at]
         return np.asarray(np.einsum("...i,...ij,...j->...", slope, covariance, slope))
 
     def applied(self, readings: Readings) -> dict[str, np.ndarray]:
-        """Return the (S, 4) values that correct each camera; 0 for parameters that are not applied."""
+        """Return the values that correct each camera in S states, (S, 4); 0 for parameters that are not applied."""
         return {name: readings[name].vector * self.mask for name in self.pair}
 
     def _interpolated(self, interval: float) -> CaseErrors:
@@ -285,11 +285,12 @@ class MonitorRun(PairFlight):
 
     @cached_property
     def cases(self) -> Mapping[str, CaseErrors]:
-        """Errors by the correction of the cameras.
+        """Errors at the check points for each way of correcting the cameras, by its name.
 
-        none: as calibrated; monitored: at every time; interval: by values interpolated over the file's interval;
-        smoothed: by values smoothed from the same measurements, if there is a prior; parameters: by the true four
-        parameters; true: the true lines. The last two are bounds that no measurement reaches.
+        none: cameras as calibrated; monitored: corrected by the monitor at every time; interval: corrected by values
+        interpolated over the file's interval; smoothed: corrected by values smoothed from the same measurements, if
+        there is a prior; parameters: corrected by the true four parameters; true: the true lines. The last two are
+        bounds that no measurement reaches.
         """
         cases = {
             "none": self.case({name: np.zeros((len(self.times), 4)) for name in self.pair}),
@@ -302,34 +303,34 @@ class MonitorRun(PairFlight):
 
     @cached_property
     def intervals(self) -> Mapping[float, CaseErrors]:
-        """Errors with values interpolated over each interval, in seconds."""
+        """Errors at the check points with interpolated values: interval between measurements, in seconds -> errors."""
         return FrozenMap({interval: self._interpolated(interval) for interval in self.spec.compared})
 
     @cached_property
     def angle(self) -> IntersectionAngleChange:
-        """Changes (T,) of the intersection angle by the monitor."""
+        """Changes of the intersection angle that the monitor measures at T times, with their sigmas."""
         first, second = (self.monitored[name] for name in self.pair)
         return exact(first, second, *self.looks, *self.monitored.across)
 
     @property
     def angle_change(self) -> np.ndarray:
-        """True change (T,) of the intersection angle, in radians."""
+        """True change of the intersection angle since the reference at T times, (T,), in radians."""
         return np.asarray(self.true_angle - self.true_angle[self.spec.reference_index])
 
     @property
     def sigma(self) -> np.ndarray:
-        """Standard deviation (T,) of the mean height, propagated from the noise of the monitor, in metres."""
+        """Standard deviation of the mean height at T times due to the noise of the monitor, (T,), in metres."""
         return np.sqrt(self.variance(self.monitored.noise))
 
     @property
     def sigma_total(self) -> np.ndarray | None:
-        """Standard deviation (T,) of the mean height from the whole error, in metres; None without a prior."""
+        """Standard deviation of the mean height at T times due to all errors, (T,), in metres; None without a prior."""
         total = self.monitored.total
         return None if total is None else np.sqrt(self.variance(total))
 
     @cached_property
     def smoothing(self) -> Mapping[float, Smoothing]:
-        """Heights smoothed from measurements at each interval, in seconds; empty without a prior."""
+        """Heights with smoothed values: interval between measurements, in seconds -> result; empty without a prior."""
         return FrozenMap({interval: self._smoothing(interval) for interval in sorted(self.together)})
 
     @property
@@ -350,7 +351,7 @@ class MonitorRun(PairFlight):
 
     @cached_property
     def parts(self) -> Mapping[str, np.ndarray]:
-        """Parts (T,) of the monitored cameras' mean height error by name, in metres."""
+        """Parts of the corrected cameras' mean height error: name -> (T,) values at T times, in metres."""
 
         def applied(values: Callable[[str], np.ndarray]) -> np.ndarray:
             return self.height({name: self.mask * values(name) for name in self.pair})
@@ -395,7 +396,10 @@ class MonitorRun(PairFlight):
 
     @cached_property
     def scatter(self) -> Scatter:
-        """Heights of repeated measurements, from exact image points, so that only the monitor's noise contributes."""
+        """Scatter of the heights over repeated measurements of the monitor, with exact image points.
+
+        Only the monitor's noise contributes.
+        """
         monitored, heights = self.applied(self.repeated), []
         for row in range(self.spec.repeats):
             pair = [self.calibrated[n].corrected(monitored[n][row]) for n in self.pair]
@@ -418,7 +422,7 @@ class MonitorRun(PairFlight):
         return max(away)
 
     def cause_heights(self, cause: Cause) -> tuple[float, float]:
-        """Return the height errors by one cause, in metres: without monitoring, and by the monitor's misreading."""
+        """Return the height errors due to one cause, in metres: without monitoring, and due to the monitor's error."""
         slopes = {n: self.slopes[n][self.worst] for n in self.pair}
         without = sum(float(-slopes[n] @ cause.truth[n]) for n in self.pair)
         return without, sum(float(slopes[n] @ (self.mask * cause.error[n])) for n in self.pair)
@@ -451,7 +455,7 @@ def run_monitor(setup: MonitorSetup, backend: Backend, seed: int, advance: Advan
 
 
 def simulate_monitoring(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance) -> MonitorRun:
-    """Trace, render and measure the monitored pair over its course.
+    """Trace, render and measure the monitored pair at all times of the test.
 
     Raises
     ------
@@ -526,7 +530,7 @@ def simulate_monitoring(setup: MonitorSetup, backend: Backend, seed: int, advanc
 
 
 def _changes(truths: Sequence[Truth], reference: int) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-    """Return the true changes (T, 4) of each camera since the reference, and its principal distance there.
+    """Return each camera's true changes (T, 4) since the reference at T times, and its principal distance there.
 
     The trace refers changes to the nominal camera; their differences are those between two states except for products
     of two arcseconds, 1e-11 rad.
@@ -543,7 +547,7 @@ def _changes(truths: Sequence[Truth], reference: int) -> tuple[dict[str, np.ndar
 def _causes(
     experiment: MonitorExperiment, spec: OrbitMonitorSpec, monitor: MonitorSeries, worst: int, gain: np.ndarray
 ) -> tuple[Cause, ...]:
-    """Return the effect of each temperature and each motion of the course alone, from the reference to one time.
+    """Return the effect of each single temperature and motion of the file, from the reference to one time.
 
     Parameters
     ----------
@@ -556,7 +560,7 @@ def _causes(
     worst : int
         Index of the time.
     gain : (8, 2 C) ndarray
-        Gain of the estimator at that time.
+        Gain of the estimator for C spots at that time: 8 parameters of the pair, in rad and m, per px.
     """
     assert spec.course is not None
     named = [("temperature", path) for path in spec.course.temperature] + [("motion", path) for path in spec.motion]

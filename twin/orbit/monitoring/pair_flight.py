@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 TOO_FAR = "temperatures and motions that keep the beams on the mirrors and the spots on their CCDs"
 """Remedy where light is lost or a spot cannot be measured."""
 HALF_SPAN = 60.0
-"""Time of the orbit before and after a time of the course that its images cover, in seconds; two views 53 degrees apart
-from 500 km are 70 s apart.
+"""Time of the orbit before and after each time of the test that its images cover, in seconds; two views 53 degrees
+apart from 500 km are 70 s apart.
 """
 _SPARE = 2
 """Number of candidates per ground point; those that a line does not see are dropped."""
@@ -46,12 +46,13 @@ it.
 
 
 _STEP = np.array([ARCSEC, ARCSEC, ARCSEC, 10e-6])
-"""Steps of the derivatives by d_alpha, d_beta, d_gamma (rad) and d_f (m): over them the intersection is linear to 1e-5.
+"""Steps of the derivatives with respect to d_alpha, d_beta, d_gamma (rad) and d_f (m): over them the intersection is
+linear to 1e-5.
 """
 
 
 def rms(values: np.ndarray) -> float:
-    """Return the root mean square."""
+    """Return the root mean square of all elements of an array, in its unit."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
@@ -82,7 +83,7 @@ class View:
 
     Attributes
     ----------
-    ground : (n, 3) ndarray
+    ground : (n, 3) ndarray for n points
         True points, ITRS, in metres.
     exact : tuple of Sightings
         Exact sightings by each true camera of the pair, with the true orbit and attitude.
@@ -106,10 +107,10 @@ class CaseErrors:
     bias : (T,) ndarray
         Mean of the height errors, intersected minus true.
     camera : (T,) ndarray
-        Mean height error by the cameras alone: less that of the true cameras with the same image points, orbit and
-        attitude.
+        Mean height error due to the cameras alone: reduced by that of the true cameras with the same image points,
+        orbit and attitude.
     camera_plan, camera_height : (T,) ndarray
-        RMS over the points of the errors by the cameras alone, in plan and in height.
+        RMS over the points of the errors due to the cameras alone, in plan and in height.
     """
 
     plan: np.ndarray
@@ -131,7 +132,7 @@ class CaseErrors:
 
     @property
     def camera_height_rms(self) -> float:
-        """RMS of the height errors by the cameras alone over all times, in metres."""
+        """RMS of the height errors due to the cameras alone over all times, in metres."""
         return rms(self.camera_height)
 
     @property
@@ -173,27 +174,30 @@ class PairFlight:
         return [self.true_line(name, k) for name in self.pair]
 
     def point_errors(self, changes: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return errors (T, n, 3) of the points, in metres, with calibrated cameras corrected by changes (T, 4)."""
+        """Return errors of n points with calibrated cameras corrected by changes (T, 4), (T, n, 3), in metres.
+
+        The errors are intersected minus true coordinates, east, north and up, at T times; changes are in rad and m.
+        """
         corrected = [[self.calibrated[n].corrected(changes[n][k]) for n in self.pair] for k in range(len(self.times))]
         return np.array([point_errors(pair, view) for pair, view in zip(corrected, self.views, strict=True)])
 
     @cached_property
     def true_errors(self) -> np.ndarray:
-        """Errors (T, n, 3) of the points with the true cameras, in metres, by image points, orbit and attitude."""
+        """Errors (T, n, 3) of n points with the true cameras, due to image points, orbit and attitude, in metres."""
         return np.array([point_errors(self.true_pair(k), view) for k, view in enumerate(self.views)])
 
     def case(self, changes: Mapping[str, np.ndarray]) -> CaseErrors:
-        """Return the errors with cameras corrected by changes; argument as in `point_errors`."""
+        """Return the errors at the check points with calibrated cameras corrected by changes (T, 4), in rad and m."""
         return case_errors(self.point_errors(changes), self.true_errors)
 
     @property
     def true_case(self) -> CaseErrors:
-        """Errors with the true cameras."""
+        """Errors at the check points with the true cameras, which are due to image points, orbit and attitude."""
         return case_errors(self.true_errors, self.true_errors)
 
     @cached_property
     def slopes(self) -> Mapping[str, np.ndarray]:
-        """Derivatives (T, 4) of the mean height by the correction of each camera.
+        """Derivatives of the mean height with respect to the correction of each camera, (T, 4) at T times.
 
         The corrections are d_alpha, d_beta, d_gamma (m/rad) and d_f (m/m). The derivatives are central differences of
         the intersection of exact image points.
@@ -215,7 +219,7 @@ class PairFlight:
 
 
 def in_calibrated_form(line: LineCamera, like: CalibratedLine) -> CalibratedLine:
-    """Return a traced line in the analysis's form, with the axes and principal distance of another."""
+    """Return a traced line in the analysis's form, with the axes and principal distance of the line `like`."""
     return calibrated_line(line, like.axes, like.principal_distance)
 
 
@@ -226,7 +230,7 @@ def traced_pair(experiment: MonitorExperiment, state: State, pair: tuple[str, st
 
 
 def point_errors(cameras: Sequence[CalibratedLine], view: View, exact_data: bool = False) -> np.ndarray:
-    """Return the errors (n, 3) east, north, up of points that two cameras intersect, in metres.
+    """Return the errors east, north, up of n points that two cameras intersect, (n, 3), in metres.
 
     Parameters
     ----------
@@ -247,7 +251,7 @@ def point_errors(cameras: Sequence[CalibratedLine], view: View, exact_data: bool
 
 
 def case_errors(errors: np.ndarray, true: np.ndarray) -> CaseErrors:
-    """Return the summary of a case's errors.
+    """Return RMS and mean of the errors of n points at T times, in all and due to the cameras alone.
 
     Parameters
     ----------
