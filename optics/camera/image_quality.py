@@ -82,8 +82,7 @@ class Wavefront:
 
 
 def _chief(camera: Camera, field: Field) -> tuple[np.ndarray, float]:
-    """Return where the chief ray meets the image plane, (3,), metres, and the distance of the exit pupil upstream,
-    metres.
+    """Return where the chief ray meets the image plane, (3,), and how far upstream the exit pupil lies, both in metres.
 
     The chief ray passes through the middle of the stop.
     """
@@ -167,9 +166,7 @@ def wavefront(camera: Camera, field: Field = (0.0, 0.0), terms: int = 28) -> Wav
 
 
 def _colours(camera: Camera, spectrum: Spectrum | None) -> list[tuple[Camera, float]]:
-    """Return, for each wavelength of a spectrum, the camera in its light and the fraction of the total light that it
-    has.
-    """
+    """Return the camera in light of each wavelength of a spectrum, with the fraction of the total light."""
     shares = {camera.wavelength: 1.0} if spectrum is None else spectrum
     total = sum(shares.values())
     if not total > 0.0 or min(shares.values()) < 0.0:
@@ -252,9 +249,7 @@ def psf(
 
 
 def _pupil(camera: Camera, field: Field, origin: np.ndarray) -> PupilFunction:
-    """Return the exit pupil as seen from a point ``origin`` (3,) of the image plane, without the parts that edges
-    block.
-    """
+    """Return the exit pupil seen from a point ``origin`` (3,) of the image plane, less what edges block."""
     pieces = shadow_pieces(camera, field)
     nodes = disk(VIGNETTED_RINGS if pieces is not None else 12)
     traced = _field_at(camera, field, nodes, origin)

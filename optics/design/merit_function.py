@@ -50,7 +50,7 @@ class Beams:
 
     @property
     def pupil(self) -> np.ndarray:
-        """Pupil coordinates of the N rays of a beam, (N, 2), in units of its radius: chief ray, quadrature nodes, rim."""
+        """Pupil coordinates of a beam's N rays, (N, 2), in units of its radius: chief ray, quadrature nodes, rim."""
         angle = 2.0 * np.pi * np.arange(self.rim) / self.rim
         nodes = np.stack([self.nodes.x, self.nodes.y], axis=-1)
         return np.concatenate([np.zeros((1, 2)), nodes, np.stack([np.cos(angle), np.sin(angle)], axis=-1)])
@@ -86,11 +86,10 @@ class DesignRays:
 
 
 def beam_axes(fields: np.ndarray, bias: complex) -> tuple[np.ndarray, np.ndarray]:
-    """Return the directions (F, 3) of the light of F fields, and two axes (F, 2, 3) in each wavefront, the first near
-    x.
+    """Return the directions (F, 3) of the light of F fields, and two axes (F, 2, 3) of each plane wavefront.
 
-    ``fields`` (F, 2) are angles from the field's centre and ``bias`` is the angle of that centre from the parent
-    axis, in radians. ``bias`` may be complex, to obtain derivatives by a complex step.
+    The first axis is near x. ``fields`` (F, 2) are angles from the field's centre and ``bias`` is the angle of that
+    centre from the parent axis, in radians. ``bias`` may be complex, to obtain derivatives by a complex step.
     """
     x, y = fields[:, 0], fields[:, 1] + bias
     along = np.stack([np.tan(x) + 0.0 * y, np.tan(y), np.ones_like(y)], axis=-1)
@@ -370,7 +369,10 @@ class MeritFunction:
         return Evaluation(*values, d_residuals, d_distance, d_across, d_extents, slopes)
 
     def _errors(self, rays: DesignRays) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-        """Return P residuals (P,), their derivatives by V variables (V, P), and rms errors of F fields (F,), in waves."""
+        """Return P residuals (P,), their derivatives (V, P), and the rms errors (F,) of F fields, in waves.
+
+        The derivatives are with respect to the V variables.
+        """
         nodes = self.beams.nodes
         pupil = slice(1, 1 + nodes.count)
         weight = np.sqrt(nodes.share / len(rays.path))
@@ -410,18 +412,18 @@ class MeritFunction:
 
     @property
     def _focal_ratio(self) -> float:
-        """Required principal distance over pupil diameter, for the unit of spot sizes; 1 where that distance is free."""
+        """Required principal distance over pupil diameter, for the unit of spot sizes; 1 where it is free."""
         distance = self.operands.principal_distance
         return 1.0 if distance is None else distance / self.beams.diameter
 
     def _principal_distance(
         self, rays: DesignRays, prescription: Prescription
     ) -> tuple[float, np.ndarray | None, np.ndarray, np.ndarray | None]:
-        """Return the principal distance f along the line (metres) and the relative departures of its fields from L = f
-        tan W.
+        """Return the principal distance f along the line (metres) and the departures of its fields from L = f tan W.
 
-        L is the distance of a chief ray's image from that of the field's centre, and W the field angle. Four values
-        are returned: f, its derivatives with respect to the variables, the departures, and their derivatives.
+        L is the distance of a chief ray's image from that of the field's centre, and W the field angle; departures are
+        relative to f tan W. Four values are returned: f, its derivatives with respect to the variables, the departures,
+        and their derivatives.
         """
         line = _on_line(self.beams)
         # between (tan x, tan b, 1) and (0, tan b, 1): tan W = tan x cos b, as both have the same part across x
@@ -463,10 +465,9 @@ class MeritFunction:
         return abs(slope), np.sign(slope) * (d_position @ weight)
 
     def _clearance(self, rays: DesignRays, passage: Passage) -> tuple[float, np.ndarray]:
-        """Return the smallest distance in y between a beam segment and a surface's edge, metres, and its derivatives
-        (V,).
+        """Return the smallest distance in y, metres, of a beam segment from a surface's edge, and its derivatives.
 
-        The derivatives are with respect to the V variables.
+        The derivatives (V,) are with respect to the V variables.
         """
         points = rays.points.reshape(len(rays.points), -1, 3)
         edge = int(np.argmax(passage.side * points[passage.surface, :, 1]))

@@ -169,9 +169,7 @@ def _slopes(evaluation: Evaluation, operands: Operands) -> np.ndarray:
 
 
 def _limits(evaluation: Evaluation, operands: Operands) -> list[tuple[str, float]]:
-    """Return the kind and the limit of each constraint: in metres, but for the anamorphism relative to the principal
-    distance.
-    """
+    """Return the kind and the limit of each constraint, in metres; that of the anamorphism is relative."""
     limits = (
         ("principal distance", operands.principal_distance, 1),
         ("anamorphism", operands.anamorphism, 2),
@@ -265,9 +263,7 @@ def descend(
 def _step(
     merit: MeritFunction, start: Prescription, variables: tuple[Variable, ...], iterations: int
 ) -> tuple[Prescription, int, bool]:
-    """Run one constrained least-squares search; return the prescription, the number of Jacobians, and True if it
-    converged.
-    """
+    """Run one constrained least-squares search; return the prescription, the Jacobians used, and whether it converged."""
     size = _sizes(start, variables)
 
     def evaluate(x: np.ndarray, differentiate: bool) -> Sample | None:

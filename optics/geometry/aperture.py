@@ -96,9 +96,7 @@ class Circle:
         return self.numbers().contains(x, y)
 
     def numbers(self, size: Any = 1.0) -> DiskNumbers | RingNumbers:
-        """Return the centre and squared radii that ``contains`` needs, for a body scaled by ``size`` (1 is nominal; or
-        an array).
-        """
+        """Return the centre and squared radii that ``contains`` needs, for a body scaled by ``size`` (1 is nominal)."""
         x, y, square = size * self.centre[0], size * self.centre[1], (size * self.radius) ** 2
         return RingNumbers(x, y, square, (size * self.inner) ** 2) if self.inner else DiskNumbers(x, y, square)
 
@@ -176,9 +174,7 @@ class Rectangle(_HalfSizeShape):
         return self.numbers().contains(x, y)
 
     def numbers(self, size: Any = 1.0) -> RectangleNumbers:
-        """Return the centre and half-widths that ``contains`` needs, for a body scaled by ``size`` (1 is nominal; or an
-        array).
-        """
+        """Return the centre and half-widths that ``contains`` needs, for a body scaled by ``size`` (1 is nominal)."""
         return RectangleNumbers(size * self.centre[0], size * self.centre[1], *self._scaled(size))
 
     def outline(self, points: int = 96) -> np.ndarray:
@@ -210,9 +206,7 @@ class Ellipse(_HalfSizeShape):
         return self.numbers().contains(x, y)
 
     def numbers(self, size: Any = 1.0) -> EllipseNumbers:
-        """Return the centre and semi-axes that ``contains`` needs, for a body scaled by ``size`` (1 is nominal; or an
-        array).
-        """
+        """Return the centre and semi-axes that ``contains`` needs, for a body scaled by ``size`` (1 is nominal)."""
         return EllipseNumbers(size * self.centre[0], size * self.centre[1], *self._scaled(size))
 
     def outline(self, points: int = 96) -> np.ndarray:

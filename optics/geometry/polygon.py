@@ -146,7 +146,7 @@ def padded(polygons: np.ndarray, corners: int) -> np.ndarray:
 
 
 def compact(polygons: np.ndarray) -> np.ndarray:
-    """Return N polygons (N, V, D) of V corners without those corners that coincide, to rounding, with the one before."""
+    """Return N polygons (N, V, D) of V corners, less those that coincide, to rounding, with the corner before."""
     step = polygons[..., :2] - np.roll(polygons[..., :2], 1, axis=1)
     selected = np.hypot(step[..., 0], step[..., 1]) > _COINCIDENT
     return _packed(polygons, selected)

@@ -71,9 +71,7 @@ def rotation_vector(matrix: Any) -> np.ndarray:
 
 
 def about_axis(axis: int, angle: float) -> np.ndarray:
-    """Return the matrix (3, 3) of the rotation through ``angle`` radians about coordinate axis 0, 1 or 2 (right-hand
-    rule).
-    """
+    """Return the rotation matrix (3, 3) for an angle in radians about coordinate axis 0, 1 or 2 (right-hand rule)."""
     vector = np.zeros(3)
     vector[axis] = angle
     return rotation_matrix(vector)

@@ -32,9 +32,7 @@ class SagTerm(Protocol):
     POWERS: ClassVar[Mapping[str, int]]
 
     def sag(self, x: Any, y: Any) -> Any:
-        """Return the height in metres at points x, y (metres), NumPy arrays of one shape; NaN outside the term's
-        domain.
-        """
+        """Return the height in metres at points x, y (metres), NumPy arrays; NaN outside the term's domain."""
         ...
 
     def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
@@ -52,9 +50,7 @@ def scaled_term(term: SagTerm, scale: Any) -> SagTerm:
 
 
 def of_kinds(terms: Sequence[SagTerm], kinds: Sequence[type[SagTerm]]) -> tuple[SagTerm, ...]:
-    """Return one term of each kind, in the order of ``kinds``: the one in ``terms``, or a term of zeros where it is
-    missing.
-    """
+    """Return one term of each kind, in the order of ``kinds``: that in ``terms``, else a term of zeros."""
     by_kind: Mapping[Any, SagTerm] = {type(term): term for term in terms}
     return tuple(by_kind[kind] if kind in by_kind else kind() for kind in kinds)
 

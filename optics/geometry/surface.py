@@ -88,9 +88,7 @@ class GridFigure:
 
     @property
     def numbers(self) -> GridNumbers:
-        """Position, spacing and size of the grid for a kernel; its coefficients ``spline`` come first in the kernel's
-        table.
-        """
+        """Position, spacing and size of the grid for a kernel, whose table begins with the coefficients ``spline``."""
         dx, dy = self.spacing
         rows, columns = self.values.shape
         return GridNumbers(self.bounds[0], self.bounds[2], 1.0 / dx, 1.0 / dy, float(columns), float(rows), 0.0)
@@ -355,8 +353,9 @@ def grid_figure(x: Any, y: Any, grid: GridNumbers, table: Any, active: Any = Tru
 
 
 def _weights(f: Any) -> tuple[list[Any], list[Any]]:
-    """Return the cubic B-spline weights of the four samples -1, 0, 1, 2 at position f between 0 and 1, and their
-    derivatives.
+    """Return the cubic B-spline weights of the four samples -1, 0, 1, 2 at a position f, and their derivatives.
+
+    f lies between 0 and 1.
     """
     e = 1.0 - f
     values = [
@@ -423,9 +422,7 @@ class Surface:
         return replace(self, figure=figure)
 
     def scaled(self, scale: float) -> Surface:
-        """Return the surface with all lengths multiplied by ``scale``, except for the figure error, which stays as it
-        is.
-        """
+        """Return the surface with all lengths multiplied by ``scale``, but the same figure error."""
         even = tuple(a / scale ** (2 * n + 3) for n, a in enumerate(self.even))
         terms = tuple(scaled_term(term, scale) for term in self.terms)
         return replace(self, curvature=self.curvature / scale, even=even, terms=terms)

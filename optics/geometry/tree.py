@@ -402,10 +402,10 @@ def _local_motions(
 
 
 def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
-    """Return the state that applies ``then`` on top of ``first``: in every body's frame a point x goes to
-    first(then(x)).
+    """Return the state that applies ``then`` on top of ``first``.
 
-    Exact for the rigid parts; figures, conic constants and indices add.
+    In every body's frame a point x goes to first(then(x)). Exact for the rigid parts; figures, conic constants and
+    indices add.
 
     Raises
     ------

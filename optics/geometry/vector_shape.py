@@ -381,9 +381,7 @@ def _phasor(k: np.ndarray, position: float) -> np.ndarray:
 
 
 def _wave_numbers(fx: np.ndarray, fy: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
-    """Return wave numbers 2 pi fx and 2 pi fy, rad/m, as arrays of two axes each, and the broadcast shape of the
-    result.
-    """
+    """Return wave numbers 2 pi fx and 2 pi fy, rad/m, as arrays of two axes, and the shape of the result."""
     fx, fy = np.asarray(fx, float), np.asarray(fy, float)
     shape = np.broadcast_shapes(fx.shape, fy.shape)
     if len(shape) > 2:
@@ -394,12 +392,11 @@ def _wave_numbers(fx: np.ndarray, fy: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _polyline(
     curve: Callable[[np.ndarray], np.ndarray], spans: int, point_map: PointMap, tolerance: float
 ) -> np.ndarray:
-    """Return points (N, 2) on the image of a closed curve whose chords deviate from it by at most the tolerance,
-    metres.
+    """Return points (N, 2) on the image of a closed curve, close enough for chords within the tolerance (metres).
 
     ``curve`` maps the parameter 0 <= t < ``spans`` to points and is smooth between integer t. Each span is divided
-    evenly into as few parts as its curvature requires; a chord's distance from the curve falls with the square of
-    their number. It is measured at three points, because a curve with an inflection crosses its chord in the middle.
+    evenly into as few parts as its curvature requires; a chord's distance from the curve falls with the square of their
+    number. It is measured at three points, because a curve with an inflection crosses its chord in the middle.
     """
     if not tolerance > 0.0:
         raise ValueError(f"the tolerance must be positive, found {tolerance}")

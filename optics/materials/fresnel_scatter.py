@@ -59,18 +59,19 @@ _FLAT = 1e-9
 
 @dataclass(frozen=True)
 class Lobe:
-    """Parameters of a lobe for the sampler.
+    """Parameters of a scatter lobe from which directions are drawn; d is the distance from the specular direction.
 
     Attributes
     ----------
     share : float
-        Fraction of the specular power for which a direction is drawn: the integral of the upper bound over d < 2.
+        Fraction of the specular power for which a direction is drawn: the integral of the lobe's upper bound over d <
+        2.
     scale : float
-        Width l, in direction cosines.
+        Width l of the lobe, in direction cosines.
     exponent : float
-        Exponent g.
+        Exponent g of (1 + (d/l)^2)^(-g/2).
     abg : bool
-        True when draws are accepted with the probability of an ABg lobe; False for Harvey-Shack, where all are
+        True when directions are accepted with the probability of an ABg lobe; False for Harvey-Shack, where all are
         accepted.
     """
 
@@ -87,7 +88,7 @@ class Lobe:
 
 @dataclass(frozen=True)
 class ABg:
-    """ABg lobe, f(d) = A / (B + d^g).
+    """ABg lobe: BSDF f(d) = A / (B + d^g), with d the distance from the specular direction in direction cosines.
 
     Raises
     ------
@@ -100,18 +101,18 @@ class ABg:
     g: float
 
     def __post_init__(self) -> None:
-        """Check the numbers and the total."""
+        """Check that the parameters are possible and that the lobe scatters no more than all of the light."""
         if not (self.a > 0.0 and self.b > 0.0 and self.g >= 0.0):
             raise ValueError(f"an ABg lobe needs A > 0, B > 0 and g >= 0, found {self.a}, {self.b}, {self.g}")
         _check_total(self, self._upper(1.0))
 
     def bsdf(self, distance: Any) -> Any:
-        """Return the BSDF f at distances d (NumPy arrays), per steradian."""
+        """Return the BSDF, 1/sr, at distances from the specular direction, in direction cosines (NumPy arrays)."""
         return self.a / (self.b + np.asarray(distance, np.float64) ** self.g)
 
     @property
     def lobe(self) -> Lobe:
-        """Parameters for the sampler.
+        """Parameters from which scattered directions are drawn.
 
         Raises
         ------
@@ -122,18 +123,20 @@ class ABg:
 
     @property
     def _scale(self) -> float:
-        """Width l of the lobe, in direction cosines."""
+        """Width l = B^(1/g) of the lobe, in direction cosines."""
         return self.b ** (1.0 / self.g) if self.g > 0.0 else 1.0
 
     def _upper(self, reach: float) -> float:
-        """Return the integral of the upper bound over d < ``reach``."""
+        """Return the integral of the lobe's upper bound over distances below ``reach``, relative to the specular power."""
         bound = self.a / self.b * _largest_ratio(self.g) if self.g > 0.0 else self.a / (1.0 + self.b)
         return bound * _harvey_integral(self._scale, self.g, reach)
 
 
 @dataclass(frozen=True)
 class HarveyShack:
-    """Harvey-Shack lobe, f(d) = b0 (1 + (d / l)^2)^(s/2), s < 0.
+    """Harvey-Shack lobe: BSDF f(d) = b0 (1 + (d / l)^2)^(s/2) with s < 0, d the distance from the specular direction.
+
+    d and the width l are in direction cosines.
 
     Raises
     ------
@@ -146,22 +149,22 @@ class HarveyShack:
     s: float
 
     def __post_init__(self) -> None:
-        """Check the numbers and the total."""
+        """Check that the parameters are possible and that the lobe scatters no more than all of the light."""
         if not (self.b0 > 0.0 and self.l > 0.0 and self.s <= 0.0):
             raise ValueError(f"a Harvey-Shack lobe needs b0 > 0, l > 0 and s <= 0, found {self.b0}, {self.l}, {self.s}")
         _check_total(self, self._upper(1.0))
 
     def bsdf(self, distance: Any) -> Any:
-        """Return the BSDF f at distances d (NumPy arrays), per steradian."""
+        """Return the BSDF, 1/sr, at distances from the specular direction, in direction cosines (NumPy arrays)."""
         return self.b0 * (1.0 + (np.asarray(distance, np.float64) / self.l) ** 2) ** (0.5 * self.s)
 
     @property
     def lobe(self) -> Lobe:
-        """Parameters for the sampler."""
+        """Parameters from which scattered directions are drawn."""
         return _require_samplable(Lobe(self._upper(MAX_DISTANCE), self.l, -self.s, False))
 
     def _upper(self, reach: float) -> float:
-        """Return the integral over d < ``reach``; the function is its own upper bound."""
+        """Return the integral of the lobe over distances below ``reach``; the lobe is its own upper bound."""
         return self.b0 * _harvey_integral(self.l, -self.s, reach)
 
 
@@ -169,7 +172,10 @@ Scatter = ABg | HarveyShack
 
 
 def total_scatter(scatter: Scatter, sine: float = 0.0) -> float:
-    """Return the total integrated scatter by quadrature, for light that arrives with |beta0| = ``sine`` (0 to 1)."""
+    """Return the total integrated scatter of a lobe, as a fraction of the specular power, by quadrature.
+
+    ``sine`` (0 to 1) is the sine of the angle of incidence.
+    """
     # imported late: scipy takes 0.25 s, and every command imports this module
     from scipy.integrate import quad
 
@@ -188,7 +194,9 @@ def total_scatter(scatter: Scatter, sine: float = 0.0) -> float:
 
 
 def sample_distance(u: Any, scale: Any, exponent: Any) -> Any:
-    """Return a distance d < 2 whose density in the plane is proportional to (1 + (d/l)^2)^(-g/2).
+    """Return a random distance d from the specular direction, for uniform random numbers.
+
+    d is below 2, and its density per area in the plane of direction cosines is proportional to (1 + (d/l)^2)^(-g/2).
 
     Parameters
     ----------
@@ -209,7 +217,7 @@ def sample_distance(u: Any, scale: Any, exponent: Any) -> Any:
 
 
 def lobe_area(scale: float, exponent: float) -> float:
-    """Return the integral of (1 + (d/l)^2)^(-g/2) over d^2 < MAX_DISTANCE^2.
+    """Return the integral of (1 + (d/l)^2)^(-g/2) over the disk of distances d up to ``MAX_DISTANCE``.
 
     The function divided by it is the density of d^2 that ``sample_distance`` draws.
 
@@ -224,9 +232,20 @@ def lobe_area(scale: float, exponent: float) -> float:
 
 
 def acceptance(distance: Any, scale: Any, exponent: Any, abg: Any) -> Any:
-    """Return the probability of accepting a drawn distance; 1 for Harvey-Shack (``abg`` < 0.5).
+    """Return the probability of accepting a random distance, so that accepted ones are distributed like an ABg lobe.
 
-    It is 0.5 or more for usual g.
+    It is 1 for a Harvey-Shack lobe (``abg`` < 0.5), and 0.5 or more for usual exponents.
+
+    Parameters
+    ----------
+    distance : array
+        Distance from the specular direction, in direction cosines.
+    scale : array
+        Width of the lobe, in direction cosines.
+    exponent : array
+        Exponent of the lobe.
+    abg : array
+        1 for an ABg lobe, 0 for a Harvey-Shack lobe.
     """
     x = distance / scale
     half = 0.5 * exponent
@@ -238,18 +257,21 @@ def acceptance(distance: Any, scale: Any, exponent: Any, abg: Any) -> Any:
 
 
 def _largest_ratio(g: float) -> float:
-    """Return the maximum of rho, the ratio of the ABg function to its upper bound's shape."""
+    """Return the largest ratio, over all distances, of an ABg lobe of exponent ``g`` to the shape of its upper bound.
+
+    The ratio is rho = (1 + x^2)^(g/2) / (1 + x^g), with x the distance over the width of the lobe.
+    """
     return float(2.0 ** max(0.5 * g - 1.0, 0.0))
 
 
 def _harvey_integral(scale: float, g: float, reach: float) -> float:
-    """Return the integral of (1 + (d/l)^2)^(-g/2) over the disk d < reach."""
+    """Return the integral of (1 + (d/l)^2)^(-g/2) over the disk of distances d below ``reach``; l is ``scale``."""
     q, level = 1.0 - 0.5 * g, float(np.log1p((reach / scale) ** 2))
     return float(np.pi * scale**2 * (level if abs(q) < _FLAT else np.expm1(q * level) / q))
 
 
 def _require_samplable(lobe: Lobe) -> Lobe:
-    """Return the lobe; raise ValueError if its upper bound integrates to more than 1."""
+    """Return the lobe; raise ValueError if its upper bound integrates to more than the specular power."""
     if lobe.share > 1.0:
         raise ValueError(
             f"the scatter lobe is too strong to be sampled: its upper bound is {lobe.share:.4g} of the light (> 1)"
@@ -267,7 +289,8 @@ def _check_total(scatter: Scatter, upper: float) -> None:
 
 
 STEPS = 90
-"""Number of intervals of the angle of incidence, from 0 to 90 degrees, for which directions are drawn."""
+"""Number of intervals of the angle of incidence, from 0 to 90 degrees, for which a table's distributions are computed.
+"""
 LEAST_RINGS, LEAST_SECTORS = 240, 36
 MOST_CELLS = 120_000
 """Largest number of cells (rings times sectors) of a table."""
@@ -283,12 +306,12 @@ class ScatterTable:
     Attributes
     ----------
     incidence : (I,) ndarray
-        Angles of incidence, ascending, radians.
+        I angles of incidence, ascending, radians.
     azimuth : (A,) ndarray
-        Azimuths, ascending, radians: a single one for a rotationally symmetric lobe, 0 to pi for one symmetric about
-        the plane of incidence, else 0 to 2 pi.
+        A azimuths about the specular direction, ascending, radians: a single one for a rotationally symmetric lobe, 0
+        to pi for one symmetric about the plane of incidence, else 0 to 2 pi.
     radial : (R,) ndarray
-        Radial angles, ascending from 0, radians.
+        R angles away from the specular direction, ascending from 0, radians.
     values : (I, A, R) ndarray
         BSDF, 1/sr.
 
@@ -305,7 +328,7 @@ class ScatterTable:
     values: np.ndarray
 
     def __post_init__(self) -> None:
-        """Copy, freeze and check."""
+        """Copy and freeze the arrays, and check them."""
         for name in ("incidence", "azimuth", "radial", "values"):
             array = np.array(getattr(self, name), np.float64)
             array.setflags(write=False)
@@ -380,7 +403,7 @@ class ScatterTable:
         return np.where(r <= self.radial[-1] * (1.0 + 1e-12), f, 0.0)
 
     def _at(self, incidence: float) -> np.ndarray:
-        """Return the table at one angle of incidence, (A, R)."""
+        """Return the BSDF at one angle of incidence (radians) for A azimuths and R radial angles, (A, R), 1/sr."""
         position = np.interp(incidence, self.incidence, np.arange(len(self.incidence)))
         k = min(int(position), max(len(self.incidence) - 2, 0))
         w = position - k
@@ -423,7 +446,7 @@ class ScatterTable:
 
     @cached_property
     def sampling(self) -> ScatterSampling:
-        """Distributions from which directions are drawn."""
+        """Cumulative distributions from which scattered directions are drawn."""
         radial, azimuth = self._edges
         share, rings, sectors = [], [], []
         for angle in np.linspace(0.0, 0.5 * np.pi, STEPS + 1):
@@ -436,10 +459,10 @@ class ScatterTable:
         )
 
     def reciprocity(self) -> float:
-        """Return the rms relative difference of f with its directions exchanged; 0 for a reciprocal surface.
+        """Return the rms relative change of the BSDF when incident and scattered direction are exchanged.
 
-        It is taken over pairs of directions, distributed evenly over the hemisphere up to 80 degrees from the normal,
-        for which the table covers both; NaN where it covers none.
+        It is 0 for a reciprocal surface, and taken over pairs of directions, distributed evenly over the hemisphere up
+        to 80 degrees from the normal, for which the table covers both; NaN where it covers none.
         """
         rng = np.random.default_rng(1)
         low, high = self.incidence[0], max(self.incidence[-1], self.incidence[0])
@@ -457,9 +480,14 @@ class ScatterTable:
         return round(float(np.sqrt(np.mean(np.square(differences)))), 9) if differences else float("nan")
 
     def _bsdf_between(self, arriving: float, leaving: float, relative: float) -> float | None:
-        """Return the BSDF from one polar angle to another; None outside the table.
+        """Return the BSDF, 1/sr, for given angles of arriving and leaving light; None outside the table.
 
-        ``relative`` is the angle from the plane of incidence on the far side of the normal, radians.
+        Parameters
+        ----------
+        arriving, leaving : float
+            Angles of the arriving and of the leaving light from the surface's normal, radians.
+        relative : float
+            Angle of the leaving light from the plane of incidence on the far side of the normal, radians.
         """
         specular = np.array([np.sin(arriving), 0.0, np.cos(arriving)])
         out = np.array([np.sin(leaving) * np.cos(relative), np.sin(leaving) * np.sin(relative), np.cos(leaving)])
@@ -474,22 +502,22 @@ class ScatterTable:
 
 @dataclass(frozen=True, eq=False)
 class ScatterSampling:
-    """Sampling distributions of a table, for angles of incidence from 0 to 90 degrees in ``STEPS`` intervals.
+    """Distributions of a table's scattered light, for angles of incidence from 0 to 90 degrees in ``STEPS`` intervals.
 
     Attributes
     ----------
     share : (STEPS + 1,) ndarray
-        Total integrated scatter.
+        Total integrated scatter, as a fraction of the incident power.
     rings : (STEPS + 1, rings + 1) ndarray
-        Cumulative shares of the rings, from 0 to 1.
+        Cumulative fractions of the scattered power by ring (interval of the radial angle), from 0 to 1.
     sectors : (STEPS + 1, rings, sectors + 1) ndarray
-        Cumulative shares of the sectors in each ring, from 0 to 1.
+        Cumulative fractions by sector (interval of the azimuth) in each ring, from 0 to 1.
     cosines : (rings + 1,) ndarray
         Cosines of the rings' edges, descending.
     azimuths : (sectors + 1,) ndarray
         Azimuths of the sectors' edges, radians.
     mirrored : bool
-        True when half of the draws go to the other side of the plane of incidence.
+        True when half of the directions go to the other side of the plane of incidence.
     """
 
     share: np.ndarray
@@ -501,7 +529,10 @@ class ScatterSampling:
 
 
 def _interpolated(table: np.ndarray, knots: int, cells: int, fraction: float) -> np.ndarray:
-    """Return values (N, knots), linear between knots, at a relative position in each of the cells, (N, cells)."""
+    """Return values of N functions, linear between knots, at the same relative position in every cell, (N, cells).
+
+    ``table`` (N, knots) holds the values at the knots, and ``fraction`` is the position in a cell, 0 to 1.
+    """
     if knots == 1:
         return np.broadcast_to(table, (len(table), cells))
     position = (np.arange(cells) + fraction) * (knots - 1) / cells
@@ -511,7 +542,7 @@ def _interpolated(table: np.ndarray, knots: int, cells: int, fraction: float) ->
 
 
 def _cumulative(power: np.ndarray) -> np.ndarray:
-    """Return cumulative shares along the last axis, (N, K + 1), from 0 to exactly 1.
+    """Return the cumulative fractions of N distributions of K powers, (N, K + 1), from 0 to exactly 1.
 
     They are uniform where there is no power.
     """
@@ -547,14 +578,31 @@ def cosine_after(cosine: Any, before: Any, after: Any) -> Any:
 def reflectance(cosine: Any, before: Any, after: Any) -> Any:
     """Return the Fresnel reflectance for unpolarised light, 0 to 1; exactly 1 beyond the critical angle.
 
-    Arguments as for ``cosine_after``. The rest of the light is transmitted.
+    The rest of the light is transmitted.
+
+    Parameters
+    ----------
+    cosine : float or array
+        Cosine of the angle of incidence, 0 to 1; float, NumPy or Dr.Jit array, as the other arguments.
+    before : float or array
+        Refractive index on the side of the incident light.
+    after : float or array
+        Refractive index on the side of the refracted light.
     """
     s, p = _polarised(cosine, before, after)
     return 0.5 * (s + p)
 
 
 def _polarised(cosine: Any, before: Any, after: Any) -> tuple[Any, Any]:
-    """Return the Fresnel reflectances of s and of p polarised light; arguments as for ``cosine_after``."""
+    """Return the Fresnel reflectances of light polarised perpendicular (s) and parallel (p) to the plane of incidence.
+
+    Parameters
+    ----------
+    cosine : float or array
+        Cosine of the angle of incidence, 0 to 1.
+    before, after : float or array
+        Refractive indices on the side of the incident and of the refracted light.
+    """
     cosine = select(cosine > GRAZING, cosine, 0.0 * cosine + GRAZING)
     bent = cosine_after(cosine, before, after)
     s = (before * cosine - after * bent) / (before * cosine + after * bent)
@@ -607,34 +655,34 @@ def fresnel(angle: ArrayLike, before: float, after: float) -> tuple[np.ndarray, 
 
 @dataclass(frozen=True)
 class Finish:
-    """Optical finish of one side of a surface.
+    """Optical properties of one side of a surface: the fractions of light that it reflects, transmits and scatters.
 
     Attributes
     ----------
     reflectance : float
-        Reflected share, specular or into the scatter lobe around the specular direction.
+        Fraction that is reflected, in the specular direction or into the scatter lobe about it.
     transmission : float
-        Transmitted (refracted) share; beyond the critical angle all of it is reflected instead.
+        Fraction that is transmitted (refracted); beyond the critical angle all of it is reflected instead.
     diffuse : float
-        Share diffused by Lambert's law to the side the light came from.
+        Fraction scattered by Lambert's law to the side that the light came from.
     scatter : ABg or HarveyShack, optional
-        Lobe around the specular and the refracted direction, which takes its share out of them.
+        Lobe about the specular and the refracted direction; its light is taken from these two.
     bare : bool
         True for bare glass: reflectance and transmission follow Fresnel's formulas and must be given as 0.
     records : bool
         True when the absorbed light counts as detected.
     coating : CoatingTable, optional
-        Measured coating, in place of reflectance and transmission; light is transmitted where transmission is not 0.
+        Measured coating, instead of reflectance and transmission; light is transmitted where transmission is not 0.
     table : ScatterTable, optional
-        Measured scattering about the specular direction, in place of ``scatter``; it is taken out of the reflected
-        share.
+        Measured scattering about the specular direction, instead of ``scatter``; its light is taken from the reflected
+        fraction.
     scattered_only : bool
         True when only the table's scattered light is reflected; reflectance is then given as 0.
 
     Raises
     ------
     ValueError
-        The shares are impossible.
+        A fraction is negative, or they add up to more than 1.
     """
 
     reflectance: float = 0.0
@@ -648,7 +696,7 @@ class Finish:
     scattered_only: bool = False
 
     def __post_init__(self) -> None:
-        """Check the shares."""
+        """Check that the fractions are possible together."""
         self._check_table()
         shares = (self.reflectance, self.transmission, self.diffuse)
         if min(shares) < 0.0 or sum(shares) > 1.0 + 1e-12:
@@ -681,7 +729,11 @@ class Finish:
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """Reflectance, transmission, bare, diffuse, and the lobe's share, scale, exponent and kind."""
+        """Numbers for the path tracer.
+
+        They are reflectance, transmission, 1 for bare glass, diffuse fraction, and share, scale, exponent and kind of
+        the lobe.
+        """
         lobe = (0.0, 1.0, 2.0, 0.0) if self.scatter is None else self.scatter.lobe.numbers
         return (self.reflectance, self.transmission, float(self.bare), self.diffuse, *lobe)
 
@@ -689,8 +741,8 @@ class Finish:
 POLISH = ABg(2.0e-6, 1.0e-6, 2.0)
 """Scatter of a polished mirror of about 1 nm rms roughness: total integrated scatter 9e-5.
 
-(4 pi sigma / lambda) squared would be 3.7e-4 at 650 nm over all spatial periods; about a quarter of it falls into the
-angles that the lobe covers.
+The formula (4 pi roughness / wavelength) squared would give 3.7e-4 at 650 nm over all spatial periods; about a quarter
+of it falls into the angles that the lobe covers.
 """
 
 PAINT = ABg(5.0e-3, 0.1, 2.0)
@@ -730,7 +782,7 @@ class CoatingTable:
     Attributes
     ----------
     angles : (K,) ndarray
-        Angles of incidence on the side of air, ascending from 0, radians.
+        K angles of incidence on the side of air, ascending from 0, radians.
     reflectance : (K,) ndarray
         Reflectance, 0 to 1.
     transmittance : (K,) ndarray, optional
@@ -739,7 +791,7 @@ class CoatingTable:
     Raises
     ------
     ValueError
-        Angles do not ascend, or shares are impossible.
+        Angles do not ascend, or reflectance and transmittance are impossible.
     """
 
     angles: np.ndarray
@@ -747,7 +799,7 @@ class CoatingTable:
     transmittance: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        """Copy, freeze and check."""
+        """Copy and freeze the arrays, and check them."""
         names = ("angles", "reflectance", *(("transmittance",) if self.transmittance is not None else ()))
         for name in names:
             array = np.array(getattr(self, name), np.float64)
@@ -769,7 +821,7 @@ class CoatingTable:
         angle : float
             Angle of incidence, radians.
         through : bool
-            True when light is transmitted; without a known transmittance all that is not reflected is.
+            True when light is transmitted; if the transmittance is not known, all light that is not reflected is.
         """
         reflected = float(np.interp(angle, self.angles, self.reflectance))
         if not through:
@@ -779,8 +831,8 @@ class CoatingTable:
         return reflected, float(np.interp(angle, self.angles, self.transmittance))
 
     def sampled(self, through: bool) -> np.ndarray:
-        """Return reflectance and transmittance from 0 to 90 degrees, (COATING_STEPS + 1, 2).
+        """Return reflectance and transmittance at even steps from 0 to 90 degrees, (COATING_STEPS + 1, 2).
 
-        ``through`` is as for ``at``.
+        ``through`` is True when light is transmitted.
         """
         return np.array([self.at(float(angle), through) for angle in np.linspace(0.0, 0.5 * np.pi, COATING_STEPS + 1)])

@@ -58,7 +58,7 @@ class ThermalDispersion:
     known: TemperatureRange = SCHOTT_RANGE
 
     def change(self, index: float, wavelength_m: float, temperature_k: float) -> float:
-        """Return the change of the absolute index from 20 C to a temperature.
+        """Return the change of the refractive index in vacuum from 20 C to another temperature.
 
         Parameters
         ----------
@@ -75,7 +75,17 @@ class ThermalDispersion:
         return (index * index - 1.0) / (2.0 * index) * polynomial
 
     def slope(self, index: float, wavelength_m: float, temperature_k: float) -> float:
-        """Return the derivative of ``change`` by temperature, 1/K; arguments as there."""
+        """Return the derivative of the refractive index in vacuum with respect to temperature, 1/K.
+
+        Parameters
+        ----------
+        index : float
+            Index at 20 C.
+        wavelength_m : float
+            Wavelength, metres.
+        temperature_k : float
+            Temperature of the glass, kelvin, inside ``known``.
+        """
         t, w2 = temperature_k - REFERENCE_TEMPERATURE, (wavelength_m * 1e6) ** 2
         slope = self.d0 + 2.0 * self.d1 * t + 3.0 * self.d2 * t**2
         slope += (self.e0 + 2.0 * self.e1 * t) / (w2 - self.lambda_tk**2)
@@ -88,12 +98,12 @@ class _IndexByTemperature:
     name: str
 
     def _at_reference(self, wavelength_m: float) -> float:
-        """Return the index relative to air at the reference temperature. Raises UnphysicalError out of its range."""
+        """Return the index relative to air at 20 C; raise UnphysicalError for a wavelength outside the formula's range."""
         raise NotImplementedError
 
     @property
     def _dispersion(self) -> ThermalDispersion | None:
-        """Constants of dn/dT, None where they are not known."""
+        """Constants of the index's change with temperature (dn/dT); None where they are not known."""
         raise NotImplementedError
 
     def index(self, wavelength_m: float, temperature_k: float = REFERENCE_TEMPERATURE) -> float:
@@ -122,18 +132,45 @@ class _IndexByTemperature:
         return n + self._constants(temperature_k).change(n, wavelength_m, temperature_k)
 
     def vacuum_index(self, wavelength_m: float, temperature_k: float = REFERENCE_TEMPERATURE) -> float:
-        """Return the absolute refractive index, for glass in vacuum; arguments and errors are those of ``index``."""
+        """Return the absolute refractive index, for glass in vacuum.
+
+        Parameters
+        ----------
+        wavelength_m : float
+            Wavelength in air, metres.
+        temperature_k : float
+            Temperature of the glass, kelvin.
+
+        Raises
+        ------
+        ValueError
+            The wavelength or the temperature is outside the formula's range, or the glass has no temperature constants
+            and the temperature is not 293.15 K.
+        """
         at_reference = self.index(wavelength_m)
         change = self.index(wavelength_m, temperature_k) - at_reference
         return at_reference * air_index(wavelength_m) + change
 
     def dn_dt(self, wavelength_m: float, temperature_k: float = REFERENCE_TEMPERATURE) -> float:
-        """Return the derivative of the absolute index by temperature, 1/K; errors as ``index``."""
+        """Return the derivative of the absolute refractive index with respect to temperature, 1/K.
+
+        Parameters
+        ----------
+        wavelength_m : float
+            Wavelength in air, metres.
+        temperature_k : float
+            Temperature of the glass, kelvin.
+
+        Raises
+        ------
+        ValueError
+            The wavelength or the temperature is outside the formula's range, or the glass has no temperature constants.
+        """
         n = self.index(wavelength_m)
         return self._constants(temperature_k).slope(n, wavelength_m, temperature_k)
 
     def _constants(self, temperature_k: float) -> ThermalDispersion:
-        """Return the constants of dn/dT. Raise UnphysicalError where they are unknown or not valid there."""
+        """Return the constants of dn/dT; raise UnphysicalError where they are unknown or not valid at the temperature."""
         known = self._dispersion
         if known is None:
             raise UnphysicalError(f"{self.name}: no constants for the change of its index with temperature are known")
@@ -188,7 +225,7 @@ class Glass(_IndexByTemperature):
 
 @dataclass(frozen=True)
 class WarmGlass:
-    """Thermal properties of the glass of a lens at one wavelength.
+    """Properties of a lens's glass at one wavelength that depend on temperature: its size and its refractive index.
 
     Attributes
     ----------
@@ -214,12 +251,12 @@ class WarmGlass:
     thermal: ThermalDispersion
 
     def change(self, start_k: float, end_k: float) -> float:
-        """Return the change of the absolute index from one temperature to another, in kelvin."""
+        """Return the change of the absolute refractive index between two temperatures given in kelvin."""
         start, end = (self.thermal.change(self.index, self.wavelength, t) for t in (start_k, end_k))
         return end - start
 
     def slope(self, temperature_k: float) -> float:
-        """Return the derivative of the absolute index by temperature, 1/K."""
+        """Return the derivative of the absolute refractive index with respect to temperature, 1/K."""
         return self.thermal.slope(self.index, self.wavelength, temperature_k)
 
 
@@ -262,7 +299,7 @@ GLASSES: Mapping[str, Glass] = FrozenMap({g.name: g for g in (FUSED_SILICA, N_BK
 
 
 def glass(name: str) -> Glass:
-    """Return the built-in glass of a name; case does not matter.
+    """Return the built-in glass of the given name; case does not matter.
 
     Raises
     ------
@@ -280,24 +317,24 @@ ABBE_LINES = (587.5618e-9, 486.1327e-9, 656.2725e-9)
 
 
 def _powers(c: Sequence[float], w: float, exponents: Sequence[int]) -> float:
-    """Return the index n with n^2 = sum c_k w^e_k."""
+    """Return the index n at wavelength ``w`` (um) from n^2 = sum of c_k w^e_k, with coefficients c and exponents e."""
     return sqrt(sum(a * w**e for a, e in zip(c, exponents, strict=False)))
 
 
 def _sellmeier(c: Sequence[float], w: float, start: float = 1.0) -> float:
-    """Return the index n with n^2 = start + sum B w^2 / (w^2 - C) over pairs B, C."""
+    """Return the index n at wavelength ``w`` (um) from n^2 = start + sum of B w^2 / (w^2 - C) over pairs B, C in ``c``."""
     w2 = w * w
     return sqrt(start + sum(b * w2 / (w2 - d) for b, d in zip(c[0::2], c[1::2], strict=False) if b))
 
 
 def _herzberger(c: Sequence[float], w: float) -> float:
-    """Return the index by Herzberger's formula."""
+    """Return the index at wavelength ``w`` (um) by Herzberger's dispersion formula with coefficients ``c``."""
     ell = 1.0 / (w * w - 0.028)
     return c[0] + c[1] * ell + c[2] * ell**2 + c[3] * w**2 + c[4] * w**4 + c[5] * w**6
 
 
 def _sellmeier_2(c: Sequence[float], w: float) -> float:
-    """Return the index by the formula Sellmeier 2 of AGF files."""
+    """Return the index at wavelength ``w`` (um) by the formula "Sellmeier 2" of AGF files with coefficients ``c``."""
     w2 = w * w
     return sqrt(1.0 + c[0] + c[1] * w2 / (w2 - c[2] ** 2) + c[3] / (w2 - c[4] ** 2))
 
@@ -356,7 +393,7 @@ class CatalogueGlass(_IndexByTemperature):
     source: str = ""
 
     def __call__(self, wavelength: float) -> float:
-        """Return the index relative to air.
+        """Return the refractive index relative to air at a wavelength, metres.
 
         Raises
         ------

@@ -13,13 +13,16 @@ from optics.numerics.number_tree import FrozenMap
 
 
 class UnknownNameError(KeyError, ValueError):
-    """A name that no catalogue has; the message lists those that are allowed."""
+    """Name that is not in a catalogue; the message lists the names that are allowed."""
 
     __str__ = ValueError.__str__
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
-    """Return an error that names the nearest known name and lists all of them."""
+    """Return the error for an unknown name, whose message gives the nearest known name and lists all known ones.
+
+    ``kind`` says what is named, e.g. a glass.
+    """
     names = sorted(known)
     by_lower = {n.lower(): n for n in names}
     near = get_close_matches(name.lower(), by_lower, n=1, cutoff=0.4)
@@ -228,7 +231,7 @@ _OTHER_NAMES: Mapping[str, str] = FrozenMap(
 
 
 def material(name: str) -> Material:
-    """Return the built-in material of a name; case does not matter, and BK7 is N-BK7.
+    """Return the built-in material of the given name; case does not matter, and BK7 is N-BK7.
 
     Raises
     ------

@@ -28,22 +28,22 @@ def _is_numpy(x: Any) -> bool:
 
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the matrix product of stacks (..., M, K) and (..., K, N), with a fixed order of summation."""
+    """Return products of M x K with K x N matrices, (..., M, K) and (..., K, N), with a fixed order of summation."""
     return np.asarray(np.einsum("...ij,...jk->...ik", a, b))
 
 
 def matvec(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return matrices (..., M, K) times vectors (..., K), with a fixed order of summation."""
+    """Return products of M x K matrices (..., M, K) with vectors (..., K), with a fixed order of summation."""
     return np.asarray(np.einsum("...ij,...j->...i", matrix, vector))
 
 
 def inner(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return scalar products of vectors (..., K), with a fixed order of summation."""
+    """Return scalar products of pairs of vectors with K components (..., K), with a fixed order of summation."""
     return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
 def norm(vector: np.ndarray) -> np.ndarray:
-    """Return lengths of vectors (..., K), with a fixed order of summation."""
+    """Return lengths of vectors with K components (..., K), with a fixed order of summation."""
     return np.asarray(np.sqrt(inner(vector, vector)))
 
 
@@ -99,8 +99,8 @@ def select(mask: Any, a: Any, b: Any) -> Any:
 ROUNDING = 1e-6
 """Tolerance of ``in_span``, in seconds, lines or pixels: files write times to the microsecond.
 
-A low satellite moves by 8 mm in a microsecond, over which a curve through its readings is smooth, so that the tolerance
-costs no accuracy.
+A low satellite moves by 8 mm in a microsecond, over which a curve through its measured positions is smooth, so that the
+tolerance costs no accuracy.
 """
 _DIGITS = 1e-15
 """Relative tolerance of an end far from zero: nine units in the last place."""
@@ -235,10 +235,10 @@ def check_close(
 def _worst_beyond(
     values: np.ndarray | float, others: np.ndarray | float, limit: float, measure: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[float, float] | None:
-    """Return the pair of values whose difference exceeds the limit most, or None.
+    """Return the pair (value, other) whose difference exceeds the limit most, or None if none exceeds it.
 
-    ``measure`` maps the difference (value - other) to what is compared with the limit. A pair with a NaN counts as
-    within the limit.
+    ``measure`` is a function of the differences (value - other) whose result is compared with the limit. A pair with a
+    NaN counts as within the limit.
     """
     value, other = np.broadcast_arrays(np.asarray(values, dtype=np.float64), np.asarray(others, dtype=np.float64))
     with np.errstate(invalid="ignore"):
@@ -250,11 +250,12 @@ def _worst_beyond(
 
 
 def covariance_root(covariance: np.ndarray) -> np.ndarray:
-    """Return a matrix G (M, M) with G G' = covariance (M, M), a positive semidefinite matrix.
+    """Return a matrix G (M, M) with G G' = covariance, to draw M correlated random numbers as G times independent ones.
 
-    G is the standard deviations times the symmetric root of the correlation matrix, so that uncorrelated numbers are
-    drawn independently, each in its unit. It depends continuously on the covariance, whatever its rank. Eigenvectors
-    alone do not: those of equal eigenvalues are determined by rounding, and every processor would draw other numbers.
+    The covariance (M, M) is positive semidefinite. G is the standard deviations times the symmetric root of the
+    correlation matrix, so that uncorrelated numbers are drawn independently, each in its unit. It depends continuously
+    on the covariance, whatever its rank. Eigenvectors alone do not: those of equal eigenvalues are determined by
+    rounding, and every processor would draw other numbers.
     """
     sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     safe = np.where(sigma > 0.0, sigma, 1.0)

@@ -182,7 +182,7 @@ def default_backend() -> Backend:
 
 @cache
 def _controller() -> ThreadpoolController:
-    """Return the controller of the BLAS thread pools."""
+    """Return the object that sets the number of threads of the BLAS libraries in this process."""
     # imported late, so that a bad input file is reported before anything is computed
     from threadpoolctl import ThreadpoolController
 
@@ -239,7 +239,7 @@ ONE_THREAD = {
     "MKL_NUM_THREADS": "1",
     "NUMEXPR_NUM_THREADS": "1",
 }
-"""Environment of a worker process."""
+"""Environment variables of a worker process, so that it and its linear algebra run on one thread."""
 
 
 def cores() -> int:

@@ -29,16 +29,16 @@ _MIN_GAIN_RATIO = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Residuals (R) and constraints (C) at one point of the V variables.
+    """Residuals and constraints at one point x, a vector of V variables.
 
     Attributes
     ----------
     residuals : (R,) ndarray
-        Residuals.
+        R residuals, the sum of whose squares is minimised.
     constraints : (C,) ndarray
-        Constraints; fulfilled where zero (equations) or not positive (inequalities).
+        C constraints; fulfilled where zero (equations) or not positive (inequalities).
     d_residuals, d_constraints : ndarray, optional
-        Derivatives (R, V) and (C, V); None where they were not requested.
+        Derivatives (R, V) and (C, V) with respect to the variables; None where they were not requested.
     """
 
     residuals: np.ndarray
@@ -54,7 +54,7 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Result of a constrained least-squares search.
+    """Result of a constrained least-squares search over V variables with C constraints.
 
     Attributes
     ----------
@@ -63,8 +63,8 @@ class Solution:
     sample : Sample
         Residuals and constraints there, with derivatives.
     multipliers : (C,) ndarray
-        Lagrange multipliers, not negative for inequalities: decrease of the cost per unit by which a constraint is
-        relaxed.
+        Lagrange multipliers, not negative for inequalities: decrease of the cost (half the sum of squared residuals)
+        per unit by which a constraint is relaxed.
     converged : bool
         True when no further step improves the solution; False when the iterations were used up.
     jacobians : int
@@ -83,7 +83,7 @@ Evaluate = Callable[[np.ndarray, bool], Sample | None]
 
 
 def violations(constraints: np.ndarray, equal: np.ndarray) -> np.ndarray:
-    """Return the violations of constraints (C,), not negative; ``equal`` (C,) is the mask of equations."""
+    """Return by how much C constraints (C,) are violated, not negative; ``equal`` (C,) is the mask of the equations."""
     return np.where(equal, np.abs(constraints), np.maximum(constraints, 0.0))
 
 
@@ -97,12 +97,12 @@ def constrained_least_squares(
     tolerance: float = 1e-8,
     constraint_tolerance: float = 1e-8,
 ) -> Solution:
-    """Minimise a sum of squares under constraints, from a starting point.
+    """Minimise a sum of squares of V variables under C constraints, from a starting point.
 
     Parameters
     ----------
     evaluate : callable
-        Residuals and constraints at a point (``Evaluate``).
+        Function (x, with derivatives or not) -> ``Sample`` at x, or None where there is none.
     start : (V,) ndarray
         Starting point, between the bounds.
     equal : (C,) ndarray of bool
@@ -173,7 +173,7 @@ def constrained_least_squares(
 
 
 def _merit(sample: Sample | None, equal: np.ndarray, penalty: float) -> float:
-    """Return the cost plus penalised violations; infinite where there is no sample."""
+    """Return the cost plus ``penalty`` times the violations; infinite where there is no sample."""
     if sample is None or not np.all(np.isfinite(sample.residuals)):
         return np.inf
     return sample.cost + penalty * float(violations(sample.constraints, equal).sum())
@@ -181,16 +181,19 @@ def _merit(sample: Sample | None, equal: np.ndarray, penalty: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """Subproblem of one step: damped least squares, min |J p + r|^2 + |D p|^2, under linearised constraints.
+    """Damped linear least-squares problem whose solution is one step of the search, under linearised constraints.
+
+    It minimises |J p + r|^2 + |D p|^2 over the step p of V variables, with R residuals r, their Jacobian J (R, V), the
+    diagonal damping D, and C constraints.
 
     Attributes
     ----------
     sample : Sample
         Sample at which the step begins.
     triangle : (V, V) ndarray
-        R of the QR decomposition of J stacked on D.
+        Triangular factor of the QR decomposition of J stacked on D.
     basis : (R, V) ndarray
-        Rows of its Q that belong to J.
+        Rows of its orthogonal factor Q that belong to J.
     equal : (C,) ndarray of bool
         Mask of the constraints that are equations.
     room : (ndarray, ndarray)
@@ -207,7 +210,10 @@ class _Model:
     def of(
         cls, sample: Sample, widths: np.ndarray, damping: float, equal: np.ndarray, room: tuple[np.ndarray, np.ndarray]
     ) -> _Model:
-        """Return the subproblem at a sample; ``widths`` (V,) are the largest norms of the Jacobian's columns so far."""
+        """Return the damped linear problem at a sample.
+
+        ``widths`` (V,) are the largest norms of the Jacobian's V columns so far, to which the damping is relative.
+        """
         assert sample.d_residuals is not None
         most = widths.max(initial=0.0)
         damp = np.sqrt(damping) * np.maximum(widths, 1e-8 * most if most > 0.0 else 1.0)
@@ -216,15 +222,17 @@ class _Model:
 
     @property
     def slopes(self) -> np.ndarray:
-        """Derivatives of the constraints, (C, V)."""
+        """Derivatives (C, V) of the C constraints with respect to the V variables."""
         assert self.sample.d_constraints is not None
         return self.sample.d_constraints
 
     def solve(self, residuals: np.ndarray, constraints: np.ndarray, fraction: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the step (V,) and the multipliers (C,) for residuals and constraints at its start.
+        """Return the step (V,) and the Lagrange multipliers (C,) for given residuals and constraints at its start.
 
-        With R p = z - q, where q is Q^T r, it is the shortest z that removes a ``share`` of the violations: equations
-        by their pseudoinverse, inequalities G z <= h by the dual, y >= 0 with least |G^T y|^2 / 2 + h y.
+        ``fraction`` is the fraction of the violations that the step has to remove. With R p = z - q, where R is
+        ``triangle``, p the step and q the residuals times the transpose of ``basis``, the shortest z is computed: for
+        equations by their pseudoinverse, for inequalities G z <= h by the dual problem, the y >= 0 with the smallest
+        |G^T y|^2 / 2 + h y.
         """
         low, high = self.room
         eye = np.eye(len(low))

@@ -48,7 +48,7 @@ def entries() -> tuple[Entry, ...]:
 
 
 class ExtensionTable(UserDict[str, Value]):
-    """Table of this program, extended by the entries of other distributions.
+    """Table of named values of this program, to which other installed distributions can add entries.
 
     Other distributions are searched when the table is first read, and an entry is imported when its value is requested:
     neither the program's start nor a broken entry that nobody requests costs anything.

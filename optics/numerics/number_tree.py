@@ -49,7 +49,7 @@ def leaves(tree: Any) -> dict[Path, Any]:
 
 
 def _collect(tree: Any, path: Path, out: dict[Path, Any]) -> None:
-    """Add the leaves of a tree to ``found``, with ``path`` before their own paths."""
+    """Add the numbers of a tree to ``out`` (path -> number); their paths begin with ``path``."""
     if tree is None:
         return
     if isinstance(tree, tuple):
@@ -65,7 +65,7 @@ def _collect(tree: Any, path: Path, out: dict[Path, Any]) -> None:
 
 
 def form_of(tree: Tree) -> Tree:
-    """Return the tree with each number replaced by its index in ``numbers_in``."""
+    """Return the tree with each number replaced by its index in the list of all its numbers (``numbers_in``)."""
     indices = count()
     return map_leaves(lambda number: next(indices), tree)
 
@@ -103,7 +103,7 @@ def map_leaves(function: Callable[..., Any], tree: Tree, *others: Any) -> Tree:
 
 
 def _mapped(function: Callable[..., Any], tree: Any, others: tuple[Any, ...]) -> Any:
-    """Return ``map_leaves`` of a branch."""
+    """Return a branch of a tree with the function applied to each leaf and to the corresponding leaves of the others."""
     if tree is None:
         return None
     if not others:
@@ -122,7 +122,7 @@ def _mapped(function: Callable[..., Any], tree: Any, others: tuple[Any, ...]) ->
 
 
 def _mapped_alone(function: Callable[[Any], Any], tree: Any) -> Any:
-    """Map the leaves of one tree.
+    """Return a tree with the function applied to each leaf.
 
     Every trace does this for hundreds of numbers, most of which are siblings; hence this fast path.
     """
@@ -141,7 +141,7 @@ def _mapped_alone(function: Callable[[Any], Any], tree: Any) -> Any:
 
 
 def _all(branches: tuple[Any, ...] | None, count: int) -> tuple[Any, ...]:
-    """Return the branches, or ``count`` times None for an absent tuple."""
+    """Return the elements of a branch, or a tuple of ``count`` times None for an absent branch."""
     return (None,) * count if branches is None else branches
 
 

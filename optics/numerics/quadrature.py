@@ -10,14 +10,14 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class PupilNodes:
-    """Quadrature rule over the unit disk or the square [-1, 1]^2.
+    """Quadrature rule of N nodes over the unit disk or the square [-1, 1]^2.
 
     Attributes
     ----------
     x, y : (N,) ndarray
-        Node coordinates.
+        Coordinates of the nodes.
     weight : (N,) ndarray
-        Area weights, summing to the area (pi or 4).
+        Area weights, which sum to the area (pi or 4).
     """
 
     x: np.ndarray
@@ -26,7 +26,7 @@ class PupilNodes:
 
     @property
     def share(self) -> np.ndarray:
-        """Weights of a mean over the pupil, shape (N,), summing to 1."""
+        """Weights of a mean over the pupil, one for each of the N nodes, (N,); they sum to 1."""
         return np.asarray(self.weight / np.sum(self.weight))
 
     @property
@@ -89,8 +89,8 @@ def even_disk(count: int) -> PupilNodes:
     """Return points spread evenly over the unit disk, of equal weight, for integrands that hard edges cut.
 
     They lie on Fermat's spiral, each rotated by the golden angle from the one before (Vogel, Mathematical Biosciences
-    44, 179, 1979): no edge follows a row of them, as one does along the rings of ``disk``. An edge changes the fraction
-    of the points on one side of it by some count^(-3/4).
+    44, 179, 1979): no edge follows a line of many points, as one does along the rings of ``disk``. An edge changes the
+    fraction of the points on one side of it by some count^(-3/4).
     """
     k = np.arange(count)
     r, angle = np.sqrt((k + 0.5) / count), np.pi * (3.0 - np.sqrt(5.0)) * k
@@ -98,13 +98,13 @@ def even_disk(count: int) -> PupilNodes:
 
 
 def disk_for(phase: float) -> PupilNodes:
-    """Return quadrature over the disk for images of a smooth wavefront.
+    """Return quadrature nodes over the disk, enough for images of a smooth wavefront.
 
     Parameters
     ----------
     phase : float
         Largest phase, radians, from the middle to the edge of the pupil at any image point of interest: 2 pi NA r /
-        wavelength for points up to r from the spot's centre.
+        wavelength for points up to r from the spot's centre, with NA the numerical aperture.
 
     Returns
     -------
@@ -124,19 +124,19 @@ def second_disk_for(phase: float) -> PupilNodes:
     Parameters
     ----------
     phase : float
-        Largest phase, radians, as for ``disk_for``.
+        Largest phase from the middle to the edge of the pupil, radians.
     """
     rings, arms = disk_size(phase)
     return disk(rings + 2, arms, rotation=0.5)
 
 
 def disk_size(phase: float) -> tuple[int, int]:
-    """Return the numbers of rings and arms of ``disk_for``.
+    """Return the numbers of rings and of azimuthal arms of the rule ``disk_for``.
 
     Parameters
     ----------
     phase : float
-        Largest phase, radians, as for ``disk_for``.
+        Largest phase from the middle to the edge of the pupil, radians.
     """
     arms = int(np.ceil(phase)) + 10
     return int(np.ceil(0.25 * phase)) + 3, arms + arms % 2
@@ -201,11 +201,11 @@ def gauss_of(points: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.nd
 
 
 def nodes_for(span: float, least: int) -> int:
-    """Return the number of Gauss nodes for exp(i phase) whose phase spans +-``span`` radians, with a smooth amplitude.
+    """Return the number of Gauss nodes needed to integrate exp(i phase) with a smooth amplitude over an interval.
 
-    Gauss' rule for a linear phase needs span / 2 nodes, plus a number that grows like the cube root of the span; with
-    these it is accurate to 1e-8 for spans up to 100. ``least`` is the number of nodes for a constant phase. At F/9 and
-    450 nm the transfer function of a camera with 0.1 waves of aberration is then accurate to 3e-8 within 2 mm of its
-    focus (7 waves at the edge), and to 3e-7 at 5 mm.
+    The phase varies by +-``span`` radians. Gauss' rule for a linear phase needs span / 2 nodes, plus a number that
+    grows like the cube root of the span; with these it is accurate to 1e-8 for spans up to 100. ``least`` is the number
+    of nodes for a constant phase. At F/9 and 450 nm the transfer function of a camera with 0.1 waves of aberration is
+    then accurate to 3e-8 within 2 mm of its focus (7 waves at the edge), and to 3e-7 at 5 mm.
     """
     return least + int(np.ceil(0.5 * span + 2.0 * span ** (1 / 3)))

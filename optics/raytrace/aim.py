@@ -26,7 +26,9 @@ class AimError(PhysicalError, RuntimeError):
 
 @dataclass(frozen=True, eq=False)
 class RayFan:
-    """Two-parameter family of rays for each ray to be aimed: q = (a, b) moves the direction or the launch point.
+    """Family of rays for each of N rays in each of B systems, with two parameters a, b that aim it.
+
+    The parameters move the direction or the launch point.
 
     Attributes
     ----------
@@ -47,7 +49,7 @@ class RayFan:
     moves_position: bool = False
 
     def at(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return launch points and directions for parameters q (B, N, 2)."""
+        """Return launch points and unit directions, (B, N, 3) each, for the parameters (a, b) of each ray, (B, N, 2)."""
         start = self.position if self.moves_position else self.direction
         # component by component, since each is one block of memory
         moved = np.empty((3, *q.shape[:2]))
@@ -93,14 +95,15 @@ def aim(
     systems : SystemBatch
         B systems that end at the target element; apertures are ignored.
     fan : RayFan
-        Families of rays.
+        Families of N rays for each system.
     target : ndarray
         Target x, y on that element, metres at its nominal size, broadcastable to (B, N, 2): points of an aperture,
         which expands with its body.
     start : ndarray, optional
         Initial parameters, broadcastable to (B, N, 2); 0 by default.
     jacobian : ndarray, optional
-        Initial d(hit)/dq, broadcastable to (B, N, 2, 2); by default from differences of size ``step``.
+        Initial derivatives of the intersection (x, y) with respect to the parameters, broadcastable to (B, N, 2, 2); by
+        default from differences of size ``step``.
     tolerance : float
         Largest distance from the target on the element, metres.
     step : float
@@ -111,7 +114,7 @@ def aim(
     q : (B, N, 2) ndarray
         Parameters of the aimed rays.
     jacobian : (B, N, 2, 2) ndarray
-        d(hit)/dq there.
+        Derivatives of the intersection with respect to the parameters there.
 
     Raises
     ------

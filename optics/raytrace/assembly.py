@@ -92,7 +92,7 @@ class Element:
         return self.surface.figure_disk(outer)
 
     def figured(self, motion: Motion) -> Surface:
-        """Return the surface with a motion's changes of radius, conic constant and figure.
+        """Return the surface changed as a motion says: in radius, conic constant and figure.
 
         Raises
         ------
@@ -117,7 +117,7 @@ class Element:
         return surface.with_figure(figure if grid is None else SummedFigure(figure, grid))
 
     def grid_in(self, motion: Motion) -> GridFigure | None:
-        """Return the grid figure of the surface plus that of a motion.
+        """Return the sum of the grid figure of the surface and that of a motion; None without either.
 
         Raises
         ------
@@ -181,7 +181,7 @@ class Assembly:
 
     @cached_property
     def system_cache(self) -> dict[Any, Any]:
-        """Cache of ``optics.raytrace.system.assemble`` for the nominal elements, by its own keys."""
+        """Cache of numbers of the nominal elements, which ``optics.raytrace.system.assemble`` fills and reads."""
         return {}
 
     def index(self, solid: str, motion: Motion = AT_REST) -> float:
@@ -249,7 +249,16 @@ class Assembly:
     def place(
         self, states: Sequence[State] = ({},), step: Sequence[tuple[str, str, int]] | None = None
     ) -> PlacedBodies:
-        """Return the world poses of all bodies for each state; see ``RigidTree.place``."""
+        """Return the world poses of all bodies in each state, with an imaginary step for derivatives if one is given.
+
+        Parameters
+        ----------
+        states : sequence of State
+            S perturbed states.
+        step : sequence of (str, str, int), optional
+            One (body path, kind of motion, axis) per state, to which an imaginary step is added: the imaginary part
+            divided by ``COMPLEX_STEP`` is the derivative.
+        """
         return self.tree.place(states, step)
 
     def nominal_pose(self, body: str) -> Pose:
@@ -258,7 +267,7 @@ class Assembly:
 
 
 def points_to_world(placed: PlacedBodies, body: str, points: np.ndarray) -> np.ndarray:
-    """Return the world positions of material points of a body in each state, (S, P, 3), metres.
+    """Return the world positions of P material points of a body in each of S states, (S, P, 3), metres.
 
     They are complex where ``placed`` is.
 

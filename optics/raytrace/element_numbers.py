@@ -30,7 +30,7 @@ from optics.raytrace.assembly import Assembly, Element, Interaction
 
 @dataclass(frozen=True)
 class Structure:
-    """Properties of one element that determine the code of a kernel."""
+    """Properties of one element that determine the code of a kernel, such as the kind of its surface and interaction."""
 
     interaction: Interaction
     plane: bool
@@ -44,7 +44,7 @@ class Structure:
 
 @dataclass(frozen=True, eq=False)
 class CoordinateNumbers:
-    """One coordinate of a rigid transform: ``shift`` + ``row`` . p, in metres."""
+    """Row of a rigid transform: a point p has the new coordinate ``shift`` + ``row`` . p, in metres."""
 
     shift: Any
     row: tuple[Any, Any, Any]
@@ -52,7 +52,7 @@ class CoordinateNumbers:
 
 @dataclass(frozen=True, eq=False)
 class FrameNumbers:
-    """Rigid transform of points, coordinate by coordinate."""
+    """Rigid transform of points into another frame, as 12 numbers: a shift and a row of the rotation per coordinate."""
 
     x: CoordinateNumbers
     y: CoordinateNumbers
@@ -65,15 +65,15 @@ class FrameNumbers:
 
     @property
     def coordinates(self) -> tuple[CoordinateNumbers, CoordinateNumbers, CoordinateNumbers]:
-        """Numbers of the coordinates x, y and z."""
+        """Shift and row of the rotation for each of the coordinates x, y and z."""
         return self.x, self.y, self.z
 
 
 @dataclass(frozen=True, eq=False)
 class IndexNumbers:
-    """Refractive index of a medium, ``index`` + ``gradient`` . p at p in the element's frame.
+    """Refractive index of a medium: ``index`` + ``gradient`` . p at a point p of the element's frame, metres.
 
-    The gradient is None in a homogeneous medium.
+    The gradient (1/m) is None in a homogeneous medium.
     """
 
     index: Any
@@ -105,7 +105,7 @@ class ElementNumbers:
 
 @dataclass(frozen=True, eq=False)
 class LocalNumbers:
-    """Numbers of an element that do not depend on its pose; fields as in ``ElementNumbers``."""
+    """Numbers of an element that do not depend on its pose: surface, aperture, and the indices on both sides."""
 
     surface: SurfaceNumbers
     aperture: ApertureNumbers | None
@@ -136,7 +136,7 @@ def media_along(chain: Sequence[Element]) -> list[Medium]:
 
 
 def structure_of(elements: Sequence[Element]) -> Structure:
-    """Return the common structure of nominal elements, the i-th ones of several chains."""
+    """Return the structure that serves the nominal elements at the same position of several sequences."""
     grid = any(_known_figure(e) is not None and e.surface.grid_figure is not None for e in elements)
     apertures = [None if e.aperture is None else type(e.aperture.numbers()) for e in elements]
     kinds = {(e.interaction, e.surface.is_plane, kind) for e, kind in zip(elements, apertures, strict=True)}
@@ -170,7 +170,7 @@ def local_numbers_of(
     placed: PlacedBodies,
     step: Sequence[tuple[str, str, int]] | None,
 ) -> LocalNumbers:
-    """Return shape, aperture and indices of an element between two media.
+    """Return shape, aperture and refractive indices of an element between two media, in S states.
 
     Each number has shape (S,), and is complex when a derivative is carried.
     """
@@ -189,7 +189,10 @@ def local_numbers_of(
 def _index_numbers(
     assembly: Assembly, element: Element, medium: Medium, graded: bool, states: Sequence[State], placed: PlacedBodies
 ) -> IndexNumbers:
-    """Return the index (S,) of a medium next to an element, with its gradient in the element's frame if it has one."""
+    """Return the index of a medium next to an element in S states, (S,), and its gradient in the element's frame.
+
+    The gradient is None in a medium without one.
+    """
     if medium.solid is None:
         index = np.full(len(states), medium.index)
         gradient = np.zeros((len(states), 3)) if graded else None
@@ -232,7 +235,7 @@ def _surface_numbers(
 def _figure_numbers(
     element: Element, order: int, states: Sequence[State], step: Sequence[tuple[str, str, int]] | None
 ) -> FigureNumbers:
-    """Return the monomial coefficients of the Zernike figure in each state."""
+    """Return the Zernike figure of an element in each state, as coefficients of x^a y^b up to the degree ``order``."""
     figure = element.figure_disk
     kind = np.float64 if step is None else np.complex128
     table = np.empty((len(states), zernike.triangle_size(order)), kind)
@@ -252,9 +255,9 @@ _NO_GRID = GridFigure(np.zeros((4, 4)), (-1.0, 1.0, -1.0, 1.0))
 
 
 def grid_numbers(elements: Sequence[Element], states: Sequence[State]) -> tuple[GridNumbers, np.ndarray]:
-    """Return the numbers of the grids of the i-th elements of all chains in all states, and their coefficient table.
+    """Return sampling and spline coefficients of the grid figures of elements at one position of all sequences.
 
-    The numbers have shape (chains * states,) each; the one table holds the coefficients of all grids.
+    The sampling numbers have shape (sequences * states,) each; the one table holds the coefficients of all grids.
     """
     first: dict[int, int] = {}
     figures, numbers, tables, length = [], [], [], 0

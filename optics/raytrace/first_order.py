@@ -49,13 +49,13 @@ class FirstOrder:
     Attributes
     ----------
     scale : (B, 2, 2) ndarray
-        d(image x, y)/d(object angle about the two launch axes) with the stop point held, metres per radian: the local
-        principal distance along each axis, for the plane where the image is taken; off-diagonal terms are rotation and
-        anamorphism.
+        Derivative of the image position x, y with respect to the object angle about the two launch axes, with the stop
+        point held, metres per radian: the local principal distance along each axis, for the plane where the image is
+        taken; off-diagonal terms are rotation and anamorphism.
     principal_distance : (B,) ndarray
-        Sqrt|det scale|, metres.
+        Square root of the modulus of the determinant of ``scale``, metres.
     entrance_magnification : (B, 2, 2) ndarray
-        d(stop x, y)/d(launch x, y).
+        Derivative of the position x, y on the stop with respect to that at the launch.
     exit_pupil_distance : (B,) ndarray
         Distance of the exit pupil from the image, upstream along the chief ray, mean over both axes, metres; negative
         when the pupil lies downstream, large when the image space is telecentric.
@@ -104,7 +104,10 @@ def ray_matrix(
 
 
 def first_order(matrix: RayMatrix) -> FirstOrder:
-    """Return chief-ray quantities from the ray matrix, from neighbouring fields through the same stop point."""
+    """Return the first-order quantities about chief rays from their derivatives with respect to the launch.
+
+    They follow from rays of neighbouring field points that pass the same point of the stop.
+    """
     to_stop = -product(inverse(matrix.stop_by_position), matrix.stop_by_angle)
     scale = matrix.image_by_angle + product(matrix.image_by_position, to_stop)
     angle = matrix.direction_by_angle + product(matrix.direction_by_position, to_stop)
@@ -182,12 +185,12 @@ def paraxial(matrix: RayMatrix, before: float, behind: float) -> Paraxial:
 
 
 def equal_area_radius(points: np.ndarray) -> float:
-    """Return the radius of the circle with the area of a closed smooth curve through evenly spaced points (N, 2)."""
+    """Return the radius of the circle that has the area of a closed smooth curve through N evenly spaced points (N, 2)."""
     return float(np.sqrt(enclosed_area(points) / np.pi))
 
 
 def enclosed_area(points: np.ndarray) -> float:
-    """Return the area enclosed by a closed smooth curve through points (N, 2) that are evenly spaced along it.
+    """Return the area enclosed by a closed smooth curve through N points (N, 2) that are evenly spaced along it.
 
     It is the area of the polygon times the ratio of a circle's area to that of its inscribed regular polygon: exact for
     an ellipse.
@@ -206,7 +209,7 @@ def aim_chief_rays(
     transverse: np.ndarray,
     start: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[RayFan, np.ndarray, np.ndarray]:
-    """Aim rays of image points at the centre of the stop.
+    """Aim rays of M image points at the centre of the stop, in each of B systems.
 
     Parameters
     ----------
@@ -228,9 +231,9 @@ def aim_chief_rays(
     fan : RayFan
         Family of the rays.
     q : (B, M, 2) ndarray
-        Parameters of the rays.
+        Parameters of the rays: their tilts from the rough direction about two transverse axes.
     jacobian : (B, M, 2, 2) ndarray
-        Jacobian of the aiming.
+        Derivatives of the position on the stop, metres, with respect to the parameters.
 
     Raises
     ------
@@ -294,7 +297,10 @@ def chief_rays(
 
 @dataclass(frozen=True, eq=False)
 class LineChange:
-    """True change of a line camera against its nominal state, for B states.
+    """True changes of a line camera in B perturbed states against its nominal state.
+
+    The line is what the camera's line CCD images. L is the distance of a point from the centre of the line CCD and W
+    the angle of its chief ray from the line of sight.
 
     Attributes
     ----------
@@ -321,19 +327,20 @@ class LineChange:
 
     @property
     def vector(self) -> np.ndarray:
-        """Changes d_alpha, d_beta, d_gamma (radians) and d_f (metres), (B, 4)."""
+        """Changes d_alpha, d_beta, d_gamma (radians) and d_f (metres) of each of the B states, (B, 4)."""
         return np.stack([self.d_alpha, self.d_beta, self.d_gamma, self.d_f], axis=-1)
 
 
 def line_tangents(
     sight: np.ndarray, position: np.ndarray, camera: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return lines of sight, roll and tangents of a line's view directions, about each state's own line of sight.
+    """Return the lines of sight, the rolls, and the tangents of the view angles along the imaged line, for S states.
 
     Parameters
     ----------
     sight : (S, M, 3) ndarray
-        Object-space directions of the line's points in the world frame; M odd, the middle point is the line's centre.
+        Object-space directions of M points of the line in the world frame; M odd, the middle point is the line's
+        centre.
     position : (M,) ndarray
         Coordinate of the points along camera Y on the nominal line CCD, metres.
     camera : (3, 3) ndarray
@@ -344,9 +351,9 @@ def line_tangents(
     axis : (S, 3) ndarray
         Lines of sight in the camera's axes.
     roll : (S,) ndarray
-        Roll of the imaged line about them, radians.
+        Rotation of the imaged line about the line of sight, radians.
     tangent : (S, M) ndarray
-        Tangents along the imaged line, with the sign of ``position``.
+        Tangents of the angles from the line of sight along the imaged line, with the sign of ``position``.
     """
     local = product(sight, camera)
     middle = sight.shape[1] // 2
@@ -366,13 +373,13 @@ def line_tangents(
 
 
 def line_change(sight: np.ndarray, position: np.ndarray, camera: np.ndarray) -> LineChange:
-    """Return the changes of perturbed states against the nominal one.
+    """Return the changes of a line camera in B perturbed states against its nominal state.
 
     Parameters
     ----------
     sight : (1 + B, M, 3) ndarray
-        Object-space directions of the line's points in the world frame; entry 0 is the nominal state; M odd, the middle
-        point is the line's centre.
+        Object-space directions of M points of the line in the world frame; entry 0 is the nominal state; M odd, the
+        middle point is the line's centre.
     position : (M,) ndarray
         Coordinate of the points along camera Y on the nominal line CCD, metres.
     camera : (3, 3) ndarray

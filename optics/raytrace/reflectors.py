@@ -131,12 +131,12 @@ class ReflectorParts:
 
 
 def _no_offset(width: float) -> float:
-    """Return no lateral offset, whatever the width."""
+    """Return the lateral offset of a reflector whose beam lies in its middle: 0, whatever the width."""
     return 0.0
 
 
 def _origin(length: float, width: float) -> tuple[float, float, float]:
-    """Return the origin of the frame, whatever the size."""
+    """Return the origin of the reflector's frame, (0, 0, 0), as its null point, whatever the length and width."""
     return (0.0, 0.0, 0.0)
 
 
@@ -171,13 +171,13 @@ class Reflector:
 
 
 Plane = tuple[str, tuple[float, float, float], tuple[float, float, float], Coating]
-"""A face as name, outward normal (any length), a point on it, coating; in the solid's frame."""
+"""Plane of a face of a solid: name, outward normal (any length), a point on it (metres), and coating."""
 
 _S = 1.0 / sqrt(2.0)
 
 
 def prism_180(mount: Mount) -> ReflectorParts:
-    """Return the parts of the lateral-transfer prism."""
+    """Return the parts of the 180-deg prism, which returns the beam antiparallel at a lateral distance."""
     length, width, hand = mount.length, mount.width, mount.hand
     off = roof_offset(width)
     half = 0.5 * width
@@ -233,7 +233,7 @@ def roof_offset(width: float) -> float:
 
 
 def prism_0(mount: Mount) -> ReflectorParts:
-    """Return the parts of the rhomboid.
+    """Return the parts of the 0-deg prism, a rhomboid that displaces the beam and keeps its direction.
 
     Raises
     ------
@@ -303,7 +303,7 @@ def hollow_null_point(length: float, width: float) -> tuple[float, float, float]
 
 
 def periscope(mount: Mount) -> ReflectorParts:
-    """Return the parts of two parallel mirrors.
+    """Return the parts of two parallel mirrors that displace the beam and keep its direction.
 
     Raises
     ------
@@ -321,7 +321,10 @@ def periscope(mount: Mount) -> ReflectorParts:
 
 
 def _require_length(mount: Mount, parts: str, verb: str, least: float) -> None:
-    """Raise UnphysicalError if the reflector displaces the beam by less than ``least`` metres and would vignette it."""
+    """Raise UnphysicalError if the reflector displaces the beam by less than ``least`` metres and would vignette it.
+
+    ``parts`` and ``verb`` are the subject and verb of the message.
+    """
     if mount.length < least:
         width, length = 1e3 * mount.width, 1e3 * mount.length
         text = f"{mount.path}: {parts} of width {width:.4g} mm cannot {verb} the beam by only {length:.4g} mm"
@@ -337,7 +340,7 @@ def _thickness(width: float) -> float:
 
 
 def _mirror(name: str, position: Sequence[float], direction: np.ndarray) -> Passage:
-    """Return the passage of a mirror that has a face of its own."""
+    """Return the reflection of the beam at a mirror that has a face of its own, at a position (metres) and direction."""
     return Passage(name, name, Interaction.REFLECT, np.array(position), direction)
 
 
@@ -347,7 +350,7 @@ def _on_frame(
     apex: tuple[float, float, float],
     axis: int,
 ) -> ReflectorParts:
-    """Return mirrors on plates of their own, held by a bar beyond them all along ``axis``.
+    """Return the parts of a hollow reflector: mirrors on plates, held by a bar beyond them all along ``axis``.
 
     Each mirror is given with its normal toward the light.
     """
@@ -398,7 +401,7 @@ def _parts(
     apex: tuple[float, float, float],
     origins: Mapping[str, tuple[float, float, float]],
 ) -> ReflectorParts:
-    """Return bodies, elements and solid of a prism from planes and passages.
+    """Return bodies, optical elements and glass solid of a prism, from the planes of its faces and the beam's passages.
 
     ``origins`` gives the origin of the frame of a face that two passages share.
     """
@@ -415,9 +418,9 @@ def _faces(
     origins: Mapping[str, tuple[float, float, float]],
     solid: str | None,
 ) -> tuple[tuple[Body, ...], tuple[Element, ...], tuple[Face, ...]]:
-    """Return bodies, elements and all faces from planes and passages.
+    """Return bodies, optical elements and all faces, from the planes of the faces and the beam's passages through them.
 
-    ``solid`` is the glass that light passes through.
+    ``solid`` is the path of the glass that light passes through.
     """
     path, width, errors = mount.path, mount.width, mount.errors
     used = {p.face: p for p in reversed(passages)}
@@ -456,13 +459,13 @@ def _faces(
 
 
 def _footprint(path: str, passage: Passage, shared: set[str]) -> str:
-    """Return the body of a passage's element: the face's, or a child of it when the beam meets the face twice."""
+    """Return the body that carries a passage's element: the face's, or its child if the beam meets the face twice."""
     face = f"{path}/{passage.face}"
     return f"{face}/{passage.name}" if passage.face in shared else face
 
 
 def _centre(passages: list[Passage]) -> tuple[float, float, float]:
-    """Return the mean position of the passages, metres."""
+    """Return the mean of the beam's positions on the faces, metres."""
     middle = np.mean([p.position for p in passages], axis=0)
     return (float(middle[0]), float(middle[1]), float(middle[2]))
 
@@ -481,9 +484,10 @@ def _axes(normal: np.ndarray, direction: np.ndarray | None) -> np.ndarray:
 def facet_block(
     path: str, material: str, facets: Mapping[str, str], spread: tuple[float, float], height: float
 ) -> Solid:
-    """Return the central prism: mirror facets on bodies of their own (name -> path), side walls and a bottom.
+    """Return the central block whose facets are mirrors for both cameras, with its side walls and bottom.
 
-    The walls are as far behind the centres of the facets as those are from the apex.
+    Each mirror facet has a body of its own (``facets``: name -> path). The walls are as far behind the centres of the
+    facets as those are from the apex.
     """
     x, y = 2.0 * spread[0], 2.0 * spread[1]
     walls: list[Plane] = [

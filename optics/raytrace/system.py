@@ -1,7 +1,8 @@
 """Batches of systems: the numbers of element sequences in perturbed states, ready for the trace.
 
 A *system* is one sequence in one perturbed state. Sequences of the same structure (same kinds of surface in the same
-order) can be batched together: the two cameras of an instrument, left and right channels, hundreds of states.
+order) can be batched together: the two cameras of an instrument, left and right channels, hundreds of states. The
+sequences of a batch are its *chains*. All numbers of a batch form one table, with a row for each number.
 
 The assembly caches the numbers of the nominal design. States overwrite them: frames, indices and their gradients,
 radii, conic constants and Zernike figures; and each number of an expanded body is scaled by a power of its size.
@@ -36,7 +37,7 @@ from optics.raytrace.element_numbers import (
 
 
 def changed_bodies(assembly: Assembly, states: Sequence[State], placed: PlacedBodies) -> set[str]:
-    """Return the bodies that a state names, or whose pose or size differs from nominal because their carriers' does."""
+    """Return the bodies that some state names, or whose pose or size it changes through the bodies that carry them."""
     nominal = assembly.place()
     changed = np.any(placed.rotation != nominal.rotation, axis=(0, 2, 3))
     changed |= np.any(placed.translation != nominal.translation, axis=(0, 2))
@@ -45,19 +46,19 @@ def changed_bodies(assembly: Assembly, states: Sequence[State], placed: PlacedBo
 
 
 def frames_of(placed: PlacedBodies, bodies: np.ndarray) -> np.ndarray:
-    """Return the transforms into each element's frame from that of the element before, for all chains and states.
+    """Return the transforms into each element's frame from that of the element before, for all sequences and states.
 
     Parameters
     ----------
     placed : PlacedBodies
         World poses of the bodies in S states.
     bodies : (C, K) ndarray of int
-        Indices of the elements' bodies, for C chains of K elements.
+        Indices of the elements' bodies, for C sequences of K elements.
 
     Returns
     -------
     (K, 12, C * S) ndarray
-        Numbers of ``FrameNumbers`` per element, chain by chain.
+        Numbers of ``FrameNumbers`` per element, sequence by sequence.
     """
     rotation, translation = placed.rotation[:, bodies], placed.translation[:, bodies]
     relative, offset = np.empty_like(rotation), np.empty_like(translation)
@@ -72,20 +73,22 @@ def frames_of(placed: PlacedBodies, bodies: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class SystemBatch:
-    """Numbers of B systems.
+    """Numbers of B systems (sequences of elements in perturbed states), as a table with a row for each of L numbers.
 
     Attributes
     ----------
     structure : tuple of Structure
         Structure of each element.
     form : (tuple of ElementNumbers, FrameNumbers)
-        Numbers that the trace reads per element, and the pose of the last element; each number replaced by its row.
+        Numbers that the trace reads per element, and the pose of the last element; each number replaced by its row in
+        ``numbers``.
     numbers : (L, B) ndarray
         Values of all numbers, row by row.
     world : Poses
         Poses of the elements in the world.
     tangents : tuple of ElementNumbers, optional
-        Derivatives of ``values`` by the requested parameter (None for a number that has none); None without one.
+        Derivatives of ``values`` with respect to the requested parameter (None for a number that does not depend on
+        it); None if no derivative was requested.
     world_tangents : Poses, optional
         Derivatives of ``world``.
     size : (B,) ndarray
@@ -123,9 +126,9 @@ class SystemBatch:
         ----------
         backend : Backend
             Backend to upload to.
-        own : bool
-            True: each number is an array of its own, so that results can be differentiated by it; False: the numbers of
-            several systems share one array.
+        separate : bool
+            True: each number is an array of its own, so that results can be differentiated with respect to it; False:
+            the numbers of several systems share one array.
         """
         grids = tuple(None if g is None else backend.opaque(g) for g in self.grids)
         if self.tangents is None:
@@ -183,18 +186,18 @@ class Poses:
     translation: np.ndarray
 
     def last(self) -> FrameNumbers:
-        """Return the poses of the last elements."""
+        """Return the poses of the last element of each system."""
         return FrameNumbers.of(self.last_rows())
 
     def last_rows(self) -> np.ndarray:
-        """Return the numbers of ``last`` in the order of the fields, (12, B)."""
+        """Return the 12 numbers of the last element's pose in each of B systems, (12, B), as in ``FrameNumbers``."""
         both = np.concatenate([self.translation[:, -1, :, None], self.rotation[:, -1]], axis=-1)
         return np.ascontiguousarray(both.reshape(len(both), 12).T)
 
 
 @dataclass(frozen=True, eq=False)
 class UploadedSystems:
-    """``SystemBatch`` in the memory of a backend.
+    """Numbers of B systems (a ``SystemBatch``) in the memory of a backend.
 
     Attributes
     ----------
@@ -203,7 +206,7 @@ class UploadedSystems:
     structure : tuple of Structure
         Structure of each element.
     form : (tuple of ElementNumbers, FrameNumbers)
-        Rows of the numbers, as in ``SystemBatch``.
+        Row of each of L numbers per element, as in ``SystemBatch``.
     numbers : Dr.Jit arrays
         L arrays (B,); or one array (L * B,), number by number.
     grids : tuple
@@ -227,7 +230,7 @@ class UploadedSystems:
 
     @cached_property
     def values(self) -> tuple[ElementNumbers, ...]:
-        """Numbers per element, Dr.Jit arrays (B,)."""
+        """Numbers that the trace reads per element, as Dr.Jit arrays with one value for each of B systems, (B,)."""
         import drjit as dr
 
         if isinstance(self.numbers, tuple):
@@ -250,7 +253,7 @@ class UploadedSystems:
 
 @dataclass(frozen=True, eq=False)
 class _Shapes:
-    """Changes of shape in some states that determine the code of a kernel.
+    """Changes of shape and index in some states that determine the code of a kernel.
 
     Attributes
     ----------
@@ -284,7 +287,7 @@ class _Shapes:
 
 @dataclass(frozen=True, eq=False)
 class _Chains:
-    """Sequences of C chains of K elements each.
+    """Sequences of a batch: C chains of K elements each.
 
     Attributes
     ----------
@@ -306,7 +309,7 @@ class _Chains:
 
     @classmethod
     def of(cls, assembly: Assembly, sequences: tuple[str | tuple[str, ...], ...]) -> _Chains:
-        """Return the chains of sequences; raise ValueError where their lengths differ."""
+        """Return the chains that named sequences of an assembly form; raise ValueError where their lengths differ."""
         named = [assembly.sequences[s] if isinstance(s, str) else s for s in sequences]
         chains = tuple(tuple(assembly.elements[name] for name in names) for names in named)
         lengths = {len(chain) for chain in chains}
@@ -323,18 +326,18 @@ class _Chains:
         return cls(chains, media, bodies, tuple(depends), designed)
 
     def radius(self, i: int, c: int) -> float:
-        """Return the radius of the figure's disk of the i-th element of chain c, metres."""
+        """Return the radius of the disk of Zernike figures of element ``i`` of chain ``c``, metres."""
         if (i, c) not in self._radii:
             self._radii[i, c] = self.elements[c][i].figure_disk.radius
         return self._radii[i, c]
 
     @cached_property
     def _radii(self) -> dict[tuple[int, int], float]:
-        """Cache of ``radius``."""
+        """Cache of ``radius``: (element, chain) -> radius of the disk of Zernike figures, metres."""
         return {}
 
     def elements_at(self, i: int) -> list[Element]:
-        """Return the i-th elements of all chains."""
+        """Return the elements at position ``i`` of all chains."""
         return [chain[i] for chain in self.elements]
 
     def structure(self, shapes: _Shapes) -> tuple[Structure, ...]:
@@ -365,9 +368,10 @@ class _Chains:
         placed: PlacedBodies,
         step: Sequence[tuple[str, str, int]] | None = None,
     ) -> tuple[LocalNumbers, np.ndarray | None]:
-        """Return shapes and indices of the i-th elements, each number (C * S,), and the tables of their grids.
+        """Return shapes and indices of the elements at position ``i``, and the tables of their grid figures.
 
-        An element that several chains share is computed once.
+        Each number has the shape (C * S,) for C chains in S states. An element that several chains share is computed
+        once.
         """
         by_key: dict[tuple[str, Medium, Medium], LocalNumbers] = {}
         keys = [(chain[i].name, m[i], m[i + 1]) for chain, m in zip(self.elements, self.media, strict=True)]
@@ -387,16 +391,17 @@ class _Chains:
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """Sides of elements on which one glass body lies.
+    """Sides of optical elements that one glass body fills, and where the numbers of their refractive index are kept.
 
     Attributes
     ----------
     rows, chains, bodies : (N,) ndarray of int
-        Row of the index of each side, its chain, and the index of the element's body.
+        For each of N sides, the row of its index in the table of numbers, its chain, and the index of the element's
+        body.
     gradient : ndarray of int
         Sides that have an index gradient.
     slopes : (3, ...) ndarray of int
-        Rows of the gradient's components of those sides.
+        Rows of the gradient's three components of those sides.
     """
 
     rows: np.ndarray
@@ -408,23 +413,23 @@ class _Sides:
 
 @dataclass(frozen=True, eq=False)
 class _Design:
-    """Numbers of C chains of one structure in the nominal state, and how a state changes them.
+    """Numbers of C chains of K elements in the nominal state, and how a state changes them.
 
     Attributes
     ----------
     chains : _Chains
         The chains.
     structure, form : tuple
-        Structure and rows, as in ``SystemBatch``.
+        Structure of each element, and the row of each of L numbers, as in ``SystemBatch``.
     numbers : (L, C) ndarray
         Nominal numbers; those of frames are not set.
     grids : tuple of ndarray, optional
-        Spline tables, as in ``SystemBatch``.
+        Spline tables of grid figures, as in ``SystemBatch``.
     scaling : mapping of int to (ndarray, ndarray, ndarray)
         Power -> rows and chains of the numbers that scale with that power of their bodies' sizes, and the indices of
         these bodies.
     glass : mapping of str to _Sides
-        Glass body -> sides of elements on which it lies.
+        Glass body -> sides of elements that it fills.
     frame_rows : (K + 1, 12) ndarray of int
         Rows of the elements' frames and of the last pose.
     """
@@ -440,7 +445,7 @@ class _Design:
 
     @classmethod
     def of(cls, assembly: Assembly, chains: _Chains, structure: tuple[Structure, ...]) -> _Design:
-        """Return the nominal numbers of chains."""
+        """Return the nominal numbers of chains of one structure."""
         placed, frame = assembly.place(), FrameNumbers.of(np.zeros((12, len(chains.elements))))
         twice = replace(placed, scale=np.full_like(placed.scale, 2.0))
 
@@ -471,7 +476,7 @@ class _Design:
 
     @staticmethod
     def _sides(chains: _Chains, form: tuple[ElementNumbers, ...]) -> dict[str, _Sides]:
-        """Return glass body -> sides of elements on which it lies."""
+        """Return a mapping from each glass body to the sides of elements that it fills."""
         by_solid: dict[str, list[tuple[Any, int, int]]] = {}
         for c, media in enumerate(chains.media):
             for i, element in enumerate(form):
@@ -489,7 +494,7 @@ class _Design:
         return out
 
     def in_states(self, assembly: Assembly, states: Sequence[State], placed: PlacedBodies) -> np.ndarray:
-        """Return the numbers in S states, except grid figures, (L, C * S)."""
+        """Return the L numbers of C chains in S states, (L, C * S), except grid figures."""
         count = len(states)
         out = np.repeat(self.numbers[:, :, None], count, axis=2)
         if np.any(placed.scale != 1.0):
@@ -506,7 +511,7 @@ class _Design:
         return flat
 
     def _apply_scale(self, out: np.ndarray, placed: PlacedBodies) -> None:
-        """Scale the numbers of expanded bodies."""
+        """Scale the numbers of expanded bodies in ``out`` by the body's size, to the power that their unit requires."""
         for power, (rows, columns, bodies) in self.scaling.items():
             size = placed.scale[:, bodies].T
             factor = size
@@ -520,7 +525,7 @@ class _Design:
     def _set_index(
         self, out: np.ndarray, assembly: Assembly, solid: str, states: Sequence[State], placed: PlacedBodies
     ) -> None:
-        """Set the refractive index of a glass body in each state."""
+        """Set the refractive index of a glass body, and its gradient, in ``out`` for each state."""
         sides, glass = self.glass[solid], placed.index[solid]
         motions = [state.get(solid, AT_REST) for state in states]
         out[sides.rows, sides.chains] = [assembly.index(solid, motion) for motion in motions]
@@ -540,7 +545,7 @@ class _Design:
         states: Sequence[State],
         known: dict[tuple[str, int, float], np.ndarray],
     ) -> None:
-        """Add the states' changes of the shapes of the i-th elements.
+        """Add to ``out`` the states' changes of the shapes of the elements at position ``i``.
 
         ``known`` caches figures by body, order and radius.
         """
@@ -559,7 +564,10 @@ class _Design:
 
 
 def _figures(motions: Sequence[Motion], order: int, radius: float) -> np.ndarray:
-    """Return the coefficients that figures of S motions add, (T, S), as in ``zernike.monomials``."""
+    """Return the figures of S motions as T coefficients of x^a y^b each, (T, S), up to the degree ``order``.
+
+    ``radius`` is that of the disk of the Zernike terms, metres.
+    """
     amplitudes = np.zeros((len(motions), max(j for motion in motions for j in motion.figure)))
     for s, motion in enumerate(motions):
         for j, amplitude in motion.figure.items():
@@ -586,8 +594,9 @@ def assemble(
     states : sequence of State
         S perturbed states.
     step : sequence of (str, str, int), optional
-        Derivative: one (body, kind, axis) per state; kind ``rotate``, ``shift``, ``scale`` or ``figure`` (the axis is
-        then a Noll index that the state's figure names, with 0 if there is none).
+        Motion with respect to which the numbers are differentiated: one (body, kind, axis) per state; kind ``rotate``,
+        ``shift``, ``scale`` or ``figure`` (the axis is then a Noll index that the state's figure names, with 0 if there
+        is none).
     placed : PlacedBodies, optional
         World poses of the bodies in these states, if already computed.
 
@@ -639,5 +648,5 @@ def assemble(
 
 
 def _tangent(value: np.ndarray) -> np.ndarray | None:
-    """Return the derivative of a complex-step value; None for a real one."""
+    """Return the derivative that the imaginary part of a complex-step value carries; None for a real value."""
     return value.imag / COMPLEX_STEP if np.iscomplexobj(value) else None

@@ -1,17 +1,20 @@
 """Float64 sequential ray trace on Dr.Jit, with derivatives: positions, directions and optical paths of batched systems.
 
-Curved rays in an index gradient. With d tau = ds / n the ray equation d/ds (n dr/ds) = grad n becomes r'' = n grad n.
-For n = n0 + g . (r - r0) the index along the ray obeys n'' = |g|^2 n, so that
+Curved rays in an index gradient. With r the position on a ray, s the length along it, n the index and d tau = ds / n,
+the ray equation d/ds (n dr/ds) = grad n becomes r'' = n grad n. For n = n0 + g . (r - r0), with n0 the index at the
+origin r0 of the ray and g the gradient, the index along the ray obeys n'' = |g|^2 n. With d0 the unit direction at the
+origin, T0 = n0 d0, a = g . T0 and x = |g| tau,
 
-    n(tau) = n0 cosh x + a/|g| sinh x,    x = |g| tau,  a = g . T0,  T0 = n0 d0, r(tau) = r0 + T0 tau + g [n0 (cosh x -
-    1) / |g|^2 + a (sinh x / |g| - tau) / |g|^2], optical path = integral of n^2 d tau.
+    n(tau) = n0 cosh x + a/|g| sinh x,
 
-The hyperbolic functions are evaluated by their power series, which have no 0/0 at g = 0. (Born and Wolf, Principles of
-Optics, section 3.2, for the ray equation.)
+    r(tau) = r0 + T0 tau + g [n0 (cosh x - 1) / |g|^2 + a (sinh x / |g| - tau) / |g|^2],
 
-Derivatives. ``jvp`` gives Jacobian-vector products (forward mode): all rays' derivatives by one parameter. ``vjp``
-gives vector-Jacobian products (reverse mode): one backward pass yields the derivative of a weighted sum of ray
-coordinates by every number of every system, however many there are.
+and the optical path is the integral of n^2 d tau. The hyperbolic functions are evaluated by their power series, which
+have no 0/0 at g = 0. (Born and Wolf, Principles of Optics, section 3.2, for the ray equation.)
+
+Derivatives. ``jvp`` gives Jacobian-vector products (forward mode): all rays' derivatives with respect to one parameter.
+``vjp`` gives vector-Jacobian products (reverse mode): one backward pass yields the derivative of a weighted sum of ray
+coordinates with respect to every number of every system, however many there are.
 """
 
 from __future__ import annotations
@@ -37,20 +40,22 @@ from optics.raytrace.system import SystemBatch, UploadedSystems
 class GradedRay:
     """Curved ray in an index gradient, as Dr.Jit arrays in the frame of the element that it goes to.
 
+    Its parameter tau is the integral of ds / n along the ray, with s the length and n the index: metres.
+
     Attributes
     ----------
     origin : Vector3
-        Origin r0, metres.
+        Origin, metres.
     tangent : Vector3
-        T0 = n0 d0, with d0 a unit vector.
+        Unit direction at the origin times ``index``.
     index : Float
-        Index n0 at the origin.
+        Refractive index at the origin.
     gradient : tuple of Float
-        Components of the gradient g, 1/m.
+        Components of the gradient of the index, 1/m.
     along : Float
-        a = g . T0.
+        Scalar product of gradient and tangent, 1/m.
     square : Float
-        |g|^2.
+        Square of the gradient, 1/m^2.
     """
 
     origin: Any
@@ -62,7 +67,11 @@ class GradedRay:
 
     @classmethod
     def start(cls, p: Any, d: Any, index_at_zero: Any, gradient: tuple[Any, Any, Any]) -> GradedRay:
-        """Return the ray from p along the unit vector d, where the index is index_at_zero + gradient . p."""
+        """Return the ray that starts at a point p (metres) along the unit vector d.
+
+        The refractive index is ``index_at_zero`` at the origin of the frame plus the product of ``gradient`` (1/m) and
+        position.
+        """
         gx, gy, gz = gradient
         index = index_at_zero + gx * p.x + gy * p.y + gz * p.z
         tangent = index * d
@@ -83,27 +92,30 @@ class GradedRay:
         )
 
     def position(self, tau: Any) -> Any:
-        """Return r(tau), in metres."""
+        """Return the point of the ray at the parameter ``tau``, the integral of length over index, in metres."""
         x2 = self.square * tau * tau
         even = 0.5 * tau * tau * (1.0 + x2 / 12.0 * (1.0 + x2 / 30.0))
         odd = tau * tau * tau / 6.0 * (1.0 + x2 / 20.0 * (1.0 + x2 / 42.0))
         return self._add(self.origin + self.tangent * tau, self.index * even + self.along * odd)
 
     def slope(self, tau: Any) -> Any:
-        """Return dr/dtau, which is n times the unit direction."""
+        """Return the derivative of the position with respect to ``tau``: the refractive index times the unit direction."""
         x2 = self.square * tau * tau
         odd = tau * (1.0 + x2 / 6.0 * (1.0 + x2 / 20.0))
         even = 0.5 * tau * tau * (1.0 + x2 / 12.0 * (1.0 + x2 / 30.0))
         return self._add(self.tangent, self.index * odd + self.along * even)
 
     def direction(self, tau: Any) -> Any:
-        """Return the unit direction at r(tau)."""
+        """Return the unit direction of the ray at the parameter ``tau``, the integral of length over index."""
         import drjit as dr
 
         return dr.normalize(self.slope(tau))
 
     def optical_path(self, tau: Any) -> Any:
-        """Return the integral of n ds from the origin, in metres."""
+        """Return the optical path from the origin to the parameter ``tau``, in metres.
+
+        It is the integral of the index over the length.
+        """
         y = 4.0 * self.square * tau * tau
         first = tau * (1.0 + y / 12.0 * (1.0 + y / 20.0 * (1.0 + y / 42.0)))
         second = tau * tau * (1.0 + y / 12.0 * (1.0 + y / 30.0))
@@ -112,7 +124,7 @@ class GradedRay:
         return n * n * first + a * n * second + a * a * third
 
     def _add(self, vector: Any, amount: Any) -> Any:
-        """Return the vector plus ``amount`` times the gradient."""
+        """Return a vector plus ``amount`` times the gradient of the refractive index."""
         gx, gy, gz = self.gradient
         return type(vector)(vector.x + amount * gx, vector.y + amount * gy, vector.z + amount * gz)
 
@@ -120,7 +132,10 @@ class GradedRay:
 def curve_intersection(
     curve: GradedRay, tau: Any, surface: SurfaceNumbers, table: Any, attached: bool, steps: int
 ) -> Any:
-    """Return the parameter at which a curved ray intersects the surface, by Newton's method from the straight ray's."""
+    """Return the parameter ``tau`` at which a curved ray intersects a surface, by Newton's method.
+
+    ``tau`` starts from its value for the straight ray.
+    """
     import drjit as dr
 
     def step(ray: GradedRay, tau: Any, numbers: SurfaceNumbers) -> Any:
@@ -138,7 +153,7 @@ def curve_intersection(
 
 
 NEWTON_STEPS = 3
-"""Number of Newton steps from the conic to the asphere.
+"""Number of Newton steps from a ray's intersection with the conic to that with the aspheric surface.
 
 The departure of a mirror from its conic is below 1e-4 m and its slope below 1e-3, so that each step gains at least six
 digits; three reach rounding. A ray that has not converged is marked invalid.
@@ -164,23 +179,24 @@ together take a fifth of the time to compile.
 """
 
 MIN_LANE_SYSTEMS = 32
-"""Number of systems per two threads from which each lane of the processor traces all rays of one system.
+"""Smallest number of systems per two threads for which each SIMD lane of the processor traces all rays of one system.
 
 With fewer systems an element-by-element trace takes up to half as much time again, but its kernels, which elements
 share, are compiled already: those of lanes take seconds.
 """
 
 MIN_LANE_RAYS = 1 << 15
-"""Number of rays from which lanes are used: fewer take some milliseconds either way."""
+"""Smallest number of rays for which lanes (one system per SIMD lane) are used: fewer take some milliseconds either way.
+"""
 
 MAX_RECORDINGS = 16
-"""Largest number of recordings of one trace in one thread.
+"""Largest number of recordings (instructions kept for replay) of one trace in one thread.
 
 A trace is recorded anew where a bundle shares other numbers, such as a direction.
 """
 
 CONVERGED = 1e-12
-"""Largest distance to the surface of a valid intersection, metres."""
+"""Largest distance from the surface, metres, at which an intersection counts as valid."""
 
 
 class BeamMissedError(PhysicalError, RuntimeError):
@@ -194,7 +210,7 @@ class Rays:
     Attributes
     ----------
     position, direction, path, valid : Dr.Jit arrays
-        Arrays of width systems * N, lengths in metres; a direction that all rays share has width 1.
+        Arrays of width systems * N for N rays each, lengths in metres; a direction that all rays share has width 1.
     systems : int
         Number of systems that the rays are for, system by system; 1: every system gets all of them.
     """
@@ -228,9 +244,9 @@ class Traced:
     count: int
 
     def numpy(self, rays: Rays | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return position (B, N, 3), direction (B, N, 3), path (B, N) and valid (B, N) as NumPy arrays.
+        """Return position (B, N, 3), direction (B, N, 3), path (B, N) and valid (B, N) of N rays in B systems.
 
-        They are those of ``rays``, by default ``local``.
+        They are NumPy arrays, in metres, of ``rays``, by default ``local``.
         """
         rays = self.local if rays is None else rays
         return (
@@ -241,17 +257,20 @@ class Traced:
         )
 
     def hit(self, element: int) -> np.ndarray:
-        """Return the local intersections (B, N, 3) with a requested element, in metres."""
+        """Return the intersections (B, N, 3) of N rays in B systems with a requested element, in its frame, metres."""
         return rows(self.hits[element], self.count)
 
     def xy(self, element: int | None = None) -> np.ndarray:
-        """Return the local x, y (B, N, 2), in metres, on the last element or on a requested one."""
+        """Return x, y (B, N, 2) of N rays in B systems on the last element or on a requested one, in its frame, metres."""
         vector = self.local.position if element is None else self.hits[element]
         return np.moveaxis(np.stack([c.numpy() for c in (vector.x, vector.y)]).reshape(2, self.count, -1), 0, -1)
 
 
 def rows(vector: Any, count: int) -> np.ndarray:
-    """Return the components of a ``Vector3`` of B * N rays as an array (B, N, 3), stored component by component."""
+    """Return the components of N rays' vectors in each of B systems (a ``Vector3``) as an array (B, N, 3).
+
+    The array is stored component by component.
+    """
     return np.moveaxis(np.stack([c.numpy() for c in vector]).reshape(3, count, -1), 0, -1)
 
 
@@ -388,10 +407,10 @@ class _TracePlan:
         Parameters
         ----------
         form : tuple
-            Rows of the numbers, as in ``UploadedSystems``.
+            Row of each number per element, as in ``UploadedSystems``.
         numbers : tuple
             Numbers and grids as in ``UploadedSystems``; number of systems, as an array of width 1, or None for one;
-            offset of the numbers, likewise, or None for 0; and the indices of the systems (B,) where each takes its
+            offset of the numbers, likewise, or None for 0; and the indices of the B systems (B,) where each takes its
             rays one after the other, else None.
         rays : tuple
             Position, direction, path and validity.
@@ -419,13 +438,13 @@ class _TracePlan:
         return rays, hits, tuple(outside) if self.world else None
 
     def _system(self, position: Any, shared: Any) -> Any:
-        """Return the system of each ray; None for a single system."""
+        """Return the index of the system that each ray belongs to; None for a single system."""
         import drjit as dr
 
         return shared if shared is None or self.alone else dr.arange(self.backend.UInt, dr.width(position)) // shared
 
     def _launch(self, leg: range, form: Any, lookup: _Lookup, rays: Any, hits: list[Any], outside: list[Any]) -> None:
-        """Launch the kernel of a leg, if kernels are launched at its end."""
+        """Launch the kernel that traces a range ``leg`` of elements, if kernels are launched at its end."""
         import drjit as dr
 
         last = leg.stop == len(self.structure)
@@ -450,7 +469,7 @@ class _TracePlan:
         return p, d, path, valid
 
     def _along(self, leg: range, elements: Sequence[ElementNumbers], grids: Any, rays: Any, hits: list[Any]) -> Any:
-        """Return the rays after some elements, and append requested intersections to ``hits``."""
+        """Return the rays after the elements of the range ``leg``, and append requested intersections to ``hits``."""
         import drjit as dr
 
         backend, differentiable = self.backend, self.differentiable
@@ -490,7 +509,7 @@ class _TracePlan:
         hits: list[Any],
         outside: list[Any],
     ) -> Any:
-        """Trace a leg along which each lane of the processor takes all rays of one system, one after the other.
+        """Trace rays along some elements such that each SIMD lane takes all rays of one system, one after the other.
 
         A lane reads its system's numbers once. Where each lane has a ray of its own, it looks up all of them, which
         takes more time than the rays.
@@ -500,11 +519,11 @@ class _TracePlan:
         leg : range
             Indices of the elements.
         elements : sequence of ElementNumbers
-            Numbers of the elements, each (B,).
+            Numbers of the elements, one value for each of B systems, (B,).
         pose : FrameNumbers, optional
             Pose of the last element, where rays in the world frame are requested at its end.
         grids : tuple
-            Spline tables, as for ``through``.
+            Spline tables of grid figures, per element.
         rays : tuple
             Position, direction, path and validity.
         owned : tuple
@@ -560,7 +579,7 @@ _threads = local()
 
 
 def _recorded(plan: _TracePlan, form: Any) -> Any:
-    """Return the instructions of a trace, recorded when they first run and launched without Python after that.
+    """Return the function that traces by a plan; it is recorded when it first runs, and then replayed without Python.
 
     A recording belongs to one thread.
     """
@@ -583,7 +602,7 @@ def _recorded(plan: _TracePlan, form: Any) -> Any:
 
 
 def require_rays(valid: np.ndarray, name: str) -> None:
-    """Raise BeamMissedError when some system of ``valid`` (B, N) has no valid ray at all."""
+    """Raise BeamMissedError when one of B systems has no valid ray; ``valid`` (B, N) is the mask of N rays each."""
     alive = np.asarray(np.any(valid.reshape(len(valid), -1), axis=1))
     if not alive.all():
         raise BeamMissedError(
@@ -593,7 +612,7 @@ def require_rays(valid: np.ndarray, name: str) -> None:
 
 
 def _full_width(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
-    """Return rays of full width, and the number of rays per system as an array of width 1.
+    """Return the rays repeated for ``count`` systems, and the number of rays per system as an array of width 1.
 
     The number is None for a single system.
     """
@@ -617,7 +636,7 @@ def _full_width(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
 
 
 def _lanes(systems: UploadedSystems, rays: int) -> Any:
-    """Return the indices of the systems (B,), or None where they and the rays do not fill the lanes of all threads."""
+    """Return the indices of the B systems (B,), one for each SIMD lane, or None where they do not fill the lanes."""
     import drjit as dr
 
     backend, threads = systems.backend, dr.thread_count()
@@ -632,8 +651,8 @@ def _lanes(systems: UploadedSystems, rays: int) -> Any:
 class _Lookup:
     """Lookup of the numbers of each ray's or lane's system, element after element.
 
-    The row at which they begin is passed along with the rays from kernel to kernel. If it were written into a kernel,
-    no two elements could share one.
+    The numbers form a table with a row for each number and a column for each system. The row at which they begin is
+    passed along with the rays from kernel to kernel. If it were written into a kernel, no two elements could share one.
 
     Parameters
     ----------
@@ -657,7 +676,7 @@ class _Lookup:
         self.place = None if isinstance(numbers, tuple) else system if start is None else system + start
 
     def __call__(self, form: Any) -> Any:
-        """Return the numbers of a form of rows."""
+        """Return the numbers whose rows in the table are given by ``form``, for each ray or lane."""
         import drjit as dr
 
         if self.place is not None:
@@ -667,17 +686,17 @@ class _Lookup:
         return map_leaves(lambda row: dr.gather(self._number, self._numbers[row], self._system), form)
 
     def advance(self, row: int) -> None:
-        """Set the row at which the next numbers begin."""
+        """Set the row of the table at which the numbers of the next element begin."""
         if self.place is not None:
             self.place, self._row = self._after(row), row
 
     def _after(self, row: int) -> Any:
-        """Return the index of a row's number, for each ray or lane."""
+        """Return the position in memory of a row's number, for each ray or lane."""
         return self.place + self._count(row - self._row) * self._stride
 
 
 def _to_frame(backend: Backend, p: Any, d: Any, frame: FrameNumbers) -> tuple[Any, Any]:
-    """Return positions and directions transformed into an element's frame."""
+    """Return positions p (metres) and unit directions d transformed into an element's frame."""
     import drjit as dr
 
     def point(c: CoordinateNumbers) -> Any:
@@ -690,7 +709,7 @@ def _to_frame(backend: Backend, p: Any, d: Any, frame: FrameNumbers) -> tuple[An
 
 
 def _distance(p: Any, d: Any, surface: SurfaceNumbers, table: Any, differentiable: bool, steps: int) -> tuple[Any, Any]:
-    """Return the path from p along d to the surface (may be negative) and whether the intersection exists."""
+    """Return the distance from p along d to the surface, metres (may be negative), and whether an intersection exists."""
     import drjit as dr
 
     if surface.curvature is None:
@@ -729,20 +748,20 @@ def _distance(p: Any, d: Any, surface: SurfaceNumbers, table: Any, differentiabl
 
 
 def _steps(surface: SurfaceNumbers, interaction: Interaction) -> int:
-    """Return the number of Newton steps from the conic to the surface."""
+    """Return the number of Newton steps from the intersection with the conic to that with the surface."""
     lens = bool(surface.even) and interaction is Interaction.REFRACT
     return NEWTON_STEPS + (FURTHER_STEPS if surface.terms or lens else 0)
 
 
 def _on_surface(p: Any, surface: SurfaceNumbers, table: Any) -> Any:
-    """Return whether p lies on the sheet of the surface through the vertex."""
+    """Return whether points p lie on the surface, on the sheet of the conic that goes through the vertex."""
     return _on_sheet(level(p.x, p.y, p.z, surface, table))
 
 
 def _on_sheet(level_and_gradient: tuple[Any, Any, Any, Any]) -> Any:
-    """Return whether a point with that level and gradient lies on the sheet of the vertex.
+    """Return whether a point lies on the surface's sheet through the vertex, from its level function and gradient.
 
-    The level divided by nz is the point's height to first order.
+    The level divided by the gradient's z component is the point's height above the surface to first order.
     """
     import drjit as dr
 
@@ -753,7 +772,10 @@ def _on_sheet(level_and_gradient: tuple[Any, Any, Any, Any]) -> Any:
 def _redirect(
     backend: Backend, p: Any, d: Any, element: ElementNumbers, interaction: Interaction, table: Any
 ) -> tuple[Any, Any]:
-    """Return the direction after reflection or refraction (Snell), and whether it exists."""
+    """Return the direction of rays after reflection or refraction (Snell's law), and whether it exists.
+
+    It does not exist for light that is totally reflected where it should be refracted, or the reverse.
+    """
     import drjit as dr
 
     _, nx, ny, nz = level(p.x, p.y, p.z, element.surface, table)
@@ -798,7 +820,7 @@ one, the kernels of the main job take twice as long to compile as one by one, an
 
 @dataclass(frozen=True, eq=False)
 class RayTangents:
-    """Derivatives of rays at the last element of a sequence, in its own frame.
+    """Derivatives with respect to one parameter of N rays in B systems at the last element, in its own frame.
 
     Attributes
     ----------
@@ -828,7 +850,7 @@ def jvp(
     direction_step: np.ndarray | float = 0.0,
     keep: Collection[int] = (),
 ) -> RayTangents:
-    """Trace rays and differentiate each by one parameter (forward mode).
+    """Trace rays and differentiate each with respect to one parameter (forward mode).
 
     Parameters
     ----------
@@ -837,7 +859,7 @@ def jvp(
     systems : SystemBatch
         B systems; derivatives that they carry (``assemble(..., step=...)``) are added.
     position : (B, N, 3) ndarray
-        Launch points in the world frame, metres.
+        Launch points of N rays per system in the world frame, metres.
     direction : (B, N, 3) ndarray
         Unit directions in the world frame.
     position_step : ndarray or float
@@ -890,16 +912,19 @@ def jvp(
 
 @dataclass(frozen=True, eq=False)
 class RayCotangents:
-    """Derivatives of the weighted sums S_b = sum_n w_bn . r_bn of ray positions r at the last element of system b.
+    """Derivatives of a weighted sum of ray positions at the last element, one sum for each of B systems.
+
+    The sum of a system is over its N rays, each position times its weight vector.
 
     Attributes
     ----------
     values : tuple of mapping of Path to ndarray
-        Per element, path of a number -> dS_b/d(number of system b), (B,), for those requested.
+        Per element, path of a number -> derivative of each system's sum with respect to that number of the system,
+        (B,), for those requested.
     position : (B, N, 3) ndarray
-        dS_b/d(launch point), per metre.
+        Derivative with respect to the launch point, per metre.
     direction : (B, N, 3) ndarray
-        dS_b/d(launch direction); its component along the ray is meaningless by itself.
+        Derivative with respect to the launch direction; its component along the ray is meaningless by itself.
     """
 
     values: tuple[Mapping[Path, np.ndarray], ...]
@@ -915,7 +940,7 @@ def vjp(
     weight: np.ndarray,
     names: Sequence[Collection[Path]],
 ) -> RayCotangents:
-    """Trace rays and differentiate a weighted sum of their final positions by all inputs (reverse mode).
+    """Trace rays and differentiate a weighted sum of their final positions with respect to all inputs (reverse mode).
 
     Parameters
     ----------
@@ -924,13 +949,13 @@ def vjp(
     systems : SystemBatch
         B systems; derivatives that they carry are ignored.
     position : (B, N, 3) ndarray
-        Launch points in the world frame, metres.
+        Launch points of N rays per system in the world frame, metres.
     direction : (B, N, 3) ndarray
         Unit directions in the world frame.
     weight : ndarray
         Weights of the positions at the last element, in its own frame, broadcastable to (B, N, 3).
     names : sequence of collection of Path
-        Per element, paths of the numbers in ``systems.values`` to differentiate by.
+        Per element, paths of the numbers in ``systems.values`` with respect to which the sum is differentiated.
 
     Returns
     -------

@@ -26,19 +26,22 @@ from optics.targets.target_shapes import Target
 from optics.waves.diffraction import Grid
 
 Transfer = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Function that returns complex H at frequencies fx, fy, (N,) each, cycles/m, independent of their order."""
+"""Function that returns the complex transfer function H at N frequencies fx, fy, (N,) each, cycles/m.
+
+The value at a frequency must not depend on the others.
+"""
 
 _SAMPLES = 16
 """Knots of an edge profile per 1/cut-off: the quintic spline through them is accurate to 1e-9."""
 
 _NODES = 16
-"""Gauss-Legendre nodes per panel, in which the phase of an edge profile's integrand changes by one cycle.
+"""Number of Gauss-Legendre nodes per interval, in which the phase of an edge profile's integrand changes by one cycle.
 
 A transfer function may add two more cycles: the rule's error on three cycles is below 1e-12.
 """
 
 _LEAST_PANELS = 32
-"""Smallest number of panels, for a transfer function that is only piecewise smooth."""
+"""Smallest number of intervals of integration, for a transfer function that is only piecewise smooth."""
 
 LEAST_GUARD = 64.0
 """Default distance between the window and the periodic copies of the target, in units of 1/cut-off."""
@@ -47,7 +50,7 @@ _FACTORS = (1.0, 4.0, 16.0, 64.0)
 """Periods of the Fourier series for successively lower frequencies, in units of the first period."""
 
 _WIDTH = 1.5
-"""Width of a low pass times the distance of the copies; its kernel there is 1e-9 of its peak."""
+"""Width of a low pass (in frequency) times the distance of the copies; its kernel there is 1e-9 of its peak."""
 
 _WIDTHS = 7.0
 """Frequency, in widths of a low pass, at which it counts as 0: it is 5e-11."""
@@ -67,7 +70,7 @@ class EdgeProfile:
     extent : float
         Largest distance from the edge, metres.
     level : float
-        H(0), the image far inside.
+        Irradiance far inside the bright side: the transfer function at zero frequency.
     spline : BSpline
         Irradiance as a function of distance.
     """
@@ -79,7 +82,9 @@ class EdgeProfile:
 
     @classmethod
     def build(cls, transfer: Transfer, normal: np.ndarray, cutoff: float, extent: float) -> EdgeProfile:
-        """Integrate the transfer function along the normal.
+        """Compute the image of an edge by an integral of the transfer function along the edge's normal.
+
+        With H the transfer function, n the normal, f the frequency along it and d the distance from the edge,
 
         E(d) = H(0)/2 + integral from -inf to inf of H(f n)/(2 pi i f) exp(2 pi i f d) df (principal value). For a real
         image the two halves of the axis make E(d) = H(0)/2 + integral from 0 to the cut-off of Im[H(f n) exp(2 pi i f
@@ -112,7 +117,7 @@ class EdgeProfile:
     def __call__(self, distance: np.ndarray) -> np.ndarray:
         """Return the irradiance at distances from the edge, metres, positive on the bright side.
 
-        It is 1 far inside where H(0) = 1.
+        It is 1 far inside where the transfer function is 1 at zero frequency.
 
         Raises
         ------
@@ -127,16 +132,16 @@ class EdgeProfile:
         return np.asarray(self.spline(distance))
 
     def image(self, edge: HalfPlane, x: Grid, y: Grid) -> np.ndarray:
-        """Return the irradiance at pixel centres, (R, C), for any edge with the profile's normal.
+        """Return the irradiance of an edge with the same normal at R rows and C columns of pixels, (R, C).
 
         Parameters
         ----------
         edge : HalfPlane
             Half-plane with the profile's normal.
         x : Grid
-            Pixel centres along columns, (C,), metres.
+            Pixel centres of the columns, (C,), metres.
         y : Grid
-            Pixel centres along rows, (R,), metres.
+            Pixel centres of the rows, (R,), metres.
 
         Raises
         ------
@@ -155,11 +160,11 @@ class _EdgeSampling:
     Attributes
     ----------
     frequency, share : (N,) ndarray
-        Gauss nodes, and their weights divided by pi f.
+        N Gauss nodes in frequency f, cycles/m, and their weights divided by pi f.
     distance : (D,) ndarray
-        Knots of the profile, metres.
+        D distances d from the edge at which the profile is computed, metres.
     coarse, fine : (A, N) and (N, B) ndarray
-        exp(2 pi i f d) of distances split into coarse and fine steps, A B >= D, so that the sum over frequencies
+        exp(2 pi i f d) of distances split into A coarse and B fine steps, A B >= D, so that the sum over frequencies
         becomes one matrix product.
     """
 
@@ -172,7 +177,7 @@ class _EdgeSampling:
 
 @lru_cache(maxsize=8)
 def _edge_sampling(cutoff: float, extent: float) -> _EdgeSampling:
-    """Return the sampling of an edge profile to a distance ``extent``."""
+    """Return frequencies, weights and distances for an edge profile as far as ``extent`` metres from the edge."""
     panels = _LEAST_PANELS + int(np.ceil(cutoff * extent))
     node, weight = gauss(_NODES)
     f = (cutoff / panels * (np.arange(panels)[:, None] + 0.5 * (node + 1.0))).ravel()
@@ -249,7 +254,10 @@ def target_image(
 def _finite_image(
     parts: list[tuple[float, FiniteShape]], transfer: Transfer, cutoff: float, x: Grid, y: Grid, guard: float | None
 ) -> np.ndarray:
-    """Return the irradiance of finite shapes, (R, C), as a sum of Fourier series of increasing periods."""
+    """Return the irradiance of finite shapes at R rows and C columns of pixels, (R, C).
+
+    It is a sum of Fourier series of increasing periods.
+    """
     overhang = _overhang(parts, x, y)
     if guard is None:
         guard = overhang + max(LEAST_GUARD / cutoff, overhang)
@@ -286,14 +294,20 @@ class _Band:
 
 
 def _low_pass(square: np.ndarray, width: float) -> np.ndarray:
-    """Return 1 - (1 - g)^2 with a Gaussian g of the given width; it departs from 1 with f^4; ``square`` is f^2."""
+    """Return 1 - (1 - g)^2 with a Gaussian g of the frequency, of the given width (cycles/m).
+
+    It departs from 1 with the fourth power of the frequency; ``square`` is the square of the frequency.
+    """
     return np.asarray(1.0 - np.expm1(-0.5 * square / width**2) ** 2) if width > 0.0 else np.zeros_like(square)
 
 
 def _series(
     parts: list[tuple[float, FiniteShape]], transfer: Transfer, cutoff: float, x: Grid, y: Grid, periods: np.ndarray
 ) -> np.ndarray:
-    """Return the Fourier series of the parts with periods (x, y), terms inside the cut-off, at pixel centres (R, C)."""
+    """Return the Fourier series of some shapes at the centres of R rows and C columns of pixels, (R, C).
+
+    ``periods`` are its periods along x and y, metres; it has all terms inside the cut-off.
+    """
     fx = np.arange(int(cutoff * periods[0]) + 1) / periods[0]
     last = int(cutoff * periods[1])
     fy = np.arange(-last, last + 1) / periods[1]
@@ -329,7 +343,7 @@ def _overhang(parts: list[tuple[float, FiniteShape]], x: Grid, y: Grid) -> float
 
 
 def _evaluated(transfer: Transfer, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
-    """Return H at frequencies (N,), after checking shape and finiteness."""
+    """Return the transfer function at N frequencies (N,), after checking its shape and finiteness."""
     value = np.asarray(transfer(fx, fy))
     if value.shape != fx.shape or not np.all(np.isfinite(value)):
         raise ValueError(f"the transfer function must give one finite number per frequency, found shape {value.shape}")

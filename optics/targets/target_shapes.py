@@ -37,7 +37,7 @@ class Target:
     parts: tuple[tuple[float, Shape], ...]
 
     def __post_init__(self) -> None:
-        """Check the levels."""
+        """Check that every transmittance lies between 0 and 1."""
         object.__setattr__(self, "parts", tuple((float(level), shape) for level, shape in self.parts))
         for level in (self.background, *(self.background + level for level, _ in self.parts)):
             if not 0.0 <= level <= 1.0:
@@ -114,9 +114,8 @@ def bar_group(frequency: float, bars: int, length: float, angle: float = 0.0) ->
 def siemens_star(spokes: int, radius: float, inner: float = 0.0) -> Target:
     """Return bright spokes on dark about the origin, of the same angular width as the gaps.
 
-    The first spoke lies along +x.
-
-    At the distance r from the middle the star has the frequency spokes / (2 pi r). The ends of the spokes are chords.
+    The first spoke lies along +x. At a distance r from the middle (metres) the star has the frequency spokes / (2 pi
+    r), cycles/m. The ends of the spokes are chords.
 
     Parameters
     ----------
@@ -155,12 +154,12 @@ PINHOLE = 1.0
 
 
 def star_target(pitch: float, region: int) -> Target:
-    """Return the Siemens star of a window of ``region`` pixels of ``pitch`` metres."""
+    """Return the Siemens star for a window of ``region`` x ``region`` pixels of ``pitch`` metres each."""
     return siemens_star(SPOKES, 0.5 * STAR_SHARE * region * pitch)
 
 
 def pinhole_target(pitch: float, region: int) -> Target:
-    """Return the pinhole of a window of ``region`` pixels of ``pitch`` metres."""
+    """Return the pinhole for a window of ``region`` x ``region`` pixels of ``pitch`` metres each."""
     return pinhole(PINHOLE * pitch)
 
 

@@ -25,7 +25,7 @@ _INNER_SQUARE = 0.55  # half-diagonal of the inner block of a disk's mesh, in ra
 
 
 def mirror_mesh(surface: Surface, aperture: Aperture, thickness: float, behind: float, cells: int) -> MeshHex2:
-    """Return hexahedra with 27 nodes between an optical face and a plane back.
+    """Return a mesh of hexahedra with 27 nodes each that fill a mirror between its optical face and a plane back.
 
     Every node of the face lies on the surface.
 
@@ -79,7 +79,7 @@ def mirror_mesh(surface: Surface, aperture: Aperture, thickness: float, behind: 
 
 
 def _grid(aperture: Aperture, cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (V, 2) and quadrilaterals (Q, 4) of a grid over [-1, 1]^2, nearly square on the aperture."""
+    """Return V vertices (V, 2) and Q quadrilaterals (Q, 4) of a grid over [-1, 1]^2, nearly square on the aperture."""
     x0, x1, y0, y1 = aperture.bounds
     wide = max(x1 - x0, y1 - y0)
     nx, ny = (max(2, round(cells * w / wide)) for w in (x1 - x0, y1 - y0))
@@ -87,14 +87,17 @@ def _grid(aperture: Aperture, cells: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _tensor(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices and quadrilaterals of a tensor grid; vertex (i, j) has index i * len(b) + j."""
+    """Return vertices and quadrilaterals of the grid of all pairs of coordinates from ``a`` and ``b``.
+
+    The vertex of a[i] and b[j] has the index i * len(b) + j.
+    """
     number = np.arange(len(a) * len(b)).reshape(len(a), len(b))
     corners = [number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]]
     return np.stack([np.repeat(a, len(b)), np.tile(b, len(a))], axis=-1), np.stack([c.ravel() for c in corners], axis=1)
 
 
 def _disk_blocks(cells: int, hole: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return the blocks of a disk as squares.
+    """Return vertices and quadrilaterals of a disk's blocks, in coordinates (u, v) in which the disk is a square.
 
     The inner block is |u|, |v| <= 1/2, the rings around it are squares up to 1.
     """
@@ -121,7 +124,7 @@ def _disk_blocks(cells: int, hole: bool) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _on_disk(u: np.ndarray, v: np.ndarray, inner: float) -> tuple[np.ndarray, np.ndarray]:
-    """Map the squares of ``_disk_blocks`` to the unit disk with a hole of radius ``inner``."""
+    """Map the square coordinates (u, v) of ``_disk_blocks`` to the unit disk with a hole of radius ``inner``."""
     size = np.maximum(np.abs(u), np.abs(v))
     safe = np.where(size > 0.0, size, 1.0)
     along = np.where(np.abs(u) >= np.abs(v), v * np.sign(u), u * np.sign(v)) / safe  # place on a side, -1..1
@@ -167,12 +170,12 @@ def polyhedron_mesh(vertices: Any, spacing: float) -> MeshTet1:
 
     The body is divided into tetrahedra from its middle over the middles of its faces. Then every edge longer than
     ``spacing`` is halved, the longest of each tetrahedron first (Rivara, Int. J. Numer. Meth. Eng. 20, 745 (1984)).
-    Halving keeps volumes positive and faces plane, needs no repair and turns long thin pieces into compact ones.
+    Halving keeps volumes positive and faces plane, needs no repair and turns long thin tetrahedra into compact ones.
 
     Parameters
     ----------
     vertices : (V, 3) array_like
-        Corners of the polyhedron in any order, metres.
+        V corners of the polyhedron in any order, metres.
     spacing : float
         Length of the longest edge of the mesh, metres.
 
@@ -217,7 +220,7 @@ def polyhedron_mesh(vertices: Any, spacing: float) -> MeshTet1:
 
 
 def _volumes(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Return the signed volumes, shape (T,)."""
+    """Return the signed volumes of T tetrahedra, (T,), in m^3."""
     a, b, c, d = (nodes[tetrahedra[:, k]] for k in range(4))
     return np.asarray(np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6.0)
 
@@ -235,7 +238,7 @@ _Edges = list[tuple[int, int]]
 
 
 def _separated(points: np.ndarray, least: float) -> np.ndarray:
-    """Return those of some points (P, 3) that are farther than ``least`` from all points selected before, (K, 3)."""
+    """Return those of P points (P, 3) that are farther than ``least`` metres from all points selected before, (K, 3)."""
     selected: list[np.ndarray] = []
     for point in points:
         if all(np.linalg.norm(point - other) > least for other in selected):
@@ -244,7 +247,7 @@ def _separated(points: np.ndarray, least: float) -> np.ndarray:
 
 
 def _faces(hull: ConvexHull, tolerance: float) -> tuple[np.ndarray, list[_Edges]]:
-    """Return corners (V, 3) and faces of a hull; neighbouring triangles in one plane are one face.
+    """Return the V corners (V, 3) and the faces of a convex hull; neighbouring triangles in one plane are one face.
 
     A face is defined by its edges and not by the points in its plane: whatever the tolerance, neighbours fit.
     """
@@ -266,9 +269,9 @@ def _faces(hull: ConvexHull, tolerance: float) -> tuple[np.ndarray, list[_Edges]
 
 
 def _slabs(corners: np.ndarray, faces: list[_Edges], spacing: float) -> list[tuple[np.ndarray, list[_Edges]]]:
-    """Cut a body across its length into pieces about as long as it is wide; return corners and faces of each.
+    """Cut a long body across its length into parts about as long as it is wide; return corners and faces of each.
 
-    Cuts stay away from the corners, so that no piece is a splinter. Neighbours share identical corners.
+    Cuts stay away from the corners, so that no part is a splinter. Neighbours share identical corners.
     """
     middle = np.mean(corners, axis=0)
     axes = np.linalg.svd(corners - middle)[2]
@@ -329,10 +332,10 @@ def _fan(corners: np.ndarray, faces: list[_Edges]) -> tuple[np.ndarray, np.ndarr
 
 
 def _bisected(nodes: np.ndarray, tetrahedra: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Halve edges until none is longer than ``spacing``.
+    """Halve edges until none is longer than ``spacing`` metres.
 
     Each round halves the edges that are the longest in *every* tetrahedron around them. No tetrahedron has two of them,
-    so all its pieces fit their neighbours; and the longest edge of the mesh is always among them, so the process ends.
+    so its two halves fit their neighbours; and the longest edge of the mesh is always among them, so the process ends.
     """
     pairs = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
     while True:

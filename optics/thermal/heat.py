@@ -13,7 +13,7 @@ from optics.numerics.array_math import inner, matvec
 
 @dataclass(frozen=True)
 class Temperature:
-    """Change of temperature in a body's frame: change + gradient . r.
+    """Change of temperature that is linear in position: ``change`` + ``gradient`` . r at r in the body's frame.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class Temperature:
         return Temperature(self.change + other.change, (x, y, z))
 
     def at(self, point: np.ndarray) -> float:
-        """Return the change at a point (3,) of the body's frame, in kelvin."""
+        """Return the change of temperature at a point (3,) of the body's frame (metres), in kelvin."""
         return float(self.change + inner(np.array(self.gradient), point))
 
     def seen_from(self, child: Pose) -> Temperature:
@@ -41,7 +41,7 @@ class Temperature:
 
 @dataclass(frozen=True, eq=False)
 class Temperatures:
-    """Changes of temperature of one body in S states.
+    """Changes of temperature of one body in S states, each linear in position.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Temperatures:
 
     @classmethod
     def of(cls, fields: Sequence[Temperature]) -> Temperatures:
-        """Return the temperatures of the states from one field for each."""
+        """Combine the temperature fields of S states, one for each, into one object."""
         return cls(np.array([f.change for f in fields]), np.array([f.gradient for f in fields]).reshape(-1, 3))
 
     def __add__(self, other: Temperatures) -> Temperatures:
@@ -67,7 +67,7 @@ class Temperatures:
         return Temperatures(self.change[states], self.gradient[states])
 
     def at(self, point: np.ndarray) -> np.ndarray:
-        """Return the changes at a point (3,) of the body's frame, in kelvin, (S,)."""
+        """Return the change of temperature at a point (3,) of the body's frame in each of S states, (S,), kelvin."""
         return np.asarray(self.change + inner(self.gradient, point))
 
     def seen_from(self, child: Pose) -> Temperatures:
@@ -76,10 +76,11 @@ class Temperatures:
 
 
 def carried_motion(expansion: float, gradient: np.ndarray, arm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rotation vectors and shifts that a gradient gives to a part at ``arm`` from the fixed point.
+    """Return the rotation vectors and shifts that a temperature gradient in a body gives to a part mounted on it.
 
-    They are the stress-free displacement of a linear field, u = a ((g . q) q - q^2 g / 2), and its rotation a (g x q);
-    see ``optics.thermal.thermo_elastic.free_linear_field``. The uniform part, a dT q, is the body's
+    With q the part's position from the fixed point, g the gradient, a the expansion and T the uniform change, the
+    displacement without stress is u = a ((g . q) q - q^2 g / 2), and its rotation a (g x q); see
+    ``optics.thermal.thermo_elastic.free_linear_field``. The uniform part of the displacement, a T q, is the body's
     ``Motion.expansion``.
 
     Parameters

@@ -9,7 +9,7 @@ The nodes' displacements are decomposed in this order, each part from the remain
    slides along the surface is compared with the nominal surface at its new position, so that no slope is neglected;
 3. Zernike terms of that change, from piston on: the nearest rigid motion of the material leaves piston and tilts of the
    optical surface as it slides;
-4. the rest as a cubic spline on a grid, with least bending where there are no nodes.
+4. the remainder as a cubic spline on a grid, with the smallest bending where there are no nodes.
 
 The error between the nodes is estimated by leaving out every second node and predicting it from the spline of the
 others. A residual that is not predicted changes from node to node: the mesh prints through, or is too coarse.
@@ -34,7 +34,7 @@ if TYPE_CHECKING:  # imported late: scipy is slow, and every job imports this mo
     from scipy.sparse import sparray
 
 TERMS = 36
-"""Default number of Zernike terms: to seventh order."""
+"""Default number of Zernike terms, in Noll's order: all to the seventh radial order."""
 OFF_SURFACE = 2e-4
 """Largest distance of a node from the nominal surface, in radii of the figure's disk.
 
@@ -90,9 +90,9 @@ class NodalDeformation:
     figure : FrozenMap of int to float
         Noll index -> amplitude of the change of sag along +z, metres rms over the disk; from Z1 on.
     grid : GridFigure, optional
-        The rest on a grid; None where it is below rounding.
+        Change of sag beyond these terms, on a grid; None where it is below rounding.
     places : (K, 2) ndarray
-        Positions x, y of the nodes used, on the moved face, metres.
+        Positions x, y of the K nodes used, on the moved face, metres.
     weight : (K,) ndarray
         Fraction of the clear aperture that belongs to each of these nodes.
     change : (K,) ndarray
@@ -124,11 +124,11 @@ class NodalDeformation:
     others: int = field(default=0)
 
     def rms(self, values: np.ndarray) -> float:
-        """Return the root mean square over the clear aperture of values at the nodes (K,)."""
+        """Return the root mean square over the clear aperture of values at the K nodes (K,), in their unit."""
         return float(np.sqrt(np.sum(self.weight * values**2)))
 
     def range(self, values: np.ndarray) -> float:
-        """Return the peak-to-valley in the clear aperture of values at the nodes (K,)."""
+        """Return the largest minus the smallest of the values at the K nodes (K,) in the clear aperture, in their unit."""
         inside = values[self.weight > 0.0]
         return float(np.ptp(inside))
 
@@ -145,7 +145,7 @@ class NodalDeformation:
 def nodal_deformation(
     nodes: Any, displacements: Any, surface: Surface, aperture: Aperture, terms: int = TERMS
 ) -> NodalDeformation:
-    """Decompose the displacements of nodes into a motion, Zernike terms and a grid.
+    """Decompose the displacements of N nodes into a motion, Zernike terms and a grid.
 
     Nodes off the surface, such as those inside the body, are ignored. The order of the nodes has no effect.
 
@@ -250,7 +250,7 @@ def _on_face(
 
 
 def _lattice(aperture: Aperture, step: float) -> np.ndarray:
-    """Return lattice points in the aperture, (P, 2), metres, incommensurate with any even mesh."""
+    """Return P points of a lattice in the aperture, (P, 2), metres, that does not line up with any even mesh."""
     x0, x1, y0, y1 = aperture.bounds
     counts = [int(np.clip(np.ceil(side / step), 40, _FINEST)) for side in (x1 - x0, y1 - y0)]
     x, y = (a + (b - a) * (np.arange(n) + 0.5) / n for (a, b), n in zip(((x0, x1), (y0, y1)), counts, strict=True))
@@ -267,7 +267,7 @@ def _filled(aperture: Aperture) -> float:
 
 
 def _cells(places: np.ndarray, aperture: Aperture, spacing: float) -> np.ndarray:
-    """Return the fraction of the aperture that is nearer to each position than to the others, (K,).
+    """Return, for each of K positions, the fraction of the aperture that is nearer to it than to the others, (K,).
 
     Raises
     ------
@@ -287,9 +287,10 @@ def _cells(places: np.ndarray, aperture: Aperture, spacing: float) -> np.ndarray
 
 
 def _similarity(points: np.ndarray, moves: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return rotation R, shift and size s of the similarity p -> s R p + shift nearest to points + moves.
+    """Return the rotation R, shift and size s that best map points p to the displaced points, as s R p + shift.
 
-    The rotation has shape (3, 3), the shift (3,); the fit is by weighted least squares.
+    The rotation has shape (3, 3), the shift (3,), in metres; the displaced points are ``points`` + ``moves``, and the
+    fit is by weighted least squares.
     """
     middle, drift = weight @ points, weight @ moves
     p = points - middle
@@ -334,7 +335,7 @@ class _Spline:
     Parameters
     ----------
     places : (K, 2) ndarray
-        Positions inside the bounds, metres.
+        K positions inside the bounds, metres.
     bounds : tuple of float
         (x_min, x_max, y_min, y_max) of the first and last samples, metres.
     shape : (int, int)
@@ -362,7 +363,7 @@ class _Spline:
         self._bending = _BENDING * (sum(b.T @ b for b in bending) + 2.0 * twist.T @ twist)
 
     def fit(self, values: np.ndarray, used: np.ndarray) -> GridFigure:
-        """Return the grid nearest to values (K,) at the positions selected by the mask ``used`` (K,)."""
+        """Return the grid nearest to values at K positions, (K,), of which the mask ``used`` (K,) selects some."""
         from scipy import sparse
         from scipy.sparse.linalg import splu
 
@@ -374,7 +375,10 @@ class _Spline:
 
 
 def _cubic(position: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights and indices (K, 4) of a cubic B-spline's coefficients at positions in samples, mirrored."""
+    """Return, for K positions, weights and indices (K, 4) of the four coefficients of a cubic B-spline there.
+
+    Positions count in samples; at the ends the coefficients are mirrored.
+    """
     cell = np.clip(np.floor(position), 0, count - 2).astype(int)
     f = (position - cell)[:, None]
     e = 1.0 - f
@@ -386,14 +390,14 @@ def _cubic(position: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _first(count: int) -> sparray:
-    """Return the matrix of first differences."""
+    """Return the matrix of differences between successive ones of ``count`` values."""
     from scipy import sparse
 
     return sparse.diags_array([-np.ones(count - 1), np.ones(count - 1)], offsets=[0, 1], shape=(count - 1, count))
 
 
 def _second(count: int) -> sparray:
-    """Return the matrix of second differences."""
+    """Return the matrix of second differences of ``count`` successive values."""
     from scipy import sparse
 
     ones = np.ones(count - 2)

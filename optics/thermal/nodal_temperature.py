@@ -21,11 +21,14 @@ from optics.thermal.nodal_deformation import MIN_NODES, NodesError
 MAX_NODES = 200_000
 """Largest number of nodes: the Delaunay triangulation of more takes minutes."""
 FLAT = 1e-6
-"""Relative thickness, in longest extents, below which nodes count as coplanar."""
+"""Ratio of the thickness of a set of nodes to its longest extent below which the nodes count as coplanar."""
 _JITTER = 1e-7
-"""Relative displacement of nodes before they are triangulated: the Delaunay tetrahedra of a lattice are not unique."""
+"""Random displacement of nodes, relative to their extents, before they are triangulated.
+
+It makes the Delaunay tetrahedra of a regular lattice unique.
+"""
 _EDGE = 1e-6
-"""Barycentric coordinate (negative) down to which a point counts as inside the outermost tetrahedra."""
+"""Largest distance outside the outermost tetrahedra, in barycentric coordinates, at which a point counts as inside."""
 _MOST_STEPS = 2000
 """Largest number of steps from tetrahedron to tetrahedron in the search for a point."""
 
@@ -52,7 +55,7 @@ class _Interpolator:
         self._values, self._tree = values, cKDTree(moved)
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Return the values (P,) at points (P, 3); NaN outside the nodes."""
+        """Return the interpolated values (P,) at P points (P, 3); NaN outside the nodes."""
         cells = self.cells
         out = np.full(len(points), np.nan)
         simplex = cells.vertex_to_simplex[self._tree.query(points)[1]]
@@ -94,7 +97,7 @@ class Coverage:
 
 
 class NodalTemperature:
-    """Change of temperature given at nodes.
+    """Change of temperature of a body, given at N nodes and interpolated between them.
 
     Attributes
     ----------
@@ -105,7 +108,7 @@ class NodalTemperature:
     linear : Temperature
         Least-squares linear field, every node with the same weight.
     spacing : float
-        Side of the cube of each node's mean share of the spanned volume, metres; 0 for coplanar nodes.
+        Cube root of the volume that the nodes span, divided by their number, metres; 0 for coplanar nodes.
     flat : bool
         True when the nodes lie in a plane or on a line; they then have a linear fit only.
     """
@@ -163,16 +166,16 @@ class NodalTemperature:
             self.spacing = (volume / count) ** (1.0 / 3.0)
 
     def _placed(self, points: np.ndarray) -> np.ndarray:
-        """Return points relative to the nodes' mean, in units of their extents."""
+        """Return points (metres) relative to the nodes' mean position, in units of the nodes' extents."""
         return np.asarray((points - self._middle) / self._scale)
 
     def _linear_at(self, points: np.ndarray) -> np.ndarray:
-        """Return the linear fit at points, kelvin."""
+        """Return the change of temperature at points according to the nodes' linear fit, kelvin."""
         return np.asarray(self.linear.change + points @ np.array(self.linear.gradient))
 
     @property
     def departures(self) -> np.ndarray:
-        """Deviations of the nodes from the linear fit, kelvin, (N,)."""
+        """Deviations of the N nodes' values from the linear fit, (N,), kelvin."""
         return self._deviations
 
     def departure(self) -> float:
@@ -180,7 +183,7 @@ class NodalTemperature:
         return float(np.max(np.abs(self._deviations)))
 
     def at(self, points: Any) -> np.ndarray:
-        """Return the change of temperature at points (P, 3), in kelvin, (P,).
+        """Return the change of temperature at P points, (P,), in kelvin.
 
         Parameters
         ----------
@@ -195,20 +198,22 @@ class NodalTemperature:
         return self._linear_at(places) + rest
 
     def _inside_rest(self, places: np.ndarray) -> np.ndarray:
-        """Return the deviation from the linear fit; NaN outside the nodes."""
+        """Return the interpolated deviation from the linear fit at points between the nodes, kelvin; NaN outside the
+        nodes.
+        """
         if self._inside is None:
             return np.full(len(places), np.nan)
         return self._inside(self._placed(places))
 
     def coverage(self, points: Any, weights: Any) -> Coverage:
-        """Return how well the nodes cover points of a body that represent parts of its volume.
+        """Return how well the nodes cover a body's volume, which P points with their volumes represent.
 
         Parameters
         ----------
         points : (P, 3) array_like
-            Points, metres.
+            Points in the body, metres.
         weights : (P,) array_like
-            Volumes, m^3.
+            Volume that each point represents, m^3.
         """
         places, share = np.asarray(points, np.float64), np.asarray(weights, np.float64)
         distance = self._tree.query(places)[0]
@@ -217,7 +222,7 @@ class NodalTemperature:
 
     @property
     def between(self) -> float:
-        """Rms error at left-out nodes (every second one), kelvin; computed once.
+        """Rms error of the interpolation at left-out nodes (every second one), kelvin; computed once.
 
         The remaining nodes have twice the volume each; this is some 1.6 times the error of all nodes where the field is
         smooth.
@@ -237,7 +242,7 @@ class NodalTemperature:
 
 
 def linear_part(points: Any, values: Any, weights: Any) -> tuple[Temperature, np.ndarray]:
-    """Return the linear field nearest to temperatures by weighted least squares, and the remainder.
+    """Return the linear field nearest to temperatures at P points by weighted least squares, and the remainder.
 
     Parameters
     ----------

@@ -37,7 +37,7 @@ _CANDIDATES = ((12, _INSIDE), (150, _NEAR))  # numbers of nearest cells to try, 
 
 @dataclass(frozen=True, eq=False)
 class Displacement:
-    """Displacement field of a body on a mesh.
+    """Displacement field of a body, given at the N nodes of a mesh.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class Displacement:
     finder: Finder
 
     def at(self, points: Any) -> np.ndarray:
-        """Return the displacement at points (P, 3) of the body, by the elements' own shape functions; metres, (P, 3).
+        """Return the displacement at P points (P, 3) of the body, by the elements' own shape functions; metres, (P, 3).
 
         Points outside the mesh by up to 2 % of a cell are extrapolated, as a curved face deviates from its cells.
 
@@ -71,7 +71,7 @@ class Displaced(Protocol):
     """Protocol of a body whose displacement is known at every point."""
 
     def at(self, points: Any) -> np.ndarray:
-        """Return the displacement at points (P, 3) of the body, metres, (P, 3)."""
+        """Return the displacement at P points (P, 3) of the body, metres, (P, 3)."""
         ...
 
 
@@ -88,7 +88,7 @@ class Formula:
     field: Callable[[np.ndarray], np.ndarray]
 
     def at(self, points: Any) -> np.ndarray:
-        """Return the displacement at points (P, 3), metres, (P, 3)."""
+        """Return the displacement at P points (P, 3) by the formula, metres, (P, 3)."""
         return self.field(np.asarray(points, np.float64))
 
 
@@ -105,7 +105,10 @@ class Finder:
         self._last: tuple[bytes, tuple[np.ndarray, np.ndarray]] | None = None
 
     def shapes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the node indices (P, I) of each point's cell, and their shape functions at the point (P, I)."""
+        """Return the I nodes of the cell that contains each of P points, and their shape functions at the point.
+
+        Both have the shape (P, I); the nodes are given by their indices.
+        """
         if points.ndim != 2 or points.shape[1] != 3 or not np.all(np.isfinite(points)):
             raise ValueError(f"points must be finite and of shape (P, 3), found shape {points.shape}")
         key = points.tobytes()
@@ -114,7 +117,9 @@ class Finder:
         return self._last[1]
 
     def _search(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return node indices and shape functions as ``shapes`` does, by a search among the nearest cells."""
+        """Return indices of nodes and shape functions at points, as ``shapes`` does, by a search among the nearest
+        cells.
+        """
         best = np.full(len(points), np.inf)
         cell = np.zeros(len(points), int)
         reference = np.zeros_like(points)
@@ -140,7 +145,11 @@ class Finder:
         )
 
     def _local(self, points: np.ndarray, cells: np.ndarray) -> np.ndarray:
-        """Return reference coordinates of points (P, 3) in cells (P,), by Newton's method; infinite where it fails."""
+        """Return the coordinates of P points (P, 3) within given cells (P,), by Newton's method; infinite where it
+        fails.
+
+        They are coordinates of the element's reference shape, the unit cube or tetrahedron.
+        """
         corners = self._corners[cells]
         x = np.full_like(points, 0.25 if self._simplex else 0.5)
         for _ in range(1 if self._simplex else 8):
@@ -157,7 +166,7 @@ class Finder:
 
 
 def rigid_modes(points: np.ndarray) -> np.ndarray:
-    """Return displacements of points (P, 3) by unit shifts and unit rotations about the origin, (6, 3 P)."""
+    """Return the displacements of P points (P, 3) by unit shifts along and unit rotations about the axes, (6, 3 P)."""
     shifts = np.broadcast_to(np.eye(3)[:, None, :], (3, len(points), 3))
     turns = np.cross(np.eye(3)[:, None, :], points[None])
     return np.concatenate([shifts, turns]).reshape(6, -1)
@@ -190,10 +199,11 @@ def face_change(
 ) -> FaceChange:
     """Return the rigid motion and change of figure of a face, by least squares over its aperture.
 
-    First the rigid motion nearest to the displacement of the material is subtracted. The rest changes the sag at fixed
-    x, y by u_z - s_x u_x - s_y u_y (first order in u). Zernike terms from Z4 on are fitted to it, together with the
-    piston and tilts that a further rigid motion of this surface makes, which are then added to the rigid motion. For a
-    plane, rotate, shift and figure together thus describe the whole normal displacement except the residual.
+    First the rigid motion nearest to the displacement u of the material is subtracted. The remainder changes the sag at
+    fixed x, y by u_z - s_x u_x - s_y u_y (first order in u), with s_x and s_y the slopes of the surface. Zernike terms
+    from Z4 on are fitted to it, together with the piston and tilts that a further rigid motion of this surface makes,
+    which are then added to the rigid motion. For a plane, rotate, shift and figure together thus describe the whole
+    normal displacement except the residual.
 
     The disk of the terms is that of the surface's Zernike figure, else the aperture's circle, else the circle around
     the rectangle, as in the ray trace. On a narrow rectangle some combinations of terms are nearly dependent; those
@@ -211,7 +221,7 @@ def face_change(
     pose : Pose
         Pose of the face's frame in the mesh's.
     terms : int
-        Highest Noll index, 3 for none.
+        Highest Noll index, 3 for no Zernike terms.
 
     Raises
     ------
@@ -255,7 +265,7 @@ def face_change(
 
 
 def _samples(aperture: Aperture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return quadrature nodes x, y over an aperture and the weights of a mean, each shape (P,)."""
+    """Return P quadrature nodes x, y over an aperture, metres, and the weights of a mean over it, (P,) each."""
     match aperture:
         case Circle():
             nodes = quadrature.disk(10, inner=aperture.inner / aperture.radius)
@@ -275,7 +285,7 @@ def _samples(aperture: Aperture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 Field = Callable[[np.ndarray], Any]
-"""Function of points: (P, 3) metres -> values (P,)."""
+"""Function of position: P points (P, 3) in metres -> values (P,), e.g. changes of temperature."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,7 +303,7 @@ class Kinematic:
     points: np.ndarray
 
     def __post_init__(self) -> None:
-        """Copy, freeze and check."""
+        """Copy and freeze the points, and check that they are three that do not lie on a line."""
         points = np.array(self.points, np.float64)
         if points.shape != (3, 3) or not np.all(np.isfinite(points)):
             raise ValueError(f"a kinematic support needs three finite points (3, 3), found shape {points.shape}")
@@ -303,7 +313,7 @@ class Kinematic:
         object.__setattr__(self, "points", points)
 
     def released(self, motion: np.ndarray) -> np.ndarray:
-        """Return the six components of displacements (3 points, 3) that this support forbids, metres, shape (6,)."""
+        """Return the six components that this support holds at 0, from the displacements (3 points, 3), metres, (6,)."""
         along = self.points[1] - self.points[0]
         along = along / np.linalg.norm(along)
         normal = np.cross(along, self.points[2] - self.points[0])
@@ -316,12 +326,12 @@ class Kinematic:
 class Bonded:
     """Part of the body's surface bonded to a stiff foundation that expands independently.
 
-    The bonded nodes move by expansion * change * (r - about).
+    The bonded nodes, at r, move by expansion * change * (r - about).
 
     Attributes
     ----------
     where : callable
-        Nodes (N, 3) in metres -> mask of the bonded ones, (N,) bool.
+        N nodes (N, 3) in metres -> mask of the bonded ones, (N,) bool.
     expansion : float
         Thermal expansion of the foundation, 1/K.
     change : float
@@ -350,9 +360,9 @@ class ElasticBody:
     Attributes
     ----------
     nodes : (N, 3) ndarray
-        All nodes of the quadratic elements, metres.
+        All N nodes of the quadratic elements, metres.
     places : (P, 3) ndarray
-        Quadrature points at which loads are evaluated, metres.
+        P quadrature points at which loads are evaluated, metres.
     volumes : (P,) ndarray
         Volumes that the quadrature points represent, m^3.
     """
@@ -391,14 +401,14 @@ class ElasticBody:
     def solve_many(
         self, temperatures: Sequence[Field], support: Support | Sequence[Support]
     ) -> tuple[Displacement, ...]:
-        """Return one displacement for each temperature change.
+        """Return the displacement of the body for each of several changes of temperature.
 
         Load cases on supports that hold the same nodes share one factorisation, and so do all kinematic supports.
 
         Parameters
         ----------
         temperatures : sequence of callable
-            Changes of temperature in kelvin, points (P, 3) -> (P,).
+            Changes of temperature in kelvin, each a function of P points, (P, 3) -> (P,).
         support : Kinematic or Bonded, or a sequence of them
             One support for all, or one for each load case.
 
@@ -430,7 +440,7 @@ class ElasticBody:
         return tuple(out)
 
     def _load(self, temperature: Field) -> np.ndarray:
-        """Return the thermal forces divided by Young's modulus, shape (3 N,)."""
+        """Return the thermal forces at the N nodes divided by Young's modulus, (3 N,), m^2."""
         points = self.places
         change = np.asarray(temperature(points), np.float64)
         if change.shape != (len(points),):
@@ -452,7 +462,7 @@ class ElasticBody:
         return chosen
 
     def _solved(self, load: np.ndarray, fixed: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return nodal displacements (N, 3) with the components ``fixed`` held at ``values``."""
+        """Return the displacements (N, 3) of N nodes, metres, with the components ``fixed`` held at ``values``."""
         key = fixed.tobytes()
         if key not in self._factors:
             free = np.setdiff1d(np.arange(len(load)), fixed)
@@ -468,7 +478,7 @@ class ElasticBody:
         return out.reshape(-1, 3)
 
     def _supported(self, values: np.ndarray, support: Kinematic) -> np.ndarray:
-        """Move a deformation rigidly so that it satisfies the support."""
+        """Return nodal displacements plus the rigid motion that makes them satisfy a kinematic support."""
         at_points = Displacement(self.nodes, values, self._finder).at(support.points)
         modes = rigid_modes(support.points).reshape(6, 3, 3)
         matrix = np.stack([support.released(mode) for mode in modes], axis=-1)
@@ -479,9 +489,10 @@ class ElasticBody:
 def free_linear_field(
     expansion: float, change: float, gradient: Any, about: Any = (0.0, 0.0, 0.0)
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the exact displacement of a free body whose temperature changes by T = change + gradient . (r - about).
+    """Return the exact displacement of a free body whose change of temperature is linear in position.
 
-    u = a change q + a ((g . q) q - q^2 g / 2) with q = r - about. Its strain is a T in all directions, so there is no
+    At r the temperature changes by T = change + g . q, with q = r - about and g the gradient, and the displacement is u
+    = a change q + a ((g . q) q - q^2 g / 2), with a the expansion. Its strain is a T in all directions, so there is no
     stress in any shape of body. Of all rigid motions the one is chosen that leaves ``about`` fixed without rotation;
     elsewhere the body rotates by a (g x q).
 
@@ -499,7 +510,7 @@ def free_linear_field(
     Returns
     -------
     callable
-        Points (P, 3) in metres -> displacements (P, 3) in metres.
+        P points (P, 3) in metres -> displacements (P, 3) in metres.
     """
     g, origin = np.asarray(gradient, np.float64), np.asarray(about, np.float64)
 
@@ -512,6 +523,6 @@ def free_linear_field(
 
 
 def _on_a_line(points: np.ndarray) -> bool:
-    """Return True when points (P, 3) span no plane, within 1e-6 of their extent."""
+    """Return True when P points (P, 3) lie on one line, within 1e-6 of their extent."""
     spread = np.linalg.svd(points - np.mean(points, axis=0), compute_uv=False)
     return bool(spread[1] <= 1e-6 * spread[0])
