@@ -395,7 +395,7 @@ class Equations:
 
     @cached_property
     def _carried(self) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
-        """Negative derivatives (3m, P) and (3m, S) of the points with respect to x and z."""
+        """Negative derivatives of point coordinates with respect to unknowns, (3m, P), and shared noise, (3m, S)."""
         both, count = (self.point_inverse @ self.cross).tocsc(), self.design.shape[1]
         return both[:, :count].tocsr(), both[:, count:].tocsr()
 
@@ -659,7 +659,7 @@ def _point_blocks(point: Array, place: NDArray[np.intp], weight: Array, count: i
 
 
 def _padded(rows: sparse.coo_matrix, size: int) -> tuple[Array, NDArray[np.intp]]:
-    """Return sparse rows (n size, K), grouped by `size`, as dense values (n, size, w) with their columns (n, w)."""
+    """Return a sparse matrix of n groups of `size` rows in dense form: values (n, size, w) and columns (n, w)."""
     count, width = rows.shape[0] // size, rows.shape[1]
     key = (rows.row // size).astype(np.int64) * width + rows.col
     used, slot = np.unique(key, return_inverse=True)

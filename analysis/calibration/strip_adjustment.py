@@ -347,7 +347,7 @@ def _used(parameters: Parameters, name: str, line: str) -> Array:
 def _alternate(
     normal: Array, right: Array, blocks: Sequence[NDArray[np.intp]], sigma: Array, tolerance: float, most: int
 ) -> tuple[Array, list[float]]:
-    """Iterate rounds on linear equations until one is below the tolerance.
+    """Solve linear normal equations for two blocks of unknowns alternately, until the steps are below a tolerance.
 
     Returns
     -------

@@ -29,7 +29,7 @@ from analysis.arrays import Array, MeasurementError
 from analysis.images.image_file import FITS_MAGIC, ImageError, ImageFile, fits_cards
 
 WAVES = "waves"
-"""Unit that needs a wavelength."""
+"""Unit of values in wavelengths, whose conversion to metres needs the wavelength."""
 _LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "pm": 1e-12}
 """Metres in each unit of length."""
 _NAMES = {
@@ -174,7 +174,7 @@ def length_from(path: Path, text: str, key: str) -> float:
 
 
 def agreed(path: Path, key: str, stated: float | None, found: float | None) -> float | None:
-    """Return the value from file or user; raise MapError if both state different ones.
+    """Return a value that file or user specifies; raise MapError if both specify it differently.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ MOST_POINTS = 20_000_000
 _ZEMAX_UNITS = {0: 1e-3, 1: 1e-2, 2: 25.4e-3, 3: 1.0}
 """Metres for each unit flag of a Grid Sag file."""
 _CODEV_NO_DATA = -32768
-"""Count that marks missing data in CODE V files without NDA."""
+"""Integer value that marks missing data in CODE V files whose header does not define another by the keyword NDA."""
 _CODEV_DATA = ("WFR", "SUR", "FIL")
 _CODEV_KEY = re.compile(r"\b(GRD|ZFR|ZRN)\s+\d+", re.IGNORECASE)
 _STATEMENT = re.compile(r"#\s*([\w ]+?)\s*[:=]\s*(.*)")
@@ -274,7 +274,7 @@ def is_codev(lines: list[Line]) -> bool:
 
 
 def is_zemax(lines: list[Line]) -> bool:
-    """Return True if the first line has the five or seven numbers of a Grid Sag file, two sizes first.
+    """Return True if the first line has the five or seven numbers of the header of a Zemax Grid Sag file.
 
     Parameters
     ----------
@@ -290,7 +290,7 @@ def is_zemax(lines: list[Line]) -> bool:
 
 
 def _numbers(path: Path, lines: Iterable[Line], split: str = r"\s+") -> tuple[Array, list[int]]:
-    """Return all numbers of lines in a row and the number of each line; raise MapError at text that is not a number."""
+    """Return all numbers in some lines as one array, and how many each line holds; MapError for other text."""
     numbers, widths = array("d"), []
     for number, text in lines:
         words = re.split(split, text.strip(" \t,;"))
@@ -305,7 +305,9 @@ def _numbers(path: Path, lines: Iterable[Line], split: str = r"\s+") -> tuple[Ar
 
 
 def read_codev(path: Path, lines: list[Line]) -> WavefrontMap:
-    """Read a CODE V interferogram with a grid: integers of which SSZ make one wave of WVL micrometres.
+    """Read a CODE V interferogram file that holds a grid of integers.
+
+    The header gives SSZ, the integer that corresponds to one wave, and WVL, the wavelength in micrometres.
 
     Parameters
     ----------
@@ -465,7 +467,7 @@ def read_table(path: Path, text: str, wavelength: float | None) -> WavefrontMap:
 
 
 def statements(path: Path, text: str, keys: tuple[str, ...]) -> dict[str, str]:
-    """Return the values of lines ``# key: value`` of a table; other comments are ignored.
+    """Return the values of the header lines ``# key: value`` of a text table; other comments are ignored.
 
     Parameters
     ----------
@@ -493,7 +495,7 @@ def statements(path: Path, text: str, keys: tuple[str, ...]) -> dict[str, str]:
 
 
 def unit_written(path: Path, found: str | None, remedy: str) -> str:
-    """Return the unit that a file states.
+    """Return the unit specified in a file; raise MapError if it is missing or unknown.
 
     Parameters
     ----------
@@ -536,9 +538,9 @@ METROPRO_MAGIC = b"\x88\x1b\x03"
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 """First bytes of HDF5 files."""
 _HEADERS = {0x6F: 834, 0x70: 834, 0x71: 4096}
-"""Smallest header size in bytes for each header format, the last byte of the magic number."""
+"""Smallest header size, in bytes, of each MetroPro header format; the key is the last byte of the magic number."""
 _STEPS = {0: 4096, 1: 32768, 2: 131072}
-"""Counts per fringe for each phase resolution of the header."""
+"""Number of integer counts per fringe for each value of the header's phase resolution in MetroPro files."""
 _INVALID = 2147483640
 """Count from which a point of a Zygo file is invalid."""
 _LARGEST_WAVELENGTH = 1e-3
@@ -558,7 +560,7 @@ _FIELDS = {
     "sign": (">H", 232),
     "codev_type": (">H", 298),
 }
-"""Format and byte offset of the header fields that are used."""
+"""Format (as in Python's struct) and byte offset of the fields of a MetroPro header that are read."""
 
 
 def is_metropro(start: bytes) -> bool:
@@ -629,7 +631,7 @@ def read_metropro(path: Path) -> WavefrontMap:
 
 
 def _of_scale(scale: float) -> str:
-    """Return the note on the interferometric scale factor."""
+    """Return the sentence that reports the interferometric scale factor used, in waves per fringe."""
     return f"The interferometric scale factor of the file, {scale:.6g} waves per fringe, is in the values."
 
 
@@ -717,7 +719,7 @@ def _surfaces(file: Any) -> Iterator[Any]:
 
 
 def _member(node: Any, name: str) -> Any:
-    """Return the group or data set of a name, None for none; links are refused without following them.
+    """Return an HDF5 group or data set by its name, or None if there is none; links are refused.
 
     Raises
     ------
@@ -738,7 +740,7 @@ def _member(node: Any, name: str) -> Any:
 
 
 def _attributes(file: Any, surface: Any) -> dict[str, Any]:
-    """Return scalar and text attributes of the surface and, where missing there, of the measurement."""
+    """Return scalar and text attributes of an HDF5 surface, supplemented by those of its measurement."""
     import h5py
 
     general = _member(file, "Measurement/Attributes")
@@ -764,7 +766,10 @@ def _number(keys: dict[str, Any], key: str, otherwise: float) -> float:
 
 
 def _spacing(surface: Any) -> float:
-    """Return metres per pixel from the converter of x: category, unit, and parameters, of which it is the second."""
+    """Return the pixel spacing, in metres, of a surface in an Mx file, from its attribute for the x axis.
+
+    The attribute holds category, unit and parameters; the spacing is the second parameter.
+    """
     try:
         category, _, parameters = surface.attrs["X Converter"][0]
         spacing = float(parameters[1])
@@ -843,7 +848,7 @@ def _read(path: Path, start: bytes, wavelength: float | None) -> WavefrontMap:
 
 
 def _fits(path: Path, wavelength: float | None) -> WavefrontMap:
-    """Read an image of a FITS file; row 0, which FITS viewers display lowest, is row 0 of the map."""
+    """Read a wavefront or surface from an image of a FITS file; its row 0, displayed lowest, is row 0 of the map."""
     try:
         image = ImageFile.open(path, choose="")
         if len(image.header.pages) != 1:

@@ -36,7 +36,7 @@ _ORIENTATION_NAMES = {
 }
 """Name of each orientation, by (mirrored, quarter turns)."""
 _COSINE = (1, 0, -1, 0)
-"""Cosine of multiples of 90 degrees."""
+"""Cosine of 0, 90, 180 and 270 degrees, as exact integers."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Orientation:
 
     @property
     def matrix(self) -> NDArray[np.int_]:
-        """Matrix (2, 2) that maps points: a feature at p moves to ``matrix @ p``."""
+        """Matrix (2, 2) of the operation: a feature at the point p = (x, y) moves to ``matrix @ p``."""
         c, s = _COSINE[self.quarter_turns], _COSINE[(self.quarter_turns + 3) % 4]
         return np.array([[c, -s], [s, c]]) @ np.diag([1, -1 if self.mirrored else 1])
 
@@ -103,7 +103,7 @@ class Orientation:
         return self.name if self.sign > 0 else f"{self.name}, sign inverted"
 
     def values(self, values: Array) -> Array:
-        """Return the values of a map after the operation.
+        """Return an array of map values after mirror, rotations and sign change.
 
         Parameters
         ----------
@@ -115,7 +115,7 @@ class Orientation:
         return self.sign * np.rot90(flipped, -self.quarter_turns)
 
     def apply(self, measured: WavefrontMap) -> WavefrontMap:
-        """Return a map after the operation.
+        """Return a wavefront map after mirror, rotations and sign change.
 
         Parameters
         ----------
@@ -130,7 +130,7 @@ class Orientation:
         Parameters
         ----------
         terms : sequence of int
-            Noll's indices, (Z,), with both the cosine and the sine term of every azimuthal order.
+            Noll's indices of the Z terms, with both the cosine and the sine term of every azimuthal order.
 
         Raises
         ------
@@ -181,7 +181,7 @@ class OrientationEvidence:
     Attributes
     ----------
     readings : tuple of Orientation
-        Orientations, the best one first.
+        The K possible orientations, the best one first.
     chi_square : (K,) ndarray
         Chi-square of each against the prediction.
     log_evidence : (K,) ndarray
@@ -206,12 +206,13 @@ class OrientationEvidence:
 
     @property
     def found(self) -> Orientation | None:
-        """Best orientation, if the data allow it and distinguish it from all others; None otherwise."""
+        """Best orientation if it agrees with the data and no other one fits nearly as well, otherwise None."""
         return self.readings[0] if len(self.indistinguishable) == 1 and self.readings[0] in self.allowed else None
 
 
 _ODDS = 100.0
-"""Odds of the best orientation from which another one is distinguished from it."""
+"""Ratio of the probability of the best orientation to that of another one above which the two count as distinguished.
+"""
 
 
 def orientation_evidence(
@@ -226,7 +227,7 @@ def orientation_evidence(
     Parameters
     ----------
     measured : (F, Z) ndarray
-        Coefficients in the orientation of the files, in metres.
+        Measured coefficients of Z terms at F field points, in the orientation of the files, in metres.
     expected : (F, Z) ndarray
         Predicted coefficients, in metres.
     covariance : (F*Z, F*Z) ndarray
@@ -276,8 +277,8 @@ def orientation_evidence(
 
 
 LEAST_INDEPENDENCE = 1e-6
-"""Smallest share of a term that is independent of the terms before it; below it the illuminated pixels do not separate
-them.
+"""Smallest fraction of a term's mean square over the illuminated pixels that the terms before it cannot represent;
+below it these pixels do not separate the terms.
 """
 _CHUNK = 50_000
 """Number of pixels processed at a time, which limits the memory for large maps."""
@@ -286,11 +287,9 @@ _TRIES, _NEAR, _STEP = 400, 1.5, 0.75
 first and when it is refined: a step lies within half a pixel of the edge.
 """
 _SPECK = 0.02
-"""Smallest area of a connected illuminated region, relative to the largest; smaller ones lie outside the pupil, or are
-negligible.
-"""
+"""Smallest area of a connected illuminated region, relative to the largest; smaller regions are ignored as specks."""
 _ROUND_SHARE = 0.5
-"""Smallest share of the full angle over which the edge of a pupil must be visible."""
+"""Smallest fraction of 360 degrees over which the edge of a pupil must be visible."""
 
 
 @dataclass(frozen=True)
@@ -326,7 +325,7 @@ class Pupil:
             raise MapError(f"a pupil at {self.x:g}, {self.y:g} with radius {self.radius:g} pixels: radii are positive")
 
     def unit(self, columns: Array, rows: Array) -> tuple[Array, Array]:
-        """Return coordinates on the unit disk.
+        """Return pixel positions as coordinates x, y relative to the pupil's centre, in units of its radius.
 
         Parameters
         ----------
@@ -340,12 +339,12 @@ class Pupil:
 
 @dataclass(frozen=True, eq=False)
 class MapFit:
-    """Zernike terms of a map.
+    """Coefficients of Zernike terms fitted to a map.
 
     Attributes
     ----------
     coefficients : (Z,) ndarray
-        Coefficients of the circular terms, in metres RMS over the full disk.
+        Coefficients of the Z Zernike terms, in metres RMS over the full disk.
     parts : (Z,) ndarray
         Coefficients of terms that are orthonormal over the illuminated pixels, in metres RMS over these.
     """
@@ -419,7 +418,7 @@ def find_pupil(values: ArrayLike) -> Pupil:
 
 
 def _ends(lit: NDArray[np.bool_]) -> Array:
-    """Return the first and last steps of each row of a mask inside the map, as (column, row)."""
+    """Return the first and last edge of the illuminated pixels in each row of a mask, as points (column, row)."""
     rows = np.flatnonzero(lit.any(axis=1))
     first, last = lit[rows].argmax(axis=1), lit.shape[1] - 1 - lit[rows, ::-1].argmax(axis=1)
     left, right = np.stack([first - 0.5, rows], axis=1), np.stack([last + 0.5, rows], axis=1)
@@ -427,7 +426,7 @@ def _ends(lit: NDArray[np.bool_]) -> Array:
 
 
 def _circle(points: Array) -> tuple[float, float, float]:
-    """Return column and row of the centre, and radius, of the circle that fits points (N, 2) best."""
+    """Return column and row of the centre, and radius, of the least-squares circle through N points, in pixels."""
     middle = points.mean(axis=0)
     offset = points - middle
     solution, *_ = np.linalg.lstsq(
@@ -519,7 +518,7 @@ def fit_wavefront_map(values: ArrayLike, terms: Sequence[int], pupil: Pupil | No
 
 
 def _checked_map(values: ArrayLike) -> Array:
-    """Return a map as float64; raise MapError if it is not a plane of real numbers."""
+    """Return a map as a float64 array; raise MapError if it is not a two-dimensional array of real numbers."""
     plane = np.asarray(values)
     if plane.ndim != 2 or plane.dtype.kind not in "iuf":
         raise MapError(

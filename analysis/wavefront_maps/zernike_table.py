@@ -30,7 +30,7 @@ from analysis.wavefront_maps import map_files
 HIGHEST_ORDER = 30
 """Highest radial order of the supported terms."""
 MOST_TERMS = (HIGHEST_ORDER + 1) * (HIGHEST_ORDER + 2) // 2
-"""Number of supported terms."""
+"""Number of Zernike terms up to the highest radial order, and largest supported index."""
 LAST_FRINGE = 37
 """Last Fringe index: spherical aberration of the twelfth order, which the general rule would count as the 49th term."""
 
@@ -156,11 +156,13 @@ def ansi_to_nm(index: int) -> tuple[int, int]:
 
 
 ORDERS = {"noll": noll_to_nm, "fringe": fringe_to_nm, "ansi": ansi_to_nm}
-"""Functions from the index of each order of terms to n and m."""
+"""Functions that convert an index to radial order n and azimuthal order m, by the name of the ordering."""
 
 
 def edge_value(n: int, m: int) -> float:
-    """Return the largest value at the edge of a term of unit RMS, where a term of unit peak reaches 1.
+    """Return the largest value at the edge of the disk of a Zernike term of unit RMS.
+
+    It converts coefficients of terms that reach 1 at the edge to those of terms of unit RMS.
 
     Parameters
     ----------
@@ -173,12 +175,12 @@ def edge_value(n: int, m: int) -> float:
 
 
 def circle_terms(terms: Any, x: Any, y: Any) -> Array:
-    """Return the values of terms of unit RMS over the disk at points, as columns (N, Z).
+    """Return the values of Z Zernike terms, of unit RMS over the disk, at N points, as (N, Z).
 
     Parameters
     ----------
     terms : sequence of int
-        Noll's indices, (Z,).
+        Noll's indices of the Z terms.
     x : (N,) array_like
         x on the unit disk.
     y : (N,) array_like
@@ -199,7 +201,7 @@ def circle_terms(terms: Any, x: Any, y: Any) -> Array:
 
 
 ORDER_NAMES = {"noll": "noll", "fringe": "fringe", "ansi": "ansi", "osa": "ansi", "osa/ansi": "ansi"}
-"""Names of orders in files, and the orders that they mean."""
+"""Names of orderings of Zernike terms in files, and the keys of `ORDERS` that they mean."""
 NORMALISATIONS = {"rms": True, "peak": False}
 """Normalisations: True for unit RMS over the disk, False for unit peak, terms that reach 1 at the edge."""
 _INDEX = ("index", "j", "term")
@@ -212,12 +214,12 @@ _MOST_CHARACTERS = 10_000_000
 
 @dataclass(frozen=True, eq=False)
 class ZernikeTable:
-    """Coefficients of F wavefronts.
+    """Zernike coefficients of F wavefronts, for instance at F field points, read from a file.
 
     Attributes
     ----------
     terms : (Z,) tuple of int
-        Noll's indices, ascending.
+        Noll's indices of the Z terms, ascending.
     coefficients : (F, Z) ndarray
         Coefficients of terms of unit RMS over the disk, in metres, with the file's sign.
     others : mapping of str to tuple of str
@@ -236,7 +238,7 @@ class ZernikeTable:
 
 
 def read_zernikes(path: Path, *, wavelength: float | None = None) -> ZernikeTable:
-    """Read the coefficients of a table.
+    """Read Zernike coefficients from a CSV table and convert them to Noll's terms in metres.
 
     Parameters
     ----------
@@ -298,7 +300,7 @@ def read_zernikes(path: Path, *, wavelength: float | None = None) -> ZernikeTabl
 
 
 def _keyword(path: Path, key: str, found: str | None, known: Mapping[str, Any]) -> Any:
-    """Return the value of a key in a file, translated to its meaning here."""
+    """Return the meaning of the value of a header key such as ``order``; raise MapError for an unknown value."""
     if found is None:
         raise map_files.MapError(
             f"{path} does not state its {key}: add a line '# {key}: {next(iter(known))}' ({', '.join(known)})"
@@ -309,7 +311,7 @@ def _keyword(path: Path, key: str, found: str | None, known: Mapping[str, Any]) 
 
 
 def _table(path: Path, text: str) -> tuple[list[int], Array, dict[str, tuple[str, ...]], set[str | None]]:
-    """Return indices (Z,), coefficients (F, Z), other columns, and the units in the heads of the coefficients."""
+    """Return term indices (Z,), coefficients (F, Z), other columns, and units in the heads of a CSV table."""
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and line.strip()[0] != "#"]
     if not lines:
         raise map_files.MapError(f"{path} holds no table")
@@ -344,7 +346,7 @@ def _table(path: Path, text: str) -> tuple[list[int], Array, dict[str, tuple[str
 
 
 def _whole(path: Path, line: int, cell: str) -> int:
-    """Return the index of a term in a cell."""
+    """Return the index of a Zernike term in a table cell; raise MapError if it is not a whole number."""
     match = _TERM.fullmatch(cell) or re.fullmatch(r"([0-9]{1,4})", cell)
     if match is None:
         raise map_files.MapError(f"{path}, line {line}: {cell[:40]!r} is not the index of a term")
@@ -352,7 +354,7 @@ def _whole(path: Path, line: int, cell: str) -> int:
 
 
 def _real(path: Path, line: int, cell: str) -> float:
-    """Return the coefficient in a cell."""
+    """Return the coefficient in a table cell; raise MapError if it is not a finite number."""
     try:
         value = float(cell.replace("_", "?"))
     except ValueError:
