@@ -336,7 +336,7 @@ class LoopCourse:
 
     @property
     def contradiction(self) -> int | None:
-        """Index of the first reading that contradicts the prior, at `FALSE_ALARM` over all readings; None for none."""
+        """Index of the first reading that contradicts the prior, at `FALSE_ALARM` over all readings, or None."""
         p_value = chance_beyond(self.chi_square, self.model.prior.spots.shape[0])
         beyond = np.flatnonzero(p_value < FALSE_ALARM / len(self.times))
         return int(beyond[0]) if len(beyond) else None
@@ -364,7 +364,7 @@ def drifting_states(spec: OrbitMonitorSpec, experiment: MonitorExperiment, seed:
 
 
 Read: TypeAlias = Callable[[State, int], Recovery]
-"""Function of a state and the index of its moment that returns the recovered shifts since the nominal images."""
+"""Function of a state and the index of its moment that returns the spots' shifts since the nominal images."""
 
 
 def reader(model: LoopModel, spec: OrbitMonitorSpec, seed: int) -> Read:

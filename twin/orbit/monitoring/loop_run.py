@@ -363,7 +363,7 @@ class LoopRun:
     def worse(self) -> dict[str, tuple[float, float]]:
         """Errors that the loop increases: name -> RMS over the moments with the loop open and closed.
 
-        Angle and quantities are in rad and m, height in m; of the MTF at Nyquist, its difference from 1.
+        Angle and quantities are in rad and m, height in m; for the MTF at Nyquist it is the largest difference from 1.
         """
         open_errors, closed_errors = self._errors(self.open), self._errors(self.closed)
         return {

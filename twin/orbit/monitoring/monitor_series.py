@@ -114,7 +114,7 @@ class Readings:
 
     @property
     def across(self) -> tuple[np.ndarray, np.ndarray | None]:
-        """Covariances (T, 4, 4) between the errors of the two cameras: from noise, and of the whole error."""
+        """Covariances between the errors of the two cameras at T times, (T, 4, 4): from noise, and of all errors."""
         return self.noise[:, :4, 4:], None if self.total is None else self.total[:, :4, 4:]
 
 
@@ -144,7 +144,7 @@ class Measured:
     Attributes
     ----------
     positions : (2, S, C, 2) ndarray
-        Positions before and after, in px.
+        Positions of the C spots at the reference (first) and in the S states (second), row and column, in px.
     covariance : (S, 2 C, 2 C) ndarray
         Covariance of each state's shifts, in px^2.
     noise : SeriesNoise or None
@@ -264,7 +264,10 @@ class MonitorSeries:
         return Measured.of(*self._observed(states, (self._expected,))[0])
 
     def prism_shifts(self) -> np.ndarray:
-        """Return the (T, 2 C) shifts, without noise, by temperatures that the file gives to the monitor's prisms."""
+        """Return the shifts of C spots due to the temperatures of the monitor's prisms, (T, 2 C), in px.
+
+        The temperatures are those of the file at T times; the shifts have no noise.
+        """
         job = self.spec.job
         states = []
         for k in range(len(self.spec.times)):
@@ -298,7 +301,9 @@ class MonitorSeries:
         return Measured.of([recovery for recoveries, _, _ in repeats for recovery in recoveries], None, repeats[0][2])
 
     def gains(self, measured: Measured, numbers: Sequence[int]) -> np.ndarray:
-        """Return the (S, 8, 2 C) gains of the estimator: parameters of the pair per pixel of shift.
+        """Return the estimator's gains for C spots in S states, (S, 8, 2 C): parameters per pixel of shift.
+
+        The 8 parameters are d_alpha, d_beta, d_gamma (rad) and d_f (m) of the first camera, then of the second.
 
         Parameters
         ----------

@@ -211,7 +211,7 @@ def _positions_figure(run: LoopRun) -> Figure:
 
 
 def _loop_figure(run: LoopRun) -> Figure:
-    """Draw the open loop in the complex plane, and the drift that remains with the closed loop."""
+    """Draw the open loop's frequency response in the complex plane, and the drift that remains with the loop closed."""
     figure = svg.new_figure(4.2)
     left, right = figure.subplots(1, 2)
     svg.gridded(left)

@@ -256,7 +256,7 @@ class MonitorRun(PairFlight):
         return np.array([float(name in self.spec.apply) for name in PARAMETERS])
 
     def height(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the (T,) mean height errors, in metres, by errors (T, 4) of each camera's parameters."""
+        """Return the mean height errors due to errors (T, 4) of each camera's parameters at T times, (T,), in m."""
         heights = [np.sum(self.slopes[n] * values[n], axis=1) for n in self.pair]
         return np.asarray(np.sum(heights, axis=0))
 
@@ -370,7 +370,7 @@ class MonitorRun(PairFlight):
 
     @cached_property
     def conversion(self) -> Conversion:
-        """Height change for an arcsecond, at the reference, where the calibrated cameras are the true ones."""
+        """Height change for a rotation by an arcsecond, at the reference, where the calibrated cameras are true."""
         k = self.spec.reference_index
         view, traced = self.views[k], {}
         first, second = self.pair

@@ -205,7 +205,7 @@ class PairFlight:
         return FrozenMap({name: self._slopes(i) for i, name in enumerate(self.pair)})
 
     def _slopes(self, i: int) -> np.ndarray:
-        """Return the derivatives (T, 4) for camera i of the pair."""
+        """Return the derivatives of the mean height with respect to camera i's correction, (T, 4), m/rad and m/m."""
         table = np.empty((len(self.views), 4))
         for k, view in enumerate(self.views):
             for j, step in enumerate(_STEP):
