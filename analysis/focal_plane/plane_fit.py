@@ -43,7 +43,9 @@ _LEAST_SPREAD = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class RigidMotion:
-    """Rotation about O' followed by a shift, both in the frame before the motion.
+    """Small rigid motion of the focal-plane assembly: rotation about the line's centre O', then a shift.
+
+    Both are in the assembly's frame O'-X'Y'Z' before the motion.
 
     Attributes
     ----------
@@ -141,7 +143,7 @@ class FocalPlaneFit:
     slope_x, slope_y : float
         Slopes of the best focus along +X' and +Y', in radians.
     covariance : (3, 3) ndarray
-        Covariance of piston, slope_x and slope_y.
+        Covariance of piston (metres), slope_x and slope_y (radians).
     position : (N, 2) ndarray
         Positions X', Y', in metres.
     residual : (N,) ndarray
@@ -183,13 +185,15 @@ class FocalPlaneFit:
         return np.asarray((gain * self.sigma**2) @ gain.T)
 
     def plane(self, position: ArrayLike) -> tuple[Array, Array]:
-        """Return the height (...) of the fitted plane at positions (..., 2), and its sigma (...), in metres."""
+        """Return the height of the fitted plane at positions X', Y' (..., 2), and its sigma, both (...), in metres."""
         design = _design(np.asarray(position, np.float64))
         height = design @ np.array([self.piston, self.slope_x, self.slope_y])
         return np.asarray(height), np.sqrt(np.einsum("...i,ij,...j->...", design, self.covariance, design))
 
     def predicted_defocus(self) -> tuple[Array, Array]:
-        """Return the predicted defocus (N,) after an exact correction, in metres, and its covariance (N, N).
+        """Return the defocus at the N positions predicted after an exact correction, in metres, and its covariance.
+
+        The covariance is (N, N), in m^2.
 
         True heights are the plane plus independent deviations of extra_sigma. The prediction is the best linear one:
         each residual is multiplied by extra_sigma^2 / (extra_sigma^2 + sigma^2), so it is zero for a true plane, and
@@ -325,7 +329,7 @@ def fit_focal_plane(
 
 
 def _design(position: Array) -> Array:
-    """Return the columns 1, X', Y' as (..., 3)."""
+    """Return the derivatives (1, X', Y') of a plane's height with respect to piston and slopes, (..., 3)."""
     return np.stack([np.ones(position.shape[:-1]), position[..., 0], position[..., 1]], axis=-1)
 
 
@@ -491,7 +495,10 @@ class ShimPlan:
         return self.shims_only.line_turn - self.wanted.line_turn
 
     def focus_error(self, position: ArrayLike) -> Array:
-        """Return the defocus (focus minus CCD along +Z') that rounding leaves at positions (..., 2), in metres."""
+        """Return the defocus that remains at positions (..., 2) because shims are rounded, in metres.
+
+        It is the focus minus the CCD along +Z'.
+        """
         spots = np.asarray(position, np.float64)
         point = np.concatenate([spots, np.zeros((*spots.shape[:-1], 1))], axis=-1)
         return np.asarray((self.wanted.moved(point) - self.achieved.moved(point))[..., 2])
@@ -554,7 +561,7 @@ def shim_plan(correction: RigidMotion, mount: Mount, present: ArrayLike) -> Shim
 
 
 def _seated(motion: RigidMotion, mount: Mount, change: Array) -> RigidMotion:
-    """Return the motion after the assembly has settled on shims changed by (H,), in metres.
+    """Return the motion after the assembly has settled on H shims changed by `change`, in metres.
 
     It is the nearest motion whose holes rise by `change` in the least-squares sense. The assembly settles by tilts
     about axes in the mounting surface through the holes' centre and a lift along the normal, so rotation and slide stay

@@ -37,7 +37,7 @@ from analysis.arrays import Array, MeasurementError
 from analysis.statistics import chance_beyond
 
 QUARTIC = 0.3
-"""Fourth-order coefficient q of the fitted form."""
+"""Fourth-order coefficient q of the fitted curve p (1 - u + q u^2), with u the scaled square of the defocus."""
 FRACTION = 0.5
 """Fraction of the peak above which the fitted curve uses points."""
 LEAST_POINTS = 5
@@ -85,7 +85,11 @@ def _main_peak(z: Array, v: Array, weight: Array) -> tuple[NDArray[np.intp], NDA
 
 
 class _Lobe:
-    """Fit v = p (1 - u + q u^2), u = a (x - x0)^2, of B curves; x is z about a centre in units of a scale."""
+    """Fit of the main lobe of B through-focus curves: value v = p (1 - u + q u^2), u = a (x - x0)^2.
+
+    p is the peak value, x0 the position of the vertex, a the width parameter and q = `QUARTIC`; x is the focus position
+    about a centre, in units of a scale.
+    """
 
     def __init__(self, z: Array, v: Array, weight: Array, start: NDArray[np.intp], mask: NDArray[np.bool_]) -> None:
         rows = np.arange(len(z))
@@ -127,7 +131,7 @@ class _Lobe:
         return mask
 
     def window(self, fraction: float) -> NDArray[np.bool_]:
-        """Return a mask (B, Z) of measured points where the fitted curve exceeds a fraction of its peak."""
+        """Return a mask of the measured points, (B, Z), at which the fitted curve exceeds a fraction of its peak."""
         distance = np.abs(self.x - self.x0[:, None]) * self.scale[:, None]
         return (distance <= self.reach(fraction)[:, None]) & (self.weight > 0)
 
@@ -137,7 +141,7 @@ class _Lobe:
         return np.asarray(np.sqrt(u / self.a) * self.scale)
 
     def positions(self, mask: NDArray[np.bool_]) -> NDArray[np.intp]:
-        """Return the number (B,) of different positions among selected points."""
+        """Return the number of different focus positions among the selected points of each of B curves."""
         present = np.zeros(mask.shape, dtype=bool)
         rows = np.broadcast_to(np.arange(len(mask))[:, None], mask.shape)
         present[rows[mask], self.group[mask]] = True
@@ -175,7 +179,10 @@ class _Lobe:
         return change
 
     def result(self, mask: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
-        """Return peak, position and second derivative, each (B,), and their covariance (B, 3, 3)."""
+        """Return peak value, position and second derivative with respect to focus of B curves, and their covariance.
+
+        The first three are (B,), the covariance (B, 3, 3).
+        """
         covariance = _covariance(self._values()[1], np.where(mask, self.weight, 0.0))
         jacobian = np.zeros_like(covariance)
         jacobian[:, 0, 0], jacobian[:, 1, 1] = 1.0, self.scale
@@ -184,7 +191,7 @@ class _Lobe:
         return self.p, self.centre + self.x0 * self.scale, -2 * self.p * self.a / self.scale**2, covariance
 
     def skew(self, mask: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Return the shift of the vertex (B,) if the curve may be skewed, and the sigma of the shift.
+        """Return the shift of the vertex of B curves if an asymmetry is fitted as well, and the sigma of the shift.
 
         The skewed curve has different widths on both sides of its peak, u = a (z - z0)^2 (1 +- k), to first order of k.
         """
@@ -195,12 +202,12 @@ class _Lobe:
         return _solve(design, weight, self.v - value)[:, 1] * self.scale, np.sqrt(np.maximum(more, 0.0)) * self.scale
 
     def chi_square(self, mask: NDArray[np.bool_]) -> Array:
-        """Return the weighted sum (B,) of squared residuals."""
+        """Return the chi-square of each of B curves over the selected points."""
         return np.asarray(np.sum(np.where(mask, self.weight, 0.0) * (self.v - self._values()[0]) ** 2, axis=1))
 
 
 def _covariance(design: Array, weight: Array) -> Array:
-    """Return the covariances (B, P, P) of B fits with designs (B, Z, P) and weights (B, Z)."""
+    """Return the covariance of P parameters of B fits from derivatives (B, Z, P) and weights (B, Z) at Z points."""
     normal = np.einsum("bzi,bz,bzj->bij", design, weight, design)
     size = np.sqrt(np.einsum("bii->bi", normal))
     size = np.where(size > 0, size, 1.0)
@@ -211,7 +218,7 @@ def _covariance(design: Array, weight: Array) -> Array:
 def _solve(design: Array, weight: Array, data: Array) -> Array:
     """Return the weighted least-squares solutions (B, P) of B curves; unobservable parameters stay zero.
 
-    Input are designs (B, Z, P), weights (B, Z) and data (B, Z).
+    Inputs are the derivatives (B, Z, P) with respect to P parameters, weights (B, Z) and data (B, Z) at Z points.
     """
     normal = np.einsum("bzi,bz,bzj->bij", design, weight, design)
     right = np.einsum("bzi,bz->bi", design, weight * data)
@@ -231,7 +238,9 @@ _HINT = 3.0
 _MISFIT = 10.0
 """Chi-square per degree of freedom that, near an end of the scan, means a flank and not a peak."""
 _FORM = 0.02
-"""Largest deviation of real pupils' curves from the fitted form, as a share of the peak: 1.8 % half way down."""
+"""Largest deviation of real pupils' curves from the fitted form, as a fraction of the peak value: 1.8 % at half of the
+peak.
+"""
 # A curve has at least _SOUND_TO_BAD points for each outlier; one with a p-value above _EXPLAINED has none. Pairs that
 # mask each other are sought among at most _MOST_PAIRED points.
 _SOUND_TO_BAD, _EXPLAINED, _MOST_PAIRED = 4, 0.01, 50
@@ -278,9 +287,9 @@ class FocusVertex:
     peak, peak_sigma : float
         Value at the vertex and its standard deviation.
     curvature : float
-        Second derivative at the vertex, negative.
+        Second derivative of the value with respect to the position at the vertex, negative.
     skew, skew_sigma : float
-        Shift of the vertex if the curve may be skewed, and its standard deviation.
+        Shift of the vertex if an asymmetry of the curve is fitted as well, and its standard deviation.
     chi_square : float
         Chi-square of the fit.
     degrees_of_freedom : int
@@ -342,9 +351,9 @@ def focus_vertex(position: ArrayLike, value: ArrayLike, sigma: ArrayLike) -> Foc
     position : (Z,) array_like
         Focus positions, in metres or any other unit, in any order.
     value : (Z,) array_like
-        Quantity with a peak at best focus, such as the MTF at one frequency.
+        Quantity with a peak at best focus, such as the MTF at one spatial frequency.
     sigma : float or (Z,) array_like
-        Standard deviations of the values; inf leaves a point out.
+        Standard deviations of the values; infinite to exclude a point.
 
     Returns
     -------
@@ -448,7 +457,7 @@ def focus_vertices(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, *, s
 
 
 def outlying_points(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, limit: float) -> Array:
-    """Return the deviations (Z,) of outliers of one curve from the curve through all other points; 0 for good points.
+    """Return the deviation of each outlier of a curve from the curve fitted to all other points; 0 for good points.
 
     A curve that its sigmas explain has no outliers. Otherwise, the point that deviates most from the fit without it is
     sought, or, if there is none, the two that do together and mask each other. Sigmas that are too small for the
@@ -488,7 +497,10 @@ def outlying_points(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, lim
 
 
 def _deviations(z: Array, v: Array, s: Array, groups: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Return the deviations of point groups (G, K) from curves without them, also in sigmas; 0 without a curve."""
+    """Return deviations of G groups of K points from curves fitted without them, as values and in sigmas.
+
+    They are 0 where no curve can be fitted.
+    """
     spread = np.tile(s, (len(groups), 1))
     np.put_along_axis(spread, groups, np.inf, axis=1)
     fits = focus_vertices(z, np.broadcast_to(v, spread.shape), spread, strict=False)
@@ -533,7 +545,7 @@ def _faults(
 
 
 def _contrast(model: _Lobe, mask: NDArray[np.bool_]) -> Array:
-    """Return the difference (B,) of the mean of the selected points from that of all others, in sigmas."""
+    """Return the mean of each curve's selected points minus that of all its others, in sigmas, (B,)."""
     inside, outside = np.where(mask, model.weight, 0.0), np.where(mask, 0.0, model.weight)
     sums = [np.maximum(part.sum(axis=1), 1e-300) for part in (inside, outside)]
     means = [(part * model.v).sum(axis=1) / total for part, total in zip((inside, outside), sums, strict=True)]
@@ -541,7 +553,7 @@ def _contrast(model: _Lobe, mask: NDArray[np.bool_]) -> Array:
 
 
 def _trend(model: _Lobe, mask: NDArray[np.bool_]) -> Array:
-    """Return the slope (B,) of the straight line through the selected points, in sigmas."""
+    """Return the slope of the straight line through the selected points of each of B curves, in sigmas."""
     weight = np.where(mask, model.weight, 0.0)
     middle = (weight * model.x).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-300)
     offset = model.x - middle[:, None]

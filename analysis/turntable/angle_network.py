@@ -36,7 +36,7 @@ class NotConvergedError(MeasurementError, RuntimeError):
 
 
 def network(x: Array, y: Array, s: Array, seed: int) -> tuple[dict[str, float], Curve, Curve]:
-    """Train the network on points (N,) that the caller has checked.
+    """Train the network on N points that the caller has validated.
 
     Parameters
     ----------
@@ -52,7 +52,8 @@ def network(x: Array, y: Array, s: Array, seed: int) -> tuple[dict[str, float], 
     Returns
     -------
     tuple of (dict of str to float, callable, callable)
-        Settings, the curve, (M,) to (M,), and its derivatives with respect to the values, (M,) to (M, N).
+        Settings of the training; function from M angles to values of the curve, (M,); function from M angles to the
+        derivatives of the curve with respect to the N training values, (M, N).
 
     Raises
     ------
@@ -107,7 +108,9 @@ def network(x: Array, y: Array, s: Array, seed: int) -> tuple[dict[str, float], 
 
 
 def gradient(net: Any, x: Array) -> Array:
-    """Return the derivatives (M, 3 H + 1) of the output c + v . tanh(w x + b) with respect to (w, b, v, c).
+    """Return the derivatives of the network's output at M inputs with respect to its weights, (M, 3 H + 1).
+
+    The output is c + v . tanh(w x + b), and the weights are in the order w, b, v (H each), c.
 
     Parameters
     ----------
@@ -123,7 +126,7 @@ def gradient(net: Any, x: Array) -> Array:
 
 
 def response(net: Any, x: Array, y: Array, weight: Array) -> Array:
-    """Return the derivatives (3 H + 1, N) of the trained weights with respect to the training values.
+    """Return the derivatives of the 3 H + 1 trained weights with respect to the N training values.
 
     They follow from the implicit function theorem at the minimum of 1/2 sum weight (net - y)^2 + DECAY/2 (|w|^2 +
     |v|^2).

@@ -66,14 +66,14 @@ SMOOTHINGS = (0.0, *np.logspace(-8.0, 1.0, 46))
 SLACK = 1e-9
 """Tolerance, in radians, within which an angle equals that of a point."""
 GAP_ORDER = {"piecewise_linear": 2, "polynomial": 0, "cubic_spline": 4, "fourier": 0, "network": 0}
-"""Power of the step with which the error between points falls for a smooth curve: h^2 and h^4 for the local fits. The
-error of the others comes from missing terms and does not depend on the step.
+"""Exponent p with which the error of a fit between points, h apart, decreases as h^p for a smooth curve: 2 and 4 for
+the local fits. The error of the others is due to missing terms and does not depend on the step (0).
 """
 
 
 @dataclass(frozen=True, eq=False)
 class AngleFit:
-    """Fitted curve.
+    """Curve fitted to values at N angles, with its dependence on these values.
 
     Attributes
     ----------
@@ -84,9 +84,9 @@ class AngleFit:
     settings : mapping of str to float
         Selected parameters, for display (order, period, smoothing, trainings).
     curve : callable
-        Function from angles (M,) to predictions (M,).
+        Function from M angles to predicted values (M,).
     derivative : callable
-        Function from angles (M,) to weights (M, N).
+        Function from M angles to the derivatives of the predictions with respect to the N values, (M, N).
     """
 
     name: str
@@ -103,7 +103,7 @@ class AngleFit:
         return float(self.angle[0]), float(self.angle[-1])
 
     def __call__(self, angle: ArrayLike) -> Array:
-        """Return the predictions, in the shape of the angles.
+        """Return the values of the fitted curve at the angles, in the shape of the angles.
 
         Raises
         ------
@@ -114,11 +114,13 @@ class AngleFit:
         return self.curve(self._inside(angles).ravel()).reshape(angles.shape)
 
     def weights(self, angle: ArrayLike) -> Array:
-        """Return the derivatives (M, N) of the predictions at angles (M,) with respect to the points' values."""
+        """Return the derivatives of the predictions at M angles with respect to the N fitted values, (M, N)."""
         return self.derivative(self._inside(np.atleast_1d(np.asarray(angle, np.float64))))
 
     def covariance(self, angle: ArrayLike, other: ArrayLike | None = None) -> Array:
-        """Return the covariance of the predictions at angles (M,) and (L,), or (M, M), from the points' sigmas.
+        """Return the covariance of the predictions at M angles, or between those at M and at L other angles.
+
+        It is (M, M) or (M, L), and is propagated from the sigmas of the points.
 
         It includes the noise alone, not the error of the fitted form; see `DividingCompensation.covariance`.
         """
@@ -132,7 +134,7 @@ class AngleFit:
         return float(np.trace(self.weights(self.angle)))
 
     def step_at(self, angle: ArrayLike) -> Array:
-        """Return the distance of the two points around each angle, in the shape of the angles, in radians."""
+        """Return the distance between the two fitted points on either side of each angle, in radians."""
         angles = np.asarray(angle, np.float64)
         steps = np.diff(self.angle)
         # a point belongs to the smaller of its two steps
@@ -164,7 +166,7 @@ class CrossValidation:
     residual : (K,) ndarray
         Value of an excluded point minus its prediction from the others.
     variance : (K,) ndarray
-        Variance of the residual by noise alone, that of the point and of the prediction.
+        Variance of the residual due to noise alone, of the point and of the prediction.
     """
 
     name: str
@@ -261,7 +263,10 @@ def fit_dividing_error(
 
 
 def fewest(name: str) -> int:
-    """Return the smallest number of angles of a fit: its unknowns, plus one where its order is selected."""
+    """Return the smallest number of angles to which a kind of curve can be fitted.
+
+    It is the number of its unknowns, plus one where its order is selected.
+    """
     return {"piecewise_linear": 2, "polynomial": 4, "cubic_spline": 4, "fourier": 5, "network": 10}[name]
 
 
@@ -317,7 +322,7 @@ def cross_validate(
 
 
 def angles_left(count: int, folds: int) -> int:
-    """Return the number of angles that the largest fold of `cross_validate` leaves to fit."""
+    """Return the number of angles that remain for the fit in cross-validation when the largest fold is excluded."""
     return count - -(-max(count - 2, 0) // folds)
 
 
@@ -346,13 +351,18 @@ _FitResult = tuple[dict[str, float], Curve, Curve]
 
 
 def _linear(basis: Curve, solve: Array, value: Array) -> tuple[Curve, Curve]:
-    """Return curve and derivative of a linear fit with basis (M, K) at the angles and solution matrix (K, N)."""
+    """Return the curve of a fit that is linear in the values, and its derivatives with respect to the values.
+
+    `basis` gives K basis functions at M angles, (M, K); `solve` (K, N) gives their coefficients from the N values.
+    """
     coefficients = solve @ value
     return lambda a: np.asarray(basis(a) @ coefficients), lambda a: np.asarray(basis(a) @ solve)
 
 
 def _left_out(hat: Array, value: Array) -> float:
-    """Return the mean square of the leave-one-out residuals of the inner points from the hat matrix (N, N).
+    """Return the mean square of the leave-one-out residuals of the inner points.
+
+    It follows from the hat matrix H (N, N), which gives the predictions at the points from their N values y.
 
     It is exact for least squares and smoothing splines: (y - H y) / (1 - H_ii). Infinite if a point is always fitted
     exactly.
@@ -373,7 +383,10 @@ def _piecewise_linear(x: Array, y: Array, s: Array, seed: int) -> _FitResult:
 
 
 def _least_squares(design: Array, s: Array) -> Array:
-    """Return the (K, N) weighted least-squares matrix; directions that the points hardly determine are omitted."""
+    """Return the matrix (K, N) that gives K weighted least-squares coefficients from N values.
+
+    Combinations of coefficients that the points hardly determine are omitted.
+    """
     return np.linalg.pinv(design / s[:, None], rcond=1e-10) / s
 
 
@@ -391,7 +404,7 @@ def _polynomial(x: Array, y: Array, s: Array, seed: int) -> _FitResult:
 
 
 def _chebyshev(middle: float, half: float, order: int) -> Curve:
-    """Return the Chebyshev basis on an interval."""
+    """Return a function that gives the Chebyshev polynomials of an interval at angles."""
     return lambda a: np.asarray(np.polynomial.chebyshev.chebvander((a - middle) / half, order), np.float64)
 
 
@@ -410,7 +423,7 @@ def _fourier(x: Array, y: Array, s: Array, seed: int) -> _FitResult:
 
 
 def _harmonics(first: float, period: float, order: int) -> Curve:
-    """Return the basis of a constant and of cosines and sines of a fundamental period."""
+    """Return a function that gives a constant, cosines and sines of a fundamental period at angles."""
 
     def basis(a: Array) -> Array:
         phase = 2.0 * np.pi / period * np.outer(a - first, np.arange(1, order + 1))
@@ -453,20 +466,25 @@ FITS: Mapping[str, Callable[[Array, Array, Array, int], _FitResult]] = {
     "fourier": _fourier,
     "network": network,
 }
-"""Fits by name."""
+"""Functions that fit each kind of curve, by its name."""
 
 
 FEWEST = 3
-"""Smallest number of readings of which one can be rejected: two readings deviate by the same amount."""
+"""Smallest number of repeated readings of which one can be rejected; two readings always deviate by the same amount
+from their mean.
+"""
 
 
 def limit(n: ArrayLike) -> Array:
-    """Return the largest accepted deviation of n readings, in units of s."""
+    """Return the largest deviation from the mean that Chauvenet's criterion accepts among n readings.
+
+    It is in units of the readings' sample standard deviation.
+    """
     return np.asarray(norm.isf(0.25 / np.asarray(n, np.float64)))
 
 
 def chauvenet(readings: ArrayLike, present: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
-    """Return which of repeated readings to keep by Chauvenet's criterion, applied once.
+    """Return a mask of the repeated readings that Chauvenet's criterion, applied once, keeps.
 
     A reading is rejected if fewer than half a reading would be expected at its deviation or beyond.
 
@@ -547,7 +565,7 @@ def normal_reduction(n: int | NDArray[np.int64]) -> float:
 
 
 def _left(n: int) -> tuple[float, float]:
-    """Return the expected sum of squares (sigma^2) and degrees of freedom after the criterion for n readings."""
+    """Return expected sum of squares, in sigma^2, and degrees of freedom of n readings after Chauvenet's criterion."""
     if n < FEWEST:
         return float(max(n - 1, 1)), float(max(n - 1, 1))
     square = float(beta.sf(_scaled(n), 1.5, 0.5 * (n - 2)))
@@ -555,7 +573,7 @@ def _left(n: int) -> tuple[float, float]:
 
 
 def _scaled(n: int) -> float:
-    """Return the squared limit as an argument of the beta distribution."""
+    """Return Chauvenet's limit for n readings, squared and scaled, as an argument of the beta distribution."""
     return min(float(limit(n)) ** 2 * n / (n - 1) ** 2, 1.0)
 
 
@@ -754,7 +772,7 @@ class Choice:
     chosen: str
 
     def __getitem__(self, name: str) -> Trial:
-        """Return the trial of a fit.
+        """Return the fit of a name with its cross-validation.
 
         Raises
         ------
@@ -835,7 +853,8 @@ class DividingCompensation:
     step : float
         Step of the calibration, in radians.
     common, smooth, white : float
-        Standard deviations of the three misfits, in radians.
+        Standard deviations, in radians, of the three errors of the fit described above: constant, between points, and
+        independent.
     repeatability : float
         Standard deviation of one comparison, in radians; an upper limit for one reading, because it includes the
         reference's noise.
@@ -885,7 +904,9 @@ class DividingCompensation:
         return np.asarray(reading, np.float64) - self.error(reading)
 
     def covariance(self, reading: ArrayLike, other: ArrayLike | None = None) -> Array:
-        """Return the covariance of the corrected angles at readings (M,) and (L,), or (M, M), in rad^2; see the class.
+        """Return the covariance of the corrected angles at M readings, or between those at M and at L, in rad^2.
+
+        It is (M, M) or (M, L), the sum of the four parts of the class.
 
         The white part applies to equal readings.
         """
@@ -897,7 +918,7 @@ class DividingCompensation:
         return self.fit.covariance(first, second) + self.common**2 + misfit + same
 
     def _missed(self, reading: Array) -> Array:
-        """Return the sigma of the smooth misfit at readings, in radians."""
+        """Return the standard deviation of the fit's error between its points, at each reading, in radians."""
         wide = np.maximum(1.0, self.fit.step_at(reading) / self.bridged)
         return np.asarray(self.smooth * wide ** GAP_ORDER[self.fit.name])
 
@@ -907,7 +928,7 @@ class DividingCompensation:
 
 
 def gaps(angle: Array) -> Array:
-    """Return first and last angle of each gap of a calibration at angles (N,), as (K, 2).
+    """Return first and last angle of each of K gaps in a calibration at N angles, (K, 2), in radians.
 
     A gap is wider than any step that cross-validation has bridged.
     """
@@ -916,7 +937,7 @@ def gaps(angle: Array) -> Array:
 
 
 def covered(angle: Array, reading: ArrayLike) -> NDArray[np.bool_]:
-    """Return a mask of the readings that a calibration at angles (N,) covers, in their shape.
+    """Return a mask of the readings that a calibration at N angles covers, in the readings' shape.
 
     They lie between its first and last angle, and in no gap.
     """
@@ -928,7 +949,7 @@ def covered(angle: Array, reading: ArrayLike) -> NDArray[np.bool_]:
 
 
 def step_kernel(first: Array, second: Array, step: float) -> Array:
-    """Return the correlation (M, L) of the misfit at two sets of readings, zero beyond one step.
+    """Return the correlation of the fit's error between M and L readings, (M, L), zero beyond one step.
 
     It falls linearly from 1 to 0 over one step.
 

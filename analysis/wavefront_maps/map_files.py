@@ -263,7 +263,7 @@ def lines_of(text: str, comment: str) -> list[Line]:
 
 
 def is_codev(lines: list[Line]) -> bool:
-    """Return True if one of the first lines, after possible titles, announces a grid or Zernike terms of CODE V.
+    """Return True if one of the first lines, after possible titles, is a CODE V header of a grid or Zernike terms.
 
     Parameters
     ----------

@@ -156,7 +156,7 @@ class Orientation:
         return self.sign * matrix
 
     def coefficients(self, coefficients: Array, terms: Sequence[int]) -> Array:
-        """Return Zernike coefficients after the operation, exactly.
+        """Return Zernike coefficients of the wavefront after mirror, rotations and sign change, computed exactly.
 
         Parameters
         ----------
@@ -277,8 +277,8 @@ def orientation_evidence(
 
 
 LEAST_INDEPENDENCE = 1e-6
-"""Smallest fraction of a term's mean square over the illuminated pixels that the terms before it cannot represent;
-below it these pixels do not separate the terms.
+"""Smallest RMS, relative to the whole term's over the illuminated pixels, of the part of a term that the terms before
+it cannot represent; below it these pixels do not separate the terms.
 """
 _CHUNK = 50_000
 """Number of pixels processed at a time, which limits the memory for large maps."""
