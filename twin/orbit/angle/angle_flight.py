@@ -215,7 +215,7 @@ class Measurement:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AnglePass(LineAngles):
-    """Truth at the moment of exposure, as `fly` simulates it; all coordinates in the ITRS, in metres.
+    """Truth at the moment of exposure, made by `fly`; all coordinates in the ITRS, in metres.
 
     The cameras are those in orbit, so that the angles are the true ones.
 
@@ -304,7 +304,7 @@ class AnglePass(LineAngles):
         return np.stack([x, np.cross(z, x), z]) @ self.trajectory.body_to_itrs(self.spec.time).T
 
     def ground(self, effects: LightEffects) -> dict[str, np.ndarray]:
-        """Return the (n, 3) true ground points of each line for these effects on the light, ITRS, in metres.
+        """Return the true ground points of each line for these effects on the light, ITRS, in metres.
 
         Raises
         ------
@@ -332,8 +332,8 @@ class AnglePass(LineAngles):
 
         Parameters
         ----------
-        points : Mapping[str, (n, 3) ndarray]
-            Line -> true points.
+        points : Mapping[str, (n, 3) ndarray for n points]
+            Line -> true points, ITRS, in metres.
         seed : np.random.SeedSequence or None
             Seed of the errors; None for no errors but the datum's.
         corrected : LightEffects
@@ -475,7 +475,7 @@ def _interior(camera: LineCamera, pixel: np.ndarray) -> dict[str, Any]:
 def without_effects(
     points: np.ndarray, station: np.ndarray, velocity: np.ndarray, earth: Earth, effects: LightEffects
 ) -> np.ndarray:
-    """Return ground points (N, 3) moved to the lines of sight that would see them without effects on the light.
+    """Return N ground points moved to the lines of sight that would see them without effects on the light.
 
     Parameters
     ----------
@@ -514,7 +514,7 @@ def _spread(camera: LineCamera, pixel: np.ndarray) -> np.ndarray:
 
 
 def _terrain(spec: OrbitAngleSpec, position: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Draw heights (N,) at positions along a strip, in metres: a normal process with a Gaussian correlation."""
+    """Draw heights at N positions along a strip, (N,), in metres: a normal process with a Gaussian correlation."""
     distance = (position[:, None] - position) / spec.terrain.length
     unit = covariance_root(np.exp(-0.5 * distance**2)) @ random.standard_normal(len(position))
     return np.asarray(spec.terrain.height + spec.terrain.relief * unit)

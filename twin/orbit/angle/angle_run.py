@@ -163,22 +163,22 @@ class Scatter:
 
     @property
     def sigma(self) -> np.ndarray:
-        """Predicted standard deviations, (m,), in radians."""
+        """Predicted standard deviations of the m angles, (m,), in radians."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
     def spread(self) -> np.ndarray:
-        """Standard deviation of the values, (m,), in radians."""
+        """Standard deviations of the m angles over the passes, (m,), in radians."""
         return np.asarray(np.std(self.values, axis=0, ddof=1))
 
     @property
     def bias(self) -> np.ndarray:
-        """Mean minus truth, (m,), in radians."""
+        """Mean over the passes minus truth of the m angles, (m,), in radians."""
         return np.asarray(np.mean(self.values, axis=0) - self.truth)
 
     @property
     def p_value(self) -> np.ndarray:
-        """Two-sided p-value of the spread under the predicted sigma, (m,)."""
+        """Two-sided p-values of the spread of the m angles over the passes, given the predicted sigmas, (m,)."""
         free = len(self.values) - 1
         below = chi2.cdf(free * (self.spread / self.sigma) ** 2, free)
         return np.asarray(2.0 * np.minimum(below, 1.0 - below))
@@ -196,7 +196,7 @@ class PassAngles:
         Moment of the angles, in seconds from the epoch.
     laboratory : LineAngles
         Angles between the lines as the laboratory measured them.
-    ids : Mapping[str, (n,) ndarray]
+    ids : Mapping[str, (n,) ndarray for n points]
         Line -> names of its points.
     span : Mapping[str, tuple[float, float]]
         Line -> first and last time of its points from the moment, in seconds.
@@ -216,7 +216,7 @@ class PassAngles:
 
     @property
     def change(self) -> np.ndarray:
-        """Changes of the angles along the track since the laboratory, (m,), in radians."""
+        """Changes of the m angles along the track since the laboratory, (m,), in radians."""
         return np.asarray(self.estimate.along.values - values_of(self.laboratory.along_track))
 
     @property
@@ -258,7 +258,7 @@ class SimulatedAngleRun(AngleRun):
         Each effect alone and all together, without errors.
     planes, resection, along : Scatter
         Scatter of the dihedral angles (tls), of the resection's angles, and of the planes' angles along the track.
-    difference_sigma : (m,) ndarray
+    difference_sigma : (m,) ndarray for m angles
         Standard deviation of planes minus resection over the passes, in radians.
     table : tuple of Sensitivity
         Sensitivity of tls planes in the Earth-fixed frame.
@@ -299,9 +299,7 @@ class SimulatedAngleRun(AngleRun):
 
     @property
     def narrow(self) -> np.ndarray:
-        """Mask (m,), True for angles below 5 deg, whose dihedral angle changes with a rotation about the lines of
-        sight.
-        """
+        """Mask (m,) of those of the m angles, below 5 deg, that a rotation about the lines of sight changes."""
         return narrow(self.flight)
 
     @property
@@ -317,7 +315,7 @@ class SimulatedAngleRun(AngleRun):
 
     @property
     def change(self) -> np.ndarray:
-        """Look angles from the planes minus the laboratory's, (m,), in radians."""
+        """Look angles from the planes minus the laboratory's, (m,) for m angles, in radians."""
         return self.estimate.look - values_of(self.flight.before_launch.look)
 
 
@@ -445,7 +443,7 @@ def tls_angles(common: Measurement) -> PlaneAngles:
 
 
 def line_of_sight_angles(measurement: Measurement, section: Resection) -> tuple[np.ndarray, AlongTrackAngles]:
-    """Return the angles (m,) between the lines' central lines of sight, in radians, and their along-track parts."""
+    """Return the m angles between central lines of sight, (m,), in radians, and their along-track parts."""
     common, frames = reduce_to_station(measurement, section), []
     for name, strip in common.strips.items():
         distance = np.linalg.norm(strip.points - common.station.position, axis=1)[:, None]

@@ -107,7 +107,7 @@ class _Reference:
 
     Attributes
     ----------
-    ground : (m, 3) ndarray
+    ground : (m, 3) ndarray for m points
         Coordinates of the points, ITRS, in metres.
     covariance : (m, 3, 3) ndarray
         Covariances of these coordinates, in metres^2.
@@ -147,7 +147,7 @@ class BlockRun:
     cameras : Mapping[str, CameraChange]
         Scene -> change of its camera.
     check : tuple of ndarray
-        Indices (k,) of the check points, their errors (k, 3) east, north and up, in metres, and the sigmas (k, 3).
+        Indices (k,) of the k check points, their errors (k, 3) east, north and up, in metres, and the sigmas (k, 3).
     rejected : Rejected
         Point and scene of each gross error that was rejected.
     """
@@ -282,7 +282,7 @@ def _datum(block: Block, robust: bool, pool: Pool | None) -> tuple[DatumTest | N
 
 
 def _check(adjustment: BlockAdjustment, reference: _Reference) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the indices (k,) of adjusted check points, their errors (k, 3), ITRS, metres, and their covariances."""
+    """Return indices (k,), errors (k, 3), ITRS, metres, and covariances of the errors of k adjusted check points."""
     block = adjustment.assembly.block
     where = np.flatnonzero((block.points.role == "check") & np.isfinite(adjustment.ground).all(axis=1))
     spread = adjustment.point_covariance(where) + reference.covariance[where]

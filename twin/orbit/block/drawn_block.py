@@ -67,9 +67,9 @@ class TruePlatform:
     axes : (3, 3) ndarray
         Body axes in the middle of the pass as columns, ITRS.
     rotation : Course
-        Function of times of the block (n,), in seconds, that returns rotation vectors (n, 3), in radians.
+        Function of n times of the block (n,), in seconds, that returns rotation vectors (n, 3), in radians.
     shift : Course
-        Function of times of the block (n,), in seconds, that returns shifts (n, 3) along `axes`, in metres.
+        Function of n times of the block (n,), in seconds, that returns shifts (n, 3) along `axes`, in metres.
     begin : float
         Zero of the readings' time on that of the block, in seconds.
     """
@@ -81,16 +81,16 @@ class TruePlatform:
     begin: float
 
     def position(self, seconds: np.ndarray) -> np.ndarray:
-        """Return the true (n, 3) positions at times (n,) of the readings, ITRS, in metres."""
+        """Return the true positions at n times of the readings, (n, 3), ITRS, in metres."""
         position: np.ndarray = self.readings.position(seconds) + self.shift(seconds + self.begin) @ self.axes.T
         return position
 
     def inertial_velocity(self, seconds: np.ndarray) -> np.ndarray:
-        """Return the true (n, 3) inertial velocities at times (n,) of the readings, in axes of the ITRS, in m/s."""
+        """Return the true inertial velocities at n times of the readings, (n, 3), in axes of the ITRS, in m/s."""
         return self.readings.inertial_velocity(seconds)
 
     def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
-        """Return the true (n, 3, 3) rotation matrices from body to ITRS axes at times (n,) of the readings."""
+        """Return the true rotation matrices from body to ITRS axes at n times of the readings, (n, 3, 3)."""
         rotation = Rotation.from_rotvec(self.rotation(seconds + self.begin)).as_matrix()
         return np.asarray(self.readings.body_to_itrs(seconds) @ rotation)
 

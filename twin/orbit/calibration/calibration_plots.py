@@ -15,7 +15,7 @@ from twin.orbit.calibration.schemes import RMS, FieldErrors, Monitoring, values_
 
 
 def _expected_height(run: CalibrationRun, study: Monitoring, factor: np.ndarray) -> np.ndarray:
-    """Return the expected height RMS without a monitor, in metres, for the file's drift times each `factor` (n,).
+    """Return the expected height RMS without a monitor, in metres, for the file's drift times each of n factors.
 
     It is the mean over many campaigns. All fields are adjusted at once and each has one drift. The mean over the fields
     of the outer lines' d_alpha goes into the parameters and is therefore taken out.

@@ -73,7 +73,7 @@ def light_shift(
         The laboratory's line on the measured trajectory, with the effects that are to be taken out.
     model : LineModel
         The same line as the adjustment models it.
-    line : (n,) ndarray
+    line : (n,) ndarray for n points
         Image lines of the points.
     pixel : (n,) ndarray
         Pixels of the points.
@@ -102,7 +102,7 @@ def light_shift(
 
 
 def _place(direction: np.ndarray, model: LineModel) -> np.ndarray:
-    """Return the (n, 2) images of directions (n, 3) in the body frame, from the principal point, in metres."""
+    """Return the images of n directions (n, 3) in the body frame, (n, 2), in metres from the principal point."""
     a, b, c = (direction @ model.to_body).T
     ideal = -model.interior[0] * np.stack([a / c, b / c], axis=-1)
     distorted = ideal
@@ -152,7 +152,7 @@ class PassData:
     unit: float | None = None
 
     def places(self, name: str, pixel: np.ndarray) -> np.ndarray:
-        """Return the (n, 2) positions of pixels (n,) of a line in its focal plane, in metres."""
+        """Return the positions of n pixels of a line in its focal plane, (n, 2), in metres."""
         return pixel_positions(self.lines[name], pixel, self.sensors[name].camera.pixels, self.pitch[name])
 
     @property
@@ -217,9 +217,9 @@ class PassData:
         return rays_by_line
 
     def spread(self, name: str, row: ImagePoints) -> np.ndarray:
-        """Return the (n, 2, 2) covariances of image points in the focal plane, in metres^2.
+        """Return the covariances of n image points in the focal plane, (n, 2, 2), in metres^2.
 
-        A later line acts as a smaller x.
+        An error toward a later line counts as one toward a smaller x.
         """
         scale = self.pitch[name] * np.array([-self.pixels_per_line(name), 1.0])
         return row.covariance * scale[:, None] * scale
@@ -288,7 +288,7 @@ class PassData:
             Line -> image points.
         removed : LightEffects
             Effects on the light that are taken out.
-        height : (m,) ndarray
+        height : (m,) ndarray for m ground points
             Heights of the ground points above the ellipsoid, in metres; NaN where unknown.
 
         Raises
@@ -319,7 +319,7 @@ class FieldPoints:
     ----------
     control_images : Mapping[str, ImagePoints]
         Line -> image points of the control points, followed by those of the tie points.
-    control_ground : (n, 3) ndarray
+    control_ground : (n, 3) ndarray for n points
         Given coordinates of control points and first guesses of tie points, ITRS, in metres.
     control : (n,) ndarray of bool
         True for control points.
@@ -327,7 +327,7 @@ class FieldPoints:
         Standard deviations of the given coordinates, of each axis in plan and of the height, in metres.
     check_images : Mapping[str, ImagePoints]
         Line -> image points of the check points.
-    check_ground : (m, 3) ndarray
+    check_ground : (m, 3) ndarray for m check points
         True coordinates of the check points, ITRS, in metres.
     """
 
@@ -414,9 +414,10 @@ class FieldImages:
     shown : Patch
         First patch itself, for a figure.
     wrong : Mapping[str, ndarray]
-        Line -> (n,) bool, True where the position of a control or tie point is wrong, by number of the point.
+        Line -> (n,) bool for n points, True where the position of a control or tie point is wrong, by number of the
+        point.
     wrong_check : Mapping[str, ndarray]
-        Line -> (m,) bool, True where the position of a check point is wrong.
+        Line -> (m,) bool for m check points, True where the position of a check point is wrong.
     screening : Screening or None
         Points that the adjustment rejected; None before the adjustment.
     """

@@ -379,7 +379,7 @@ def fly_fields(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: A
 
 
 def true_bias(spec: OrbitCalibrationSpec, latitude: np.ndarray) -> np.ndarray:
-    """Return (n, 3) roll, pitch, yaw from measured to true attitude at latitudes (n,), radians, without season."""
+    """Return roll, pitch, yaw from measured to true attitude at n latitudes, (n, 3), in radians, without season."""
     tracker = spec.errors.star_tracker
     drift = np.array(tracker.thermal.amplitude) * spec.errors.switched_on
     rotation = np.array(tracker.bias) + np.sin(latitude - tracker.thermal.reference)[:, None] * drift
@@ -544,7 +544,7 @@ def _points(
     sensors: Mapping[str, Sensor],
     random: np.random.Generator,
 ) -> tuple[np.ndarray, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """Draw ground points (n, 3), control points first, and compute their image lines and pixels (n,) by line."""
+    """Draw n ground points (n, 3), control points first; return them with image lines and pixels (n,) by line."""
     wanted, nadir = counts.control + counts.check, sensors["nadir"]
     height = field.height + field.relief * random.uniform(-1.0, 1.0, int(np.ceil(_SPARE * wanted)))
     pixel = random.uniform(counts.first, counts.last, len(height))

@@ -123,7 +123,7 @@ class SchemeMeans:
 
 
 _LEAST_SCHEMES = 3
-"""Least number of schemes for a comparison: two of averaged parameters, and each field with its own."""
+"""Smallest number of schemes for a comparison: two of averaged parameters, and each field with its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -371,7 +371,7 @@ def field_with_ties(campaign: Campaign, flight: FieldPass) -> CalibrationField:
 
 
 def with_points(field: CalibrationField, rays: Mapping[str, Rays], ground: np.ndarray) -> CalibrationField:
-    """Return a field with further points (n, 3) that have no given coordinates; their rays are numbered from zero."""
+    """Return a field with n further points (n, 3) without given coordinates, whose rays are numbered from zero."""
     more, joined = len(ground), {}
     for line, row in field.rays.items():
         pairs = (

@@ -64,9 +64,9 @@ def mislabelled_points(campaign: Campaign, flight: FieldPass) -> tuple[dict[str,
 
     Returns
     -------
-    wrong : dict of str to (n,) ndarray of bool
+    wrong : dict of str to (n,) ndarray of bool for n image points
         Line -> mask of its image points, for control points alone.
-    wrong_check : (m,) ndarray of bool
+    wrong_check : (m,) ndarray of bool for m check points
         Check points that at least one line shows elsewhere.
     """
     wrong, wrong_check, still = {}, np.zeros(len(flight.check_ground), bool), np.zeros(3)
@@ -247,7 +247,7 @@ def _without(
 
 
 def _reduced(flight: FieldPass, good: dict[str, np.ndarray], remain: np.ndarray, good_checks: np.ndarray) -> FieldPass:
-    """Return a pass with the selected image points (masks by line), ground points (n,) and check points (m,) alone."""
+    """Return a pass with only the image points, n ground points and m check points that the masks select."""
     images = {
         name: _renumbered(row.taken(good[name] & remain[row.point]), remain)
         for name, row in flight.control_images.items()
@@ -269,7 +269,7 @@ def _reduced(flight: FieldPass, good: dict[str, np.ndarray], remain: np.ndarray,
 
 
 def _renumbered(row: ImagePoints, retained: np.ndarray) -> ImagePoints:
-    """Return image points renumbered for the ground points that remain, given as a mask (n,)."""
+    """Return image points renumbered for those of the n ground points that remain, given as a mask (n,)."""
     return replace(row, point=(np.cumsum(retained) - 1)[row.point])
 
 

@@ -715,28 +715,28 @@ def spread(count: int, most: int) -> np.ndarray:
 
 
 def line_of(reading: PassConventions, raw: ImagePoints, clock: LineClock) -> np.ndarray:
-    """Return lines of image points (n,) in the numbering of the table of times."""
+    """Return the lines of n image points, (n,), in the numbering of the table of times."""
     number = raw.line - reading.line_origin
     return clock.line[0] + clock.line[-1] - number if reading.backward else number
 
 
 def pixel_of(reading: PassConventions, raw: ImagePoints, pixels: int) -> np.ndarray:
-    """Return pixels of image points (n,), counted from the one that looks farthest to the right of the track."""
+    """Return the pixels of n image points, (n,), counted from the pixel that looks farthest right of the track."""
     number = raw.pixel - reading.pixel_origin
     return number if reading.first_pixel_sees == "right" else pixels - 1.0 - number
 
 
 def _plan(known: np.ndarray, computed: np.ndarray) -> np.ndarray:
-    """Return east and north (n, 2) from known to computed points, in metres."""
+    """Return the distances east and north from n known points to the computed ones, (n, 2), in metres."""
     lon, lat, _ = Earth().geodetic(known)
     axes = east_north_up(lon, lat)[:, :2]
     return np.asarray(np.einsum("nij,nj->ni", axes, computed - known))
 
 
 def _ground_noise(known: Any, point: np.ndarray, rise: np.ndarray) -> np.ndarray:
-    """Return covariances (n, 2, 2) of residuals from those of the ground points.
+    """Return the covariances of n points' residuals due to those of the ground points, (n, 2, 2), in m^2.
 
-    `rise` (n, 2) is the displacement by a metre of height.
+    `rise` (n, 2) is the displacement east and north for a metre of height.
     """
     lon, lat, _ = Earth().geodetic(known.itrs[point])
     axes = east_north_up(lon, lat)

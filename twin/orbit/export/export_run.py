@@ -74,7 +74,7 @@ class ControlledPolynomial:
 
     Attributes
     ----------
-    names : (N,) ndarray of object
+    names : (N,) ndarray of object for N points
         Names of the points.
     correction : ImageCorrection
         Correction in the image.

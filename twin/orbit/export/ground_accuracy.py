@@ -129,22 +129,22 @@ class AccuracyMap:
 
     @property
     def covariance(self) -> Array:
-        """Covariance (N, 3, 3) of a point, in m^2."""
+        """Covariance of all errors of each of N points, east, north and up, (N, 3, 3), in m^2."""
         return self.constant + self.random + self.heights
 
     @property
     def ce90(self) -> Array:
-        """Radius (N,) of the circle that holds 90 % of the horizontal errors, in metres."""
+        """Radius of the circle that holds 90 % of the horizontal errors of each of N points, (N,), in metres."""
         return self._where_seen(lambda c: circular_error(c[:, :2, :2]))
 
     @property
     def le90(self) -> Array:
-        """Half width (N,) of the interval that holds 90 % of the vertical errors, in metres."""
+        """Half width of the interval that holds 90 % of the vertical errors of each of N points, (N,), in metres."""
         return self._where_seen(lambda c: linear_error(c[:, 2, 2]))
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Mask (N,) of points that have a covariance."""
+        """Mask of those of the N points that have a covariance, (N,)."""
         return np.isfinite(self.longitude)
 
     def horizontal(self) -> tuple[float, float]:
@@ -205,7 +205,7 @@ def _derivatives(sensor: Sensor, line: Array, pixel: Array, height: float, level
 
 
 def _grid(sensor: Sensor, first_pixel: int, pixels: int) -> tuple[Array, Array]:
-    """Return lines and pixels (N,) of a grid over an image."""
+    """Return the lines and pixels of a grid of N points over an image, (N,) each."""
     line = np.linspace(min(0.0, 0.5 * (sensor.lines - 1)), sensor.lines - 1.0, _GRID[0])
     pixel = np.linspace(first_pixel, first_pixel + pixels - 1.0, _GRID[1])
     at, which = np.meshgrid(line, pixel, indexing="ij")
@@ -318,7 +318,7 @@ def intersected_accuracy(
 
 
 def _places(sensor: Sensor, line: Array, pixel: Array, height: float) -> tuple[Array, Array, Array]:
-    """Return longitude and latitude (N,) that pixels see, and the level frames there (N, 3, 3)."""
+    """Return longitude and latitude (N,), in radians, that N pixels see, and the level frames there (N, 3, 3)."""
     ground = sensor.ground(line, pixel, height)
     if not np.any(np.isfinite(ground)):
         raise ValueError("no line of sight meets the Earth")

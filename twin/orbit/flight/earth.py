@@ -81,7 +81,7 @@ def ut1_of(epoch: str, dut1: float) -> tuple[float, float]:
     Parameters
     ----------
     epoch : str
-        ISO 8601 text with its time zone; see `tai_of`.
+        ISO 8601 text with its time zone, "2011-03-05T03:05:00Z".
     dut1 : float
         UT1 - UTC, seconds.
     """

@@ -92,7 +92,7 @@ def aberrated(direction: np.ndarray, velocity: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     direction : ndarray
-        Unit vectors from the observer toward the source in the frame at rest, (N, 3).
+        Unit vectors from the observer toward the source in the frame at rest, (N, 3) for N sources.
     velocity : ndarray
         Velocity of the observer in that frame, m/s, broadcastable to (N, 3).
 
@@ -115,7 +115,7 @@ def rotated_with_earth(vectors: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     vectors : ndarray
-        Vectors in the ITRS, (N, 3).
+        Vectors in the ITRS, (N, 3) for N vectors.
     seconds : ndarray
         Duration, seconds, (N,); negative values rotate westward.
 
@@ -162,7 +162,7 @@ def refractive_shift(zenith: np.ndarray, height: np.ndarray, radius: np.ndarray,
     Parameters
     ----------
     zenith : ndarray
-        Angle z of the straight line at the ground from the vertical, radians, (N,), at most 80 degrees.
+        Angle z of the straight line at the ground from the vertical, radians, (N,) for N points, at most 80 degrees.
     height : ndarray
         Height of the point above sea level, metres, broadcastable to (N,).
     radius : ndarray
@@ -198,7 +198,8 @@ def refracted(point: np.ndarray, station: np.ndarray, earth: Earth, wavelength: 
     Parameters
     ----------
     point : ndarray
-        Points at which the straight continuation of the look from space meets a height, ITRS, metres, (N, 3).
+        Points at which the straight continuation of the look from space meets a height, ITRS, metres, (N, 3) for N
+        points.
     station : ndarray
         Positions of the satellite when the light left the ground, ITRS, metres, (N, 3).
     earth : Earth

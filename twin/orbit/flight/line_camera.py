@@ -63,7 +63,7 @@ class LineTimes:
 
         Parameters
         ----------
-        line : (K,) array_like
+        line : (K,) array_like for K lines
             Image coordinates of at least two lines.
         time : (K,) array_like
             Middle of the exposure of each line, seconds.
@@ -303,10 +303,10 @@ def polynomial_line(name: str, pixels: int, forward: ArrayLike, right: ArrayLike
         Name of the line.
     pixels : int
         Number of pixels.
-    forward : (K,) array_like
+    forward : (K,) array_like for K coefficients
         Coefficients of the tangent of the look's angle forward, ascending powers of the pixel.
     right : (K,) array_like
-        Coefficients of the tangent of the look's angle to the right, likewise.
+        Coefficients of the tangent of the look's angle to the right, ascending powers of the pixel.
     """
     ahead, aside = np.atleast_1d(forward), np.atleast_1d(right)
 
@@ -346,7 +346,7 @@ def pixel_positions(line: LineCameraSpec, pixel: np.ndarray, pixels: int, pitch:
     ----------
     line : LineCameraSpec
         Line of a payload.
-    pixel : (N,) ndarray
+    pixel : (N,) ndarray for N pixels
         Positions on the line, pixels.
     pixels : int
         Number of pixels of the line.
@@ -453,8 +453,8 @@ def dihedral_angle(
     """Return the angle between the planes of two lines, in radians, 0 to pi/2.
 
     A line's plane is the one through the station from which its looks deviate least (total least squares over the whole
-    line, or over `pixels`, each (N,)). Ground points of the strips give this angle (paper 000, eqs. 1 to 7). It differs
-    from `look_angle` when the lines are not parallel.
+    line, or over the given `pixels` of each line). Ground points of the strips give this angle (paper 000, eqs. 1 to
+    7). It differs from `look_angle` when the lines are not parallel.
     """
     angle = _angle(*(line_normal(camera, pixel) for camera, pixel in zip((a, b), pixels, strict=True)))
     return min(angle, np.pi - angle)
@@ -470,7 +470,7 @@ class LineAngles:
         Camera of each line.
     pairs : mapping of str to tuple of str
         The two lines of each angle.
-    pixel : mapping of str to (n,) ndarray
+    pixel : mapping of str to (n,) ndarray for n points
         Positions of the ground points on each line whose angles are measured, pixels.
     """
 
@@ -503,8 +503,8 @@ def line_normal(camera: LineCamera, pixel: np.ndarray | None = None) -> np.ndarr
     Parameters
     ----------
     camera : LineCamera
-        The line.
-    pixel : (N,) ndarray or None
+        Line camera.
+    pixel : ndarray or None
         Pixels to which the plane is fitted; None for the whole line.
     """
     looks = camera.look(np.linspace(0.0, camera.pixels - 1.0, _PLANE_POINTS) if pixel is None else pixel)

@@ -88,13 +88,13 @@ class PlatformTable:
         ----------
         epoch : str
             UTC, ISO 8601.
-        orbit_time : (N,) array_like
+        orbit_time : (N,) array_like for N orbit readings
             Times of the orbit readings, seconds.
         position : (N, 3) array_like
             Positions in the ITRS, metres.
         velocity : (N, 3) array_like or None
             Velocities relative to the Earth-fixed axes, m/s, or None.
-        attitude_time : (M,) array_like
+        attitude_time : (M,) array_like for M attitude readings
             Times of the attitude readings, seconds.
         quaternion : (M, 4) array_like
             x, y, z, w, body to ITRS, either sign.
@@ -137,7 +137,7 @@ def continuous_quaternions(quaternion: Array) -> Array:
 
     Parameters
     ----------
-    quaternion : (N, 4) ndarray
+    quaternion : (N, 4) ndarray for N quaternions
         Quaternions, of which q and -q are the same rotation.
 
     Returns

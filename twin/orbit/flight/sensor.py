@@ -37,13 +37,13 @@ class Platform(Protocol):
     """
 
     def position(self, seconds: np.ndarray) -> np.ndarray:
-        """Return the position of the body's origin, (N, 3), in metres."""
+        """Return the position of the body's origin at N times, (N, 3), ITRS, in metres."""
 
     def inertial_velocity(self, seconds: np.ndarray) -> np.ndarray:
-        """Return the velocity relative to the stars, (N, 3), in m/s."""
+        """Return the velocity relative to the stars at N times, (N, 3), in axes of the ITRS, in m/s."""
 
     def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
-        """Return matrices whose columns are the body axes X, Y, Z, (N, 3, 3)."""
+        """Return matrices whose columns are the body axes X, Y, Z in the ITRS at N times, (N, 3, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,16 +65,16 @@ class OffsetPlatform:
     turn: np.ndarray
 
     def position(self, seconds: np.ndarray) -> np.ndarray:
-        """Return the shifted positions, (N, 3), in metres."""
+        """Return the shifted positions at N times, (N, 3), in metres."""
         at = self.base.position(seconds)
         return at + self.base.body_to_itrs(seconds) @ self.shift if np.any(self.shift) else at
 
     def inertial_velocity(self, seconds: np.ndarray) -> np.ndarray:
-        """Return the velocities relative to the stars, which the offset leaves unchanged, (N, 3), in m/s."""
+        """Return the velocities relative to the stars at N times, (N, 3), in m/s; the offset does not change them."""
         return self.base.inertial_velocity(seconds)
 
     def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
-        """Return the rotated body axes as columns, (N, 3, 3)."""
+        """Return the rotated body axes at N times as columns, (N, 3, 3)."""
         return np.asarray(self.base.body_to_itrs(seconds) @ rotation_matrix(self.turn))
 
 
@@ -139,7 +139,7 @@ class Sensor:
         return cls(camera, trajectory, earth, times.line_time, float(times.time[0]), lines, effects, times)
 
     def time(self, line: np.ndarray) -> np.ndarray:
-        """Return the time of exposure of lines (N,), in seconds of the trajectory."""
+        """Return the times of exposure of N lines, (N,), in seconds of the trajectory."""
         if self.times is not None:
             return self.times.at(line)
         return self.first_line_time + np.asarray(line, dtype=np.float64) * self.line_time
@@ -150,7 +150,7 @@ class Sensor:
         Parameters
         ----------
         line : ndarray
-            Line coordinate, broadcastable to (N,).
+            Line coordinate, broadcastable to (N,) for N points.
         pixel : ndarray
             Pixel coordinate, broadcastable to (N,).
         height : ndarray or float
@@ -192,7 +192,7 @@ class Sensor:
 
         Parameters
         ----------
-        point : (N, 3) ndarray
+        point : (N, 3) ndarray for N points
             Points in the ITRS, metres.
 
         Returns
@@ -223,7 +223,7 @@ class Sensor:
         return np.where(arrived, line, np.nan), np.where(arrived, pixel, np.nan)
 
     def _step(self, point: np.ndarray, line: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-        """Return the Newton step of line and pixel, (N, 2)."""
+        """Return the Newton step of line and pixel for N points, (N, 2)."""
         look, slope = self.camera.look_and_slope(pixel)
         rate = np.linalg.norm(slope, axis=-1)
         along = slope / rate[:, None]
@@ -240,7 +240,7 @@ class Sensor:
         return np.stack([line_step, (here[:, 0] + by_line[:, 0] * line_step) / rate], axis=-1)
 
     def _arrival(self, point: np.ndarray, line: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-        """Return unit directions from which light of the points reaches the camera at a line, body frame, (N, 3)."""
+        """Return unit directions from which light of N points reaches the camera at a line, body frame, (N, 3)."""
         seconds = self.time(line)
         to_itrs = self.trajectory.body_to_itrs(seconds)
         station = self._station(seconds, to_itrs, pixel)
@@ -262,11 +262,11 @@ class Sensor:
         return np.einsum("nij,ni->nj", to_itrs, direction)
 
     def _station(self, seconds: np.ndarray, to_itrs: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-        """Return the origins of the pixels' rays in the ITRS, (N, 3), in metres."""
+        """Return the origins of N pixels' rays in the ITRS, (N, 3), in metres."""
         return self.trajectory.position(seconds) + np.einsum("nij,nj->ni", to_itrs, self.camera.origin(pixel))
 
     def _faces(self, point: np.ndarray, line: np.ndarray) -> np.ndarray:
-        """Return whether the points see the satellite above their horizon, (N,)."""
+        """Return whether N points see the satellite above their horizon, (N,) bool."""
         lon, lat, _ = self.earth.geodetic(point)
         outward = east_north_up(lon, lat)[:, 2]
         return np.sum((self.trajectory.position(self.time(line)) - point) * outward, axis=-1) > 0.0

@@ -110,7 +110,7 @@ class Jitter:
 
     @property
     def amplitude(self) -> np.ndarray:
-        """Amplitude of each sinusoid, about all axes together, (K,), radians."""
+        """Amplitude of each of K sinusoids, root sum square over the axes, (K,), in radians."""
         return np.sqrt(np.sum(self.sine**2 + self.cosine**2, axis=1))
 
     def later(self, seconds: float) -> Jitter:
@@ -254,7 +254,7 @@ Series = Callable[[np.ndarray], np.ndarray]
 
 
 def readings(first: float, last: float, interval: float) -> np.ndarray:
-    """Return times (K,) of readings, in seconds: multiples of the interval over the span, with some to spare."""
+    """Return the times of K readings, (K,), in seconds: multiples of the interval over the span and beyond its ends."""
     begin, end = np.floor(first / interval) - _SPARE_READINGS, np.ceil(last / interval) + _SPARE_READINGS
     return np.asarray(interval * np.arange(begin, end + 1.0))
 

@@ -351,7 +351,7 @@ class Terrain:
         return self.surface.on_grid(east, north)
 
     def slopes(self, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return exact slopes toward east and toward north on a regular grid, (N, E) each, in metres per metre."""
+        """Return exact slopes toward east and north on a grid of N rows and E columns, (N, E) each, in m/m."""
         return self.surface.on_grid(east, north, (1, 0)), self.surface.on_grid(east, north, (0, 1))
 
     @cached_property

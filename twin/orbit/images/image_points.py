@@ -311,17 +311,17 @@ class MatchedLine:
 
     @property
     def accepted(self) -> np.ndarray:
-        """Mask of points matched and not contradicted, or chosen in this frame, (n,) bool."""
+        """Mask of those of n points that are matched and not contradicted, or chosen in this frame, (n,) bool."""
         return np.asarray((self.status == 0) | (self.status == SOURCE))
 
     @property
     def matched(self) -> np.ndarray:
-        """Mask of points accepted by matching, before consensus, (n,) bool."""
+        """Mask of those of n points that matching accepted, before the comparison with neighbours, (n,) bool."""
         return np.asarray((self.status == 0) | (self.status == CONSENSUS))
 
     @property
     def image(self) -> np.ndarray:
-        """Line and pixel in the whole image, (n, 2)."""
+        """Measured line and pixel of n points in the whole image, (n, 2)."""
         return self.place + np.array(self.first)
 
     @property
@@ -354,7 +354,7 @@ class MatchedLine:
         return {status_text(code): number for code, number in count.most_common()}
 
     def displacement(self, place: np.ndarray, height: np.ndarray) -> np.ndarray:
-        """Return the smooth displacement (n, 2) from predicted to measured at positions (n, 2) and heights (n,)."""
+        """Return the smooth displacement from predicted to measured at n positions (n, 2) and heights (n,), (n, 2)."""
         if self.displacement_field is None:
             return np.zeros_like(place)
         return self.displacement_field(place, None if self.displacement_field.heights is None else height)
@@ -371,7 +371,7 @@ class MatchedPoints:
     east, north, height : (n,) ndarray
         Coordinates in the map, metres; for tie points, where the nadir line's measured sensor meets the reference
         heights.
-    ground : (n, 3) ndarray
+    ground : (n, 3) ndarray for n points
         The same points in the ITRS, metres.
     check : (n,) ndarray of bool
         Mask of check points.
@@ -394,12 +394,12 @@ class MatchedPoints:
 
     @property
     def searched_lines(self) -> Mapping[str, MatchedLine]:
-        """Lines that were searched for the points: without the source of ties."""
+        """Lines in which the points were searched: all but the line in which tie points were chosen."""
         return {name: line for name, line in self.lines.items() if name != self.source}
 
     @property
     def in_all(self) -> np.ndarray:
-        """Mask of points accepted in every line, (n,) bool."""
+        """Mask of those of n points that are accepted in every line, (n,) bool."""
         return np.all([line.accepted for line in self.lines.values()], axis=0)
 
 
@@ -576,7 +576,7 @@ def _distinct_map(
 def _ground_of_looks(
     patch: ImagedGround, image: LineFrame, heights: ReferenceHeights, place: np.ndarray, known: MatchedLine | None
 ) -> np.ndarray:
-    """Return the points at which the measured sensor's looks meet the reference heights, ITRS, (n, 3), in metres.
+    """Return where the measured sensor's looks of n points meet the reference heights, ITRS, (n, 3), in metres.
 
     They are NaN beyond the reference heights. `known` are matches from which the displacement of the measured sensor is
     taken.

@@ -96,7 +96,7 @@ class LineImage(LineFrame):
     saturated : int
         Number of saturated pixels.
     error : float
-        Error of the renderer's interpolated geometry, pixels (see `RenderedPatch`).
+        Largest difference of an interpolated position of the renderer from the rigorous one, pixels.
     """
 
     sensor: Sensor
@@ -389,7 +389,7 @@ class LineComparison:
 
 
 def true_ground(patch: Patch, points: MatchedPoints) -> np.ndarray:
-    """Return the true ground points that the measured points show, ITRS, (n, 3), in metres.
+    """Return the true ground points that the measured points show, ITRS, (n, 3) for n points, in metres.
 
     The ground shown at a position of a map lies at that position minus its error; a tie point is what its source's
     pixel truly sees.

@@ -341,7 +341,7 @@ def camera_data(camera: ThreeLineCameraSpec) -> dict[str, Any]:
 
 
 def trajectory_data(run: Simulation, path: Trajectory) -> dict[str, Any]:
-    """Return orbit and attitude at the times of the pass's readings.
+    """Return orbit and attitude at the times of the pass's readings, for a JSON file.
 
     Between the readings the errors of a measured trajectory are the cubic spline that `twin.orbit.flight.trajectory`
     describes. Quaternions are (x, y, z, w); neighbours lie on one side, so that they can be interpolated.

@@ -308,7 +308,7 @@ class _Prior:
 
     @property
     def normal(self) -> np.ndarray:
-        """Inverse covariances (n, 3, 3), singular for tie points."""
+        """Inverse covariances of n points, (n, 3, 3), in 1/m^2, singular for tie points."""
         return np.asarray(self.root.swapaxes(1, 2) @ self.root)
 
     def of(self, rows: np.ndarray, ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -440,7 +440,7 @@ def _whitened_observations(
 
 
 def _moments(line: _Line, off: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Return the times (n,) at which points cross a line, in seconds, without the noise of the measured lines.
+    """Return the times at which n points cross a line, (n,), in seconds, without the noise of measured lines.
 
     A measured line number contains the same noise as the observation, so that a time that follows from it is correlated
     with the observation; where points lie on rows, all of the scatter of their times is this noise.

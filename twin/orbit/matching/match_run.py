@@ -280,7 +280,7 @@ def _measured(points: PatchPoints, spec: OrbitMatchSpec) -> tuple[GroundPoints, 
 
 
 def _used(points: MatchedPoints) -> np.ndarray:
-    """Return the mask of points accepted in one line or more, or in two or more for tie points, (n,) bool."""
+    """Return the mask of those of n points that enough lines accept: one, or two for tie points, (n,) bool."""
     seen = np.sum([line.accepted for line in points.lines.values()], axis=0)
     return np.asarray(seen >= (2 if points.kind == "tie" else 1))
 

@@ -59,7 +59,7 @@ class Readings:
         ----------
         epoch : str
             Reading of the clock at 0 s, ISO 8601 text.
-        seconds : (N,) ndarray
+        seconds : (N,) ndarray for N readings
             Seconds since then.
 
         Raises

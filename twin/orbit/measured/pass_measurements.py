@@ -50,7 +50,7 @@ class GroundPoints:
 
         Parameters
         ----------
-        ids : (n,) array_like
+        ids : (n,) array_like for n points
             Names.
         itrs : (n, 3) array_like
             Coordinates, metres.
@@ -124,7 +124,7 @@ class ImagePoints:
 
         Parameters
         ----------
-        point : (n,) array_like of int
+        point : (n,) array_like of int for n image points
             Indices of ground points.
         line : (n,) array_like
             Line coordinates.
@@ -176,7 +176,7 @@ def duplicates(ids: NDArray[np.object_], places: Array) -> str:
 
     Parameters
     ----------
-    ids : (n,) ndarray of object
+    ids : (n,) ndarray of object for n points
         Names.
     places : (n, 3) ndarray
         Coordinates, ITRS, metres; NaN where unknown.

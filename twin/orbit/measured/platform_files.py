@@ -59,7 +59,7 @@ _EME2000_FROM_GCRS = np.asarray(erfa.bp06(2451545.0, 0.0)[0])
 
 @dataclass(frozen=True)
 class Conventions:
-    """Conventions of orbit and attitude files; names as in `scenes.specs.orbit.measurements`.
+    """Conventions of orbit and attitude files, with the names of values that the keys of test files have.
 
     Attributes
     ----------

@@ -144,7 +144,7 @@ class LoopModel:
         ----------
         state : State
             State without the mechanisms.
-        positions : (n,) ndarray
+        positions : (n,) ndarray for n correctors
             Commanded positions of the correctors, in rad or m.
         """
         bodies = {body.path: body for body in self.experiment.instrument.assembly.tree.bodies}
@@ -184,7 +184,7 @@ class LoopModel:
 
     @cached_property
     def observed_share(self) -> np.ndarray:
-        """Share of each mechanism's unmodelled response that one reading of the spots reveals, (n,), 0 to 1."""
+        """Share of each of n mechanisms' unmodelled response that one reading of the spots reveals, (n,), 0 to 1."""
         gain = self.prior.best_gain(_READ**2 * np.eye(len(self.spots)))
         estimate = gain @ self.spots
         return np.array(

@@ -280,7 +280,7 @@ class LoopOutcome:
         Parameters
         ----------
         rows : (P,) or (T, P) ndarray
-            Coefficients of the combination, the same at all moments or one row for each.
+            Coefficients of the combination of P quantities, the same at all T moments or one row for each.
         """
         value, sigma = self.posterior(rows)
         positive = sigma > 0.0

@@ -400,7 +400,7 @@ class MonitorSeries:
         return self._clean_reference, self.experiment.expected_frames(photons)
 
     def _reference_spots(self, images: np.ndarray) -> MeasuredSpots:
-        """Measure the spots of mean frames (1, C, rows, columns) at the reference."""
+        """Measure the C spots of mean frames (1, C, rows, columns) at the reference."""
         experiment, centroid = self.experiment, self.spec.analysis.centroid
         with self._reporting_spot_errors([self.spec.reference_index]), one_blas_thread():
             return judged_spots(images[0], self.frames, experiment.calibration, centroid, cores())

@@ -111,7 +111,7 @@ def _height_figure(run: MonitorRun) -> Figure:
 
 
 def _smoothed_figure(run: MonitorRun) -> Figure:
-    """Draw the mean height error by the cameras, smoothed and interpolated, with the smoother's sigma."""
+    """Draw the mean height error due to the cameras, smoothed and interpolated, and the sigma of the smoothed one."""
     spec, minutes, chosen = run.spec, run.times / 60.0, run.smoothed
     figure, (axes,) = _panels(3.8, 1)
     for many, alpha, label in ((2.0, 0.2, "2σ of the smoother"), (1.0, 0.4, "σ of the smoother")):

@@ -183,11 +183,11 @@ class PairFlight:
 
     @cached_property
     def true_errors(self) -> np.ndarray:
-        """Errors (T, n, 3) of n points with the true cameras, due to image points, orbit and attitude, in metres."""
+        """Errors of n points with the true cameras at T times, due to image points and platform, (T, n, 3), in m."""
         return np.array([point_errors(self.true_pair(k), view) for k, view in enumerate(self.views)])
 
     def case(self, changes: Mapping[str, np.ndarray]) -> CaseErrors:
-        """Return the errors at the check points with calibrated cameras corrected by changes (T, 4), in rad and m."""
+        """Return the errors with calibrated cameras corrected by changes (T, 4) at T times, in rad and m."""
         return case_errors(self.point_errors(changes), self.true_errors)
 
     @property
@@ -205,7 +205,7 @@ class PairFlight:
         return FrozenMap({name: self._slopes(i) for i, name in enumerate(self.pair)})
 
     def _slopes(self, i: int) -> np.ndarray:
-        """Return the derivatives of the mean height with respect to camera i's correction, (T, 4), m/rad and m/m."""
+        """Return derivatives (T, 4) of the mean height to camera i's correction at T times, in m/rad and m/m."""
         table = np.empty((len(self.views), 4))
         for k, view in enumerate(self.views):
             for j, step in enumerate(_STEP):
