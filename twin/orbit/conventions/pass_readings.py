@@ -651,7 +651,7 @@ class PassBench:
         step: np.ndarray | float = 0.0,
         rise: np.ndarray | float = 0.0,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return ITRS positions (n, 3), in metres, at the ground points' heights, and the line times, in seconds."""
+        """Return n image points' ITRS positions at the ground points' heights, (n, 3), metres, and line times, s."""
         clock = self.readings.lines[name]
         number = line_of(reading, raw, clock)
         for worst in number[~in_span(number, clock.line[0] - 1.0, clock.line[-1] + 1.0)][:1]:

@@ -478,7 +478,10 @@ def _rotation_record(number: int, nodes: list[float], quaternion: Array, rate: A
 
 
 def _angular_velocity(camera: EffectiveCamera) -> Array:
-    """Return the angular velocity of the camera's axes against Earth-fixed ones, in the latter, (N, 3), in rad/s."""
+    """Return the angular velocity of the camera's axes in the Earth-fixed frame at N nodes, (N, 3), in rad/s.
+
+    It is relative to the Earth-fixed axes.
+    """
     step = camera.seconds[1] - camera.seconds[0]
     rate = (camera.rotation[1:] * camera.rotation[:-1].inv()).as_rotvec() / step
     return np.concatenate([rate[:1], 0.5 * (rate[1:] + rate[:-1]), rate[-1:]])

@@ -466,9 +466,9 @@ def _moments(line: _Line, off: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def _visibility_groups(seen: np.ndarray, tie: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return lines (m,) and points (n,), as indices, for each set of lines that see the same points of one sort.
+    """Return sets of lines (indices (m,)) that see the same points (indices (n,)) of one sort.
 
-    Sets of fewer than two lines are left out.
+    Each set has m lines, at least two, and n points.
     """
     groups = []
     for sort in (True, False):

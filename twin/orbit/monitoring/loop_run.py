@@ -224,7 +224,7 @@ class LoopOutcome:
     Attributes
     ----------
     course : LoopCourse
-        Simulated course.
+        Simulated states, commands and estimates over time.
     flight : PairFlight
         Lines and check points.
     truth : (T, P) ndarray for T moments and P quantities
