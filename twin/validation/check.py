@@ -100,7 +100,7 @@ class Chosen:
 
     @classmethod
     def power(cls, name: str, value: float, unit: str, measured: float, exponent: float = 1.0) -> Chosen:
-        """Return an input that the measured value follows as a power; exponent 1 if it is proportional."""
+        """Return an input to a power of which the measured value is proportional; exponent 1 if simply proportional."""
         return cls(name, value, unit, lambda factor: measured * factor**exponent)
 
     def range(self, holds: Callable[[float], bool], agrees: bool) -> InputRange:
@@ -134,7 +134,7 @@ class Chosen:
 
 @dataclass(frozen=True)
 class Supposed:
-    """Choice that is not a number.
+    """Chosen input of a check that is not a number.
 
     Attributes
     ----------
@@ -178,10 +178,10 @@ _STATISTICS: Mapping[str, Callable[[Any], Any]] = {
 
 
 class _Sentences(Formatter):
-    """Formatter of texts with facts; see `sentence`."""
+    """Formatter that inserts facts into the texts of ``printed.yaml``."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
-        """Apply the words before the digits, and show each value of a mapping with its name."""
+        """Apply statistics and unit that precede the digits in a format, and name each value of a mapping."""
         *words, digits = format_spec.split(" ")
         for word in words:
             if isinstance(value, Mapping) and word in _UNITS:
@@ -250,7 +250,7 @@ PAPERS = {
     "004": "Li et al., Infrared and Laser Engineering, doi 10.3788/IRLA20200143",
     "017": "Wang Renxiang, Acta Geodaetica et Cartographica Sinica 46(3) 332 (2017)",
 }
-"""Source papers by the number with which the ids begin."""
+"""Number of each source paper -> its citation."""
 
 Comparison = Literal["two-sided", "at most", "at least"]
 Basis = Literal["printed", "chosen", "theory"]
@@ -336,7 +336,7 @@ class CheckResult:
     seconds: float
 
     def __post_init__(self) -> None:
-        """Check that the values can be shown and written to JSON."""
+        """Raise an error if a value cannot be shown or written to JSON."""
         if self.verdict not in VERDICTS:
             raise ValueError(f"{self.id}: no verdict {self.verdict!r}; there are {', '.join(VERDICTS)}")
         for name in ("printed", "implied", "measured", "sigma", "tolerance", "power", "tells", "seconds"):
@@ -459,7 +459,7 @@ class Check(Spec):
 
     @model_validator(mode="after")
     def _can_separate(self) -> Check:
-        """Refuse ids that cannot be selected, and rows that cannot distinguish what they test."""
+        """Raise an error for ids that cannot be selected, and for rows that cannot distinguish what they test."""
         for name in self.names:
             parts = name.split(".")
             if parts[0] not in PAPERS or len(parts) < 2 or not all(p and p.replace("_", "").isalnum() for p in parts):
@@ -567,7 +567,7 @@ class Check(Spec):
         return replace(result, implied=None if self.printed is not None else goal, power=allowed, inputs=ranges)
 
     def worse(self, *results: CheckResult) -> CheckResult:
-        """Return the result of a statement in several forms: the first unexpected one, otherwise the first."""
+        """Return one of several results for the same statement: the first unexpected one, otherwise the first."""
         return next((r for r in results if r.verdict != self.expected), results[0])
 
     def failed(self, why: str) -> CheckResult:

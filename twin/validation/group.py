@@ -30,7 +30,10 @@ from twin.validation.row_names import FILE, FOLDER, matches
 
 
 class ArtefactText(Spec):
-    """Texts of a figure or a table, with facts in braces, see `sentence`; attributes as of `Table`."""
+    """Title, caption and column heads of a figure or a table of a group.
+
+    Facts in braces are inserted when it is shown; the attributes are those of `Table`.
+    """
 
     title: Text
     caption: Text = ""
@@ -78,11 +81,11 @@ class Context:
     artefacts: list[Artefact] = field(default_factory=list)
 
     def wants(self, *prefixes: str) -> bool:
-        """Return True if a selected id lies under one of the prefixes."""
+        """Return True if a selected id begins with one of the prefixes."""
         return any(matches(identifier, prefix) for identifier in self.selected for prefix in prefixes)
 
     def count(self, full: int, fast: int) -> int:
-        """Return the number of trials, by the length of the run."""
+        """Return the number of trials: ``full``, or ``fast`` in the fast run."""
         return fast if self.fast else full
 
     def check(self, identifier: str) -> Check:
@@ -145,7 +148,10 @@ class Context:
         inputs: Sequence[Chosen | Supposed] = (),
         **facts: object,
     ) -> CheckResult:
-        """Evaluate one of the group's checks; arguments as of `Check.evaluate`, facts by name."""
+        """Return the result of one of the group's checks for a measured value.
+
+        The arguments are those of `Check.evaluate`; facts for the texts are passed by name.
+        """
         return self.checks[identifier].evaluate(measured, sigma, "", implied, explained, inputs, facts)
 
 
@@ -183,7 +189,7 @@ class CheckGroup:
     artefacts: Mapping[str, ArtefactText] = FrozenMap()
 
     def __post_init__(self) -> None:
-        """Refuse groups that cannot be distinguished or shown."""
+        """Raise an error for groups that cannot be distinguished or shown."""
         if not self.checks or self.seconds <= 0 or (self.fast_seconds is not None and self.fast_seconds <= 0):
             raise ValueError(f"group {self.prefix!r} needs checks and a rough time > 0")
         if not self.prefix.replace(".", "").replace("_", "").isalnum():
@@ -205,7 +211,7 @@ _Seconds = Annotated[Number, Field(gt=0.0)]
 
 
 class GroupRows(Spec):
-    """Rows that share work, as the paper's file states them.
+    """Rows of one group as they are in the paper's file.
 
     The attributes are those of `CheckGroup`, and ``sentences``: texts by name, which may be named in braces in the
     ``how`` of several rows, or in a later one of these texts.
@@ -220,7 +226,7 @@ class GroupRows(Spec):
 
 
 class PaperRows(Spec):
-    """Rows of a paper's file, whose other keys are the printed values."""
+    """Rows of the checks in a paper's file, whose other keys are the printed values."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -237,31 +243,31 @@ class Printed:
     content: YamlFile
 
     def number(self, key: str) -> float:
-        """Return one number."""
+        """Return the printed number of a key, in the unit that the key names."""
         return self._number(_path(key), self._at(key))
 
     def whole(self, key: str) -> int:
-        """Return a count."""
+        """Return the printed whole number of a key."""
         value = self._at(key)
         if not isinstance(value, int) or isinstance(value, bool):
             raise self._error(_path(key), "no whole number", value)
         return value
 
     def column(self, key: str) -> tuple[float, ...]:
-        """Return a list of numbers."""
+        """Return the printed list of numbers of a key."""
         return self._column(_path(key), self._at(key))
 
     def numbers(self, key: str) -> Mapping[str, float]:
-        """Return a mapping of numbers, in the order of the file."""
+        """Return the printed numbers below a key, by name, in the order of the file."""
         return FrozenMap({k: self._number((*_path(key), k), v) for k, v in self._mapping(key).items()})
 
     def columns(self, key: str) -> Mapping[str, tuple[float, ...]]:
-        """Return a mapping of lists, in the order of the file."""
+        """Return the printed lists of numbers below a key, by name, in the order of the file."""
         return FrozenMap({k: self._column((*_path(key), k), v) for k, v in self._mapping(key).items()})
 
     @cached_property
     def groups(self) -> Mapping[str, GroupRows]:
-        """Rows by the prefix of their group, in the order of the file, checked."""
+        """Prefix of each group -> its rows, in the order of the file, validated."""
         return FrozenMap(validate(PaperRows, replace(self.content, data=self._named(self.content.data))).groups)
 
     def group(self, prefix: str, run: Run) -> CheckGroup:
@@ -367,7 +373,10 @@ def load_printed(paper: str) -> Printed:
 def group_of(prefix: str, run: Run = lambda context: ()) -> CheckGroup:
     """Return a group by its prefix, with the rows of its paper's file and the function that computes them.
 
-    Errors are those of `load_printed`.
+    Raises
+    ------
+    InputError
+        There is no file of that paper, it cannot be read, or it has no such group.
     """
     return load_printed(prefix.partition(".")[0]).group(prefix, run)
 

@@ -49,12 +49,12 @@ TEST = "angle"
 OFF_AXIS = "angle_off_axis"
 TRACED = "angle_gf7"
 PAIRS = (("forward", "nadir"), ("nadir", "backward"))
-"""Pairs of lines that define alpha and beta."""
+"""Pairs of camera lines that enclose the intersection angles alpha and beta."""
 
 
 @dataclass(frozen=True, eq=False)
 class Passes:
-    """Pass with its repeated measurements.
+    """Simulated pass over ground points with its repeated measurements.
 
     Attributes
     ----------
@@ -69,12 +69,12 @@ class Passes:
 
     @cached_property
     def points(self) -> Mapping[str, np.ndarray]:
-        """Line -> true ground points on straight lines of sight, (n, 3)."""
+        """Line -> true positions of its n ground points on straight lines of sight, (n, 3), metres."""
         return self.flight.ground(NO_EFFECTS)
 
     @cached_property
     def sections(self) -> tuple[Resection, ...]:
-        """Space resection of every measurement."""
+        """Space resection of every measurement: attitude and look angles adjusted from the ground points."""
         return tuple(resect_measurement(m) for m in self.measured)
 
     def normal(self, line: str) -> np.ndarray:
@@ -101,7 +101,10 @@ class Passes:
         return np.asarray(look / np.linalg.norm(look))
 
     def pitch_error(self, normals: Mapping[str, np.ndarray]) -> dict[str, tuple[float, float]]:
-        """Line -> mean error of fitted unit normals (passes, 3) toward the line of sight, and its sigma, arcsec."""
+        """Return line -> mean error of fitted unit normals toward the line of sight, and its sigma, in arcsec.
+
+        ``normals`` has line -> (passes, 3).
+        """
         out = {}
         for line, normal in normals.items():
             turns = (normal - self.normal(line)) @ self.ahead(line) / ARCSEC
@@ -110,7 +113,7 @@ class Passes:
 
 
 def planes_of(measured: Measurement, method: Method, lines: Iterable[str] = LINES) -> list[PlaneFit]:
-    """Fit the planes of lines through the measured station."""
+    """Fit planes through the measured station and the ground points of each line."""
     return [fit_plane(measured.station, measured.strips[line], method) for line in lines]
 
 
@@ -139,22 +142,22 @@ def repeated(
     turns: Mapping[str, tuple[float, float, float]] = FrozenMap(),
     corrected: bool = True,
 ) -> Passes:
-    """Fly and measure `count` times.
+    """Simulate a pass and ``count`` measurements of it.
 
     Parameters
     ----------
     setup : AngleSetup
-        The test.
+        Test to simulate.
     seed : np.random.SeedSequence
-        Of terrain and errors.
+        Seed of terrain and errors.
     count : int
-        Of measurements.
+        Number of measurements.
     backend : Backend | None
-        To trace an instrument's lines.
+        Backend that traces an instrument's lines; None for lines without an instrument.
     turns : Mapping[str, tuple[float, float, float]]
-        Line -> further rotation vector in body axes since the laboratory, radians.
+        Line -> rotation vector in body axes since the laboratory calibration, radians.
     corrected : bool
-        Whether the analysis takes the light's effects out of the points.
+        True if the analysis removes aberration, light time and refraction from the points.
     """
     terrain, errors = seed.spawn(2)
     flight = fly(setup, _turned(angle_camera(setup, backend), turns), terrain)
@@ -172,13 +175,13 @@ def _turned(camera: AngleCamera, turns: Mapping[str, tuple[float, float, float]]
 
 _STEP = 1e-3
 TWIST = np.radians(10.0 / 60.0)
-"""Rotation of the forward array about its line of sight for eq6.parallel, radians."""
+"""Rotation of the forward array about its line of sight, radians, for the check ``eq6.parallel``."""
 
 
 def sum_of_squares(slopes: Array, points: Array, station: Array) -> float:
-    """Return S of eq. (2), in square metres, for slopes a0, a1 (2,), with a2 by eq. (1).
+    """Return the sum of squares S of eq. (2), in square metres, for the slopes a0 and a1 of a plane, (2,).
 
-    Points (n, 3) and station (3,) are in metres.
+    The third coefficient a2 follows from eq. (1). Points, (n, 3), and station, (3,), are in metres.
     """
     x, y, z = points.T
     x0, y0, z0 = station
@@ -187,7 +190,7 @@ def sum_of_squares(slopes: Array, points: Array, station: Array) -> float:
 
 
 def derivatives(slopes: Array, points: Array, station: Array) -> Array:
-    """Return the left sides of eq. (4), (2,), in square metres."""
+    """Return the left sides of eq. (4), the printed derivatives of S with respect to a0 and a1, (2,), m^2."""
     x, y, z = points.T
     x0, y0, z0 = station
     a0, a1 = slopes
@@ -196,7 +199,7 @@ def derivatives(slopes: Array, points: Array, station: Array) -> Array:
 
 
 def numerical_derivatives(slopes: Array, points: Array, station: Array) -> Array:
-    """Return the derivatives of S by central differences, (2,).
+    """Return the derivatives of the sum of squares S with respect to a0 and a1 by central differences, (2,), m^2.
 
     For a quadratic form they are exact except for rounding.
     """
@@ -208,9 +211,10 @@ def numerical_derivatives(slopes: Array, points: Array, station: Array) -> Array
 
 
 def least_slopes(points: Array, station: Array) -> Array:
-    """Return the slopes that minimise S, (2,), as the vertex of a parabola through its values.
+    """Return the slopes a0, a1 of the plane that minimise the sum of squares S, (2,).
 
-    The vertex is computed twice, because from nearby values the second one keeps more digits.
+    They are the vertex of a parabola through its values, computed twice: from nearby values the second one keeps more
+    digits.
     """
     place, size = np.zeros(2), 1.0
     for _ in range(3):
@@ -229,7 +233,7 @@ def least_slopes(points: Array, station: Array) -> Array:
 
 
 class Planes:
-    """Planes of the three lines of every measurement, fitted when asked for, and the rows of the equations on them."""
+    """Planes of the three camera lines of every measurement, fitted when needed, for the checks of the equations."""
 
     def __init__(self, context: Context, passes: Passes) -> None:
         self.context = context
@@ -238,17 +242,17 @@ class Planes:
 
     @cached_property
     def corrected(self) -> list[list[PlaneFit]]:
-        """Planes by eq. (5) with the correct sign, [pass][line]."""
+        """Planes by eq. (5) with the correct sign: for each pass, one plane per line."""
         return [planes_of(m, "corrected") for m in self.passes.measured]
 
     @cached_property
     def printed(self) -> list[list[PlaneFit]]:
-        """Planes by eq. (5) as printed, [pass][line]."""
+        """Planes by eq. (5) as printed: for each pass, one plane per line."""
         return [planes_of(m, "printed") for m in self.passes.measured]
 
     @cached_property
     def angles(self) -> Array:
-        """Angles by eqs. (6) and (7) from the corrected planes, (passes, 2), radians."""
+        """Angles alpha and beta by eqs. (6) and (7) from the corrected planes, (passes, 2), radians."""
         return np.array([intersection_angles(*fits).printed for fits in self.corrected])
 
 
@@ -270,7 +274,7 @@ def twisted_passes(context: Context) -> tuple[Passes, Passes]:
 
 @one_blas_thread()
 def run(context: Context) -> Iterator[CheckResult]:
-    """All checks of the equations."""
+    """Yield the results of all checks of the equations."""
     context.progress(0.0, "measure ground points")
     planes = Planes(context, make_passes(context))
     checks: Mapping[str, Callable[[Planes], CheckResult]] = {
@@ -400,7 +404,7 @@ def _arccos(planes: Planes) -> CheckResult:
 
 
 def _exact(a: PlaneFit, b: PlaneFit) -> float:
-    """Acute angle between two planes, radians; 18 digits."""
+    """Return the acute angle between two planes, radians, computed with 18 digits."""
     first, second = (np.array([*fit.coefficients[:2], -1.0], np.longdouble) for fit in (a, b))
     cross = np.cross(first, second)
     return float(np.arctan2(np.sqrt(np.sum(cross * cross)), abs(np.sum(first * second))))
@@ -425,7 +429,7 @@ SCALE_HEIGHT = 8435.0
 
 @one_blas_thread()
 def run_suppositions(context: Context) -> Iterator[CheckResult]:
-    """All checks of what the method leaves out."""
+    """Yield the results of all checks of what the method neglects: light effects and changes of the camera."""
     if context.wants("000.light"):
         context.progress(0.0, "true ground points with each effect on the light")
         # only the true points are used
@@ -459,7 +463,7 @@ def _light(context: Context, passes: Passes) -> Iterator[CheckResult]:
 
 
 def _refraction(passes: Passes, line: str) -> float:
-    """Return the first-order change of an angle by a thin atmosphere below the station, radians (negative)."""
+    """Return the first-order change of a look angle due to a thin atmosphere below the station, radians (negative)."""
     flight = passes.flight
     point = passes.points[line]
     arm = flight.station - point[len(point) // 2]
@@ -495,7 +499,7 @@ def _traced(context: Context, passes: Passes) -> Iterator[CheckResult]:
 
 
 def _seen(passes: Passes, line: str) -> float:
-    """Return the rotation of a line's plane by its projection centres, as observed from the ground, radians."""
+    """Return the rotation of a line's plane due to shifts of the projection centre, seen from the ground, radians."""
     flight = passes.flight
     camera = flight.laboratory[line]
     origin, look = camera.origin(flight.pixel[line]), camera.look(flight.pixel[line])
@@ -508,19 +512,19 @@ def _seen(passes: Passes, line: str) -> float:
 
 
 def height_passes(context: Context) -> Passes:
-    """Simulate one pass of th1 for the heights."""
+    """Simulate one pass of the camera ``th1`` for the checks of heights."""
     return repeated(setup_of(TEST), np.random.SeedSequence([context.seed, 6]), 2)
 
 
 def off_axis_passes(context: Context) -> Passes:
-    """Simulate measurements of all five lines."""
+    """Simulate measurements with all five camera lines, the off-axis ones included."""
     seed = np.random.SeedSequence([context.seed, 7])
     return repeated(setup_of(OFF_AXIS), seed, context.count(full=800, fast=120))
 
 
 @one_blas_thread()
 def run_uses(context: Context) -> Iterator[CheckResult]:
-    """All checks of the method's uses."""
+    """Yield the results of all checks of the method's uses: height errors and off-axis angles."""
     if context.wants("000.height"):
         context.progress(0.0, "intersect with a turned line")
         yield from _height(context, height_passes(context).flight)

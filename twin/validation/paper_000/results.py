@@ -2,7 +2,7 @@
 
 Each statement of the text is decided by a number. The words on the figures have no numbers: "far more" is taken as at
 least twice, "very near" as within a quarter, "little" as at most a quarter of the largest, and a slope that grows as
-one that grows by 5 %, the least that is visible in a figure.
+one that grows by 5 %, the smallest change that is visible in a figure.
 """
 
 from __future__ import annotations
@@ -29,18 +29,21 @@ from twin.validation.paper_000.method import PAIRS, TEST, Passes, planes_of, rep
 PRINTED_ARCSEC = load_printed("000").numbers("table1.difference_arcsec")
 ALPHA, BETA = PRINTED_ARCSEC["alpha"], PRINTED_ARCSEC["beta"]
 POINT_SIGMA = float(np.hypot(2.0, 5.0 / 3.0))
-"""Metres: control points of 2 m, matched to a third of a pixel of 5 m."""
+"""Standard deviation of a ground point, metres: control points of 2 m, matched to a third of a pixel of 5 m."""
 
 POINTS = float(setup_of(TEST).test.strips.points)
-"""On each line."""
+"""Number of ground points on each line."""
 
 LIMIT = 3.44
-"""Distance in two dimensions that 99.7 % keep, as three standard deviations in one."""
+"""Distance from the centre of a two-dimensional normal distribution within which 99.7 % lie, in sigmas.
+
+It corresponds to three standard deviations in one dimension.
+"""
 
 
 @drawing("table1-000", 4.2)
 def differences_svg(figure: Figure, same: Array, independent: Array, printed: tuple[float, float]) -> None:
-    """Scatter of alpha and beta, both (passes, 2), arcsec, and the printed pair."""
+    """Draw the differences of alpha and beta as points, both arrays (passes, 2) in arcsec, and the printed pair."""
     axes = figure.subplots()
     axes.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
     axes.axvline(0.0, color=LIGHT, lw=0.8, zorder=0)
@@ -59,7 +62,10 @@ def differences_svg(figure: Figure, same: Array, independent: Array, printed: tu
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """Resection minus planes, (passes, 2) of alpha and beta, arcsec; and the sigma that both methods claim, (2,)."""
+    """Angles alpha and beta by resection minus those by planes, and the sigma that each method claims.
+
+    The differences are a (passes, 2) array and the sigmas (2,), in arcsec.
+    """
 
     values: Array
     planes_sigma: Array
@@ -67,12 +73,12 @@ class Differences:
 
     @property
     def spread(self) -> Array:
-        """Standard deviation, (2,)."""
+        """Standard deviation of the differences of alpha and of beta over the passes, (2,), arcsec."""
         return np.asarray(np.std(self.values, axis=0, ddof=1))
 
 
 def differences(planes: Passes, resection: Passes) -> Differences:
-    """Both methods on measurements that may be the same."""
+    """Return the differences of the two methods, each on its measurements, which may be the same."""
     by_planes = [intersection_angles(*planes_of(m, "tls")) for m in planes.measured]
     resected = np.array([section.angles(PAIRS) for section in resection.sections])
     claimed = [section.angle_covariance(PAIRS) for section in resection.sections]
@@ -85,16 +91,16 @@ def differences(planes: Passes, resection: Passes) -> Differences:
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """Measurements for the table.
+    """Simulated measurements for Table 1.
 
     Attributes
     ----------
     same : Passes
-        Of points of 1.5 m, light taken out.
+        Measurements of ground points with 1.5 m error, light effects removed, for both methods.
     own : Passes
-        Of `POINT_SIGMA`, light taken out, with which the resection works.
+        Measurements of ground points with an error of `POINT_SIGMA`, light effects removed, for the resection.
     light : Passes
-        Others with the same stations and the light left in, with which the planes work.
+        Further measurements with the same stations and the light effects left in, for the planes.
     """
 
     same: Passes
@@ -103,7 +109,7 @@ class Data:
 
 
 def make_data(context: Context) -> Data:
-    """Draw all measurements."""
+    """Simulate all measurements for Table 1."""
     count = context.count(full=800, fast=120)
     first, second, third = np.random.SeedSequence([context.seed, 5]).spawn(3)
     setup = setup_of(TEST, points=POINT_SIGMA)
@@ -120,7 +126,7 @@ def _at(measured: Measurement, position: Array) -> Measurement:
 
 @one_blas_thread()
 def run_table_1(context: Context) -> Iterator[CheckResult]:
-    """All checks of Table 1."""
+    """Yield the results of all checks of Table 1."""
     context.progress(0.1, "measure ground points for both methods")
     data = make_data(context)
     same, independent = differences(data.same, data.same), differences(data.light, data.own)
@@ -168,7 +174,10 @@ def _points(response: Callable[[float], float]) -> list[Chosen]:
 
 
 def _pair(context: Context, data: Data, independent: Differences) -> CheckResult:
-    """Both angles have the nadir plane: what makes one larger makes the other smaller."""
+    """Check the printed pair of differences together, by their Mahalanobis distance.
+
+    Both angles share the plane of the nadir line: what makes one larger makes the other smaller.
+    """
     measured, flight = data.light.measured[0], data.light.flight
     # the station is common and drops out, the points of the two methods are not
     exact = replace(measured, station=Station.of(measured.station.position))
@@ -190,14 +199,17 @@ def _pair(context: Context, data: Data, independent: Differences) -> CheckResult
 
 
 def _pitch_variance(passes: Passes, line: str) -> float:
-    """Variance of the pitch of a plane through n points at their range, arcsec^2."""
+    """Return the variance of the pitch of a line's plane through its ground points, arcsec^2.
+
+    It follows from the number of points, their error and their distance.
+    """
     points = passes.points[line]
     reach = float(np.mean(np.linalg.norm(points - passes.flight.station, axis=1)))
     return (passes.flight.spec.errors.points / reach / ARCSEC) ** 2 / len(points)
 
 
 def _distance(off: Array, covariance: Array) -> float:
-    """Return the Mahalanobis distance of a pair."""
+    """Return the Mahalanobis distance of a pair of errors with its covariance, in sigmas."""
     return float(np.sqrt(off @ np.linalg.solve(covariance, off)))
 
 
@@ -219,17 +231,17 @@ def _accuracy(context: Context, data: Data) -> Iterator[CheckResult]:
 Kind = Literal["signs", "largest", "far", "alike", "little", "grows", "opposite"]
 Angle = Literal["alpha", "beta"]
 Place = tuple[float, float]
-"""Latitude and longitude, degrees."""
+"""Latitude and longitude of a simulated pass, degrees."""
 Rises = Mapping[tuple[str, Angle, str], float]
-"""(what is moved, angle, axis) -> change of the angle for 10 m, arcsec."""
+"""(moved object, angle, axis) -> change of the angle for a move of 10 m, arcsec."""
 AXES = ("x", "y", "z")
 FAR, ALIKE, LITTLE, GROWS = 2.0, 1.25, 0.25, 0.05
 GREEK: Mapping[str, str] = {"alpha": "α", "beta": "β"}
 _STYLES = {"x": (BLUE, "o"), "y": (GREEN, "s"), "z": (VERMILION, "^")}
 REACH = 10.0
-"""Metres."""
+"""Largest displacement of a station or of ground points in the figures, metres."""
 ELSEWHERE = (45.0, 120.0)
-"""Latitude and longitude, degrees, of a pass on which what the paper says of place-dependent sizes holds."""
+"""Latitude and longitude, degrees, of a pass for which the paper's statements on position-dependent sizes hold."""
 PANELS = {
     "fig3": (("station", "alpha"), ("station", "beta")),
     "fig4": (("forward", "alpha"), ("nadir", "alpha")),
@@ -239,7 +251,7 @@ PANELS = {
 
 @dataclass(frozen=True)
 class Sentence:
-    """Statement of the text about the response of `angle` when `what` is moved.
+    """Statement of the paper's text about the response of an angle when station or ground points are moved.
 
     Attributes
     ----------
@@ -277,7 +289,11 @@ class Sentence:
         }[self.kind]  # fmt: skip
 
     def measure(self, rises: Rises, growth: Rises) -> float:
-        """Return the number that decides, from the rises of the angles and the relative growth of their slopes."""
+        """Return the number that decides the statement.
+
+        It is computed from the changes of the angles (``rises``) and the relative increase of their slopes
+        (``growth``).
+        """
 
         def rise(axis: str, angle: Angle = self.angle) -> float:
             return rises[self.what, angle, axis]
@@ -326,7 +342,10 @@ SENTENCES: tuple[Sentence, ...] = (
 def sensitivity_svg(
     figure: Figure, amount: Array, change: Mapping[tuple[str, str, str], Array], panels: Sequence[tuple[str, str]]
 ) -> None:
-    """Draw a panel for each pair of moved object and angle, with a curve for each axis, arcsec over metres."""
+    """Draw a panel for each pair of moved object and angle: change of the angle, arcsec, over the move, metres.
+
+    Each panel has a curve for each axis.
+    """
     for axes, (what, angle) in zip(figure.subplots(1, 2, sharey=True), panels, strict=True):
         axes.axhline(0.0, color=GREY, lw=0.8)
         ends = {}
@@ -366,14 +385,14 @@ def places_svg(figure: Figure, held: Mapping[Place, int], total: int, marked: Se
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """Curves of one measurement, by planes fitted anew.
+    """Changes of the angles over the displacement of station or ground points, with planes fitted anew.
 
     Attributes
     ----------
-    amount : Array
-        (k,) metres.
-    change : Mapping[tuple[str, str, str], Array]
-        (what is moved, angle, axis) -> (k,), arcsec.
+    amount : (k,) ndarray
+        The k displacements, metres.
+    change : Mapping[tuple[str, str, str], ndarray]
+        (moved object, angle, axis) -> (k,) changes of the angle, arcsec.
     """
 
     amount: Array
@@ -381,7 +400,7 @@ class Answers:
 
     @classmethod
     def of(cls, table: Sequence[Sensitivity]) -> Answers:
-        """Return the answers from the rows for every moved object along every axis."""
+        """Return the curves from a table of sensitivities, for every moved object along every axis."""
         change = {
             (row.what, angle, row.axis): row.change[k] / ARCSEC for row in table for k, angle in enumerate(row.angles)
         }
@@ -389,12 +408,12 @@ class Answers:
 
     @property
     def rises(self) -> Rises:
-        """At the end."""
+        """(moved object, angle, axis) -> change of the angle at the largest displacement, arcsec."""
         return {key: float(change[-1]) for key, change in self.change.items()}  # type: ignore[misc]
 
     @property
     def growth(self) -> Rises:
-        """Growth of the steepness from the first to the last step, relative."""
+        """(moved object, angle, axis) -> relative increase of the slope from the first to the last step."""
         out = {}
         for key, change in self.change.items():
             slope = np.abs(np.diff(change))
@@ -414,14 +433,14 @@ def make_passes(
 
 
 def answers(measured: Measurement, flight: AnglePass, steps: int = 10, method: Method = "corrected") -> Answers:
-    """All planes fitted anew for every move."""
+    """Return how the angles change when station or ground points are displaced; planes are fitted anew each time."""
     amount = np.linspace(0.0, REACH, steps + 1)
     return Answers.of(sensitivity(measured.station, measured.strips, flight.pairs, method=method, amounts=amount))
 
 
 @one_blas_thread()
 def run_figures(context: Context) -> Iterator[CheckResult]:
-    """All checks of Figs. 3 to 5."""
+    """Yield the results of all checks of the statements about Figs. 3 to 5."""
     context.progress(0.0, "move station and points")
     passes = make_passes(context)
     all_answers = [answers(m, passes.flight) for m in passes.measured]
@@ -461,14 +480,14 @@ def _row(
 
 
 def _place(sentences: Sequence[Sentence], places: Mapping[Place, Answers]) -> Supposed:
-    """Return the positions where all of some statements are confirmed, as a choice."""
+    """Return the position of the pass as a chosen input, with the positions where some statements are all confirmed."""
     held = sum(all(s.holds(a.rises, a.growth) for s in sentences) for a in places.values())
     text = f"holds at {held} of {len(places)} places from 25° to 50° N and 80° to 130° E"
     return Supposed("a descending pass over 40° N 116° E", text)
 
 
 def _explained(sentence: Sentence, passes: Passes, other: Answers) -> list[float]:
-    """Value that the reason of the row gives, where there is one."""
+    """Return the values that the explanations of a statement's row would give; empty if it has none."""
     if sentence.kind == "grows":
         return [REACH / float(np.linalg.norm(passes.flight.station - passes.flight.middle_point))]
     if sentence.kind == "alike" and sentence.holds(other.rises, other.growth):
@@ -512,7 +531,7 @@ def _single(context: Context, passes: Passes) -> CheckResult:
 
 
 def _places(context: Context) -> dict[Place, Answers]:
-    """Place -> answers of one measurement there."""
+    """Return position of the pass -> response of the angles in one measurement there."""
     step = 5.0 if context.fast else 2.5
     out = {}
     grid = [(lat, lon) for lat in np.arange(25.0, 50.1, step) for lon in np.arange(80.0, 130.1, 2.0 * step)]
@@ -525,7 +544,11 @@ def _places(context: Context) -> dict[Place, Answers]:
 
 
 def _readings(context: Context) -> list[tuple[str, str, int, int]]:
-    """Frame and direction of the pass -> how many sentences hold of the angle, and of the figures' ordinate."""
+    """Return, for each frame and flight direction, how many statements are confirmed.
+
+    The first count interprets the statements as about the angle, the second about the ordinate of the figures, which
+    has the opposite sign.
+    """
     rows = []
     for direction in ("descending", "ascending"):
         passes = make_passes(context, count=1, direction=direction)

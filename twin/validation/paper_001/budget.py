@@ -1,4 +1,4 @@
-"""Paper 001's error budget: Tables 3 and 4 and (12), with their figure, and Table 5 with section 3.2.3."""
+"""Checks of paper 001's error budget: Tables 3 to 5, eq. (12) and section 3.2.3, with a figure."""
 
 from __future__ import annotations
 
@@ -28,16 +28,19 @@ from twin.validation.check import SIGMAS, CheckResult, Chosen, Supposed
 from twin.validation.group import Context, drawing, group_of, load_printed
 
 FRAMES = 9
-"""Averaged in one measurement, (12)."""
+"""Number of frames averaged in one measurement, as in eq. (12)."""
 BUDGET = "monitor_pair"
 TABLE_3 = load_printed("001").numbers("table3.spot_arcsec")
 TABLE_4 = load_printed("001").number("table4.spot_arcsec")
 FOCAL_PLANE, LONG_PRISM = "coordinate_thermal", "prism_180_thermal"
 """Causes whose inputs are also applied by themselves."""
 FEW_DRAWS = (FOCAL_PLANE, "central_prism_thermal")
-"""Lines of two or three random numbers a state, which need more states than those of a prism in every channel."""
+"""Causes with only two or three random numbers per state.
+
+They need more states than those of a prism in every channel.
+"""
 ROLL = load_printed("001").number("table5.d_gamma_arcsec") * ARCSEC
-"""Table 5's error of d_gamma."""
+"""Error of the roll d_gamma that Table 5 prints, radians."""
 FROM_ALL_CAUSES = frozenset(
     f"001.{name}"
     for name in (
@@ -45,10 +48,10 @@ FROM_ALL_CAUSES = frozenset(
         *(f"table5.{parameter}" for parameter in ("d_beta", "d_alpha", "d_gamma", "d_f")),
     )
 )
-"""Checks that need all causes at once."""
+"""Ids of the checks that need a simulation with all causes at once."""
 _CHUNK = 40
 _LARGEST = ("prism_180_thermal", "prism_0_rotation")
-"""The two lines that make most of (12)."""
+"""The two causes that contribute most to the total of eq. (12)."""
 _INPUT_OF = {
     "centroid": "light",
     "coordinate_thermal": "temperature of the focal plane",
@@ -58,7 +61,7 @@ _INPUT_OF = {
     "prism_0_rotation": "rotation of the 0° prism",
     "central_prism_thermal": "gradient in the central prism",
 }
-"""Input of each line; rotations act through the residual angle errors of the prisms, which are chosen too."""
+"""Cause -> its main input. Rotations act through the residual angle errors of the prisms, which are chosen too."""
 _ANGLE, _LENGTH = ("arcsec", ARCSEC), ("mm", 1e-3)
 _PARAMETERS = {
     "d_beta": ("d_beta_rad", "Δβ, 3σ", *_ANGLE),
@@ -66,21 +69,24 @@ _PARAMETERS = {
     "d_gamma": ("d_gamma_rad", "Δγ by (5), 3σ", *_ANGLE),
     "d_f": ("d_f_m", "Δf by (7), 3σ", *_LENGTH),
 }
-"""Parameter of Table 5 -> its field in simulated errors, its head, unit and that in SI."""
+"""Parameter of Table 5 -> attribute of the simulated errors, column head, unit, and the unit in SI."""
 
 
 def frame_mean(error: float, frames: int = FRAMES) -> float:
-    """Return the random error of a mean of frames from that of a single one, the first term of eq. (12)."""
+    """Return the random error of the mean of several frames from that of one frame, the first term of eq. (12)."""
     return error / sqrt(frames)
 
 
 def root_sum(errors: Mapping[str, float]) -> float:
-    """Return eq. (12): the root of the sum of squares of Table 3's lines, with the centroid's error over the frames."""
+    """Return the total error of eq. (12) from the errors of Table 3, in their unit.
+
+    It is the root of the sum of their squares, with the centroid's error divided by the root of the number of frames.
+    """
     return sqrt(sum((frame_mean(e) if name == "centroid" else e) ** 2 for name, e in errors.items()))
 
 
 def root_sum_of_squares(lines: Mapping[str, BudgetLine]) -> tuple[float, float]:
-    """Return eq. (12) for simulated lines and its standard deviation, radians."""
+    """Return the total error of eq. (12) from the simulated errors, and its standard deviation, radians."""
     total = root_sum({name: line.three_sigma for name, line in lines.items()})
     weight = {name: frame_mean(1.0) ** 2 if name == "centroid" else 1.0 for name in lines}
     sigma = sqrt(sum((weight[n] * line.three_sigma * line.sigma) ** 2 for n, line in lines.items())) / total
@@ -88,16 +94,17 @@ def root_sum_of_squares(lines: Mapping[str, BudgetLine]) -> tuple[float, float]:
 
 
 def propagated(spot: float, geometry: MonitorGeometry, estimator: str = "paper_single") -> dict[str, float]:
-    """Table 5 from Table 4: errors of the parameters from that of one coordinate of one spot, all independent.
+    """Return the errors of Table 5 from the error of one coordinate of one spot (Table 4), all independent.
 
     Parameters
     ----------
     spot : float
-        As an angle, radians.
+        Error of a spot coordinate as an angle, radians.
     geometry : MonitorGeometry
-        Of the camera.
+        Geometry of the camera.
     estimator : str
-        Whose factors; (2), (3), (5), (7) or, as ``paper_joint``, Table 1's last column.
+        Estimator whose factors are used: those of eqs. (2), (3), (5), (7) or, as ``paper_joint``, of Table 1's last
+        column.
 
     Returns
     -------
@@ -111,28 +118,28 @@ def propagated(spot: float, geometry: MonitorGeometry, estimator: str = "paper_s
 
 @dataclass(frozen=True, eq=False)
 class BudgetImages:
-    """Results of the simulation; parts that are not requested are empty or None.
+    """Errors simulated with rendered images; parts that are not requested are empty or None.
 
     Attributes
     ----------
     geometry : MonitorGeometry
         Geometry of the first camera; both are alike.
     inputs : (int, int, int)
-        Trials per line (twice as many for FEW_DRAWS), trials with all causes, and groups of frames.
+        Trials per cause (twice as many for FEW_DRAWS), trials with all causes, and groups of frames.
     lines : dict of str to BudgetLine
-        Lines of Table 3.
+        Cause of Table 3 -> its simulated error.
     focal_plane : (float, float) or None
-        True and measured change of d_f by the focal plane's temperature, metres.
+        True and measured change of d_f due to the focal plane's temperature, metres.
     halved : (float, float, float) or None
         Glass path of the 180-deg prism before and after halving, metres, and the ratio of its errors.
     together : CombinedErrors or None
-        All causes at once.
+        Errors with all causes at once.
     scatter : pair of (float, float) or None
         Scatter of the centroid in single frames and in means of FRAMES, radians, with standard deviations.
     line_pixel : float
         Pixel of the line CCD, metres.
     roll_pixels : float or None
-        Displacement of the line of sight at the line's end by ROLL, in pixels of the line CCD.
+        Displacement of the line of sight at the line's end due to a rotation by ROLL, in pixels of the line CCD.
     """
 
     geometry: MonitorGeometry
@@ -184,7 +191,7 @@ def three_sigma(budget: ErrorBudget, cause: str) -> float:
 
 
 def more_trials(budget: ErrorBudget, factor: int) -> ErrorBudget:
-    """Error budget with ``factor`` times the trials for each line."""
+    """Return an error budget with ``factor`` times the trials for each cause."""
     other = copy(budget)
     other.spec = budget.spec.model_copy(update={"trials": factor * budget.spec.trials})
     return other
@@ -215,7 +222,7 @@ def centroid_scatter(budget: ErrorBudget, groups: int) -> tuple[tuple[float, flo
 
 
 def _positions(budget: ErrorBudget, images: np.ndarray, frames: int) -> np.ndarray:
-    """Energy centroids of images (C, N, H, W), px, (N, C, 2)."""
+    """Return energy centroids of N images for each of C channels, (N, C, 2), from images (C, N, H, W), in pixels."""
     count, spots = images.shape[1], images.shape[0]
     flat = np.swapaxes(images, 0, 1).reshape(-1, *images.shape[2:]).astype(np.float64)
     with one_blas_thread():
@@ -224,7 +231,7 @@ def _positions(budget: ErrorBudget, images: np.ndarray, frames: int) -> np.ndarr
 
 
 def line_end_shift(budget: ErrorBudget) -> float:
-    """Return the displacement of the line of sight at the line CCD's end by a rotation ROLL, in its pixels."""
+    """Return the displacement of the line of sight at the line CCD's end due to a rotation by ROLL, in its pixels."""
     experiment = budget.experiment
     camera = next(iter(experiment.instrument.cameras))
     state = {f"{BASE}/{camera}/focal_plane": Motion(rotate=(0.0, 0.0, ROLL))}
@@ -237,7 +244,7 @@ def line_end_shift(budget: ErrorBudget) -> float:
 
 @drawing("error-budget", lambda lines: 1.0 + 0.32 * len(lines))
 def budget_svg(figure: Figure, lines: Mapping[str, tuple[float, float, float]]) -> None:
-    """Draw a row per line with the printed and the simulated value and its sigma, in arcsec."""
+    """Draw the printed and the simulated error of each cause, with its sigma, in arcsec."""
     axes = figure.subplots()
     for row, (printed, simulated, sigma) in enumerate(lines.values()):
         axes.plot([printed], [row], "|", color=INK, ms=16.0, mew=2.0, label="printed" if row == 0 else None)
@@ -255,7 +262,7 @@ def budget_svg(figure: Figure, lines: Mapping[str, tuple[float, float, float]]) 
 
 
 def run(context: Context) -> Iterator[CheckResult]:
-    """Simulate what is wanted; (12) needs all lines."""
+    """Yield the results of the selected checks of the budget; eq. (12) needs the simulation of all causes."""
     images = measured(context)
     for name, line in images.lines.items():
         value, trials = line.three_sigma, images.inputs[0] * (2 if name in FEW_DRAWS else 1)
@@ -283,7 +290,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 
 def _in_sum(images: BudgetImages, name: str, value: float) -> Chosen:
-    """Return the input of one line, on which a root of squares depends only through the line's share."""
+    """Return the input of one cause, with the response of a root of a sum of squares to it."""
     line = images.lines[name]
     share = (frame_mean(1.0) if name == "centroid" else 1.0) * line.three_sigma / ARCSEC
 
@@ -294,7 +301,7 @@ def _in_sum(images: BudgetImages, name: str, value: float) -> Chosen:
 
 
 def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
-    """Check eq. (12) and Table 4."""
+    """Check the total error by eq. (12), and Table 4."""
     facts: dict[str, Any] = {"images": images, "frames": FRAMES}
     if {"001.eq12", "001.table4.root_sum"} & context.selected:
         total, sigma = root_sum_of_squares(images.lines)
@@ -341,7 +348,7 @@ def _all_causes(value: float) -> list[Chosen]:
 
 
 def _monitored(context: Context, images: BudgetImages, together: CombinedErrors) -> Iterator[CheckResult]:
-    """Check the rows of all causes at once, Table 5 among them, with errors by formula and by Monte Carlo."""
+    """Check the errors with all causes at once, Table 5 among them, by formula and by Monte Carlo."""
     facts: dict[str, Any] = {"images": images, "frames": FRAMES}
 
     def row(identifier: str, error: tuple[float, float], unit: float, implied: float | None = None) -> CheckResult:
@@ -366,7 +373,7 @@ def _monitored(context: Context, images: BudgetImages, together: CombinedErrors)
 
 
 def _propagated(context: Context, geometry: MonitorGeometry) -> Iterator[CheckResult]:
-    """Table 5 by formula from the printed Table 4."""
+    """Check Table 5 by formula from the printed Table 4."""
     for name, (*_, size) in _PARAMETERS.items():
 
         def error(changed: MonitorGeometry, name: str = name, size: float = size) -> float:

@@ -38,20 +38,24 @@ from twin.validation.group import Context, drawing, group_of
 
 Value = TypeVar("Value", float, np.ndarray)
 Measured = tuple[float, float]
-"""A value and its standard deviation."""
+"""A measured value and its standard deviation, in the same unit."""
 MIRROR_TURNS = tuple(math.radians(angle) for angle in (1 / 3600, 1 / 60, 0.5, 2.0, 10.0))
 INSTRUMENT = "monitor_pair"
-"""The camera that Table 5 implies: f = 7.7 m, area CCDs 0.73 m apart."""
+"""Name of the instrument with the camera that Table 5 implies: f = 7.7 m, area CCDs 0.73 m apart."""
 FRAMES = 9
 PARAMETERS = ("d_alpha", "d_beta", "d_gamma", "d_f")
 SHIFT, TURN, SCALE, PISTON, FACE = 50e-6, 20 * ARCSEC, 20e-6, 50e-6, 4 * ARCSEC
 """Motions, SI: of the line CCD along X or Y, about Z; growth of the camera; line CCD along Z; turn of a return face."""
 AMOUNTS = {"d_alpha": SHIFT, "d_beta": SHIFT, "d_gamma": TURN, "d_f": SCALE}
-"""Motion behind each parameter: line CCD along X, along Y (m) and about Z (rad), growth of the camera."""
+"""Parameter -> size of the motion that changes it.
+
+The line CCD moves along X (d_alpha) and Y (d_beta), in metres, and rotates about Z (d_gamma), in radians; the camera
+scales (d_f), relative.
+"""
 SMALLEST = 0.5
 """Smallest size of a random motion, as a share of its AMOUNTS."""
 UNITS = np.array([ARCSEC, ARCSEC, ARCSEC, 1e-6])
-"""Units of the response matrix: arcsec and micrometres."""
+"""Units of the response matrix in SI: arcsec for the three angles, micrometres for d_f."""
 _FACTS: dict[str, Any] = {
     "frames": FRAMES,
     "instrument": INSTRUMENT,
@@ -62,17 +66,20 @@ _FACTS: dict[str, Any] = {
 
 
 def roll_displacement(x_left: Value, x_right: Value) -> Value:
-    """Eq. (4): how far a roll of the camera moves a spot across the line."""
+    """Return the displacement of a spot across the line due to a roll of the camera, from both spots' X, by eq. (4)."""
     return (x_left - x_right) / 2.0
 
 
 def scale_displacement(y_left: Value, y_right: Value) -> Value:
-    """Eq. (6): how far a change of the focal length moves a spot along the line; (y11 - y01) is minus the left Y."""
+    """Return the displacement of a spot along the line due to a change of the focal length, by eq. (6).
+
+    The term (y11 - y01) of the paper is minus Y of the left spot.
+    """
     return (y_right - y_left) / 2.0
 
 
 def superposed(first: Value, second: Value) -> Value:
-    """Eq. (8), of one side: the displacement by two changes at once from those by each of them."""
+    """Return the displacement of a spot due to two changes at once from those due to each, by eq. (8)."""
     return first + second
 
 
@@ -85,12 +92,12 @@ def right_of_focal_length(left: Value) -> Value:
 
 
 def parts_along(left: Value, right: Value) -> tuple[Value, Value]:
-    """Eq. (10): the shares of the focal length and of the turn about X in Y."""
+    """Return the parts of the spots' Y due to the focal length and to the rotation about X, by eq. (10)."""
     return (left - right) / 2.0, (left + right) / 2.0
 
 
 def parts_across(left: Value, right: Value) -> tuple[Value, Value]:
-    """Eq. (11): the shares of the turn about Y and of the roll in X."""
+    """Return the parts of the spots' X due to the rotation about Y and to the roll, by eq. (11)."""
     return (left + right) / 2.0, (left - right) / 2.0
 
 
@@ -102,14 +109,14 @@ def focal_lengths(geometry: MonitorGeometry) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Ratio:
-    """A reading divided by what it should be.
+    """Measured value divided by the correct one, as a mean over the cameras.
 
     Attributes
     ----------
     value : float
         Mean of the cameras.
     sigma : float
-        Its standard deviation.
+        Standard deviation of ``value``.
     cameras : Mapping[str, Measured]
         Camera -> (value, sigma).
     """
@@ -120,25 +127,25 @@ class Ratio:
 
     @property
     def text(self) -> str:
-        """Each camera's own value."""
+        """Text with the ratio of each camera."""
         return ", ".join(f"{name} {value:.5f} ± {sigma:.5f}" for name, (value, sigma) in self.cameras.items())
 
 
 def quotient(above: Measured, below: Measured) -> Measured:
-    """Quotient of two measured numbers, (value, sigma) each, with its sigma."""
+    """Return the quotient of two measured numbers, (value, sigma) each, with its sigma."""
     value = above[0] / below[0]
     return value, float(np.hypot(above[1], value * below[1]) / abs(below[0]))
 
 
 class MonitorImages:
-    """Nine frames before and after every state, measured; what the formulas make of the spots is worked out on demand.
+    """Spots measured in nine rendered frames before and after every state, with the estimates by the formulas.
 
     Parameters
     ----------
     context
-        Of the group, for the noise.
+        Context of the group, which gives the seed of the noise.
     experiment
-        The instrument.
+        Monitoring experiment with the instrument.
     states
         Name -> state; both cameras' bodies may move in it.
     """
@@ -163,17 +170,17 @@ class MonitorImages:
 
     @property
     def first(self) -> MonitorGeometry:
-        """The geometry of the first camera; both have the same prescription."""
+        """Geometry of the first camera; both cameras have the same prescription."""
         return self.geometry(self.cameras[0])
 
     def local(self, camera: str) -> float:
-        """Focal length along the line at its centre, where d_beta is taken, over the formulas' f."""
+        """Return the focal length along the line at its centre, where d_beta is defined, divided by the formulas' f."""
         model = self.experiment.instrument.cameras[camera]
         return model.line_principal_distance / self.geometry(camera).principal_distance_m
 
     @property
     def local_share(self) -> float:
-        """Mean of `local` over the cameras."""
+        """Mean over the cameras of the focal length at the line's centre divided by the formulas' f."""
         return fmean(self.local(camera) for camera in self.cameras)
 
     def estimates(self) -> recovery.Estimates:
@@ -181,7 +188,7 @@ class MonitorImages:
         return recovery.estimates(self.before, self.after, self.covariance, self.experiment.calibration.cameras)
 
     def reading(self, camera: str, motion: str, parameter: str) -> Measured:
-        """Return the reading of one state by the printed formula of a single change, in SI units."""
+        """Return the estimate in one state by the printed formula for a single change, in SI units."""
         estimate = self.estimates().parameters[camera]["paper_single"]
         state, k = self.motions.index(motion), PARAMETERS.index(parameter)
         return float(estimate.vector[state, k]), float(estimate.sigma[state, k])
@@ -202,13 +209,13 @@ class MonitorImages:
         return float(moved[0]) * pitch, float(moved[1]) * pitch, float(np.sqrt(variance.mean())) * pitch
 
     def ratio(self, of: Callable[[str], Measured]) -> Ratio:
-        """Return the mean of the cameras' ratios; the noise of the cameras is independent."""
+        """Return the mean over the cameras of a measured ratio, with its sigma; the cameras' noise is independent."""
         cameras = {camera: of(camera) for camera in self.cameras}
         values, sigmas = np.array(list(cameras.values())).T
         return Ratio(float(values.mean()), float(np.sqrt(np.sum(sigmas**2)) / len(values)), cameras)
 
     def over(self, motion: str, parameter: str, amount: float | None = None) -> Ratio:
-        """Return the reading divided by the amount of the motion, by default by the traced change."""
+        """Return the estimate divided by the amount of the motion, by default by the traced change."""
         return self.ratio(
             lambda camera: quotient(
                 self.reading(camera, motion, parameter),
@@ -218,7 +225,7 @@ class MonitorImages:
 
 
 class SingleMotions(MonitorImages):
-    """Images of the motions that the formulas were derived for, one at a time, made by both cameras."""
+    """Images of the single motions for which the formulas were derived, made with both cameras at once."""
 
     def __init__(self, context: Context, experiment: MonitorExperiment) -> None:
         cameras = [f"{BASE}/{name}" for name in experiment.instrument.cameras]
@@ -237,9 +244,11 @@ class SingleMotions(MonitorImages):
         super().__init__(context, experiment, states)
 
     def needed_factor(self, parameter: str) -> Ratio:
-        """Return the factor required in place of cos² in (2) or (3): true change times 2f over the mean spot shift.
+        """Return the correct factor to use instead of cos² in eq. (2) or (3).
 
-        Along the line f is the focal length at its centre, where d_beta is taken; across it, that of the formula.
+        It is the true change times 2f over the mean spot shift.
+
+        Along the line f is the focal length at its centre, where d_beta is defined; across it, that of the formula.
         """
         motion = {"d_beta": "along Y", "d_alpha": "along X"}[parameter]
 
@@ -271,7 +280,7 @@ class SingleMotions(MonitorImages):
         return self.ratio(turn)
 
     def roll(self) -> Ratio:
-        """Eq. (4): how far the spots move across the line over how far the line CCD's ends do."""
+        """Return the spots' displacement across the line over that of the line CCD's ends, for a roll, eq. (4)."""
 
         def moved(camera: str) -> Measured:
             left, right, sigma = self.spots(camera, "about Z", "X")
@@ -281,7 +290,10 @@ class SingleMotions(MonitorImages):
         return self.ratio(moved)
 
     def growth(self) -> Ratio:
-        """Eq. (6): its mean displacement over the growth L Δf / f that (7) makes of it, with the traced Δf."""
+        """Return the mean spot displacement by eq. (6) over L Δf / f, that of eq. (7) with the traced change Δf.
+
+        L is the position of the spot along the line.
+        """
 
         def moved(camera: str) -> Measured:
             left, right, sigma = self.spots(camera, "scale", "Y")
@@ -292,7 +304,7 @@ class SingleMotions(MonitorImages):
         return self.ratio(moved)
 
     def growth_by_side(self) -> float:
-        """Largest relative distance of one side's own displacement from the mean of (6)."""
+        """Return the largest relative difference between one side's displacement and the mean of eq. (6)."""
         worst = 0.0
         for camera in self.cameras:
             left, right, _ = self.spots(camera, "scale", "Y")
@@ -319,7 +331,7 @@ def _ratios_svg(figure: Figure, ratios: Mapping[str, tuple[str, float]]) -> None
 
 
 def _show_ratios(context: Context, name: str, ratios: Mapping[str, float]) -> None:
-    """Draw what was measured of the selected rows, id -> value, that are 1 where a formula is right."""
+    """Draw the measured ratios of the selected checks, id -> value, which are 1 where a formula is correct."""
     checks = {i: context.check(i) for i in ratios if i in context.selected}
     exact = {i: (check.equation, ratios[i]) for i, check in checks.items() if check.printed == 1.0}
     if exact:
@@ -327,7 +339,10 @@ def _show_ratios(context: Context, name: str, ratios: Mapping[str, float]) -> No
 
 
 def mirror_turns(backend: Backend, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Turn of the reflected ray, radians, and how far it moves on a screen at unit distance, for turns of a mirror."""
+    """Return rotation and displacement of a reflected ray for rotations of a mirror, in radians.
+
+    The displacement is on a screen at unit distance.
+    """
     mirror = Element("mirror", "mirror", plane(), Interaction.REFLECT)
     assembly = Assembly(RigidTree((Body("mirror"),)), {"mirror": mirror}, {"path": ("mirror",)})
     states = [{"mirror": Motion(rotate=(float(turn), 0.0, 0.0))} for turn in (0.0, *turns)]
@@ -340,7 +355,7 @@ def mirror_turns(backend: Backend, turns: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def run(context: Context) -> Iterator[CheckResult]:
-    """All checks of single changes; the images of all motions are one batch."""
+    """Yield the results of all checks of single changes; the images of all motions are rendered in one batch."""
     if "001.eq1.turn" in context.selected:
         context.progress(0.0, "trace a plane mirror")
         turns = np.array(MIRROR_TURNS)
@@ -368,15 +383,15 @@ def single_images(context: Context) -> SingleMotions:
 
 
 def without_cos2(geometry: MonitorGeometry, local: float) -> float:
-    """Return the reading of a rotation about X by (2) and Table 1 without cos²β, relative to the truth.
+    """Return the rotation about X by eq. (2) or Table 1 without cos²β, relative to the true rotation.
 
-    The local value is the focal length at the line's centre over f.
+    ``local`` is the focal length at the line's centre divided by f.
     """
     return math.cos(geometry.field_beta_rad) ** 2 * local
 
 
 def _singles(context: Context, images: SingleMotions, shown: dict[str, Ratio]) -> Iterator[CheckResult]:
-    """Check the rows of (1) to (7); equations with the same content share a row."""
+    """Check eqs. (1) to (7) for single changes; equations with the same content share a row."""
 
     def row(identifier: str, ratio: Ratio, *explained: float | None, **facts: object) -> CheckResult:
         shown.setdefault(identifier, ratio)
@@ -414,7 +429,7 @@ def _singles(context: Context, images: SingleMotions, shown: dict[str, Ratio]) -
 
 
 def state_of(cameras: tuple[str, ...], shares: Mapping[str, np.ndarray]) -> State:
-    """Camera -> shares of the four AMOUNTS, in the order of PARAMETERS, as a state."""
+    """Return the state in which each camera makes given shares of the four AMOUNTS, in the order of PARAMETERS."""
     state: dict[str, Motion] = {}
     for camera in cameras:
         along_x, along_y, turn, growth = (
@@ -426,9 +441,9 @@ def state_of(cameras: tuple[str, ...], shares: Mapping[str, np.ndarray]) -> Stat
 
 
 def states_of(cameras: tuple[str, ...], rounds: int, seed: int) -> dict[str, State]:
-    """Every change by itself, the two that share an axis, all four, and random mixtures of all four.
+    """Return states with single changes, pairs on one axis, all four changes, and random mixtures of all four.
 
-    A round of mixtures has every combination of signs once, each camera in an order of its own, sizes at random.
+    A round of mixtures has every combination of signs once, each camera in its own order, with random sizes.
     """
     groups = [(p,) for p in PARAMETERS] + [("d_f", "d_beta"), ("d_alpha", "d_gamma"), PARAMETERS]
     states = {}
@@ -445,7 +460,7 @@ def states_of(cameras: tuple[str, ...], rounds: int, seed: int) -> dict[str, Sta
 
 
 class JointMotions(MonitorImages):
-    """Images of changes by themselves and together, and of ``rounds`` of 16 random mixtures."""
+    """Images of single and combined changes, and of ``rounds`` of 16 random mixtures."""
 
     def __init__(self, context: Context, experiment: MonitorExperiment, rounds: int) -> None:
         super().__init__(context, experiment, states_of(tuple(experiment.instrument.cameras), rounds, context.seed))
@@ -467,7 +482,10 @@ class JointMotions(MonitorImages):
         return self.ratio(worse)
 
     def symmetry(self, motion: str, right_from_left: Callable[[float], float]) -> Ratio:
-        """Displacement along Y of the right spot over what ``right_from_left`` makes of the left one's."""
+        """Return the right spot's displacement along Y over its prediction from the left spot's displacement.
+
+        ``right_from_left`` computes the prediction.
+        """
 
         def sides(camera: str) -> Measured:
             left, right, sigma = self.spots(camera, motion, "Y")
@@ -476,7 +494,7 @@ class JointMotions(MonitorImages):
         return self.ratio(sides)
 
     def stray(self, motion: str, wrong: str, right: str) -> Ratio:
-        """Return the common displacement along the wrong axis over the size along the right one."""
+        """Return the spots' common displacement along the wrong axis, relative to that along the right axis."""
 
         def share(camera: str) -> Measured:
             left, other, sigma = self.spots(camera, motion, wrong)
@@ -547,7 +565,7 @@ def joint_images(context: Context) -> JointMotions:
 
 
 def run_joint(context: Context) -> Iterator[CheckResult]:
-    """All checks of the joint form; the images of all states are one batch."""
+    """Yield the results of all checks of the joint form; the images of all states are rendered in one batch."""
     images = joint_images(context)
     ratios: dict[str, Any] = {
         "001.eq8.y": images.superposition("d_f", "d_beta", "Y"),
@@ -570,7 +588,7 @@ def run_joint(context: Context) -> Iterator[CheckResult]:
 
 
 def _table_1(context: Context, images: JointMotions) -> Iterator[CheckResult]:
-    """Table 1's diagonal and its two couplings that are not zero."""
+    """Check the diagonal of Table 1 and its two couplings that are not zero."""
     matrix, sigma = images.response("paper_joint")
     right, _ = images.response("derived")
     g, (f, f_x) = images.first, focal_lengths(images.first)

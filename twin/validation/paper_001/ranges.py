@@ -1,7 +1,7 @@
 """Ranges of validity of the formulas of paper 001.
 
-Readings of noise-free images are followed along single and joint changes, under defocus, and for other pupil offsets,
-fields and kinds of return, up to where they exceed a tolerance.
+Estimates from noise-free images are followed along single and joint changes, under defocus, and for other pupil
+offsets, fields and kinds of return reflector, up to where their errors exceed a tolerance.
 """
 
 from __future__ import annotations
@@ -39,29 +39,36 @@ from twin.validation.paper_001.formulas import focal_lengths
 
 PRINTED, JOINT, CORRECTED, CALIBRATED = "printed", "Table 1", "corrected", "calibrated"
 FORMS = (PRINTED, JOINT, CORRECTED, CALIBRATED)
-"""(2), (3), (5), (7) with the arctangent; Table 1's joint forms; the same with f_x for d_alpha, half of d_gamma times
-f/f_x, no cos^2, and (7); those with the two calibrated gradients over the field as well."""
+"""Names of the four sets of formulas that are compared.
+
+They are eqs. (2), (3), (5), (7) with the arctangent; Table 1's joint forms; the same with f_x for d_alpha, half of
+d_gamma times f/f_x, no cos^2, and (7); those with the two calibrated gradients over the field as well. f and f_x are
+the focal lengths along and across the line.
+"""
 SHARE = 24
-"""Images of 96 x 96 pixels that are rendered at once: bounds the memory."""
+"""Number of images of 96 x 96 pixels that are rendered at once, to limit memory."""
 ROUNDS, NEAR = 3, 1e-3
 """Refinement steps at most; and how near a point to a limit, relative to the size, makes another one needless."""
 
 Sample = Callable[[np.ndarray], Mapping[str, np.ndarray]]
-"""Sizes (N,) -> name -> values (N,), not negative; 1 is the limit."""
+"""Function from N sizes of a change, (N,), to name -> (N,) errors as shares of the allowed one.
+
+The values are not negative; at 1 the limit is reached.
+"""
 
 
 class Bench:
-    """Spot positions, readings and truth of one instrument's monitor, without noise.
+    """Spot positions, estimates and true changes of one instrument's monitor, without noise.
 
     Parameters
     ----------
     experiment
-        The instrument.
+        Monitoring experiment with the instrument.
     like
-        a bench on the same cameras: its geometry is taken over.
+        Another bench with the same cameras whose geometry is used.
     shapes
-        Whether its spot shapes are taken over as well; needed for larger CCDs, of which only a window around each spot
-        is read out, as large as the CCDs of ``like``.
+        True to use its spot shapes as well; needed for larger CCDs, of which only a window around each spot is read
+        out, as large as the CCDs of ``like``.
     """
 
     def __init__(self, experiment: MonitorExperiment, like: Bench | None = None, shapes: bool = False) -> None:
@@ -80,7 +87,7 @@ class Bench:
         return self._geometry[camera]
 
     def positions(self, states: Sequence[State]) -> np.ndarray:
-        """Return the centres of the spots in rendered images, (S, C, 2) (row, column), in pixels.
+        """Return the spot centres in rendered images of S states and C channels, (S, C, 2) (row, column), in pixels.
 
         Raises
         ------
@@ -101,9 +108,9 @@ class Bench:
         return out
 
     def traced(self, states: Sequence[State]) -> np.ndarray:
-        """Return the means of the traced spots over the return face, also outside the CCD.
+        """Return the means of the traced rays over the return face, also for spots outside the CCD.
 
-        They are (S, C, 2) (row, column), in pixels from the CCD's middle.
+        They are (S, C, 2) (row, column) for S states and C channels, in pixels from the CCD's middle.
 
         Raises
         ------
@@ -121,7 +128,10 @@ class Bench:
         return np.moveaxis(known.centre, 0, 1)
 
     def readings(self, start: np.ndarray, end: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
-        """Camera -> form -> (S, 4) in the units of ``monitoring.PARAMETERS``, from positions (S, C, 2)."""
+        """Return camera -> set of formulas -> (S, 4) estimated changes for S states, from spot positions (S, C, 2).
+
+        The units are those of ``monitoring.PARAMETERS``; C is the number of channels.
+        """
         start = np.broadcast_to(start, end.shape)
         nothing = np.zeros((4, 4))
         out = {}
@@ -140,7 +150,7 @@ class Bench:
         return out
 
     def truth(self, states: Sequence[State]) -> dict[str, np.ndarray]:
-        """Camera -> (S, 4) traced changes in the units of ``monitoring.PARAMETERS``."""
+        """Return camera -> (S, 4) traced changes of S states in the units of ``monitoring.PARAMETERS``."""
         changes = self.experiment.sight.truth(states)
         return {
             name: np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f], axis=-1) * PER_SI
@@ -149,7 +159,10 @@ class Bench:
 
 
 def _windows(images: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return windows around the brightest pixel of each image (B, H, W), and their offsets from the middle (B, 2)."""
+    """Return windows around the brightest pixel of each of B images, (B, H, W), and their offsets from the middle.
+
+    The offsets are (B, 2), in pixels.
+    """
     if images.shape[1:] == shape:
         return images, np.zeros((len(images), 2))
     brightest = np.stack(np.unravel_index(images.reshape(len(images), -1).argmax(axis=1), images.shape[1:]), axis=-1)
@@ -161,28 +174,28 @@ def _windows(images: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """Quantities over the size of a change.
+    """Errors over the size of a change.
 
     Attributes
     ----------
     size : np.ndarray
-        (N,), ascending, > 0.
+        The N sizes, (N,), ascending, > 0.
     value : Mapping[str, np.ndarray]
-        Name -> (N,), as shares of what is allowed.
+        Name -> (N,) errors as shares of what is allowed.
     """
 
     size: np.ndarray
     value: Mapping[str, np.ndarray]
 
     def bracket(self, name: str) -> int | None:
-        """Index of the first size at which the limit is passed, None where it is not."""
+        """Return the index of the first size at which the limit is exceeded, None if it never is."""
         beyond = np.flatnonzero(self.value[name] > 1.0)
         return int(beyond[0]) if len(beyond) else None
 
     def crossing(self, name: str) -> float | None:
-        """Size at which the limit is first passed, interpolated on logarithmic axes; None where it is not.
+        """Return the size at which the limit is first exceeded, interpolated on logarithmic axes.
 
-        0 where it is passed at the smallest size already.
+        None if it never is, 0 if it is exceeded at the smallest size already.
         """
         k = self.bracket(name)
         if k is None:
@@ -194,7 +207,7 @@ class Curves:
         return math.exp(low - start * (high - low) / (end - start))
 
     def merged(self, size: np.ndarray, value: Mapping[str, np.ndarray]) -> Curves:
-        """With more points."""
+        """Return the curves with further points, sorted by size."""
         sizes = np.concatenate([self.size, size])
         order = np.argsort(sizes)
         return Curves(sizes[order], {n: np.concatenate([v, value[n]])[order] for n, v in self.value.items()})
@@ -202,7 +215,7 @@ class Curves:
 
 @dataclass(frozen=True, eq=False)
 class Domain:
-    """Domain of validity: followed in images as far as they go, and traced from there until the beam is lost.
+    """Domain of validity: errors from rendered images as far as possible, then traced until the beam is lost.
 
     Attributes
     ----------
@@ -220,7 +233,7 @@ class Domain:
     lost_why: str
 
     def limit(self, name: str) -> tuple[float, str]:
-        """Largest size within a limit, and whence it is known: "images", "trace" or why there is none."""
+        """Return the largest size within a limit, and its source: "images", "trace" or why there is no limit."""
         for curves, whence in ((self.images, "images"), (self.traced, "trace")):
             crossing = curves.crossing(name)
             if crossing is not None:
@@ -263,24 +276,29 @@ CLAIMED = {
     "d_gamma": _TABLE.number("table5.d_gamma_arcsec"),
     "d_f": 1e3 * _TABLE.number("table5.d_f_mm"),
 }
-"""Errors claimed by section 3.3 and Table 5, in arcsec and um."""
+"""Parameter -> error claimed by section 3.3 and Table 5, in arcsec and um."""
 FINE = {"d_alpha": 0.1, "d_beta": 0.1, "d_gamma": 0.1, "d_f": 40.0}
-"""0.1 arcsec for all angles, and Table 5's 0.04 mm."""
+"""Parameter -> tighter tolerance: 0.1 arcsec for all angles, and Table 5's 0.04 mm for d_f."""
 RELATIVE = 0.01
 WINDOW, CUT = "leaves the area CCD", "an aperture cuts the beam"
 EDGE_PX = 11.0
-"""Spots may come this near to the outermost pixel centres: half a pixel nearer the fit's template ends on one side, one
-pixel nearer the centroid refuses them on all."""
+"""Smallest distance of a spot from the outermost pixel centres, pixels.
+
+Half a pixel nearer, the fit's template ends on one side; one pixel nearer, the centroid refuses the spot.
+"""
 WIDE_PX = 384
-"""Rows and columns of the larger CCD that shows what comes after the window's edge."""
+"""Rows and columns of the larger CCD with which errors are followed beyond the edge of the instrument's own CCD."""
 _START = {"d_alpha": 0.02, "d_beta": 0.02, "d_gamma": 0.02, "d_f": 8.0}
 _FAR = {"d_alpha": 3600.0, "d_beta": 3600.0, "d_gamma": 36000.0, "d_f": 600e3}
-"""Table units: where the curves begin, and where the trace ends at the latest."""
+"""Parameter -> largest change up to which the trace follows it, table units."""
 _WIDE_SHARE = 0.76
 _Raw = dict[str, list[np.ndarray]]
 KINDS = ("1 %", "fine", "claimed")
 BOX = np.array([4.0, 4.0, 24.0, 950.0])
-"""Half widths in d_alpha, d_beta, d_gamma (arcsec) and d_f (um): all at once, the spots just stay on the area CCD."""
+"""Half widths in d_alpha, d_beta, d_gamma (arcsec) and d_f (um) of the box of joint changes.
+
+With all at once, the spots just stay on the area CCD.
+"""
 BOX_TEXT = f"±({BOX[0]:g}″, {BOX[1]:g}″, {BOX[2]:g}″, {1e-3 * BOX[3]:g} mm)"
 CORNERS = np.array(list(product((-1.0, 1.0), repeat=4)))
 _FAR_BOX = 200.0
@@ -319,7 +337,7 @@ class Range(Domain):
 
 
 def criterion(form: str, kind: str) -> str:
-    """Name of a form's error as a share of "1 %", "0.1" or "claimed"."""
+    """Return the name of the error of a set of formulas as a share of "1 %", "0.1" or "claimed"."""
     return f"{form} {kind}"
 
 
@@ -332,20 +350,20 @@ def motion_of(camera: str, parameter: str, geometry: MonitorGeometry) -> tuple[E
 
 
 def single_range(bench: Bench, wide: Bench, parameter: str, sign: int, count: int) -> Range:
-    """Follow one parameter in one direction.
+    """Follow one parameter in one direction, up to where the beam is lost.
 
     Parameters
     ----------
     bench : Bench
-        With the instrument's own area CCDs, for the window's edge.
+        Bench with the instrument's own area CCDs, for the edge of the CCD.
     wide : Bench
-        With larger ones, same camera.
+        Bench with larger CCDs and the same camera.
     parameter : str
-        Of NAMES.
+        One of NAMES.
     sign : int
-        Of the change.
+        Sign of the change.
     count : int
-        Number of sizes to begin with.
+        Number of initial sizes.
     """
     camera = bench.cameras[0]
     geometry = bench.geometry(camera)
@@ -406,7 +424,7 @@ def single_range(bench: Bench, wide: Bench, parameter: str, sign: int, count: in
 
 
 def _joined(parts: Mapping[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
-    """Form -> (N, 2), ascending in the change."""
+    """Return set of formulas -> (N, 2) errors over the N changes, ascending in the change."""
     out = {}
     for form, pieces in parts.items():
         joined = np.concatenate(pieces)
@@ -438,7 +456,7 @@ def beam_end(bench: Bench, states: Callable[[np.ndarray], list[State]], start: f
 
 
 def joint_states(bench: Bench, changes: Mapping[str, np.ndarray]) -> list[State]:
-    """Return states in which every camera has changes (S, 4), in table units, as exactly as motions can."""
+    """Return S states in which every camera has given changes, (S, 4), in table units, as exactly as motions can."""
     states: list[dict[str, Motion]] = [{} for _ in next(iter(changes.values()))]
     for camera, wanted in changes.items():
         units = [motion_of(camera, name, bench.geometry(camera))[1] for name in NAMES]
@@ -450,25 +468,25 @@ def joint_states(bench: Bench, changes: Mapping[str, np.ndarray]) -> list[State]
 
 @dataclass(frozen=True, eq=False)
 class Corners(Domain):
-    """The worst of the 16 corners over the share of the box.
+    """Largest errors at the 16 corners of the box of joint changes, over the size as a share of the box.
 
-    The names of the curves are form and parameter; the values the worst error of all corners and cameras as a share of
-    what is claimed.
+    The names of the curves consist of set of formulas and parameter; the values are the largest error of all corners
+    and cameras as a share of what is claimed.
     """
 
     def text(self, name: str) -> str:
-        """Return the limit as text."""
+        """Return the limit of an error, as a share of the box, as text."""
         share, whence = self.limit(name)
         return f"{share:.3g}" + (" (beam cut)" if whence == self.lost_why else "")
 
 
 def key(form: str, parameter: str, fine: bool = False) -> str:
-    """Name of an error as a share of what Table 5 claims, or of 0.1 arcsec and 0.04 mm."""
+    """Return the name of an error as a share of what Table 5 claims or, if ``fine``, of 0.1 arcsec and 0.04 mm."""
     return f"{form} {parameter}{' fine' if fine else ''}"
 
 
 def corners(bench: Bench, count: int) -> Corners:
-    """Follow the corners of the box from a thousandth of it until beams are cut."""
+    """Follow the errors at the corners of the box, from a thousandth of its size until beams are vignetted."""
     origin, traced_origin = bench.positions([{}]), bench.traced([{}])
 
     def states(share: np.ndarray) -> list[State]:
@@ -498,16 +516,17 @@ def corners(bench: Bench, count: int) -> Corners:
 
 @dataclass(frozen=True, eq=False)
 class Separation:
-    """Readings of many random changes regressed on the true ones.
+    """Regression of the estimates on the true changes over many random joint changes.
 
     Attributes
     ----------
     gain : Mapping[str, Mapping[str, np.ndarray]]
-        Form -> camera -> (4, 4): reading p per unit of true change q.
+        Set of formulas -> camera -> (4, 4) matrix: estimate of the first parameter per unit of true change of the
+        second.
     sigma : Mapping[str, Mapping[str, np.ndarray]]
-        Likewise, standard deviations.
+        Standard deviations of ``gain``.
     scatter : Mapping[str, np.ndarray]
-        Form -> (4,) rms of what the regression leaves, table units, all cameras.
+        Set of formulas -> (4,) rms residual of the regression, table units, all cameras.
     trials : int
         Number of states.
     """
@@ -518,7 +537,7 @@ class Separation:
     trials: int
 
     def mean(self, form: str, read: str, changed: str) -> tuple[float, float]:
-        """Return the mean of the cameras and its standard deviation."""
+        """Return the regression coefficient of one parameter on another, mean of the cameras, and its sigma."""
         p, q = NAMES.index(read), NAMES.index(changed)
         values = [self.gain[form][c][p, q] for c in self.gain[form]]
         sigmas = [self.sigma[form][c][p, q] for c in self.sigma[form]]
@@ -526,7 +545,10 @@ class Separation:
 
 
 def separation(experiment: MonitorExperiment, bench: Bench, trials: int, seed: int) -> Separation:
-    """Random changes of all four parameters of both cameras, uniform in the box, read from noisy frames."""
+    """Regress estimates from noisy frames on random changes of all four parameters, uniform in the box.
+
+    Both cameras change.
+    """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1001,)))
     wanted = {c: rng.uniform(-1.0, 1.0, (trials, 4)) * BOX for c in bench.cameras}
     states = joint_states(bench, wanted)
@@ -560,15 +582,20 @@ RETURNS: Mapping[str, tuple[tuple[float, float] | None, str]] = {
     "roof along": ((0.0, 3e-3), "the ridge lies along the line; the area CCD stands beside its pinhole along the line"),
     "corner": ((0.0, 0.0), "the spot falls on its own pinhole: the area CCD must see it through a beam splitter"),
 }
-"""Kinds of return: a mirror facet; a roof whose ridge lies across the line, or along it; a corner cube. For each the
-place of the area CCD from its pinhole, where another one is needed, metres, and how both stand.
+"""Kind of return reflector -> position of the area CCD and a remark.
+
+The kinds are a mirror facet; a roof whose ridge lies across the line, or along it; a corner cube. The position is
+relative to the pinhole, in metres; None if the one in the instrument's file can be used.
 """
 SHIFT = 60e-6
-"""Shift of the line CCD, metres."""
+"""Shift of the line CCD for the comparison of return reflectors, metres."""
 CONFOCAL = load_printed("004").number("alignment.confocal_mm") / 1e3
 """Accuracy with which paper 004 sets the line CCD to the focus, metres."""
 SMALL = {"d_alpha": 2.0, "d_beta": 2.0, "d_gamma": 40.0, "d_f": 1500.0}
-"""Single changes whose readings are compared in a defocused camera and at other fields: a third of the area CCD."""
+"""Parameter -> single change for the comparison of defocused cameras and other fields, table units.
+
+The spots move by a third of the area CCD.
+"""
 
 
 def variant(
@@ -623,23 +650,22 @@ def variant(
 
 
 def with_return(experiment: MonitorExperiment, kind: str) -> MonitorExperiment:
-    """Return the experiment with another kind of return.
+    """Return the experiment with a return reflector of another kind.
 
-    The facet becomes an opening of the same size, behind which two or three mirrors stand square to each other and
-    meet in its middle. Rays meet them in one order; the other orders give the same ray, as turns by half a turn do not
-    depend on theirs.
+    The facet becomes an opening of the same size, behind which two or three mutually perpendicular mirrors meet in its
+    middle. Rays meet them in one order; the other orders give the same ray, because rotations by 180 deg commute here.
 
     Parameters
     ----------
     experiment : MonitorExperiment
-        With the plane return that was built.
+        Experiment with the plane return facet.
     kind : str
-        Of RETURNS.
+        One of RETURNS.
 
     Raises
     ------
     ValueError
-        It is no such kind.
+        The kind is not one of RETURNS.
     """
     if kind not in RETURNS:
         raise ValueError(f"no return {kind!r}; there are {', '.join(RETURNS)}")
@@ -679,7 +705,7 @@ def _mirrors(kind: str) -> list[Pose]:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Response of a kind of return.
+    """Response of the spots to motions of the line CCD with one kind of return reflector.
 
     Attributes
     ----------
@@ -688,7 +714,7 @@ class Response:
     across, along : (2,) ndarray
         Motion of the spots (left, right) over the motion of the line CCD across and along the line.
     gain : (4,) ndarray
-        Corrected reading over truth for single changes.
+        Corrected estimate over truth for single changes.
     """
 
     kind: str
@@ -698,7 +724,7 @@ class Response:
 
 
 def responses(resolved: ResolvedJob, backend: Backend, like: Bench) -> list[Response]:
-    """All kinds of return, by rendered images."""
+    """Return the response of every kind of return reflector, from rendered images."""
     camera, pitch = like.cameras[0], resolved.instrument.autocollimator.area_ccd.pitch
     out = []
     for kind, (offset, _) in RETURNS.items():
@@ -713,7 +739,10 @@ def responses(resolved: ResolvedJob, backend: Backend, like: Bench) -> list[Resp
 
 
 def depth_of_focus(resolved: ResolvedJob, camera: str) -> float:
-    """Return 2 λ N², at which defocus reaches a quarter wave at the monitor's wavelength, in metres."""
+    """Return 2 λ N² with wavelength λ and F-number N, at which defocus reaches a quarter wave, in metres.
+
+    The wavelength is that of the monitor.
+    """
     spec = resolved.cameras[resolved.instrument.cameras[camera].camera]
     return 2.0 * resolved.instrument.autocollimator.wavelength * (spec.focal_length / spec.entrance_pupil) ** 2
 
@@ -724,7 +753,10 @@ def piston(camera: str, amount: float, *, along: tuple[float, float] = (0.0, 0.0
 
 
 def false_slopes(bench: Bench, form: str, pistons: Sequence[float]) -> np.ndarray:
-    """Return reading minus truth per metre of piston between before and after, (4,), table units, from images."""
+    """Return the false change per metre of piston between before and after, (4,), table units per metre.
+
+    It is the estimate minus the truth, from rendered images.
+    """
     camera = bench.cameras[0]
     states = [piston(camera, z) for z in pistons]
     readings = bench.readings(bench.positions([{}]), bench.positions(states))[camera][form]
@@ -735,16 +767,16 @@ def false_slopes(bench: Bench, form: str, pistons: Sequence[float]) -> np.ndarra
 
 @dataclass(frozen=True, eq=False)
 class PupilStudy:
-    """False readings per piston over the place of the monitor's sub-aperture in the pupil.
+    """False changes due to piston, over the position of the monitor's sub-aperture in the pupil.
 
     Attributes
     ----------
     offset : np.ndarray
-        (N, 2) X, Y of the sub-aperture, metres.
+        (N, 2) X and Y of the N sub-apertures, metres.
     slope : np.ndarray
-        (N, 4) table units per metre of piston, corrected form.
+        (N, 4) false change of each parameter per metre of piston, table units, corrected form.
     gradient : np.ndarray
-        (4, 2) change of the slope by X and Y, table units per m^2.
+        (4, 2) change of the slope with X and Y, table units per m^2.
     rest : np.ndarray
         (4,) rms of the slopes about that plane, table units per metre.
     """
@@ -758,7 +790,7 @@ class PupilStudy:
 def pupil_study(
     resolved: ResolvedJob, backend: Backend, like: Bench, offsets: Sequence[tuple[float, float]], depth: float
 ) -> PupilStudy:
-    """Build the instrument anew with each sub-aperture and defocus it."""
+    """Return the false changes due to piston, with the instrument built anew for each position of the sub-aperture."""
     slopes = []
     for offset in offsets:
         bench = Bench(variant(resolved, backend, like.cameras[0], pupil_offset=offset), like)
@@ -771,7 +803,7 @@ def pupil_study(
 
 
 def piston_curves(bench: Bench, count: int) -> Curves:
-    """Return the false readings of the corrected form over the piston, in metres, as shares of FINE and CLAIMED.
+    """Return the false changes by the corrected form over the piston, in metres, as shares of FINE and CLAIMED.
 
     They are those of the worse of the two directions.
     """
@@ -791,7 +823,10 @@ def piston_curves(bench: Bench, count: int) -> Curves:
 
 
 def gains(bench: Bench, constant: float = 0.0) -> dict[str, np.ndarray]:
-    """Form -> (4,) reading over truth of SMALL single changes, with the same piston (metres) before and after."""
+    """Return set of formulas -> (4,) estimate over truth of the SMALL single changes.
+
+    The same piston, ``constant`` metres, is present before and after.
+    """
     camera = bench.cameras[0]
     states: list[State] = [piston(camera, constant)]
     for name in NAMES:
@@ -812,16 +847,18 @@ def gains(bench: Bench, constant: float = 0.0) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class FieldPoint:
-    """The formulas with the area CCDs at another field.
+    """Accuracy of the formulas with the area CCDs at another field angle.
 
     Attributes
     ----------
     field : float
-        radians. separation: of the area CCDs, metres.
+        Field angle of the area CCDs, radians.
+    separation : float
+        Distance between the area CCDs, metres.
     gains : dict[str, np.ndarray]
-        Form -> (4,) reading over truth.
+        Set of formulas -> (4,) estimate over truth.
     slope : np.ndarray
-        (4,) false reading per metre of piston, corrected form, table units.
+        (4,) false change per metre of piston, corrected form, table units.
     """
 
     field: float
@@ -833,7 +870,7 @@ class FieldPoint:
 def field_study(
     resolved: ResolvedJob, backend: Backend, camera: str, fields: Sequence[float], depth: float
 ) -> list[FieldPoint]:
-    """Build the instrument anew with the area CCDs at each field (radians)."""
+    """Return the formulas' accuracy with the instrument built anew for area CCDs at each field angle, radians."""
     out = []
     for field in fields:
         bench = Bench(variant(resolved, backend, camera, field=field))
