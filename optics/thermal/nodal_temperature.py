@@ -198,9 +198,7 @@ class NodalTemperature:
         return self._linear_at(places) + rest
 
     def _inside_rest(self, places: np.ndarray) -> np.ndarray:
-        """Return the interpolated deviation from the linear fit at points between the nodes, kelvin; NaN outside the
-        nodes.
-        """
+        """Return the interpolated deviation from the linear fit at points, kelvin; NaN outside the nodes."""
         if self._inside is None:
             return np.full(len(places), np.nan)
         return self._inside(self._placed(places))

@@ -117,8 +117,9 @@ class Finder:
         return self._last[1]
 
     def _search(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return indices of nodes and shape functions at points, as ``shapes`` does, by a search among the nearest
-        cells.
+        """Return indices of nodes and shape functions at points by a search among the nearest cells.
+
+        The result is that of ``shapes``.
         """
         best = np.full(len(points), np.inf)
         cell = np.zeros(len(points), int)
@@ -145,8 +146,7 @@ class Finder:
         )
 
     def _local(self, points: np.ndarray, cells: np.ndarray) -> np.ndarray:
-        """Return the coordinates of P points (P, 3) within given cells (P,), by Newton's method; infinite where it
-        fails.
+        """Return the coordinates of P points (P, 3) within given cells (P,); infinite where Newton's method fails.
 
         They are coordinates of the element's reference shape, the unit cube or tetrahedron.
         """

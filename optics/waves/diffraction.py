@@ -1,16 +1,17 @@
 """Diffraction images: the matrix Fourier transform of a traced pupil onto a detector's own grid.
 
-Convention: time factor exp(-i w t), a wave of phase exp(+i k L) with L its optical path.
+Convention: time factor exp(-i w t), a wave of phase exp(+i k L) with L its optical path and k = 2 pi / wavelength.
 
-Near the image point P0 every traced ray is a local plane wave of direction cosines (u, v) along the detector's x and y
-and of eikonal L (the optical path to the wave's plane through P0). The field on the detector is the sum of these waves,
+Near the image point P0 every traced ray j is a local plane wave of amplitude a_j, of direction cosines (u, v) along the
+detector's x and y, and of eikonal L (the optical path to the wave's plane through P0). The field on the detector is the
+sum of these waves,
 
     U(x, y) = 1/lambda * sum_j w_j a_j exp(i k (L_j + u_j x + v_j y)),
 
-with w_j the pupil element. Because exp(ik(ux + vy)) factors, U on a grid of R x C pixels is the product of an (R x N)
-and an (N x C) matrix: no FFT grid, no padding, pixels wherever the detector has them (Soummer et al., Opt. Express 15,
-15935 (2007), here with arbitrary pupil nodes). Plancherel: with sum w_j |a_j|^2 = P over du dv the image integrates to
-P.
+with w_j the pupil element. Because exp(ik(ux + vy)) factors, U of N rays on a grid of R x C pixels is the product of an
+(R x N) and an (N x C) matrix: no FFT grid, no padding, pixels wherever the detector has them (Soummer et al., Opt.
+Express 15, 15935 (2007), here with arbitrary pupil nodes). Plancherel: with sum w_j |a_j|^2 = P over du dv the image
+integrates to P.
 
 Sampling of the field. Along one detector axis the field of a beam is a sum of exp(i q x) with |q| no more than the half
 width of the beam's directions. On a whole interval such a function is determined by little more samples than its
@@ -68,7 +69,7 @@ class FieldSamples:
     step : float
         Distance between two samples, in steps of the points.
     weights : (N, M) ndarray
-        Weights of the samples (an even number M) in each of the N points.
+        Weights of the M samples (an even number) in each of the N points.
     """
 
     step: float
@@ -88,7 +89,7 @@ class FieldSamples:
         points : int
             Number N of grid points, at most ``MAX_POINTS``.
         band : float
-            Largest |q|, radians from one point to the next.
+            Largest spatial frequency of the field, as phase in radians from one point to the next.
         loose : bool
             True for an accuracy of 1e-8 of the sum of all waves' amplitudes; False for 2e-12.
         """
@@ -100,7 +101,7 @@ class FieldSamples:
 
 @lru_cache(maxsize=64)
 def _samples(points: int, rung: int, loose: bool) -> FieldSamples | None:
-    """Return ``FieldSamples`` for the band ``_BAND_RATIO**rung``."""
+    """Return samples for a field whose phase changes by up to ``_BAND_RATIO**rung`` radians from point to point."""
     band = _BAND_RATIO**rung
     nyquist, beyond = np.pi / band, _BEYOND_IF_LOOSE if loose else _BEYOND
     first = _OVER * points / nyquist + (_MORE_IF_LOOSE if loose else _MORE)
@@ -121,7 +122,7 @@ def _samples(points: int, rung: int, loose: bool) -> FieldSamples | None:
 
 
 def _plane_waves(points: int, count: int, step: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return cosines and sines of frequencies q at the samples and at the points."""
+    """Return cosines and sines of waves of frequencies q (radians per step of the points), at samples and at points."""
     even = step * (np.arange(count) - 0.5 * (count - 1)), np.arange(points) - 0.5 * (points - 1)
     first, then = (np.concatenate([np.cos(q[:, None] * x), np.sin(q[:, None] * x)]) for x in even)
     return first, then
@@ -129,7 +130,7 @@ def _plane_waves(points: int, count: int, step: float, q: np.ndarray) -> tuple[n
 
 @dataclass(frozen=True, eq=False)
 class PupilField:
-    """Plane waves that form B images, N nodes each.
+    """Plane waves that form B images, N nodes of the pupil each.
 
     Attributes
     ----------
@@ -138,7 +139,8 @@ class PupilField:
     eikonal : (B, N) ndarray
         Optical path to the plane wave through the image's origin, metres, common piston removed.
     amplitude : (B, N) ndarray
-        a_j * w_j * du dv, such that the module's formula holds with unit total power; 0 = blocked.
+        Amplitude of the wave times the area of the node in direction cosines, such that the module's formula holds with
+        unit total power; 0 = blocked.
     wavelength : float
         Wavelength, metres.
     """
@@ -154,7 +156,8 @@ class PupilField:
         return PupilField(self.u[piece], self.v[piece], self.eikonal[piece], self.amplitude[piece], self.wavelength)
 
     def scaled_by(self, size: np.ndarray) -> PupilField:
-        """Return the field in coordinates x / size, y / size: those of pixels scaled by ``size``, (B,).
+        """Return the field in coordinates x / size, y / size: those of pixels scaled by ``size``, one number per image,
+        (B,).
 
         Phases u x + v y stay, and so does the power: an image is then photons per area of the nominal pixels.
         """
@@ -183,7 +186,7 @@ def image(field: PupilField, x: Grid, y: Grid, single: bool = False) -> np.ndarr
     Parameters
     ----------
     field : PupilField
-        B pupils.
+        Plane waves of B images.
     x : Grid
         Detector x of the C columns.
     y : Grid
@@ -236,9 +239,9 @@ def _pieces(grid: Grid) -> list[tuple[Grid, slice]]:
 
 
 def _centred(field: PupilField, k: float) -> tuple[PupilField, tuple[float, float]]:
-    """Return the field without its common tilt, and the half-widths of its directions, radians per metre.
+    """Return the field without its common tilt, and the half-widths of its directions along x and y, radians per metre.
 
-    The common tilt does not affect the irradiance.
+    ``k`` is the wave number, 1/m. The common tilt does not affect the irradiance.
     """
     centred, bands = [], []
     for cosine in (field.u, field.v):
@@ -251,7 +254,10 @@ def _centred(field: PupilField, k: float) -> tuple[PupilField, tuple[float, floa
 def _from_samples(
     field: PupilField, k: float, across: tuple[Grid, FieldSamples], down: tuple[Grid, FieldSamples], out: np.ndarray
 ) -> None:
-    """Fill ``out`` (B, R, C) from samples of the field; rows of samples are paired as in ``_irradiance``."""
+    """Fill ``out`` (B, R, C) with the irradiance of B images at R rows and C columns, from samples of the field.
+
+    ``k`` is the wave number, 1/m; rows of samples are paired as in ``_irradiance``.
+    """
     (x, columns), (y, rows) = across, down
     count, nodes = field.u.shape
     half = rows.count // 2
@@ -280,9 +286,10 @@ def _from_samples(
 
 
 def _real_rows(first: np.ndarray, factor: np.ndarray, count: int) -> np.ndarray:
-    """Return real, then imaginary parts of first * turn^n, n = 0 .. count - 1, of phasors (B, N): (B, 2 count, N).
+    """Return the real, then the imaginary parts of ``first`` times the powers 0 .. ``count`` - 1 of ``factor``.
 
-    The powers are built by doubling as in ``_waves``.
+    Both are complex, (B, N) for N nodes in B images; the result has the shape (B, 2 count, N). The powers are built by
+    doubling as in ``_waves``.
     """
     table = np.empty((len(first), count, first.shape[1]), np.complex128)
     table[:, 0] = first
@@ -296,7 +303,7 @@ def _real_rows(first: np.ndarray, factor: np.ndarray, count: int) -> np.ndarray:
 
 
 def _phasor(phase: np.ndarray) -> np.ndarray:
-    """Return exp(i phase)."""
+    """Return the complex number exp(i phase) for phases in radians."""
     out = np.empty(phase.shape, np.complex128)
     np.cos(phase, out=out.real)
     np.sin(phase, out=out.imag)
@@ -304,11 +311,12 @@ def _phasor(phase: np.ndarray) -> np.ndarray:
 
 
 def _irradiance(field: PupilField, k: float, x: Grid, y: Grid, kind: type, out: np.ndarray) -> None:
-    """Fill ``out`` (B, R, C) with the irradiance.
+    """Fill ``out`` (B, R, C) with the irradiance of B images at R rows and C columns.
 
-    Rows at equal distances d on both sides of the grid's middle share their waves: sum_j f_j exp(+-i q_j d) is P +- i Q
-    with P the sum of f_j cos(q_j d) and Q that of f_j sin(q_j d). So real tables of half of the rows suffice, and a
-    real matrix product of half of the work.
+    Rows at equal distances d on both sides of the grid's middle share their waves: with f_j the complex amplitude of
+    node j and q_j its frequency along y (rad/m), sum_j f_j exp(+-i q_j d) is P +- i Q with P the sum of f_j cos(q_j d)
+    and Q that of f_j sin(q_j d). So real tables of half of the rows suffice, and a real matrix product of half of the
+    work.
     """
     count, nodes = field.u.shape
     half = (y.count + 1) // 2
@@ -335,7 +343,7 @@ def _irradiance(field: PupilField, k: float, x: Grid, y: Grid, kind: type, out: 
 
 
 def at_intersections(field: PupilField, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the irradiance at the intersections of a few columns and rows of each image, (B, R, C).
+    """Return the irradiance at the intersections of C columns and R rows of each of B images, (B, R, C), in 1/m^2.
 
     It is the sum of ``image``, term by term. Phases are computed in double, waves in single precision: accurate to some
     1e-6 of the peak.
@@ -343,7 +351,7 @@ def at_intersections(field: PupilField, x: np.ndarray, y: np.ndarray) -> np.ndar
     Parameters
     ----------
     field : PupilField
-        B pupils.
+        Plane waves of B images.
     x : (B, C) ndarray
         Positions of the columns, metres.
     y : (B, R) ndarray
@@ -381,10 +389,11 @@ all.
 
 
 def _waves(frequency: np.ndarray, grid: Grid, factor: np.ndarray | float, kind: type) -> np.ndarray:
-    """Return factor * exp(i frequency * point) for frequencies (..., N) on a grid, (..., N, count).
+    """Return factor * exp(i frequency * point) for frequencies (..., N), rad/m, on a grid: (..., N, count).
 
-    Built by doubling: exp(i q (p + m step)) = exp(i q p) exp(i q m step), with m = 1, 2, 4, ... from one phasor that is
-    squared in double precision. Each sample is a product of at most log2(count) + 1 phasors.
+    Built by doubling: the wave at a point m steps from the first is the wave at the first times exp(i frequency m
+    step), with m = 1, 2, 4, ... from one phasor that is squared in double precision. Each sample is a product of at
+    most log2(count) + 1 phasors.
     """
     out = np.empty((*frequency.shape, grid.count), kind)
     out[..., 0] = factor * np.exp(1j * frequency * grid.start)
@@ -450,7 +459,7 @@ MAX_REACH = 10
 
 
 class UnsampledImageError(PhysicalError, ValueError):
-    """An image is too fine for its pixels, or the source's image too large for the filter.
+    """Image that is too fine for its pixels, or whose source is too large for the pixel filter.
 
     Attributes
     ----------
@@ -530,7 +539,10 @@ class PixelResponse:
         )
 
     def apply(self, images: np.ndarray) -> np.ndarray:
-        """Return the filtered images, (B, R - 2 reach, C - 2 reach), of images (B, R, C)."""
+        """Return the filtered images, smaller by ``reach`` pixels on every side.
+
+        ``images`` (B, R, C) are B images of R rows and C columns; the result is (B, R - 2 reach, C - 2 reach).
+        """
         # imported late, since commands that only check files import this module
         import cv2
 
@@ -546,7 +558,10 @@ class PixelResponse:
 
 
 def _symmetric_kernel(fx: np.ndarray, fy: np.ndarray, wanted: np.ndarray, reach: int) -> tuple[np.ndarray, float]:
-    """Return the least-squares kernel of eightfold symmetry with a given transfer function, and its largest error."""
+    """Return the kernel of eightfold symmetry whose transfer function is nearest to ``wanted``, and the largest error.
+
+    It is a least-squares fit at the frequencies ``fx``, ``fy``, in cycles per pixel.
+    """
     orbits = []
     for i in range(reach + 1):
         for j in range(i + 1):
@@ -562,7 +577,7 @@ def _symmetric_kernel(fx: np.ndarray, fy: np.ndarray, wanted: np.ndarray, reach:
 
 
 def _jinc(z: np.ndarray) -> np.ndarray:
-    """Return 2 J1(z)/z, 1 at z = 0."""
+    """Return 2 J1(z)/z with the Bessel function J1, and 1 at z = 0: the transform of a disk relative to its area."""
     # imported late, since commands that only check files import this module
     from scipy.special import j1
 

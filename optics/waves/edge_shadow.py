@@ -42,7 +42,7 @@ FINE_SHARE, COARSE_SHARE = 3e-4, 3e-3
 used, up to the second the larger one, whose error is a third of the change."""
 
 MOST_PIECES = 160
-"""Largest number of pieces of a shadow: the time of a transfer function grows with the square of their number."""
+"""Largest number of polygons of a shadow: the time of a transfer function grows with the square of their number."""
 
 _WINDOW, _WINDOW_SIDES = 1.2, 16
 """Radius and number of sides of the polygon about the unit disk to which outlines are clipped before projection."""
@@ -51,7 +51,7 @@ _STEPS, _CLOSE = 12, 1e-9
 """Largest number of Newton steps for a corner, and tolerance of its position in radii of the stop."""
 
 WORST_FIT = 3e-4
-"""Largest distance of the rays from the polynomials, in units of the beam's size on the surface."""
+"""Largest allowed distance of rays from the polynomials fitted to them, in units of the beam's size on the surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,16 +61,16 @@ class StopOutlines:
     Attributes
     ----------
     clear : tuple of (B, V, 2) ndarray
-        Polygons inside all of which light passes.
+        Polygons of V corners, inside all of which light passes.
     blocked : tuple of (B, V, 2) ndarray
-        Polygons inside any of which light is blocked; some are empty.
+        Polygons of V corners, inside any of which light is blocked; some are empty.
     """
 
     clear: tuple[np.ndarray, ...] = ()
     blocked: tuple[np.ndarray, ...] = ()
 
     def __add__(self, other: StopOutlines) -> StopOutlines:
-        """Return the outlines of both."""
+        """Return the outlines of both together, as of the edges of two surfaces."""
         return StopOutlines(self.clear + other.clear, self.blocked + other.blocked)
 
     def take(self, images: np.ndarray | slice) -> StopOutlines:
@@ -85,12 +85,12 @@ class StopOutlines:
         count : int
             Number of images B.
         further : sequence of (B, V, 2) ndarray
-            Convex polygons of other shadows, counterclockwise.
+            Convex polygons of V corners, other shadows, counterclockwise.
 
         Returns
         -------
         (B, K, W, 2) ndarray
-            Convex polygons that do not overlap; some are empty.
+            K convex polygons of W corners that do not overlap; some are empty.
         """
         # each image separately: one piece in one of them may be many in another
         shadows = [self._of_one(number, further) for number in range(count)]
@@ -101,7 +101,9 @@ class StopOutlines:
         return out
 
     def _of_one(self, number: int, further: Sequence[np.ndarray]) -> np.ndarray:
-        """Return ``shadows`` of one image, (K, W, 2)."""
+        """Return the shadows in the pupil of image ``number``, as K polygons of W corners that do not overlap, (K, W,
+        2).
+        """
         image = slice(number, number + 1)
         open_area = _window(1)
         for polygon in self.clear:
@@ -128,19 +130,19 @@ def converged_shadows(
     count : int
         Number of images B.
     further : sequence of (B, V, 2) ndarray
-        Convex polygons of other shadows, as for ``StopOutlines.shadows``.
+        Convex polygons of V corners, other shadows, counterclockwise.
 
     Returns
     -------
     pieces : (B, K, W, 2) ndarray
-        Shadows as from ``StopOutlines.shadows``.
+        Shadows as K convex polygons of W corners that do not overlap.
     error : float
-        Accuracy of their shares of the stop.
+        Accuracy of the fraction of the stop that they cover.
 
     Raises
     ------
     UnphysicalError
-        There are too many pieces, or the largest number of sides is too small.
+        There are too many polygons, or the largest number of sides is too small.
     """
     few, *finer_sides = ROUND_SIDES
     pieces = _require_few(outlines(few).shadows(count, further))
@@ -161,7 +163,10 @@ def converged_shadows(
 
 
 def _require_few(pieces: np.ndarray) -> np.ndarray:
-    """Return pieces of shadows (B, K, V, 2); raise UnphysicalError where there are too many for a transfer function."""
+    """Return the polygons of shadows; raise UnphysicalError where there are too many for a transfer function.
+
+    ``pieces`` (B, K, V, 2) are K polygons of V corners in each of B pupils.
+    """
     if pieces.shape[1] > MOST_PIECES:
         raise UnphysicalError(
             f"edges cut the pupil into {pieces.shape[1]} pieces of shadow, but its transfer "
@@ -171,7 +176,10 @@ def _require_few(pieces: np.ndarray) -> np.ndarray:
 
 
 def shares_of_stop(pieces: np.ndarray) -> np.ndarray:
-    """Return the fractions (B,) of the stop covered by pieces of shadows (B, K, V, 2) that do not overlap."""
+    """Return, for each of B pupils, the fraction of the stop covered by its shadows, (B,).
+
+    ``pieces`` (B, K, V, 2) are K polygons of V corners in each pupil that do not overlap.
+    """
     return np.asarray(np.sum(area_in_disk(pieces), axis=-1) / np.pi)
 
 
@@ -181,18 +189,18 @@ def nodes_in_shadows(pieces: np.ndarray, count: int) -> tuple[np.ndarray, np.nda
     Parameters
     ----------
     pieces : (B, K, V, 2) ndarray
-        Convex polygons that do not overlap, counterclockwise; K may be 0.
+        K convex polygons of V corners in each of B pupils that do not overlap, counterclockwise; K may be 0.
     count : int
         Number of nodes along each side.
 
     Returns
     -------
     points : (B, Q) ndarray
-        Nodes, complex.
+        Q nodes in units of the stop's radius, as complex numbers x + iy.
     weights : (B, Q) ndarray
         Area weights.
     areas : (B, K) ndarray
-        Areas of the pieces.
+        Areas of the polygons.
     """
     images, number = pieces.shape[:2]
     if not number:
@@ -288,7 +296,10 @@ _BEAM_MARGIN = 1.1
 
 
 def _covers(edge: Edge, ring: Circle, terms: np.ndarray) -> bool:
-    """Return True when the disk within a ring's outer edge contains all of the stop in every image."""
+    """Return True when the disk within a ring's outer edge contains all of the stop in every image.
+
+    ``terms`` are the coefficients of the polynomials that map the stop to the surface.
+    """
     disk = Edge(replace(ring, inner=0.0), edge.blocks, edge.rotation)
     (outline,), _ = next(_outlines(disk, ROUND_SIDES[0]))
     rim = _window(len(terms), 1.0, RIM_SIDES)
@@ -303,7 +314,10 @@ def _disk(count: int) -> np.ndarray:
 
 
 def _outlines(edge: Edge, round_sides: int) -> Iterator[tuple[list[np.ndarray], bool]]:
-    """Yield convex outlines (V, 2) on the surface, and whether light is blocked in them or outside all of them."""
+    """Yield convex outlines (V, 2) of V corners on the surface, and whether light is blocked inside or outside them.
+
+    The flag is True where light is blocked inside each of them, False where it is blocked outside all.
+    """
     shape, unit = edge.shape, _disk(round_sides)
     match shape:
         case Circle():
@@ -336,13 +350,16 @@ _FAR = 100.0
 
 
 def _placed(outlines: list[np.ndarray], edge: Edge) -> list[np.ndarray]:
-    """Return outlines about the origin at the edge's position and rotation."""
+    """Return outlines about the origin moved to the edge's position and rotated as the edge is."""
     c, s = np.cos(edge.rotation), np.sin(edge.rotation)
     return [outline @ np.array([[c, s], [-s, c]]) + np.array(edge.shape.centre) for outline in outlines]
 
 
 def _convex_parts(corners: np.ndarray) -> list[np.ndarray]:
-    """Return a polygon (V, 2) whose sides do not cross as convex ones: itself, or triangles cut off by ear clipping."""
+    """Return the convex polygons that make up a polygon whose sides do not cross: itself, or triangles by ear clipping.
+
+    ``corners`` (V, 2) are its V corners.
+    """
     rest = corners if area(corners[None])[0] > 0.0 else corners[::-1]
     out = []
     while len(rest) > 3:
@@ -364,7 +381,7 @@ def _convex_parts(corners: np.ndarray) -> list[np.ndarray]:
 
 
 def _divided(corners: np.ndarray) -> np.ndarray:
-    """Return a polygon (V, 2) with further corners on its sides, which may be curved on the stop."""
+    """Return a polygon (V, 2) of V corners with further corners on its sides, which may be curved on the stop."""
     fraction = np.arange(_PARTS)[:, None] / _PARTS
     return np.concatenate([a + fraction * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
 
@@ -374,21 +391,21 @@ _PARTS = 8
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the cross product of vectors in a plane."""
+    """Return the cross product of vectors in a plane: x_a y_b - y_a x_b."""
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
 def _window(count: int, radius: float = _WINDOW, number: int = _WINDOW_SIDES) -> np.ndarray:
-    """Return a regular polygon about a disk, (B, number, 2)."""
+    """Return, for ``count`` images, a regular polygon of ``number`` corners about a disk of ``radius``, (B, number, 2)."""
     angle = 2.0 * np.pi * (np.arange(number) + 0.5) / number
     corners = radius / np.cos(np.pi / number) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return np.broadcast_to(corners, (count, *corners.shape))
 
 
 def _on_stop(outline: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Return an outline (V, 2) of the surface projected onto the stop of B images, counterclockwise, (B, W, 2).
+    """Return an outline of the surface projected onto the stop of B images, counterclockwise, (B, W, 2) with W corners.
 
-    It is empty where the outline lies outside the beam.
+    ``outline`` (V, 2) has V corners. The result is empty where the outline lies outside the beam.
     """
     # surface position of the ray through the middle of the stop, and the derivatives there
     values, slopes = _surface_positions(terms, np.zeros((len(terms), 1, 2)))
@@ -411,7 +428,10 @@ def _on_stop(outline: np.ndarray, terms: np.ndarray) -> np.ndarray:
 
 
 def _surface_positions(terms: np.ndarray, centre: np.ndarray, step: float = 1e-5) -> tuple[np.ndarray, np.ndarray]:
-    """Return surface positions of rays through points of the stop, both (B, V, 2), and derivatives (B, V, 2, 2)."""
+    """Return where rays through V points of the stop meet the surface in B images, (B, V, 2), metres, and derivatives.
+
+    The derivatives (B, V, 2, 2) are with respect to the point of the stop.
+    """
 
     def value(points: np.ndarray) -> np.ndarray:
         return np.asarray(products(points[..., 0], points[..., 1], DEGREE) @ terms)
@@ -422,9 +442,10 @@ def _surface_positions(terms: np.ndarray, centre: np.ndarray, step: float = 1e-5
 
 
 def _outside_of(bright: np.ndarray) -> np.ndarray:
-    """Return the part of the stop outside a convex counterclockwise polygon (V, 2), as convex pieces (K, W, 2).
+    """Return the part of the stop outside a convex counterclockwise polygon, as K convex polygons (K, W, 2).
 
-    There is one piece beyond each side; pieces beyond the stop are omitted.
+    ``bright`` (V, 2) are its V corners. There is one polygon of W corners beyond each side; those beyond the stop are
+    omitted.
     """
     bright = compact(bright[None])[0]
     if area(bright) < SMALLEST:
@@ -445,7 +466,10 @@ _MIN_HALF_WIDTH = 1e-6
 
 
 def _outside(clear: list[np.ndarray], count: int) -> list[np.ndarray]:
-    """Return the part of the window outside all clear polygons (B, V, 2), as convex pieces."""
+    """Return what lies outside all clear polygons in the window about the stop, as convex polygons.
+
+    ``clear`` are polygons (B, V, 2) of V corners in B images.
+    """
     rest = [_window(count)]
     for polygon in clear:
         rest = [piece for part in rest for piece in without(part, polygon, fewest=True)]
@@ -461,7 +485,7 @@ class SurfaceEdges:
     edges : mapping of str to tuple of Edge
         Surface -> its edges, in the order of the light, of every surface that has some.
     places : mapping of str to (B, N, 2) ndarray
-        Surface -> points where rays meet it, stopped or not, in its own x and y, metres of nominal size.
+        Surface -> points where N rays meet it, stopped or not, in its own x and y, metres of nominal size.
     nodes : PupilNodes
         Points of the stop, through which the rays go.
     """
@@ -472,7 +496,7 @@ class SurfaceEdges:
 
     @cached_property
     def passed(self) -> list[np.ndarray]:
-        """Masks (B, N) of the rays that come through each surface and those before it."""
+        """Masks of the N rays of B images that come through all surfaces up to each one, (B, N) per surface."""
         through = [
             np.all([edge.passes(place[..., 0], place[..., 1]) for edge in self.edges[name]], axis=0)
             for name, place in self.places.items()
@@ -494,16 +518,15 @@ class SurfaceEdges:
 
 
 ROUND = 1e-4
-"""Relative excess of a shadow's second moment over that of a centred disk of its area up to which it counts as that
-disk.
+"""Relative excess of a shadow's second moment over that of a centred disk up to which it counts as that disk.
 
-The disk has the smallest second moment of all shapes of its area.
+The disk of the shadow's area has the smallest second moment of all shapes of its area.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class IlluminatedStop:
-    """Quadratures over the illuminated parts of a stop for F beams.
+    """Quadratures of N nodes over the illuminated parts of a stop for F beams.
 
     Attributes
     ----------
@@ -524,7 +547,7 @@ class IlluminatedStop:
         Parameters
         ----------
         pieces : (F, K, V, 2) ndarray
-            Convex polygons on the unit disk that do not overlap.
+            Shadows of F beams: K convex polygons of V corners on the unit disk that do not overlap.
         rings : int
             Number of rings of the rule over the whole stop.
         count : int
@@ -541,19 +564,19 @@ class IlluminatedStop:
 
     @property
     def light(self) -> np.ndarray:
-        """Fraction of the stop that is illuminated, (F,)."""
+        """Fraction of the stop that is illuminated, for each of F beams, (F,)."""
         return np.asarray(np.sum(self.weight, axis=1) / np.pi)
 
 
 def holes(pieces: np.ndarray) -> np.ndarray:
-    """Return the radius of the central obscuration of each stop, in units of the stop's radius, (F,).
+    """Return the radius of the central obscuration of each of F stops, in units of the stop's radius, (F,).
 
     It is 0 where there is no shadow, and NaN where the shadow is not one disk about the stop's middle.
 
     Parameters
     ----------
     pieces : (F, K, V, 2) ndarray
-        Convex polygons that do not overlap.
+        Shadows: K convex polygons of V corners that do not overlap.
     """
     points, weight, _ = nodes_in_shadows(pieces, 4)
     blocked = np.sum(weight, axis=1)

@@ -2,12 +2,12 @@
 
 The beam is collimated and of uniform irradiance. Rays are aimed at quadrature nodes of the stop, so that its edge is
 exact in every state. With p the launch point on the incoming plane wavefront, s the point of the stop and (u, v) the
-direction cosines at the detector, power conservation |a|^2 du dv = dp / A makes the amplitude of a node
+direction cosines at the detector, power conservation |a|^2 du dv = dp / A makes the amplitude a of a node
 
     a du dv = sqrt(|d(u, v)/dp| / A) * |dp/ds| * ds,    A = sum |dp/ds| ds,
 
-with both Jacobians by forward-mode AD through the trace. Paths count from the incoming wavefront. The pupil field is
-what ``optics.waves.diffraction.image`` turns into an image.
+with A the area of the beam and both Jacobians by forward-mode AD through the trace. Paths count from the incoming
+wavefront. The pupil field is what ``optics.waves.diffraction.image`` turns into an image.
 
 Wavefronts of a traced bundle: eikonal at the image point, optical path difference on the exit pupil, Zernike fits.
 """
@@ -31,12 +31,14 @@ from optics.waves.diffraction import PupilField
 
 
 def eikonal(position: np.ndarray, direction: np.ndarray, path: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """Return the optical path of each ray's plane wave through ``origin``: path - d . (position - origin).
+    """Return each ray's eikonal: the optical path to its plane wave through the point ``origin``.
+
+    It is path - direction . (position - origin).
 
     Parameters
     ----------
     position : (..., N, 3) ndarray
-        Points at which the paths are given, metres (image space, index 1).
+        Points of N rays at which the paths are given, metres (image space, index 1).
     direction : (..., N, 3) ndarray
         Unit directions.
     path : (..., N) ndarray
@@ -91,7 +93,7 @@ class WavefrontFit:
     Attributes
     ----------
     coefficients : (..., last) ndarray
-        Coefficients, metres rms.
+        Coefficients of the terms Z1 to Z of Noll index ``last``, metres rms.
     rms : (...) ndarray
         Rms wavefront error after removal of piston and tilt, metres.
     residual_rms : (...) ndarray
@@ -311,11 +313,12 @@ class ImagingRays:
     path : (B, N) ndarray
         Optical path from the incoming wavefront, metres.
     amplitude : (B, N) ndarray
-        a du dv of the module's formula; 0 where another aperture blocks the ray.
+        Amplitude times area in direction cosines (a du dv of the module's formula); 0 where another aperture blocks the
+        ray.
     launched : (B, N, 3) ndarray
         Points of the incoming wavefront in the world frame, metres.
     launch_area : (B, N) ndarray
-        Area |dp/ds| ds of the wavefront that belongs to each node, m^2.
+        Area of the incoming wavefront that belongs to each node, m^2.
     axes : (B, 2, 3) ndarray
         Axes of the wavefront in the world frame.
     """
@@ -393,12 +396,12 @@ def pupil_field(
     origin: np.ndarray | None = None,
     incoming: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> PupilField:
-    """Return the plane waves at the detector of traced beams.
+    """Return the plane waves at the detector that traced beams form.
 
     Parameters
     ----------
     rays : ImagingRays
-        B traced beams.
+        B traced beams of N rays each.
     wavelength : float
         Wavelength, metres.
     origin : (3,) or (B, 3) ndarray, optional

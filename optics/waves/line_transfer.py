@@ -64,10 +64,10 @@ smaller.
 """
 
 _SHORT_CELLS = 0.005, 0.04
-"""Lengths of cells up to which one and two nodes suffice; three for longer ones."""
+"""Largest lengths of a cell, in radii of the pupil, with which one and two nodes suffice; longer cells get three."""
 
 _TURNS = 0.2
-"""Phase over a cell, radians, beyond which it gets a further node.
+"""Largest change of phase over a cell, radians, with which it gets no further node.
 
 Near the cut-off there are few cells without an edge.
 """
@@ -86,16 +86,16 @@ little beyond the pupil.
 
 @dataclass(frozen=True, eq=False)
 class VignettedPupil:
-    """Exit pupil vignetted by edges.
+    """Exit pupil vignetted by edges, in normalised coordinates (complex numbers x + iy, the edge near the unit circle).
 
     Attributes
     ----------
     pupil : PupilFunction
         Wavefront and own edge of the pupil, without shadows.
     clear : tuple of (V,) ndarray
-        Convex polygons in p, complex, counterclockwise, inside all of which light passes.
+        Convex polygons of V complex corners, counterclockwise, inside all of which light passes.
     blocked : tuple of (V,) ndarray
-        Convex polygons in p, complex, counterclockwise, inside any of which light is blocked.
+        Convex polygons of V complex corners, counterclockwise, inside any of which light is blocked.
     """
 
     pupil: PupilFunction
@@ -105,7 +105,7 @@ class VignettedPupil:
 
 @dataclass(frozen=True, eq=False)
 class LineTransfer:
-    """Transfer function at evenly spaced frequencies.
+    """Transfer function at M evenly spaced frequencies along one direction.
 
     Attributes
     ----------
@@ -165,7 +165,7 @@ def vignetted_pupils(
 
 
 def unvignetted_at(cut: VignettedPupil, points: np.ndarray) -> np.ndarray:
-    """Return the mask of points p, complex (N,), that no edge except the pupil's own blocks."""
+    """Return the mask of N points of the normalised pupil, complex (N,), that no edge except the pupil's own blocks."""
     out = np.ones(len(points), bool)
     for polygons, clear in ((cut.clear, True), (cut.blocked, False)):
         for polygon in polygons:
@@ -182,7 +182,7 @@ def line_transfers(
     count: int,
     lines: Sequence[int] = (),
 ) -> list[list[LineTransfer]]:
-    """Return transfer functions at the frequencies 0, step .. (count - 1) step along some directions.
+    """Return transfer functions at the frequencies 0, step .. (count - 1) step along A directions.
 
     Parameters
     ----------
@@ -225,7 +225,7 @@ def line_transfers(
 def _line_transfer(
     cut: VignettedPupil, wavelength: float, direction: np.ndarray, step: float, count: int, lines: Sequence[int]
 ) -> LineTransfer:
-    """Return ``line_transfers`` of one image along one direction."""
+    """Return the transfer function of one image along one direction, with as many lines as its error requires."""
     shift = complex(cut.pupil.normalised(*direction))
     pitch, unit = wavelength * step * abs(shift), shift / abs(shift)
     cells_per_step = int(np.ceil(pitch / _LONGEST_CELL))
@@ -251,13 +251,16 @@ def _line_transfer(
 
 
 def _counterclockwise(polygon: np.ndarray) -> np.ndarray:
-    """Return a polygon (V,), complex, counterclockwise."""
+    """Return a polygon of V complex corners, (V,), in counterclockwise order."""
     clockwise = np.sum((np.conj(polygon) * np.roll(polygon, -1)).imag) < 0.0
     return polygon[::-1] if clockwise else polygon
 
 
 def _rotated(cut: VignettedPupil, unit: complex) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return clear outlines, the pupil's own edge first, and blocked ones, rotated so that ``unit`` is along x."""
+    """Return the clear and the blocked outlines of a pupil, rotated so that the direction ``unit`` is along x.
+
+    The pupil's own edge is the first of the clear outlines.
+    """
     angle = 2.0 * np.pi * np.arange(RIM_SIDES) / RIM_SIDES
     rim = _counterclockwise(np.sqrt(angle[1] / np.sin(angle[1])) * cut.pupil.edge.boundary(angle)[0])
     back = np.conj(unit)
@@ -265,7 +268,10 @@ def _rotated(cut: VignettedPupil, unit: complex) -> tuple[list[np.ndarray], list
 
 
 def _rotated_tables(pupil: PupilFunction, unit: complex) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coefficients of eikonal and amplitude in coordinates whose x is ``unit``, (D + 1, D + 1) each."""
+    """Return the coefficients of eikonal and amplitude in coordinates whose x axis has the direction ``unit``.
+
+    They are (D + 1, D + 1) each, for polynomials of degree D.
+    """
     count = len(pupil.eikonal_terms)
     node, to_table = _chebyshev_nodes(count)
     points = (node[:, None] + 1j * node).reshape(1, -1) * unit
@@ -278,7 +284,7 @@ def _rotated_tables(pupil: PupilFunction, unit: complex) -> tuple[np.ndarray, np
 
 @cache
 def _chebyshev_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return Chebyshev nodes, (count,), and the matrix from values there to coefficients."""
+    """Return ``count`` Chebyshev nodes, and the matrix that turns values there into Chebyshev coefficients."""
     node = np.cos(np.pi * (np.arange(count) + 0.5) / count)
     matrix = chebyshev.chebvander(node, count - 1).T * (2.0 / count)
     matrix[0] *= 0.5
@@ -286,13 +292,19 @@ def _chebyshev_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _first_nodes(pitch: float, phase: float) -> int:
-    """Return the initial number of nodes on a cell over which the phase changes by up to ``phase`` radians."""
+    """Return the initial number of nodes on a cell of length ``pitch`` (radii of the pupil).
+
+    The phase changes over the cell by up to ``phase`` radians.
+    """
     more = nodes_for(phase, 0) if phase > 1.0 else int(phase > _TURNS)
     return int(np.searchsorted(_SHORT_CELLS, pitch)) + 1 + more
 
 
 def _steepest(table: np.ndarray) -> float:
-    """Return the largest derivative along x, over the unit disk, of a polynomial with coefficients (D + 1, D + 1)."""
+    """Return the largest derivative along x, over the unit disk, of a polynomial of degree D.
+
+    ``table`` (D + 1, D + 1) are its coefficients.
+    """
     axis = np.linspace(-1.0, 1.0, 33)
     slope = chebyshev.chebgrid2d(axis, axis, chebyshev.chebder(table, axis=0))
     inside = np.hypot(axis[:, None], axis) <= 1.0
@@ -300,9 +312,10 @@ def _steepest(table: np.ndarray) -> float:
 
 
 def _chords(polygon: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return both ends, (N,) each, of the chords of a convex counterclockwise polygon (V,) at y (N,).
+    """Return both ends of the chords that a convex polygon cuts out of N lines of constant y, (N,) each.
 
-    Where there is none, the left end is infinite and the right one minus infinite.
+    ``polygon`` (V,) are its V complex corners, counterclockwise. Where a line misses it, the left end is infinite and
+    the right one minus infinite.
     """
     around = np.roll(polygon, -int(np.argmin(polygon.imag)))
     top = int(np.argmax(around.imag))
@@ -314,7 +327,7 @@ def _chords(polygon: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class _Lines:
-    """N lines along the shift, and the positions where light begins and ends on them.
+    """N lines along the shift, and the positions where light begins and ends on them, in radii of the pupil.
 
     Attributes
     ----------
@@ -325,7 +338,7 @@ class _Lines:
     coarse : (N,) ndarray
         Weights of the rule on a third of the lines, 0 for the others.
     begins, ends : (N, K) ndarray
-        Ends of the illuminated intervals; both equal where there is none.
+        Ends of up to K illuminated intervals on each line; both equal where there is none.
     bright : (N, K) ndarray of bool
         True where there is an interval.
     low, high : float
@@ -343,7 +356,7 @@ class _Lines:
 
     @classmethod
     def across(cls, clear: Sequence[np.ndarray], blocked: Sequence[np.ndarray], number: int) -> _Lines:
-        """Return some ``number`` lines across the clear outlines, the first of which is the pupil's own edge."""
+        """Return about ``number`` lines across the clear outlines, the first of which is the pupil's own edge."""
         parts = [_rule(a, b, number) for a, b in _between(clear, blocked)]
         y, weight, coarse = (np.concatenate(part) for part in zip(*parts, strict=True))
         chords = [_chords(polygon, y) for polygon in clear]
@@ -414,7 +427,7 @@ def _fejer(count: int) -> np.ndarray:
 
 @cache
 def _cell_weights(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Gauss nodes and weights on a cell [0, 1], (I,) each, and polynomials of partial integrals.
+    """Return I = ``count`` Gauss nodes and weights on a cell [0, 1], (I,) each, and polynomials of partial integrals.
 
     The polynomials, Legendre coefficients over [-1, 1] of shape (I + 1, I), are the integrals of the Lagrange
     polynomials from a position to the cell's end.
@@ -431,7 +444,9 @@ def _cell_weights(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _autocorrelation(
     rows: _Lines, tables: tuple[np.ndarray, np.ndarray], wave: float, pitch: float, count: int, nodes: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return autocorrelations at shifts 0 .. (count - 1) ``pitch`` along x with and without the wavefront, 1 at 0.
+    """Return the pupil's autocorrelations with and without the wavefront at evenly spaced shifts along x, 1 at 0.
+
+    The shifts are 0 to (count - 1) times ``pitch``.
 
     Parameters
     ----------
@@ -442,7 +457,7 @@ def _autocorrelation(
     wave : float
         Wave number, 1/m.
     pitch : float
-        Length of a cell.
+        Length of a cell, in radii of the pupil.
     count : int
         Number of shifts.
     nodes : int
@@ -486,7 +501,7 @@ def _autocorrelation(
 
 @dataclass(frozen=True, eq=False)
 class _Edges:
-    """Edges of light on lines, P of them, line by line.
+    """Positions where light begins or ends on lines, P of them, line by line; lines are divided into cells of I nodes.
 
     Attributes
     ----------
@@ -513,7 +528,7 @@ class _Edges:
 
     @classmethod
     def of(cls, rows: _Lines, pitch: float, cells: int, rest: np.ndarray) -> _Edges:
-        """Return the edges of lines."""
+        """Return the positions where light begins or ends on lines divided into cells of length ``pitch``."""
         valid = np.concatenate([rows.bright, rows.bright], axis=1)
         row, number = np.nonzero(valid)
         sign = np.where(number < rows.bright.shape[1], 1.0, -1.0)
@@ -522,11 +537,11 @@ class _Edges:
         return cls(row, cell, position - cell, sign, _rest(position - cell, rest), rest)
 
     def counted(self, start: int, lines: int, cells: int, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the illuminated share of each node of some lines, and the indices of the nodes of edge cells.
+        """Return the illuminated fraction of each node of some lines, and the indices of the nodes of cells with an
+        edge.
 
-        The shapes are (lines, I, cells) and (I, P).
-
-        The share steps up and down at the edges; in their cells it is the share behind the edge.
+        The shapes are (lines, I, cells) and (I, P), for I nodes per cell and P edges. The fraction steps up and down
+        at the edges; in their cells it is the fraction behind the edge.
         """
         rows = slice(*np.searchsorted(self.row, [start, start + lines]))
         cell_index, size, nodes = (self.row[rows] - start) * cells + self.cell[rows], lines * cells, len(weight)
@@ -543,7 +558,7 @@ class _Edges:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return corrections for pairs of edges of one line whose cells coincide at a shift.
 
-        The illuminated share of such a pair is not the product of the two shares.
+        The illuminated fraction of such a pair is not the product of the two fractions.
 
         Parameters
         ----------
@@ -552,12 +567,12 @@ class _Edges:
         count : int
             Number of shifts, in cells.
         weight : ndarray
-            Weights of the nodes of a cell.
+            Weights of the I nodes of a cell.
 
         Returns
         -------
         first, second : (Q,) ndarray of int
-            Indices of the two edges.
+            Indices of the two edges of Q pairs.
         step : (Q,) ndarray of int
             Shift.
         more : (I, Q) ndarray
@@ -574,12 +589,17 @@ class _Edges:
 
 
 def _rest(position: np.ndarray, polynomials_of_rest: np.ndarray) -> np.ndarray:
-    """Return the weights (I, P) of a cell's nodes behind positions (P,) from 0 to 1 in it."""
+    """Return the weights of a cell's I nodes for the part of the cell behind P positions, (I, P).
+
+    ``position`` (P,) runs from 0 to 1 in the cell.
+    """
     return np.asarray(polynomials_of_rest.T @ legendre.legvander(2.0 * position - 1.0, len(polynomials_of_rest) - 1).T)
 
 
 def _same_rows(row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return all ordered pairs of items with the same row, from the ascending rows (P,) of all items."""
+    """Return all ordered pairs of the P items with the same value in ``row`` (P,), which ascends, as two arrays of
+    indices.
+    """
     counts = np.bincount(row)
     start = np.cumsum(counts) - counts
     many = counts[row]
