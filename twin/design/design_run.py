@@ -37,11 +37,14 @@ line CCD. Made by python -m twin.design from {start}: least squares of the wavef
 
 
 LEAST_BENEFIT = 0.01
-"""Smallest improvement of the error per millimetre of easing, as a share of the error, for which a constraint is named.
+"""Smallest relief for which a constraint is named in the verdict.
+
+The relief is the decrease of the wavefront error per millimetre by which the constraint is eased, relative to the
+error.
 """
 
 _KEYS = {"envelope": ("envelope",), "clearance": ("clearance",), "anamorphism": ("anamorphism",)}
-"""Keys of the constraints that can be eased; the principal distance is held by the variables."""
+"""Keys of the constraints that can be eased; the principal distance cannot, since the variables hold it exactly."""
 _REMEDIES = {"envelope": "a larger envelope", "clearance": "a smaller clearance", "anamorphism": "more anamorphism"}
 """Advice for each constraint that can be eased."""
 
@@ -55,7 +58,7 @@ class DesignRun:
     setup : CameraDesignSetup
         Specification of the design.
     searched : Search
-        Results of all starts.
+        Results of the optimisation from all starts.
     text : str
         File of the new camera.
     warnings : tuple of str
@@ -135,17 +138,17 @@ def run_design(
 
 
 def _known(of: Callable[[Design], Any]) -> Callable[[Attempt], Any]:
-    """Return a function that gives a number of a start's design, None if the start has none."""
+    """Return a function that gives a number of the design reached from a start; None if no design was reached."""
     return lambda attempt: None if attempt.design is None else of(attempt.design)
 
 
 def _pair(of: Callable[[Evaluation], Any]) -> Callable[[DesignRun], Any]:
-    """Return a function that gives a number of the camera before and after."""
+    """Return a function that gives a number of the camera before and after the optimisation."""
     return lambda run: {"before": of(run.best.before), "after": of(run.best.after)}
 
 
 def _chief_rays(run: DesignRun) -> dict[str, np.ndarray]:
-    """Return the angles of all chief rays from the normal of the focal plane, radians, before and after."""
+    """Return the angles of all chief rays to the normal of the focal plane, radians, before and after."""
     design, merit = run.best, run.best.merit
 
     def angles(prescription: Prescription) -> np.ndarray:
@@ -245,12 +248,12 @@ def verdict(run: DesignRun) -> str:
 
 
 def _held_text(held: tuple[ActiveConstraint, ...], start: str, across: float) -> str:
-    """Return the constraints that cost most, at most three, each with its cost.
+    """Return in words the constraints that cost most, at most three, each with its cost in wavefront error.
 
     Parameters
     ----------
     held : tuple of ActiveConstraint
-        The constraints.
+        Constraints that are active in the optimised camera.
     start : str
         Name of the camera from which the design starts.
     across : float

@@ -1,9 +1,9 @@
 """Evaluation of single beams and whole layouts of a monitor: they are built, checked and traced.
 
-A beam is first evaluated alone, four times in a pair as in every layout. The information of its spots on the bodies
-that all beams share, and the effects of its own prisms, add up over the beams of a layout, so that thousands of
-combinations are compared without a trace. The best ones are then built as a whole, which includes facets in one block
-and adjacent prisms.
+A beam is first evaluated alone, four times in a pair as in every layout. The Fisher information of its spots on the
+motions of the bodies that all beams share adds up over the beams of a layout (the motions of a beam's own prisms act as
+noise of its spots), so that thousands of combinations are compared without a trace. The best ones are then built as a
+whole, which includes facets in one block and adjacent prisms.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from twin.monitor.information import Information, ground_of, information_of, qua
 from twin.sensors.area_detector import EmvaDetector
 
 _AROUND = 24
-"""Number of rays on the edge of a beam."""
+"""Number of rays traced along the edge of a beam."""
 EDGE_PX = 10.0
 """Distance that the fit of a spot needs between its centre and the edge of its area CCD, pixels."""
 FULLEST = 0.9
@@ -52,11 +52,11 @@ class Seen:
     Attributes
     ----------
     shared : (D, M) ndarray
-        Spot shifts, px, by independent unit motions of the bodies that all beams share.
+        Spot shifts, px, due to one standard deviation of each independent motion of the bodies that all beams share.
     own : (D, D) ndarray
-        Covariance, px^2, by the bodies of this beam alone and by noise.
+        Covariance of the spot shifts, px^2, due to the motions of this beam's own bodies and to image noise.
     parameters : (4 K, M) ndarray
-        Changes of the cameras' parameters by the shared motions; the same for all beams.
+        Changes of the cameras' parameters, rad and m, due to the shared motions; the same for all beams.
     """
 
     shared: np.ndarray
@@ -77,9 +77,9 @@ class BeamFacts:
     refused : str
         Reason why it is not feasible, empty if it is; the other attributes are then empty.
     seen : dict
-        Observation models by the names of the disturbances.
+        Name of a disturbances file -> observation model of the beam's spots.
     taken : ndarray
-        Imaging rays that its prisms block, packed bits of (cameras, 3, rays).
+        Imaging rays that its prisms block: the packed bits of a boolean array (cameras, 3, rays).
     mass : float
         Mass of its prisms, kg.
     bodies : tuple of ndarray
@@ -102,7 +102,7 @@ class BeamFacts:
 
     @cached_property
     def planes(self) -> list[np.ndarray]:
-        """Planes of the faces of each of its prisms, (F, 4) each.
+        """Planes of the faces of each of its prisms, (F, 4) each: outward normal and distance from the origin.
 
         Array dimensions: F faces.
         """
@@ -124,11 +124,11 @@ class LayoutFacts:
     sigmas : dict
         Disturbances -> quantity -> posterior standard deviation, SI.
     before : dict
-        The same without any measurement.
+        Disturbances -> quantity -> prior standard deviation, without any measurement, SI.
     shares : dict
-        Disturbances -> goal -> cause -> posterior variance, SI.
+        Disturbances -> goal -> cause -> part of the posterior variance due to the cause, SI.
     shares_before : dict
-        The same without any measurement.
+        Disturbances -> quantity -> prior standard deviation, without any measurement, SI.
     pupil_share : float
         Share of the imaging pupil that its prisms block.
     mass : float
@@ -155,7 +155,7 @@ class LayoutFacts:
 
 
 class LayoutBench:
-    """Bench that evaluates beams and layouts of one design.
+    """Evaluator of the beams and layouts of one design: builds, checks and traces them.
 
     Parameters
     ----------
@@ -180,12 +180,12 @@ class LayoutBench:
 
     @property
     def imaging_shape(self) -> tuple[int, int, int]:
-        """Shape of the bits that ``BeamFacts.taken`` packs."""
+        """Shape (cameras, 3, rays) of the boolean array that ``BeamFacts.taken`` packs."""
         return len(self.setup.instrument.cameras), 3, monitor_layout.RAYS
 
     @cached_property
     def rows(self) -> dict[str, np.ndarray]:
-        """Rows from the cameras' parameters to each quantity, common to all layouts."""
+        """Linear map (matrix rows) from the cameras' parameters to each quantity, common to all layouts."""
         return quantity_rows(self.start, ground_of(self.start))
 
     def detector(self, name: str = monitor_layout.AS_STARTED) -> EmvaDetector:
@@ -194,7 +194,7 @@ class LayoutBench:
         return EmvaDetector.from_sheet(sheet, self.setup.instrument.autocollimator.area_ccd.exposure)
 
     def goals_of(self, name: str) -> tuple[str, ...]:
-        """Return the quantities whose worst is a goal's value: ``d_f`` of every camera."""
+        """Return the quantities of which a goal takes the worst, such as ``d_f`` of every camera."""
         return tuple(key for key in self.rows if key == name or key.endswith(f"/{name}"))
 
     def boards_apart(self, beam: monitor_layout.Beam, other: monitor_layout.Beam) -> bool:
@@ -206,7 +206,7 @@ class LayoutBench:
         )
 
     def try_beam(self, beam: monitor_layout.Beam) -> BeamFacts:
-        """Evaluate a beam alone."""
+        """Build and trace a beam alone and return its properties, or why it is not feasible."""
         try:
             instrument = build_instrument(
                 monitor_layout.layout_spec(self.setup, (beam,)), self.setup.cameras, self.backend
@@ -229,7 +229,7 @@ class LayoutBench:
         )
 
     def try_layout(self, beams: monitor_layout.Layout) -> LayoutFacts:
-        """Evaluate a layout as a whole."""
+        """Build and trace a layout as a whole and return its properties, or why it is not feasible."""
         try:
             instrument = build_instrument(
                 monitor_layout.layout_spec(self.setup, beams), self.setup.cameras, self.backend
@@ -239,7 +239,7 @@ class LayoutBench:
             return LayoutFacts(beams, refused=_reason(error))
 
     def judged(self, beams: monitor_layout.Layout, instrument: Instrument, limited: bool = True) -> LayoutFacts:
-        """Return the properties of an instrument as a layout.
+        """Return the properties (accuracy, obstruction, mass) of a layout that is built as an instrument.
 
         Parameters
         ----------
@@ -282,7 +282,7 @@ class LayoutBench:
     def information(
         self, instrument: Instrument, beam: monitor_layout.Beam, alike: bool = False, single: bool = True
     ) -> dict[str, Information]:
-        """Return the information of an instrument's spots, by the names of the disturbances.
+        """Return what an instrument's spots tell about the cameras' parameters, by the name of the disturbances.
 
         Parameters
         ----------
@@ -291,7 +291,8 @@ class LayoutBench:
         beam : Beam
             One of its beams, which names the area CCD.
         alike, single : bool
-            See ``information_of``.
+            True to assume the same noise for spots of one camera and one beam width; True for images in single
+            precision.
         """
         stated = self.setup.disturbances
         results = information_of(
@@ -431,7 +432,7 @@ def combined(facts: Sequence[BeamFacts], name: str) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def bench_of(config: str, backend: str) -> LayoutBench:
-    """Return the bench of a design, kept by a worker process between tasks.
+    """Return the evaluator of a design's layouts, which a worker process keeps between tasks.
 
     Parameters
     ----------

@@ -9,12 +9,13 @@ depends, mostly positions of prisms, are drawn again a few times to make room fo
 parameters are changed one by one, and changes that improve the layout are kept.
 
 Gradients: positions of prisms and facets are themselves found by tracing, so there is no closed formula from a pupil
-offset to a sigma. The derivative of sigma with respect to the traced derivatives A of the spots and to their noise R is
-exact matrix calculus (``Information.slopes``). A and R, which are smooth in every parameter of a layout, are
-differentiated by central differences of high order of layouts that are built again. The reported error has two parts
-from the same layouts: the difference from the next lower order, and a jump within the steps, for example where a
-180-deg prism of a beam in the plane of symmetry is exchanged for its mirror image (``monitor_chain``). A derivative
-across a jump does not exist; its error is as large as itself.
+offset to a sigma. The derivative of sigma with respect to A, the matrix of the traced derivatives of the spots with
+respect to the motions, and with respect to R, the spots' noise covariance, is exact matrix calculus
+(``Information.slopes``). A and R, which are smooth in every parameter of a layout, are differentiated by central
+differences of high order of layouts that are built again. The reported error has two parts from the same layouts: the
+difference from the next lower order, and a jump within the steps, for example where a 180-deg prism of a beam in the
+plane of symmetry is exchanged for its mirror image (``monitor_chain``). A derivative across a jump does not exist; its
+error is as large as itself.
 """
 
 from __future__ import annotations
@@ -37,12 +38,13 @@ from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts
 from twin.monitor.information import Information
 
 FIRST_BOX = 0.1
-"""Initial half-width of the box, relative to the range of each parameter."""
+"""Initial half-width of the trust region, relative to the range of each parameter."""
 LEAST_BOX = 2e-3
-"""Half-width of the box below which the refinement ends."""
+"""Half-width of the trust region, relative to the parameters' ranges, below which the refinement ends."""
 LEAST_BENEFIT = 1e-3
-"""Smallest change of a ratio over a parameter's whole range, relative to the largest ratio, for which the parameter is
-optimised.
+"""Smallest effect for which a parameter of the layout is optimised.
+
+It is the change of the ratio of a sigma to its goal over the parameter's whole range, relative to the largest ratio.
 """
 ROOM, ROOM_STEP = 8, 0.06
 """Number of draws of the idle parameters to make room for a step, and their rms change relative to the ranges."""
@@ -50,11 +52,11 @@ _KEPT = 0.2  # share of the predicted improvement above which the box grows
 _ORDER = 2  # order of the differences: accurate to 1 %, which suffices for a step
 
 Ask = Callable[[str, Sequence[Any]], list[Any]]
-"""Function from a part of the search and items to evaluate to their results."""
+"""Function that evaluates items: from the name of a part of the search and the items to their results."""
 
 
 def ratios(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> dict[tuple[str, str], float]:
-    """Return the ratio of the standard deviation to its goal, for all disturbances and quantities of the goals.
+    """Return the ratio of each quantity's standard deviation to its goal, by disturbances and quantity.
 
     Parameters
     ----------
@@ -88,7 +90,7 @@ def refined(
     facts : LayoutFacts
         Feasible layout at the start.
     steps : int
-        Largest number of gradients.
+        Largest number of steps, each with new gradients.
     rng : Generator
         Random generator for making room.
 
@@ -140,7 +142,7 @@ def _largest(facts: LayoutFacts, bench: LayoutBench) -> float:
 
 
 def _slopes_of(bench: LayoutBench, facts: LayoutFacts, slope: Slope) -> np.ndarray:
-    """Return the linear change of every ratio over the whole range of a parameter, (Q,).
+    """Return the linearised change of every ratio of sigma to goal over a parameter's whole range, (Q,).
 
     Array dimensions: Q ratios of sigma to goal.
     """
@@ -153,12 +155,12 @@ def _slopes_of(bench: LayoutBench, facts: LayoutFacts, slope: Slope) -> np.ndarr
 
 
 def _benefit(bench: LayoutBench, facts: LayoutFacts, slope: Slope) -> float:
-    """Return the largest change of a ratio over a parameter's range, relative to the largest ratio."""
+    """Return the largest change of a ratio of sigma to goal over a parameter's range, relative to the largest ratio."""
     return float(np.max(np.abs(_slopes_of(bench, facts, slope)))) / _largest(facts, bench)
 
 
 def _step(bench: LayoutBench, facts: LayoutFacts, slopes: Sequence[Slope], box: float) -> tuple[np.ndarray, float]:
-    """Return changes of V parameters that minimise the largest linearised ratio, and the decrease of that ratio.
+    """Return the parameter changes that minimise the largest linearised ratio of sigma to goal, and its decrease.
 
     The changes are relative to the ranges of the parameters.
     """
@@ -193,7 +195,10 @@ def _moved(bench: LayoutBench, beams: Layout, numbers: Sequence[LayoutNumber], c
 def _with_room(
     bench: LayoutBench, ask: Ask, part: str, beams: Layout, idle: Sequence[LayoutNumber], rng: np.random.Generator
 ) -> LayoutFacts:
-    """Return the best feasible layout with the idle parameters drawn again; a refused one if none is feasible."""
+    """Return the best feasible layout after the parameters on which no goal depends are drawn again.
+
+    If none is feasible, it is one with the reason of refusal.
+    """
     tried = [_moved(bench, beams, idle, ROOM_STEP * rng.standard_normal(len(idle))) for _ in range(ROOM if idle else 0)]
     feasible = [facts for facts in ask(f"{part}: room", tried) if not facts.refused]
     return min(feasible, key=lambda facts: _largest(facts, bench), default=LayoutFacts(beams, refused="no room"))
@@ -215,17 +220,20 @@ def _one_by_one(
 
 
 STEP = 0.01
-"""Step of a parameter relative to its range; A is smooth over the whole range, and rays are aimed to 1e-9 of it."""
+"""Step of a parameter in the central differences, relative to its range.
+
+The traced derivatives of the spots are smooth over the whole range, and rays are aimed to 1e-9 of it.
+"""
 ORDER = 6
 """Default order of the central differences."""
 _WEIGHTS = {2: {1: 1.0 / 2.0}, 4: {1: 8.0 / 12.0, 2: -1.0 / 12.0}, 6: {1: 45.0 / 60.0, 2: -9.0 / 60.0, 3: 1.0 / 60.0}}
-"""Order -> weights of central differences by the number of steps (Fornberg, Math. Comp. 51, 699, 1988)."""
+"""Order -> number of steps -> weight of a central difference (Fornberg, Math. Comp. 51, 699, 1988)."""
 _JUMP = {4: {1: 4.0 / 3.0, 2: -1.0 / 3.0}, 6: {1: 1.5, 2: -0.6, 3: 0.1}}
-"""Order -> weights of f(k h) + f(-k h) - 2 f(0) for the detection of jumps.
+"""Order -> number of steps k -> weight of f(k h) + f(-k h) - 2 f(0), with f a function and h the step, to detect jumps.
 
-Their sum tends to zero for a smooth f, extrapolated by even powers. Of a jump J anywhere within the steps it keeps a
-part that, divided by h, bounds the effect of J on the central difference: J at the first step against 0.62 J, J/2 at
-the second against 0.13 J, J/10 at the third against 0.02 J for order 6.
+The weighted sum tends to zero for a smooth f, extrapolated by even powers. Of a jump J anywhere within the steps it
+keeps a part that, divided by h, bounds the effect of J on the central difference. For order 6 the part and the effect
+are J and 0.62 J for a jump at the first step, J/2 and 0.13 J at the second, J/10 and 0.02 J at the third.
 """
 
 
@@ -278,7 +286,7 @@ class Slope:
     values : dict
         Disturbances -> quantity -> d(sigma)/d(parameter), SI.
     errors : dict
-        Numerical error of each; empty for differences of second order.
+        Numerical error of each derivative, in the same form; empty for differences of second order.
     brightest : (C,) ndarray
         Derivatives of the filling of the brightest pixel of each of C spots, per SI unit.
     """
@@ -308,12 +316,12 @@ def numbers_of(bench: LayoutBench, beams: Layout, order: int = ORDER) -> tuple[L
 
 @lru_cache(maxsize=2)
 def _known_here(bench: LayoutBench, beams: Layout) -> dict[str, Information]:
-    """Return the result of ``known_of``, cached for the layout at which all parameters are differentiated."""
+    """Return the information of a layout's spots, cached for the layout whose parameters are differentiated."""
     return known_of(bench, beams)
 
 
 def known_of(bench: LayoutBench, beams: Layout) -> dict[str, Information]:
-    """Return the information of a layout's spots, by the names of the disturbances, without a check for collisions.
+    """Return what a layout's spots tell about the cameras, by disturbances, without a check for collisions.
 
     Parameters
     ----------
@@ -335,7 +343,7 @@ def known_of(bench: LayoutBench, beams: Layout) -> dict[str, Information]:
 
 
 def slope_of(bench: LayoutBench, number: LayoutNumber) -> Slope:
-    """Return the derivatives of all sigmas of a layout with respect to one of its parameters.
+    """Return the derivatives of all standard deviations of a layout with respect to one of its parameters.
 
     Parameters
     ----------
@@ -375,7 +383,7 @@ def slope_of(bench: LayoutBench, number: LayoutNumber) -> Slope:
 
 @dataclass(eq=False)
 class _Sum:
-    """Weighted sum of A, of R, and of the filling of the brightest pixels."""
+    """Weighted sum of a layout's spot derivatives, noise covariances and fillings of the brightest pixels."""
 
     spots: np.ndarray
     noise: np.ndarray

@@ -33,9 +33,9 @@ FIRST_STEP = 0.15
 """Size of the first change of a beam, relative to the range of each parameter."""
 _BATCHES = 4  # batches of layouts that are built until one is feasible
 KEPT = 2
-"""Number of layouts, for each number of beams, whose beams are varied in the next round."""
+"""Number of layouts whose beams are varied in the next round, for each number of beams."""
 ALIKE = 0.02
-"""Relative difference of merits below which two searches count as having the same optimum."""
+"""Relative difference of merits (largest ratio of sigma to goal) below which two searches have the same optimum."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """Result of one search.
+    """Result of one search from one start.
 
     Attributes
     ----------
@@ -65,17 +65,17 @@ class End:
     layouts : tuple of LayoutFacts
         All feasible layouts that it built as a whole, best first.
     progress : tuple of float
-        Best merit after the first draw and after each round.
+        Best merit (largest ratio of sigma to goal) after the first random beams and after each round.
     refined : tuple of float
         Merits during the refinement by gradients; empty without one.
     tried : int
         Number of beams evaluated alone.
     standing : int
-        Number of these that are feasible.
+        Number of beams evaluated alone that are feasible.
     compared : int
         Number of combinations whose merit was computed.
     built : int
-        Number of these that were built as a whole.
+        Number of combinations that were built as a whole.
     refused : dict
         Reason why beams and layouts are not feasible -> their number.
     """
@@ -114,7 +114,7 @@ class Found:
 
     @property
     def refused(self) -> dict[str, int]:
-        """Reasons why others are not feasible, with their numbers."""
+        """Reason why beams or layouts are not feasible -> their number, over all searches."""
         out: Counter[str] = Counter()
         for end in self.ends:
             out.update(end.refused)
@@ -122,22 +122,22 @@ class Found:
 
     @property
     def beams(self) -> int:
-        """Number of beams that were evaluated."""
+        """Number of beams that were evaluated alone, over all searches."""
         return sum(end.tried for end in self.ends)
 
     @property
     def feasible(self) -> int:
-        """Number of beams that are feasible alone."""
+        """Number of beams that are feasible alone, over all searches."""
         return sum(end.feasible for end in self.ends)
 
     @property
     def compared(self) -> int:
-        """Number of combinations whose merit was computed."""
+        """Number of combinations of beams whose merit was computed, over all searches."""
         return sum(end.compared for end in self.ends)
 
     @property
     def built(self) -> int:
-        """Number of layouts that were built as a whole."""
+        """Number of layouts that were built as a whole, over all searches."""
         return sum(end.built for end in self.ends)
 
 
@@ -162,7 +162,7 @@ def optima(found: Found, bench: LayoutBench) -> list[list[End]]:
     Parameters
     ----------
     found : Found
-        Results of a search; ends without a layout are omitted.
+        Results from all starts; those without a feasible layout are omitted.
     bench : LayoutBench
         Evaluator of the layouts of the design.
     """
@@ -197,7 +197,9 @@ def journal_of(file: Path | None, config: str) -> Journal:
 
 
 class Workers:
-    """Context manager for the evaluation of items; the results do not depend on the number of processes.
+    """Context manager of the processes that evaluate beams, layouts and derivatives.
+
+    The results do not depend on the number of processes.
 
     Parameters
     ----------
@@ -307,7 +309,7 @@ class Search:
         self.workers = Workers(bench, workers, store, advance)
 
     def run(self) -> Found:
-        """Run the searches from all starts."""
+        """Run the searches from the instrument and from random beams, and return their results."""
         begun, setup = time.monotonic(), self.bench.setup
         beams = start_beams(setup)
         start = self.bench.judged(beams, self.bench.start, limited=False)
@@ -328,7 +330,7 @@ def _promise(candidate: Candidate) -> tuple[float, tuple[int, ...]]:
 
 
 def spread(level: Sequence[Candidate], width: int) -> list[Candidate]:
-    """Return ``width`` of the ranked candidates: half of them the best, the others evenly spaced over the rest.
+    """Select ``width`` of the ranked candidates: half of them the best, the others evenly spaced over the rest.
 
     The best are often similar and compatible with the same few other beams.
 
@@ -412,7 +414,10 @@ class _OneSearch:
         return sorted(feasible, key=lambda layout: merit(layout.sigmas, self.bench))
 
     def _with_other_ccds(self) -> list[Beam]:
-        """Return the beams of the best layout with each other area CCD, which only all of them together can have."""
+        """Return the beams of the best layout with each other area CCD of the file.
+
+        All beams of a layout have the same area CCD, so that they can only change it together.
+        """
         others, feasible = self.setup.test.area_ccds or {}, self._feasible()
         beams = feasible[0].beams if feasible else ()
         wanted = [replace(beam, area_ccd=name) for name in others for beam in beams]
@@ -505,7 +510,7 @@ class _OneSearch:
         return len({(kinds_of(self.setup, beam), beam.area_ccd) for beam in selected}) == 1
 
     def _within(self, beams: Sequence[int]) -> bool:
-        """Return True if beams together satisfy the limits of mass and pupil."""
+        """Return True if beams together satisfy the limits of mass and obstructed pupil share."""
         limits, facts = self.setup.test.limits, [self.pool[k] for k in beams]
         if limits.mass is not None and sum(beam.mass for beam in facts) > limits.mass:
             return False

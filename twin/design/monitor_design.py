@@ -1,4 +1,4 @@
-"""Search for a monitor's layout: the run, its numbers, and the layouts on the front of sigma against pupil and mass."""
+"""Search for a monitor's layout: the run, its results, and the best trade-offs of accuracy, pupil and mass."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from twin.path_tracing.stray_light import GHOSTS, Ghost, ghosts, stray_light
 MOST_POINTS = 6
 """Largest number of layouts that are drawn and written."""
 UNITS = {"angle": ("arcsec", ARCSEC), "d_f": ("um", 1e-6), "height": ("m", 1.0)}
-"""Unit in which each goal is reported, and its size in SI."""
+"""Unit in which each goal is reported, and the size of that unit in SI."""
 _ASIDE = "other tilts of the prisms in the instrument that it starts from, or other fields"
-"""Advice for a design with ghosts."""
+"""Advice in the error about a start with ghost images on a spot."""
 GOAL_NAMES = {"angle": "intersection angle", "d_f": "principal distance", "height": "height on the ground"}
 """Name of each goal in reports."""
 REMARK = """Made by python -m twin.design monitor from {start}. Posterior standard deviations:
@@ -37,7 +37,7 @@ REMARK = """Made by python -m twin.design monitor from {start}. Posterior standa
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """Layout on the front that is written as an instrument.
+    """Layout on the Pareto front that is written as an instrument.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Point:
     facts : LayoutFacts
         Properties of the layout.
     text : str
-        File of the instrument.
+        Text of the instrument's file.
     """
 
     name: str
@@ -80,7 +80,7 @@ class MonitorDesignRun:
         return max(sigmas[key] for sigmas in facts.sigmas.values() for key in self.bench.goals_of(goal))
 
     def merit(self, facts: LayoutFacts) -> float:
-        """Return the largest ratio of a standard deviation to its goal."""
+        """Return a layout's merit: the largest ratio of a standard deviation to its goal; 1 or less reaches all goals."""
         return merit(facts.sigmas, self.bench)
 
 
@@ -143,7 +143,9 @@ def run_monitor_design(
 
 
 def _check_start(setup: monitor_layout.MonitorDesignSetup, backend: Backend, seed: int, advance: Advance) -> None:
-    """Raise InputError for a start with ghosts, if they are to be traced, since every layout has its prisms' tilts.
+    """Raise InputError if the starting instrument has ghost images on a spot, if the file asks to trace them.
+
+    All layouts have the prism tilts of the start.
 
     Raises
     ------
@@ -195,7 +197,10 @@ def _texts(facts: LayoutFacts, bench: LayoutBench) -> dict[str, str]:
 
 
 def _front(layouts: tuple[LayoutFacts, ...], bench: LayoutBench) -> list[LayoutFacts]:
-    """Return the non-dominated layouts in merit, pupil share and mass, at most ``MOST_POINTS`` with the best."""
+    """Return the layouts not dominated in merit, obstructed pupil share and mass, the best merit first.
+
+    There are at most ``MOST_POINTS``.
+    """
 
     def cost(facts: LayoutFacts) -> tuple[float, float, float]:
         return merit(facts.sigmas, bench), facts.pupil_share, facts.mass
@@ -255,7 +260,10 @@ def _unit(key: str) -> tuple[str, float]:
 
 
 def _by_quantity(values: Mapping[str, Mapping[str, Any]], of: Callable[[Any, float], Any]) -> dict[str, Any]:
-    """Return disturbances -> quantity with its unit as suffix -> ``of`` applied to a value and the unit's size."""
+    """Return nested values with each quantity's unit as a suffix of its key.
+
+    ``of`` converts a value, given the size of the unit in SI.
+    """
     return {
         name: {
             f"{key.replace('/', '_')}_{_unit(key)[0]}": of(value, _unit(key)[1]) for key, value in quantities.items()

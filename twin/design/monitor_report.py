@@ -26,7 +26,7 @@ _MOST_CAUSES = 6
 
 
 def monitor_design_report(run: MonitorDesignRun) -> Report:
-    """Return the report of a search for a monitor's layout."""
+    """Return the report: layouts on the front, causes that limit them, drawings and the instruments' files."""
     setup, results = run.setup, run.results
     start, test = setup.instrument.name, setup.test
     rows = [_row(run, start, results.start), *(_row(run, point.name, point.facts) for point in run.points)]
@@ -166,7 +166,7 @@ def _named(run: MonitorDesignRun) -> list[tuple[str, LayoutFacts]]:
 
 
 def _causes_of(run: MonitorDesignRun, facts: LayoutFacts, name: str, goal: str, measured: bool) -> dict[str, float]:
-    """Return standard deviations by cause, for the camera in which the goal's quantity is worse, in the goal's unit."""
+    """Return a goal's standard deviations by cause, in the goal's unit, for the camera in which it is worse."""
     key = max(run.bench.goals_of(goal), key=lambda quantity: facts.sigmas[name][quantity])
     shares = (facts.shares if measured else facts.shares_before)[name][key]
     return {cause: sqrt(max(share, 0.0)) / UNITS[goal][1] for cause, share in shares.items()}
@@ -193,7 +193,7 @@ def _cause_table(run: MonitorDesignRun, name: str) -> Table:
 
 
 def _front_figure(run: MonitorDesignRun) -> Figure:
-    """Plot sigma of all layouts against pupil share and against mass."""
+    """Plot the largest ratio of sigma to goal of all layouts against obstructed pupil share and against mass."""
     figure = new_figure(3.6)
     left, right = figure.subplots(1, 2, sharey=True)
     costs = (("share of the imaging pupil [%]", lambda f: 100.0 * f.pupil_share), ("prisms [kg]", lambda f: f.mass))
@@ -225,7 +225,7 @@ def _front_figure(run: MonitorDesignRun) -> Figure:
 
 
 def _cause_figure(run: MonitorDesignRun) -> Figure:
-    """Plot standard deviations by cause, unmeasured, of the start and of the best; a panel for each goal."""
+    """Plot standard deviations by cause: without measurement, with the start, with the best; one panel per goal."""
     goals = tuple(run.setup.test.goal.wanted)
     figure = new_figure(3.4)
     panels = figure.subplots(1, len(goals), squeeze=False)[0]

@@ -148,7 +148,7 @@ def _with_targets(resolved: ResolvedJob) -> ResolvedJob:
 
 
 def _wavefront(figure: Figure, views: list[CameraView], field: float) -> None:
-    """Draw the nominal and the present wavefront."""
+    """Draw the wavefront of the nominal and of the perturbed camera."""
     waves = [one.wavefront((field, 0.0), points=65) for one in views]
     most = max(float(np.nanmax(np.abs(wave.map))) for wave in waves)
     meshes = []
@@ -160,7 +160,7 @@ def _wavefront(figure: Figure, views: list[CameraView], field: float) -> None:
 
 
 def _spot(figure: Figure, views: list[CameraView], field: float) -> None:
-    """Draw the nominal and the present spot diagram."""
+    """Draw the spot diagram of the nominal and of the perturbed camera."""
     spots = [one.spot((field, 0.0)) for one in views]
     half = max(max(1.15 * spot.airy, 1.1 * spot.farthest) for spot in spots)
     for axes, spot, name in zip(figure.subplots(1, 2), spots, ("as designed", "now"), strict=True):
@@ -171,7 +171,7 @@ def _spot(figure: Figure, views: list[CameraView], field: float) -> None:
 
 
 def _mtf(figure: Figure, views: list[CameraView], field: float) -> None:
-    """Draw the nominal and the present MTF."""
+    """Draw the MTF of the nominal and of the perturbed camera."""
     for axes, one, name in zip(figure.subplots(1, 2, sharey=True), views, ("as designed", "now"), strict=True):
         mtf = one.mtf((field, 0.0))
         draw_mtf(axes, mtf)
@@ -181,7 +181,7 @@ def _mtf(figure: Figure, views: list[CameraView], field: float) -> None:
 
 
 def _focus(figure: Figure, views: list[CameraView], field: float) -> None:
-    """Draw the nominal and the present MTF at Nyquist through focus."""
+    """Draw the MTF at the Nyquist frequency through focus, of the nominal and of the perturbed camera."""
     axes = figure.subplots()
     shift = np.linspace(-FOCUS, FOCUS, STEPS)
     for one, name, style in zip(views, ("as designed", "now"), ((0, (3, 2)), "-"), strict=True):

@@ -69,8 +69,8 @@ class _Request:
     Attributes
     ----------
     kind : str
-        Attribute of `Client` that held it; "save" for one of ``saves``.
-    asked : Any
+        Name of the attribute of `Client` that held the request; "save" for one of ``saves``.
+    asked : Message
         The message.
     """
 
@@ -89,7 +89,7 @@ class Client:
     view : AskedView | None
         Picture that it requests next.
     saves : deque[Save]
-        Files that it requests.
+        Requests for job files to be saved.
     factors : Factors | None
         Values of a study's factors that it requests.
     reveal : BlindState | None
@@ -255,7 +255,7 @@ class Client:
 
 
 def _hiding(state: messages.AskedState, seed: int) -> messages.BlindState:
-    """Return a state with hidden motions drawn from a seed."""
+    """Return a state together with the seed of the hidden motions."""
     return messages.BlindState.model_validate({**state.model_dump(), "blind": seed})
 
 

@@ -42,13 +42,13 @@ class RequestHandler:
     Parameters
     ----------
     what
-        Source, as for `twin.live.source.read_source`.
+        Name of an instrument or camera in the library, or path of a file or run folder, as for `read_source`.
     backend
         Backend that traces.
     advance
         Called with each part of the preparation.
     run
-        Number of a study's run, as for `twin.live.source.read_source`.
+        Number of one of a study's runs, from 0; None for its base.
 
     Raises
     ------
@@ -95,7 +95,7 @@ class RequestHandler:
         return self._built[key]
 
     def handle(self, kind: str, question: Any) -> Any:
-        """Return the answer to a request of one kind; see the methods."""
+        """Return the answer to a request; ``kind`` names the method that computes it."""
         return getattr(self, f"_{kind}")(question)
 
     def _factors(self, factors: Mapping[str, float]) -> Opened | str:
@@ -119,7 +119,7 @@ class RequestHandler:
         return packed(message, images)
 
     def _view(self, asked: AskedView) -> str:
-        """Return the message of a picture."""
+        """Return the message with a picture of a camera as SVG."""
         message: dict[str, Any] = {"type": "view", "n": asked.n, "view": asked.view, "camera": asked.camera}
         try:
             state = self.bench.states(asked.state)
@@ -131,19 +131,19 @@ class RequestHandler:
         return json.dumps(message)
 
     def _hidden(self, asked: BlindState) -> str:
-        """Return the hidden motions and the resulting truth."""
+        """Return the message that reveals the hidden motions and the resulting true changes."""
         return json.dumps({"type": "revealed", **self.bench.hidden(asked)})
 
     def _job(self, asked: AskedState) -> str:
-        """Return a job file of a state."""
+        """Return the message with a job file of a state."""
         return self._file("job.yaml", lambda: job_text(self.bench, asked))
 
     def _course(self, kept: Sequence[tuple[float, AskedState]]) -> str:
-        """Return a job file with the recorded states as a course."""
+        """Return the message with a job file of the recorded states as a series over time."""
         return self._file("course.yaml", lambda: course_text(self.bench, kept))
 
     def _file(self, name: str, text: Callable[[], str]) -> str:
-        """Return the message of a file."""
+        """Return the message with the name and text of a file to be saved, or with an error."""
         message: dict[str, Any] = {"type": "file", "name": name}
         try:
             message["text"] = text()
@@ -175,7 +175,7 @@ class Computer:
     Parameters
     ----------
     what
-        Source, as for `twin.live.source.read_source`.
+        Name of an instrument or camera in the library, or path of a file or run folder, as for `read_source`.
     backend
         Backend that traces.
     run
@@ -377,7 +377,7 @@ def compute(pipe: Connection, what: str, backend: str, run: int | None) -> None:
     pipe : Connection
         Pipe to the server.
     what : str
-        Source, as for `Computer`.
+        Name of an instrument or camera in the library, or path of a file or run folder.
     backend : str
         Backend that traces.
     run : int | None

@@ -76,7 +76,7 @@ def new_token(variable: str) -> str:
 
 @dataclass(frozen=True)
 class Guard:
-    """Requirements on a request.
+    """Access control: what a request has to have in order to be accepted.
 
     Attributes
     ----------
@@ -158,7 +158,7 @@ class Guard:
         socket : bool
             Whether it requests a WebSocket, for which browsers always send the origin.
         local_address : str
-            See `host_refusal`.
+            Address of this machine at which the request arrived, which is accepted as a host name.
         """
         why = self.host_refusal(headers, local_address)
         if not why and socket and "origin" not in headers:
@@ -197,9 +197,10 @@ MOST_UNAUTHENTICATED, MOST_OF_ONE_ADDRESS = 128, 64
 MOST_AUTHENTICATED = 64
 """Largest number of authenticated connections without a WebSocket: eight pages of a browser open six each."""
 ACCEPT_BACKLOG = 16
-"""Number of connections accepted before any waiting one is served: an eighth of the unauthenticated places.
+"""Number of connections accepted at a time: an eighth of the places for unauthenticated ones.
 
-Received data are therefore looked at several times before a new connection can be the one that is closed.
+The data received on open connections are therefore read several times before a new connection can be the one that is
+closed.
 """
 QUEUE = 1024
 """Number of connections that the operating system queues for acceptance."""
@@ -276,7 +277,7 @@ class Connection(H11Protocol):
         self.all.register(self, self.client[0] if self.client else "")
 
     def data_received(self, data: bytes) -> None:
-        """Handle a piece of a request."""
+        """Handle received bytes, which may be a part of a request."""
         if self._idle:
             self._idle = False
             self._set_deadline(HEAD_TIMEOUT)

@@ -23,7 +23,7 @@ from twin.study.runs.setup import StudySetup
 
 AXES = ("x", "y", "z")
 FIGURE_TERMS = tuple(f"Z{j}" for j in range(4, 16))
-"""Noll's terms of a figure that have knobs: from defocus to the neighbours of secondary spherical aberration.
+"""Zernike terms (Noll) of a surface figure that have knobs, from defocus (Z4) to Z15.
 
 Piston and tilts are rigid motions.
 """
@@ -59,7 +59,7 @@ KINDS: Mapping[str, _KnobKind] = {
     "temperature": _KnobKind("temperature", "K", 1.0, 1000.0),
     "gradient": _KnobKind("temperature", "mK/m", 50.0, 1_000_000.0),
 }
-"""Name of a kind -> its properties. Limits are those of a job's file."""
+"""Kind of knob (rotate, shift, ...) -> its properties. Limits are those of a job's file."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def knobs_of(nodes: Mapping[str, NodeInfo], job: JobSpec) -> dict[str, Knob]:
 
 
 def _job_quantities(what: Mapping[str, Any], kind: str) -> dict[str, Any]:
-    """Return axis -> quantity of a kind in the job's plain data."""
+    """Return the quantities of one kind in a body's perturbation, by axis, as the job's file has them."""
     value = what.get(KINDS[kind].key)
     if value is None:
         return {}
@@ -300,7 +300,7 @@ def base_with_factors(setup: StudySetup, scalars: Mapping[str, Any]) -> Tree:
 
 
 def _fixed(factor: FactorSpec, scalar: Any) -> FactorSpec:
-    """Return the factor with this value alone."""
+    """Return the factor with a single value instead of its distribution."""
     keys = {"key": factor.key, "keys": factor.keys, "scales": factor.scales}
     return FactorSpec.model_validate({**{k: v for k, v in keys.items() if v}, "values": (scalar,)})
 

@@ -43,7 +43,7 @@ from twin.sensors.area_detector import coarse_warnings
 from twin.study.runs.base_job import PHYSICS
 
 BLIND = 7
-"""Random stream of the hidden motions, beside those of the monitor and of targets."""
+"""Number of the random stream of the hidden motions; those of the monitor and of targets are different."""
 IMPOSSIBLE = (*PHYSICS, ArithmeticError, ValueError)
 """Exceptions that mean that a state is physically impossible."""
 
@@ -55,11 +55,16 @@ IMAGES: Mapping[str, tuple[list[str], str]] = {
     "MTF at Nyquist along the line": (["mtf_along_line", "centre"], ""),
     "MTF at Nyquist along the track": (["mtf_along_track", "centre"], ""),
 }
-"""Quantity of image quality on the page, for a camera without a monitor -> its path in quality.json, and its unit."""
+"""Quantities of image quality on the page of a camera without a monitor.
+
+Name -> its path in quality.json, and its unit.
+"""
 
 
 class LiveBench:
-    """Instrument whose knobs are adjusted. It caches everything that does not depend on the knobs.
+    """Instrument whose motions are set by knobs (sliders of the page).
+
+    It caches everything that does not depend on the knobs.
 
     Parameters
     ----------
@@ -79,7 +84,7 @@ class LiveBench:
 
     @cached_property
     def knobs(self) -> dict[str, Knob]:
-        """All knobs by name."""
+        """All knobs (adjustable motions of bodies) by name."""
         return knobs_of(self.twin.experiment.instrument.nodes, self.twin.resolved.job)
 
     @cached_property
@@ -94,7 +99,7 @@ class LiveBench:
 
     @cached_property
     def initial_state(self) -> AskedState:
-        """Initial state of the knobs."""
+        """State of the knobs when a page is opened: that of the job."""
         job = self.twin.resolved.job
         return AskedState(
             n=0,
@@ -180,7 +185,7 @@ class LiveBench:
 
     @property
     def _parameters(self) -> Sequence[parameters.Parameter]:
-        """Parameters of a camera shown on the page."""
+        """Parameters of a camera shown on the page, such as ``d_alpha`` and ``d_f``."""
         return tuple(parameters.CAMERA_PARAMETERS.values()) if self.monitored else parameters.ESTIMATED
 
     @cached_property
@@ -211,7 +216,7 @@ class LiveBench:
 
     @cached_property
     def _job_perturbations(self) -> Mapping[str, Any]:
-        """``perturb`` of the job's file."""
+        """Perturbations of bodies in the job, as under ``perturb`` of its file."""
         moved: Mapping[str, Any] = self.twin.resolved.job.plain().get("perturb", {})
         return moved
 
@@ -278,7 +283,7 @@ class LiveBench:
         return self._shown(frames, self.twin.experiment.nominal_photons)
 
     def _problem_of(self, asked: AskedState, error: Exception) -> dict[str, Any]:
-        """Return the reason why a state is impossible."""
+        """Return the page's data for an impossible state, with the reason in words."""
         if isinstance(error, SpotError):
             channels = self.twin.experiment.path.channels
             reasons = [f"{channels[i % len(channels)].key}: {reason}" for i, reason in error.reasons.items()]
@@ -287,12 +292,12 @@ class LiveBench:
         return {"problem": "this state is impossible", "causes": lines[:6]}
 
     def states(self, asked: AskedState) -> State:
-        """Return body -> motion of the knobs and of the course's time.
+        """Return the motion of each body: that of the knobs plus that of the job's series at the selected time.
 
         Raises
         ------
         InputError
-            See `perturbed`.
+            A knob does not exist, or a job's file could not have its value.
         TemperatureError
             A temperature is outside the range for which a material is known.
         """
@@ -305,7 +310,7 @@ class LiveBench:
         return experiment.thermal.state(fields, experiment.motions(job, asked.time))
 
     def _hidden(self, asked: AskedState) -> State:
-        """Return the hidden motions of a blind guess; empty without any."""
+        """Return the motions hidden from the page in a guessing game, body -> motion; empty without any."""
         experiment = self.twin.experiment
         if not isinstance(asked, BlindState) or experiment.stated is None:
             return {}
@@ -317,13 +322,13 @@ class LiveBench:
         return () if stated is None else stated.components
 
     def _drawn(self, asked: BlindState) -> np.ndarray:
-        """Return the random amounts of the hidden motions."""
+        """Return the random amounts of the hidden motions, SI units."""
         stated = self.twin.experiment.stated
         assert stated is not None
         return stated.draw(np.random.default_rng(stream(asked.blind, BLIND)), 1)[0]
 
     def hidden(self, asked: BlindState) -> dict[str, Any]:
-        """Return the hidden motions of a blind guess, the most significant first, and the resulting truth."""
+        """Return the hidden motions of a guessing game, the most significant first, and the resulting true changes."""
         state = self._hidden(asked)
         if not state:
             return {}
@@ -348,7 +353,7 @@ class LiveBench:
         """Return the seed meant by a page.
 
         The job's own seed, such as that of a study's run, may exceed the numbers that a page represents exactly. The
-        page then has its last bits, by which it is recognised.
+        page then has the lowest bits of that seed, by which it is recognised.
         """
         job_seed = self.twin.resolved.job.render.seed
         return job_seed if asked == job_seed & LARGEST_SEED else asked
@@ -413,7 +418,7 @@ class LiveBench:
         return message
 
     def _guess(self, asked: AskedState) -> dict[str, Any]:
-        """Return the expected images and spots of the knobs as a guess of the hidden motions."""
+        """Return the expected images and spots for the knobs alone, as the user's guess of the hidden motions."""
         try:
             reading = self._reader(asked.frames, asked.seed).read(self.states(asked), noise=False)
         except IMPOSSIBLE as error:
@@ -439,7 +444,7 @@ def _elapsed_ms(began: float) -> float:
 
 
 def _course_data(course: CourseSpec) -> dict[str, Any]:
-    """Return the times of a course in seconds, their texts, and the index of the one that the job shows in full."""
+    """Return the times of a job's series of states: in seconds, as texts, and the index of the one shown in full."""
     return {"times": list(course.times), "names": list(map(moment, course.times)), "shown": course.shown}
 
 
@@ -466,11 +471,11 @@ GUESSED = (
     "# Saved while motions were hidden: this job holds the guess of the knobs alone, so that twin.render gives the\n"
     "# spots of the guess and not those that were shown.\n"
 )
-"""Comment of a job that was saved while motions were hidden."""
+"""Comment at the top of a job that was saved while motions were hidden, which it does not contain."""
 
 
 def job_text(bench: LiveBench, asked: AskedState) -> str:
-    """Return a self-contained job file of one state; of a course it shows the selected time.
+    """Return a self-contained job file of one state; of a job with a series of states, that at the selected time.
 
     Parameters
     ----------
@@ -493,7 +498,7 @@ def job_text(bench: LiveBench, asked: AskedState) -> str:
 
 
 def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> str:
-    """Return a job file with every recorded state as a course, timed to the millisecond.
+    """Return a job file with the recorded states as a series over time (``course``), timed to the millisecond.
 
     Parameters
     ----------
@@ -580,7 +585,7 @@ def _split(
 def _courses(
     moving: Mapping[str, Sequence[float]], pivots: Mapping[str, str], knobs: Mapping[str, Knob], count: int
 ) -> dict[str, Any]:
-    """Return ``temperature`` and ``motion`` of a course."""
+    """Return ``temperature`` and ``motion`` of a job's series of states (``course``) for moving knobs."""
     out: dict[str, dict[str, dict[str, Any]]] = {}
     for name in moving:
         knob = knobs[name]

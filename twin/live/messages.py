@@ -54,7 +54,7 @@ class AskedState(_PageMessage):
     seed : int
         Seed of the noise.
     time : int | None
-        Index of a time of the job's course; None for the job's single state.
+        Index of a time in the job's series of states (``course``); None for the job's single state.
     """
 
     type: Literal["state"] = "state"
@@ -145,7 +145,7 @@ class Record(_PageMessage):
 
 
 class Save(_PageMessage):
-    """Request of a job file of a state, or of a job with the recorded states as a course.
+    """Request of a job file of a state, or of a job with the recorded states as a series over time (``course``).
 
     Attributes
     ----------

@@ -233,7 +233,7 @@ class Gate:
         self.app, self.guard = app, guard
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one request, or one request of a WebSocket."""
+        """Handle one HTTP request or WebSocket: refuse it, or pass it on and add the headers to the answer."""
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return

@@ -1,7 +1,7 @@
 """Sources that the live twin can open.
 
-They are an instrument, a job, a measurement, a study whose factors become knobs, or a run folder of any command whose
-instrument can be shown.
+They are an instrument, a job, a measurement, a study whose factors become knobs, or a run folder of any command from
+which an instrument can be shown.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ ALLOWED = (
     "an instrument, a camera, a job or a measurement of one, a study of jobs, or a run folder of twin.render, "
     "twin.recover, twin.uncertainty, twin.orbit monitor or such a study"
 )
-"""Description of the sources that can be opened."""
+"""Description of the sources that can be opened, for error messages."""
 MOST_NAMED = 3
 """Largest number of run folders named in an error about a folder of run folders."""
 
@@ -234,7 +234,7 @@ def _of_measurement(file: Path) -> Source:
 
 
 def _of_orbit(file: Path) -> Source:
-    """Return a monitored orbit as a course that includes its stepwise motions."""
+    """Return a monitored orbit as a job with a series of states, which includes its stepwise motions."""
     setup = MonitorSetup.read(file)
     if setup.test.course is None:
         problem = "the motions of this orbit are random, so that it has no course to show"
@@ -244,7 +244,7 @@ def _of_orbit(file: Path) -> Source:
 
 
 def _with_motions(setup: MonitorSetup) -> ResolvedJob:
-    """Return the job of a monitored orbit with the mounts' motions at each of its times.
+    """Return the job of a monitored orbit with tabulated motions of the mounts at each of its times.
 
     In its file these motions are functions of time.
 
@@ -297,7 +297,7 @@ def _of_study(file: Path, run: int | None) -> Source:
 
 
 def _limited_to_page(source: Source) -> Source:
-    """Return the source with a note on the limits of the page."""
+    """Return the source with notes on what the page cannot show of it."""
     frames = source.resolved.frames
     if frames <= MOST_FRAMES:
         return source

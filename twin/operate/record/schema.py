@@ -83,7 +83,7 @@ SOURCE = _table(
     Column("taken_utc", String(32), nullable=False),
     Column("rows_read", Integer, nullable=False),
 )
-"""One row for each ingested file; ``taking`` is the digest of the file and of the description by which it was read."""
+"""One row for each ingested file; ``taking`` is the digest of the file and of the description it was read by."""
 FRAME = _table(
     "frame",
     Column("source_id", _NUMBER, ForeignKey("source.id"), nullable=False, index=True),

@@ -179,8 +179,9 @@ def _entry(kind: str, moment: int, content: Mapping[str, Any], origin: str) -> E
 LARGEST = 1 << 28
 """Largest size of a table, in bytes."""
 MOST_DEPARTURE = 100.0
-"""Largest plausible departure of a body's temperature from the instrument's, in kelvin; a job's changes have the same
-limit.
+"""Largest plausible difference of a body's temperature from the instrument's, in kelvin.
+
+A job's changes of temperature have the same limit.
 """
 QUATERNION_TOLERANCE = 1e-3
 """Largest departure of a quaternion's length from 1."""
@@ -401,7 +402,10 @@ def _event(table: ReadingTableSpec, row: dict[str, str], moment: int, line: int)
 
 
 SETTLED = 2.0
-"""Time for which a file must be unchanged before a watching command reads it, in seconds: it may still be written."""
+"""Time for which a file must be unchanged before a watching command reads it, in seconds.
+
+A file that changed more recently may still be being written.
+"""
 
 _TIME = re.compile(r"(\d{4})-?(\d{2})-?(\d{2})T(\d{2})[:-]?(\d{2})[:-]?(\d{2}(?:\.\d+)?)Z")
 _YAML = (".yaml", ".yml")
