@@ -141,12 +141,12 @@ def with_nodes(schema: dict[str, Any], instruments: Mapping[str, Mapping[str, No
 
 
 def _only(properties: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the schema of a mapping with no other keys."""
+    """Return the JSON Schema of a mapping that allows these keys and no others."""
     return {"properties": dict(properties), "propertyNames": {"enum": list(properties)}}
 
 
 def _of_nodes(nodes: Mapping[str, NodeInfo]) -> dict[str, Any]:
-    """Return the schema of each node's content, by path."""
+    """Return path of each node -> JSON Schema of the perturbation that the node allows."""
     from scenes.specs.perturbation import ACTIONS
 
     out = {}

@@ -1,4 +1,4 @@
-"""Bodies that block light, and bodies that overlap: clearances of an instrument.
+"""Clearances of an instrument: bodies that block light, and bodies that overlap.
 
 Obstruction. A 180-deg prism stands in front of its camera, since its channel uses a part of the pupil; the fraction of
 the imaging beam that it blocks is reported, with the part of it that its channel uses. A monitor beam has to reach its
@@ -71,16 +71,21 @@ class Overlap:
 
 
 def convex_hull(points: np.ndarray) -> ConvexHull:
-    """Return the convex hull of points (N, 3). SciPy is imported here, since reading a file needs no hull."""
+    """Return the convex hull of N points, (N, 3). SciPy is imported here, since reading a file needs no hull."""
     from scipy.spatial import ConvexHull
 
     return ConvexHull(points)
 
 
 def separation(first: np.ndarray, second: np.ndarray) -> float:
-    """Return the distance between the convex hulls of two sets of points, (P, 3) and (Q, 3), in metres.
+    """Return the distance between the convex hulls of two sets of points, in metres.
 
     It is negative for hulls that overlap: minus the length of the shortest displacement that separates them.
+
+    Parameters
+    ----------
+    first, second : (P, 3) and (Q, 3) ndarray
+        P and Q points of the two bodies, in metres.
     """
     difference = convex_hull((first[:, None] - second[None]).reshape(-1, 3))
     deepest = float(np.max(difference.equations[:, 3]))  # of the origin, relative to every face
@@ -90,7 +95,18 @@ def separation(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def _distances(triangles: np.ndarray) -> np.ndarray:
-    """Return the distances (T,) of the origin from triangles (T, 3, 3), which may be degenerate."""
+    """Return the distance of the origin from each of T triangles.
+
+    Parameters
+    ----------
+    triangles : (T, 3, 3) ndarray
+        Three corners of each triangle; they may lie on a line.
+
+    Returns
+    -------
+    (T,) ndarray
+        Distances in the unit of the corners.
+    """
     after = np.roll(triangles, -1, axis=1)
     edges = after - triangles
     square = np.maximum(np.einsum("tki,tki->tk", edges, edges), np.finfo(np.float64).tiny)
@@ -133,7 +149,7 @@ def separating_move(first: np.ndarray, second: np.ndarray, room: float = LEAST_G
 
 
 def convex_bodies(instrument: Instrument, placed: PlacedBodies | None = None) -> Mapping[str, np.ndarray]:
-    """Return the corners of each body in the base frame, (P, 3), in metres, by path.
+    """Return path of each body -> its P corners in the base frame, (P, 3), in metres.
 
     Parameters
     ----------
@@ -180,7 +196,10 @@ def _pairs(instrument: Instrument, bodies: Iterable[str]) -> Iterator[tuple[str,
 
 
 def _between_boxes(first: np.ndarray, second: np.ndarray) -> float:
-    """Return the largest gap along an axis between the boxes of two sets of points, in metres; negative if none."""
+    """Return the largest gap along an axis between the bounding boxes of two sets of points, in metres.
+
+    It is negative for boxes that overlap.
+    """
     low = np.maximum(first.min(axis=0), second.min(axis=0))
     high = np.minimum(first.max(axis=0), second.max(axis=0))
     return float(np.max(low - high))
@@ -195,11 +214,11 @@ class Clearances:
     paths : tuple[str, ...]
         Paths of the bodies.
     corners : tuple[ndarray, ...]
-        Corners of each body in its own frame, (P, 3), in metres.
+        Corners of each body in its own frame, (corners, 3), in metres.
     poses : tuple[Pose, ...]
         Nominal pose of each body.
     pairs : (Q, 2) ndarray of int
-        Numbers of the two bodies of each pair.
+        Numbers of the two bodies of each of Q pairs.
     gaps : (Q,) ndarray
         Lower limit of the nominal gap of each pair, in metres.
     """
@@ -281,20 +300,20 @@ def _issue(instrument: Instrument, overlap: Overlap) -> Issue:
 
 
 def _move_text(axis: int, way: float) -> str:
-    """Return a move as text, ``+x 135 mm``, rounded up so that it is far enough."""
+    """Return a move along an axis of the base as text, ``+x 135 mm``, rounded up so that it is far enough."""
     digits = 10.0 ** (np.floor(np.log10(abs(1e3 * way))) - 2)
     return f"{'+' if way > 0.0 else '-'}{'xyz'[axis]} {np.ceil(abs(1e3 * way) / digits) * digits:.3g} mm"
 
 
 def remedy(instrument: Instrument, path: str) -> tuple[KeyPath, str]:
-    """Return the key of the file that moves a body, and what to choose there."""
+    """Return the key of the instrument's file that moves a body, and advice on the value to choose there."""
     _, key, choice = _remedy(path)
     channel = channel_of(path)
     return key if channel is None else instrument.spec.key_of(*channel, key), choice
 
 
 def _remedy(path: str) -> tuple[int, KeyPath, str]:
-    """Return the rank of a body (the lowest is moved first), the key that moves it, and what to choose there."""
+    """Return how easily a body can be moved (lowest first), the key that moves it, and advice on its value."""
     kind = prism_of(path)
     if path == CENTRAL_PRISM:
         return 2, (CENTRAL_KEY, "position"), "a position"
@@ -359,9 +378,18 @@ def _check_inside(element: Element, face: Face, solid: Solid, placed: PlacedBodi
 
 
 def _edge_remedy(path: str, across: str, over: float, wide: float) -> tuple[KeyPath, str]:
-    """Return the key to change, and what to choose there, when an aperture extends over the edge of its face.
+    """Return the key to change when an aperture extends over the edge of its face, and advice on its value.
 
-    ``across`` names the neighbouring face, ``over`` is the excess and ``wide`` the aperture's width, in metres.
+    Parameters
+    ----------
+    path : str
+        Path of the body with the face.
+    across : str
+        Name of the neighbouring face.
+    over : float
+        Distance by which the aperture extends over the edge, in metres.
+    wide : float
+        Width of the aperture, in metres.
     """
     if path != CENTRAL_PRISM:
         return key_of(path), "a width, shift and angle_errors with faces that contain their clear apertures"
@@ -374,7 +402,7 @@ def _edge_remedy(path: str, across: str, over: float, wide: float) -> tuple[KeyP
 
 
 RAYS = 400
-"""Rays in a beam, spread evenly over its cross-section: shares are accurate to about half a percent."""
+"""Number of rays in a beam, spread evenly over its cross-section: fractions are accurate to about half a percent."""
 
 _TOUCHING = 1e-6  # length inside a body below which a ray only touches it, metres
 _TOUCHING_MOVED = 1e-3  # the same in a perturbed state, whose faces depart from the flat meshes
@@ -395,7 +423,8 @@ class Obstruction:
     share : float
         Blocked fraction of the beam's cross-section; for imaging the largest along the line.
     used : float
-        Part of ``share`` that the clear aperture of the prism's own channel uses; 0 for beams of other channels.
+        Part of ``share``, as a fraction of the same cross-section, that the clear aperture of the prism's own channel
+        uses; 0 for beams of other channels.
     """
 
     body: str
@@ -439,9 +468,10 @@ def blocked_rays(segments: np.ndarray, planes: np.ndarray, touching: float = _TO
     Parameters
     ----------
     segments : (N, K, 2, 3) ndarray
-        Segments of the rays.
+        Start and end points of the K segments of N rays, in metres.
     planes : (F, 4) ndarray
-        Faces of the body, which is where ``planes`` . (x, 1) <= 0.
+        Planes of the body's F faces, (unit normal, offset): a point x is in the body where normal . x + offset <= 0 for
+        all of them.
     touching : float
         Length inside the body, in metres, below which a ray only touches it.
     """
@@ -464,7 +494,7 @@ def _disk(rays: int = RAYS) -> np.ndarray:
 
 
 def _full_disk() -> np.ndarray:
-    """Return points over a unit disk up to just inside its edge, by the tolerance of aiming, (N, 2)."""
+    """Return N points over the unit disk up to just inside its edge, by the tolerance of ray aiming, (N, 2)."""
     angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return np.concatenate([np.zeros((1, 2)), *((k + 1) / _RINGS * (1.0 - 1e-3) * ring for k in range(_RINGS))])
@@ -474,7 +504,7 @@ _WHOLE = _full_disk()
 
 
 def imaging_segments(instrument: Instrument, backend: Backend, camera: str, rays: int = RAYS) -> list[np.ndarray]:
-    """Return rays from the scene to both ends and the middle of the line, (N, K, 2, 3) each, in the world.
+    """Trace rays from the scene to both ends and the middle of a camera's line.
 
     Parameters
     ----------
@@ -486,6 +516,11 @@ def imaging_segments(instrument: Instrument, backend: Backend, camera: str, rays
         Name of the camera.
     rays : int
         Number N of rays in each of the three beams.
+
+    Returns
+    -------
+    list of (N, K, 2, 3) ndarray
+        For each beam, start and end points of the K segments of N rays, in the world, in metres.
     """
     assembly, model, placed = instrument.assembly, instrument.cameras[camera], instrument.assembly.place()
     half = 0.5 * model.spec.line.pixels * model.spec.line.pitch
@@ -520,11 +555,11 @@ class MonitorBeam:
     channel : Channel
         The channel.
     segments : (N, K, 2, 3) ndarray
-        Segments of its N rays, in the world.
+        Start and end points of the K segments of N rays, in the world, in metres.
     inside : tuple[str or None, ...]
-        The solid around each segment.
+        Path of the solid in which each segment lies, None outside.
     position, direction : (N, 3) ndarray
-        Points and unit vectors of the rays at the pinhole, in the world.
+        Points, in metres, and unit vectors of the rays at the pinhole, in the world.
     valid : (N,) ndarray of bool
         Rays that reach the area CCD.
     """
@@ -537,7 +572,7 @@ class MonitorBeam:
     valid: np.ndarray
 
     def outside(self, path: str) -> np.ndarray:
-        """Return the segments that are not inside a solid, (N, K', 2, 3)."""
+        """Return the segments of all rays that are not inside a solid: start and end points, (N, segments, 2, 3)."""
         return self.segments[:, [medium != path for medium in self.inside]]
 
 
@@ -640,7 +675,13 @@ def moved_into_beams(instrument: Instrument, backend: Backend, state: State) -> 
 def _blocking_bodies(
     instrument: Instrument, beams: list[MonitorBeam], placed: PlacedBodies, touching: float
 ) -> Iterator[tuple[MonitorBeam, str, Plate | None, np.ndarray]]:
-    """Yield beam, name of the blocking body or plate, the plate if it is one, and a mask (N,) of blocked rays."""
+    """Yield each body that blocks rays of a monitor beam.
+
+    Yields
+    ------
+    tuple
+        Beam, name of the body or plate, the plate if it is one else None, and a mask, (N,), of the N rays blocked.
+    """
     bodies = convex_bodies(instrument, placed)
     hulls = {path: convex_hull(corners).equations for path, corners in bodies.items()}
     for beam in beams:
@@ -666,9 +707,9 @@ def _blocking_bodies(
 
 
 def _beam_remedy(instrument: Instrument, channel: Channel, path: str) -> tuple[KeyPath, str]:
-    """Return the key that takes a body out of a channel's beam, and what to choose there.
+    """Return the key that takes a body out of a channel's beam, and advice on the value to choose there.
 
-    It is that of a prism if the body is one, else that of the beam.
+    It is a key of the body if that is a prism, else one of the beam.
     """
     if path in {solid.path for solid in instrument.solids}:
         where, choice = remedy(instrument, path)
@@ -678,12 +719,22 @@ def _beam_remedy(instrument: Instrument, channel: Channel, path: str) -> tuple[K
 
 
 def _count(taken: np.ndarray) -> str:
-    """Return the number of blocked rays as text."""
+    """Return the number of blocked rays as text, such as "12 of 400 rays"."""
     return f"{np.sum(taken)} of {len(taken)} rays"
 
 
 def _crossing(segments: np.ndarray, plate: Plate, placed: PlacedBodies) -> np.ndarray:
-    """Return a mask (N,) of the rays, segments (N, K, 2, 3), that cross a plate."""
+    """Return a mask (N,) of the rays that cross a plate.
+
+    Parameters
+    ----------
+    segments : (N, K, 2, 3) ndarray
+        Start and end points of the K segments of N rays, in metres.
+    plate : Plate
+        The plate.
+    placed : PlacedBodies
+        Poses of the bodies.
+    """
     into = (placed.pose(plate.body) @ plate.pose).inverse()
     start, end = into.apply(segments[:, :, 0]), into.apply(segments[:, :, 1])
     crosses = start[..., 2] * end[..., 2] < 0.0
@@ -714,7 +765,7 @@ def _vignetting_issue(instrument: Instrument, backend: Backend, beam: MonitorBea
 
 
 def _segments(places: list[np.ndarray]) -> np.ndarray:
-    """Return the segments (N, K, 2, 3) between consecutive points of N rays."""
+    """Return start and end points, (N, K, 2, 3), of the K segments between consecutive points of N rays."""
     way = np.stack(places, axis=1)
     return np.stack([way[:, :-1], way[:, 1:]], axis=2)
 
@@ -722,7 +773,28 @@ def _segments(places: list[np.ndarray]) -> np.ndarray:
 def _aimed_rays(
     instrument: Instrument, backend: Backend, camera: str, sequence: str, start: np.ndarray, target: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return rays from points (1, N, 3) of a focal plane through targets (N, 2) of a sequence's last element."""
+    """Aim N rays from points of a focal plane at points of the last element of a sequence.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    backend : Backend
+        Backend that traces the rays.
+    camera : str
+        Name of the camera.
+    sequence : str
+        Name of the sequence of elements.
+    start : (1, N, 3) ndarray
+        Start points in the world, in metres.
+    target : (N, 2) ndarray
+        Points to hit in the last element's x, y, in metres.
+
+    Returns
+    -------
+    tuple of ndarray
+        Positions and unit vectors of the rays, (1, N, 3) each.
+    """
     guess = instrument.toward_optics(instrument.assembly.place(), camera)[0]
     return _through(backend, assemble(instrument.assembly, [sequence]), start, guess, target[None])
 
@@ -730,7 +802,26 @@ def _aimed_rays(
 def _through(
     backend: Backend, systems: SystemBatch, start: np.ndarray, guess: np.ndarray, target: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return rays from points (B, N or 1, 3) near ``guess`` through targets (B, N, 2) of the last element."""
+    """Aim N rays in each of B systems at points of the last element, starting from approximate directions.
+
+    Parameters
+    ----------
+    backend : Backend
+        Backend that traces the rays.
+    systems : SystemBatch
+        B systems.
+    start : (B, N or 1, 3) ndarray
+        Start points, in metres.
+    guess : ndarray
+        Approximate unit vectors.
+    target : (B, N, 2) ndarray
+        Points to hit in the last element's x, y, in metres.
+
+    Returns
+    -------
+    tuple of ndarray
+        Positions and unit vectors of the rays, (B, N, 3) each.
+    """
     start, guess = (np.broadcast_to(a, (*target.shape[:2], 3)) for a in (start, guess))
     fan = RayFan(start, guess, transverse_axes(guess, np.broadcast_to([0.0, 1.0, 0.0], guess.shape)))
     q, _ = aim(backend, systems, fan, target, tolerance=_AIM)
@@ -738,7 +829,17 @@ def _through(
 
 
 def _used(instrument: Instrument, path: str, segments: np.ndarray) -> np.ndarray:
-    """Return a mask (N,) of imaging rays (N, K, 2, 3) that pass the entrance aperture of a prism's own channel."""
+    """Return a mask (N,) of the imaging rays that pass the entrance aperture of a prism's own channel.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    path : str
+        Path of the prism.
+    segments : (N, K, 2, 3) ndarray
+        Start and end points of the K segments of N rays, in metres.
+    """
     assembly, placed = instrument.assembly, instrument.assembly.place()
     for channel in instrument.channels:
         prism = channel.prism_body(PRISM_180)

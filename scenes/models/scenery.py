@@ -1,9 +1,10 @@
 """Scene of the path tracer: every surface of an instrument in one perturbed state, with its finish.
 
-The surfaces are mirrors, faces of glass bodies, plates and detectors, each with its exact shape, its finish, and
-triangles for the search of intersections. Figure errors of mirrors and gradients of the refractive index are omitted:
-they deflect a ray by less than a microradian and do not matter for stray light. So are motions of single footprints on
-a glass face. Bodies must stay 20 um apart from each other.
+A finish says how a surface reflects, transmits and scatters light. The surfaces are mirrors, faces of glass bodies,
+plates and detectors, each with its exact shape, its finish, and triangles for the search of intersections. Figure
+errors of mirrors and gradients of the refractive index are omitted: they deflect a ray by less than a microradian and
+do not matter for stray light. So are motions of single footprints on a glass face. Bodies must stay 20 um apart from
+each other.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ IN_PLANE = 1e-9
 
 @dataclass(frozen=True)
 class Finishes:
-    """Finish of every kind of surface.
+    """Finish of every kind of surface: how it reflects, transmits and scatters light.
 
     Attributes
     ----------
@@ -60,13 +61,13 @@ class Finishes:
     mirror_back : Finish
         Back of the mirrors.
     coated, bare, ground : Finish
-        Faces of glass bodies, see ``Coating``.
+        Faces of glass bodies: anti-reflection coated, polished without coating, or ground.
     detector : Finish
         Light-sensitive faces.
     board : Finish
         Boards that carry the detectors.
     baffle : Finish or None
-        Finish of all baffles; None for each one's own.
+        Finish of all baffles; None if each has the finish of its own plate.
     metallised : Finish or None
         Mirror faces of glass bodies; None for the finish of the mirrors.
     """
@@ -82,7 +83,7 @@ class Finishes:
     metallised: Finish | None = None
 
     def of(self, coating: Coating) -> Finish:
-        """Return the finish of a glass face."""
+        """Return the finish of a glass face with this coating."""
         return {
             Coating.MIRROR: self.mirror if self.metallised is None else self.metallised,
             Coating.TRANSMITTING: self.coated,
@@ -133,9 +134,9 @@ class SceneSurface:
     surface : Surface
         Shape, expanded as in the state.
     vertices : (V, 3) ndarray
-        Vertices of its triangles in its frame, in metres.
+        Coordinates of its V vertices in its frame, in metres.
     triangles : (T, 3) ndarray of int
-        Vertex numbers.
+        Vertex numbers of its T triangles.
     front, back, outside : Finish
         Finish met from +z, from -z, and outside the clear apertures.
     apertures : tuple[Aperture, ...]
@@ -296,7 +297,17 @@ def _elements_on(
 
 
 def plate_surfaces(plates: Iterable[Plate], placed: PlacedBodies, baffle: Finish | None = None) -> list[SceneSurface]:
-    """Return the surfaces of baffles, named ``<name>/<number>``, with one finish for all or each its own."""
+    """Return the surfaces of baffle plates, named ``<name>/<number>``.
+
+    Parameters
+    ----------
+    plates : iterable of Plate
+        The plates.
+    placed : PlacedBodies
+        Poses of the bodies that carry them.
+    baffle : Finish or None
+        Finish of all plates; None for the finish of each plate.
+    """
     out = []
     for number, plate in enumerate(plates):
         vertices, triangles, _ = sheet_mesh(plane(), plate.outline)
@@ -345,7 +356,7 @@ RECIPROCAL_TO = 0.3
 
 @dataclass(frozen=True, eq=False)
 class MeasuredFinishes:
-    """Finishes of a job that has measured ones.
+    """Finishes of a job of which some are measured.
 
     Attributes
     ----------
@@ -442,7 +453,7 @@ def measured_finishes(resolved: ResolvedJob) -> MeasuredFinishes | None:
 def _finish(
     base: Finish, spec: FinishSpec, kind: str, scatter: MeasuredScatter | None, coating: CoatingTable | None
 ) -> Finish:
-    """Return a built-in finish with measured values instead of its own."""
+    """Return a built-in finish in which measured values replace its own."""
     if kind == "black":
         assert scatter is not None
         return Finish(table=scatter.table, scattered_only=True)
@@ -463,14 +474,14 @@ FACING_THE_LIGHT = Pose(np.diag([-1.0, 1.0, -1.0]))
 
 @dataclass(frozen=True, eq=False)
 class Scenery:
-    """All surfaces of a scene and its detectors; the position in ``surfaces`` is a surface's number."""
+    """All surfaces of a scene and its detectors; a surface's number is its index in ``surfaces``."""
 
     surfaces: tuple[SceneSurface, ...]
     detectors: tuple[Detector, ...] = ()
     _by_element: Mapping[str, int] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Check the names."""
+        """Raise ValueError for repeated names of surfaces, and for surfaces that name an unknown detector."""
         names = [s.name for s in self.surfaces]
         twice = sorted({n for n in names if names.count(n) > 1})
         if twice:
@@ -488,7 +499,7 @@ class Scenery:
         return tuple(dict.fromkeys(s.part for s in self.surfaces))
 
     def of_element(self, element: str) -> int:
-        """Return the number of the surface on which an element lies. Raises KeyError if there is none."""
+        """Return the number of the surface on which an element lies; raise KeyError if there is none."""
         return self._by_element[element]
 
 
@@ -556,7 +567,7 @@ def _middle(element: Element) -> np.ndarray:
 
 
 def _reach(instrument: Instrument, camera: str) -> tuple[float, float]:
-    """Return half the size of a focal plane's board, in metres."""
+    """Return half the size of a focal plane's board along its x and y, in metres."""
     line = instrument.cameras[camera].spec.line
     channels = [c for c in instrument.channels if c.camera == camera]
     half_line = 0.5 * line.pixels * line.pitch

@@ -1,9 +1,11 @@
 """Shadows of an instrument's bodies in the pupils of its cameras: of prisms, baffles, and parts of other cameras.
 
-A convex body blocks the rays that pass through it; over the stop these fill the convex outline of its corners, each
+A convex body blocks the rays that pass through it; on the stop these fill the convex outline of its corners, each
 mapped to the ray that passes through it, with straight sides (on the stop they are bent by the aberrations of the
 pupil, some 1e-4 of its radius). The bodies have the position and size of the state and their nominal shape. A camera's
 own mirrors and board cast no shadow into its beam, as its prescription does not describe substrates.
+
+In array shapes B is the number of images (one beam and one pupil each), N that of rays and C that of bodies or corners.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ DEGREE = 6
 """Degree of the polynomials that map the stop to rays: they follow the rays of mirrors to nanometres."""
 
 _ROOM = 5e-3
-"""Nominal distance from the light between the mirrors, in metres, within which a body is considered in every state."""
+"""Nominal distance from the light between the mirrors, in metres, within which a body is considered in all states."""
 
 _LAST = 0.999
 """Fraction of the path to the image up to which bodies count: at its end all rays meet."""
@@ -69,7 +71,7 @@ class Caster:
     body : str
         Path of the body that carries it.
     corners : (C, 3) ndarray
-        Corners in that body's frame, in metres.
+        Its C corners in that body's frame, in metres.
     """
 
     name: str
@@ -79,22 +81,23 @@ class Caster:
 
 @dataclass(frozen=True, eq=False)
 class Shadows:
-    """Shadows in the pupils of B images, on the stop's unit disk.
+    """Shadows in the pupils of B images, on the stop's unit disk, as convex polygons.
 
     Attributes
     ----------
     pieces : (B, K, V, 2) ndarray
-        Convex polygons that do not overlap; K may be 0. They extend slightly beyond the disk.
+        Corners of K convex polygons of V corners each that do not overlap; K may be 0. They extend slightly beyond the
+        disk.
     owners : tuple[str, ...]
-        Name of the body that casts each piece; if several do, the first.
+        Name of the body that casts each polygon; if several do, the first.
     points : (B, Q) ndarray of complex
-        Quadrature nodes over all pieces within the disk.
+        Q quadrature nodes over all polygons within the disk, x + i y in units of the stop's radius.
     weights : (B, Q) ndarray
-        Weights of the nodes, areas.
+        Weights of the nodes: areas in units of the stop's radius squared.
     areas : (B, K) ndarray
-        Area of each piece within the disk.
-    known : Mapping[str, np.ndarray] or None
-        Name -> blocked fraction of the stop's area, (B,), where the pieces alone do not determine it; None where they
+        Area of each polygon within the disk, in the same unit.
+    known : Mapping[str, ndarray] or None
+        Name -> blocked fraction of the stop's area, (B,), where the polygons alone do not determine it; None where they
         do.
     """
 
@@ -107,7 +110,15 @@ class Shadows:
 
     @classmethod
     def of(cls, outlines: list[tuple[str, np.ndarray]], count: int) -> Shadows:
-        """Return the shadows of bodies with outlines (B, V, 2) on ``count`` stops."""
+        """Return the shadows of bodies in the pupils of B images.
+
+        Parameters
+        ----------
+        outlines : list of tuple[str, ndarray]
+            Name of each body and its outline on the stop's unit disk: V corners in each of the B pupils, (B, V, 2).
+        count : int
+            Number B of pupils.
+        """
         casting = [(name, outline) for name, outline in outlines if np.any(area(outline) > SMALLEST)]
         pieces, numbers = separate([outline for _, outline in casting])
         pieces = pieces if casting else np.zeros((count, 0, 3, 2))
@@ -115,23 +126,31 @@ class Shadows:
 
     @classmethod
     def within(cls, pieces: np.ndarray, owners: tuple[str, ...]) -> Shadows:
-        """Return the shadows of convex polygons (B, K, V, 2) that do not overlap, with the names of the K bodies."""
+        """Return the shadows that given convex polygons form on the stop's unit disk.
+
+        Parameters
+        ----------
+        pieces : (B, K, V, 2) ndarray
+            V corners of K polygons in each of B pupils; the polygons do not overlap.
+        owners : tuple[str, ...]
+            Names of the K bodies that cast them.
+        """
         return cls(pieces, owners, *nodes_in_shadows(pieces, _NODES))
 
     def and_edges(self, outlines: Callable[[int], StopOutlines], name: str) -> Shadows:
-        """Return these shadows together with those of edges of surfaces.
+        """Return these shadows together with those of the edges of the camera's own surfaces.
 
         Parameters
         ----------
         outlines : callable
             Outlines of the edges, as ``PupilEdges.outlines`` returns them.
         name : str
-            Name under which ``shares`` lists the share that the edges block in addition to all bodies.
+            Name under which ``shares`` lists the fraction that the edges block in addition to all bodies.
 
         Raises
         ------
         UnphysicalError
-            The edges divide a pupil into too many pieces.
+            The edges divide a pupil into too many parts.
         """
         pieces, _ = converged_shadows(outlines, len(self.pieces), tuple(np.moveaxis(self.pieces, 1, 0)))
         whole = Shadows.within(pieces, (name,) * pieces.shape[1])
@@ -141,7 +160,7 @@ class Shadows:
         return replace(whole, known={**bodies, name: np.maximum(rest, 0.0)})
 
     def shares(self) -> dict[str, np.ndarray]:
-        """Return the fraction of the stop's area that each body blocks, (B,)."""
+        """Return name of each body -> fraction of the stop's area that it blocks in each of B images, (B,)."""
         if self.known is not None:
             return dict(self.known)
         out: dict[str, np.ndarray] = {}
@@ -164,7 +183,7 @@ def casters(instrument: Instrument, camera: str) -> tuple[Caster, ...]:
 
 
 def _plate(plate: Plate) -> list[Caster]:
-    """Return a plate as one convex polygon, or a ring as several."""
+    """Return a flat plate as one convex polygon, or a ring-shaped plate as several."""
     match plate.outline:
         case Circle() as disk:
             angle = 2.0 * np.pi * np.arange(RING_SIDES + 1) / RING_SIDES
@@ -218,11 +237,11 @@ class ImagingShadows:
 
     Parameters
     ----------
-    instrument
+    instrument : Instrument
         Instrument with the camera.
-    camera
+    camera : str
         Name of the camera.
-    backend
+    backend : Backend
         Backend that traces the rays.
     """
 
@@ -241,7 +260,7 @@ class ImagingShadows:
         self._inner = _between_mirrors(self.casters, instrument, backend, camera)
 
     def cast(self, beams: TracedBeams) -> Shadows:
-        """Return the shadows in B pupils."""
+        """Return the shadows of the bodies in the pupils of B traced images."""
         outlines: list[tuple[str, np.ndarray]] = []
         launched = beams.rays.launched
         bundle = _Bundle.parallel(launched, beams.heading, self._end(beams), beams.nodes)
@@ -257,7 +276,13 @@ class ImagingShadows:
         return Shadows.of(outlines, len(launched))
 
     def _spheres(self, placed: PlacedBodies) -> tuple[np.ndarray, np.ndarray]:
-        """Return middles (S, C, 3) and radii (S, C) of spheres around all C casters, in the world."""
+        """Return bounding spheres of all C bodies in S states.
+
+        Returns
+        -------
+        tuple of ndarray
+            Centres in the world, (S, C, 3), and radii, (S, C), in metres.
+        """
         count = len(placed.scale)
         centre, size = np.empty((count, len(self.casters), 3)), np.empty((count, len(self.casters)))
         for body, which in self._on.items():
@@ -266,12 +291,24 @@ class ImagingShadows:
         return centre, size
 
     def _end(self, beams: TracedBeams) -> np.ndarray:
-        """Return the distances from the launch points to the first mirror's middle, (B,)."""
+        """Return the distance along the light from the launch points to the first mirror's middle, for B beams.
+
+        Returns
+        -------
+        (B,) ndarray
+            Distances in metres.
+        """
         middle = points_to_world(beams.placed, self._first, np.array([self._centre])).real[:, 0]
         return np.asarray(np.sum((middle[beams.owner] - beams.rays.launched.mean(axis=1)) * beams.heading, axis=-1))
 
     def _hits(self, beams: TracedBeams) -> list[np.ndarray]:
-        """Return the points at which the rays meet every element, in the world, (B, N, 3) each."""
+        """Return the points at which the N rays of B beams meet each element in turn, in the world.
+
+        Returns
+        -------
+        list of (B, N, 3) ndarray
+            Points on each element, in metres.
+        """
         placed, launched = beams.placed, beams.rays.launched
         chain = beams.assembly.sequences[f"{self.camera}/imaging"]
         way = np.broadcast_to(np.broadcast_to(beams.heading, (len(launched), 3))[:, None], launched.shape)
@@ -285,16 +322,16 @@ class ImagingShadows:
 
 
 def no_shadows(count: int) -> Shadows:
-    """Return the empty shadows of ``count`` unobstructed pupils."""
+    """Return the empty shadows of a number of unobstructed pupils."""
     return Shadows.within(np.zeros((count, 0, 3, 2)), ())
 
 
 class PupilEdges(SurfaceEdges):
-    """Edges of a camera's surfaces in the pupils of B images, in a state of its assembly."""
+    """Edges of a camera's surfaces as they appear in the pupils of B images, in one state of its assembly."""
 
     @classmethod
     def of(cls, beams: TracedBeams, model: CameraModel, camera: str, backend: Backend) -> PupilEdges:
-        """Return the edges of a camera.
+        """Return the edges of a camera's surfaces in the pupils of traced images.
 
         Parameters
         ----------
@@ -322,14 +359,21 @@ class PupilEdges(SurfaceEdges):
 
 @lru_cache(maxsize=8)
 def imaging_shadows(instrument: Instrument, camera: str, backend: Backend) -> ImagingShadows:
-    """Return ``ImagingShadows``, cached for the last instruments because finding the bodies takes some 0.1 s."""
+    """Return the ``ImagingShadows`` of a camera, from a cache because finding the bodies takes some 0.1 s."""
     return ImagingShadows(instrument, camera, backend)
 
 
 def _between_mirrors(
     casters: Sequence[Caster], instrument: Instrument, backend: Backend, camera: str
 ) -> dict[int, list[Caster]]:
-    """Return the bodies near the nominal light from mirror to mirror (0: first to second) and to the image."""
+    """Return the bodies near the nominal light between the camera's surfaces.
+
+    Returns
+    -------
+    dict[int, list[Caster]]
+        Number of the light path's segment -> bodies near it; 0 is from the first mirror to the second, the last one
+        leads to the image.
+    """
     placed = instrument.assembly.place()
     backward = np.concatenate(imaging_segments(instrument, backend, camera))
     inner = backward[:, :-1][:, ::-1]  # without the path from the scene, in the order of the light
@@ -345,26 +389,26 @@ def _between_mirrors(
 
 
 def _corners(caster: Caster, beams: TracedBeams) -> np.ndarray:
-    """Return the corners of a body for every image, in the world, (B, C, 3)."""
+    """Return the C corners of a body in the world, for each of B images, (B, C, 3), in metres."""
     return np.asarray(points_to_world(beams.placed, caster.body, caster.corners).real[beams.owner])
 
 
 @dataclass(frozen=True, eq=False)
 class _Bundle:
-    """Rays from one surface to the next in B beams, as functions of the stop coordinates.
+    """Rays from one surface to the next in B beams, as polynomials in the stop coordinates.
 
     Attributes
     ----------
     start, end : (B, K, 3) ndarray
-        Coefficients of the rays' points at both surfaces, for ``products``.
+        K polynomial coefficients of the rays' points at both surfaces, in metres, for ``products``.
     middle : (B, 2, 3) ndarray
-        Mean points at both.
+        Mean points at both surfaces, in metres.
     spread : (B, 2, 3, 2) ndarray
-        Mean derivatives of the points with respect to the stop's x and y.
+        Mean derivatives of the points with respect to the stop's x and y, metres per stop radius.
     along : (B, 3) ndarray
-        Mean direction.
+        Unit vector of the mean direction.
     axes : (B, 2, 3) ndarray
-        Axes perpendicular to it.
+        Two unit vectors perpendicular to it.
     """
 
     start: np.ndarray
@@ -376,7 +420,15 @@ class _Bundle:
 
     @classmethod
     def between(cls, start: np.ndarray, end: np.ndarray, nodes: PupilNodes) -> _Bundle:
-        """Return the bundle from points (B, N, 3) to points (B, N, 3), for nodes of the stop."""
+        """Return the rays between the points at which N rays of B beams meet two surfaces.
+
+        Parameters
+        ----------
+        start, end : (B, N, 3) ndarray
+            Points on the first and the second surface, in metres.
+        nodes : PupilNodes
+            Points at which the N rays meet the stop.
+        """
         both = np.stack([start, end], axis=1)
         weight = nodes.share
         middle = np.einsum("n,bknx->bkx", weight, both)
@@ -390,19 +442,50 @@ class _Bundle:
 
     @classmethod
     def parallel(cls, launched: np.ndarray, heading: np.ndarray, end: np.ndarray, nodes: PupilNodes) -> _Bundle:
-        """Return light from far away up to a distance (B,) beyond the points (B, N, 3) of a wavefront."""
+        """Return the rays of parallel light between a wavefront and a plane behind it.
+
+        Parameters
+        ----------
+        launched : (B, N, 3) ndarray
+            Points of N rays of B beams on the wavefront, in metres.
+        heading : ndarray
+            Unit vector of the light, (3,) or (B, 3).
+        end : (B,) ndarray
+            Distance from wavefront to plane, in metres.
+        nodes : PupilNodes
+            Points at which the N rays meet the stop.
+        """
         heading = np.broadcast_to(heading, (len(launched), 3))
         far = launched - _FAR * heading[:, None]
         return cls.between(far, launched + (end[:, None] * heading)[:, None], nodes)
 
     def may_meet(self, centre: np.ndarray, size: np.ndarray) -> np.ndarray:
-        """Return a mask (C,) of the spheres, middles (B, C, 3) and radii (B, C), that may meet a parallel beam."""
+        """Return a mask (C,) of the spheres that may touch a parallel beam in any of B images.
+
+        Parameters
+        ----------
+        centre : (B, C, 3) ndarray
+            Centres of C spheres, in metres.
+        size : (B, C) ndarray
+            Their radii, in metres.
+        """
         off = (centre - self.middle[:, :1]) @ self.axes.swapaxes(1, 2)
         radius = np.linalg.norm(self.axes @ self.spread[:, 0], axis=(1, 2))
         return np.asarray(np.any(np.hypot(off[..., 0], off[..., 1]) < 1.1 * radius[:, None] + size, axis=0))
 
     def outline(self, corners: np.ndarray) -> np.ndarray:
-        """Return the outline (B, V, 2) of a convex body (B, C, 3) on the stop's unit disk; empty if off the beam."""
+        """Return the outline of a convex body on the stop's unit disk in each of B images.
+
+        Parameters
+        ----------
+        corners : (B, C, 3) ndarray
+            C corners of the body in the world, in metres.
+
+        Returns
+        -------
+        (B, V, 2) ndarray
+            V corners of the outline, in units of the stop's radius; of zero area where the body is off the beam.
+        """
         corners = self._inside(corners)
         packed = np.concatenate([self._guess(corners)[0], corners], axis=-1)
         angle = 2.0 * np.pi * (np.arange(_WINDOW_SIDES) + 0.5) / _WINDOW_SIDES
@@ -424,7 +507,19 @@ class _Bundle:
         return np.where(empty[:, None, None], out[:, :1], out)
 
     def _guess(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return approximate stop coordinates (B, C, 2) of rays through points, and their Jacobian (B, C, 2, 2)."""
+        """Return approximate stop coordinates of the rays that pass through given points.
+
+        Parameters
+        ----------
+        place : (B, C, 3) ndarray
+            C points in each of B beams, in metres.
+
+        Returns
+        -------
+        tuple of ndarray
+            Stop coordinates, (B, C, 2), in stop radii; and derivatives of the rays' transverse position at the points
+            with respect to them, (B, C, 2, 2), in metres.
+        """
         first, way = self.middle[:, :1], (self.middle[:, 1:] - self.middle[:, :1])
         ahead = self._ahead(place)[..., None]
         off = np.einsum("bix,bcx->bci", self.axes, place - first - ahead * way)
@@ -433,12 +528,34 @@ class _Bundle:
         return _solved(slope, off), slope
 
     def _ahead(self, place: np.ndarray) -> np.ndarray:
-        """Return the fraction of the path at which points lie, (B, C)."""
+        """Return how far along the path from the first to the second surface points lie, as a fraction of it.
+
+        Parameters
+        ----------
+        place : (B, C, 3) ndarray
+            C points in each of B beams, in metres.
+
+        Returns
+        -------
+        (B, C) ndarray
+            0 at the first surface, 1 at the second.
+        """
         way = np.einsum("bx,bx->b", self.middle[:, 1] - self.middle[:, 0], self.along)
         return np.asarray(np.einsum("bcx,bx->bc", place - self.middle[:, :1], self.along) / way[:, None])
 
     def _inside(self, corners: np.ndarray) -> np.ndarray:
-        """Return the corners of the part of a body between both ends of the path, (B, D, 3)."""
+        """Return a convex body cut off at both ends of the light path.
+
+        Parameters
+        ----------
+        corners : (B, C, 3) ndarray
+            C corners of the body, in metres.
+
+        Returns
+        -------
+        (B, D, 3) ndarray
+            D points whose convex hull is the remaining part; some may be repeated.
+        """
         for low, sign in ((0.0, 1.0), (-_LAST, -1.0)):
             depth = sign * self._ahead(corners) - low
             if np.all(depth >= 0.0):
@@ -457,7 +574,15 @@ class _Bundle:
 
 
 def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return solutions of 2 x 2 systems (..., 2, 2) for (..., 2), by Cramer's rule, which is fast for many at once."""
+    """Solve many systems of two linear equations by Cramer's rule, which is fast for many at once.
+
+    Parameters
+    ----------
+    matrix : (..., 2, 2) ndarray
+        Matrices.
+    right : (..., 2) ndarray
+        Right-hand sides.
+    """
     (a, b), (c, d) = (np.moveaxis(row, -1, 0) for row in np.moveaxis(matrix, -2, 0))
     x, y = np.moveaxis(right, -1, 0)
     return np.asarray(np.stack([d * x - b * y, a * y - c * x], axis=-1) / (a * d - b * c)[..., None])

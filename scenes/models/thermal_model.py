@@ -80,7 +80,7 @@ class Lens:
         return np.asarray(self.parent.apply(self.middle))
 
     def expanded(self, expansion: float) -> dict[str, Motion]:
-        """Return the motions of the faces by a relative expansion of the lens about its middle."""
+        """Return face -> its motion when the lens expands about its middle by a relative amount."""
         return {
             face: Motion(
                 shift=triple(expansion * (pose.rotation.T @ (pose.translation - self.middle))), expansion=expansion
@@ -89,7 +89,7 @@ class Lens:
         }
 
     def carried(self, rotation: np.ndarray, offset: np.ndarray, expansion: float) -> dict[str, Motion]:
-        """Return the motions of the faces by the body that carries the lens.
+        """Return face -> its motion due to the motion and expansion of the body that carries the lens.
 
         All arguments are in the frame of the carrier.
 
@@ -98,7 +98,7 @@ class Lens:
         rotation : (3,) ndarray
             Rotation vector of the lens about the point at which it is held, in radians.
         offset : (3,) ndarray
-            Displacement of that point, in metres, without that by the carrier's uniform expansion.
+            Displacement of that point, in metres, without that due to the carrier's uniform expansion.
         expansion : float
             Relative expansion of the carrier, which moves the origins of the faces in the tree; the lens follows the
             displacement of its middle.
@@ -114,7 +114,7 @@ class Lens:
 
 
 def lenses_of(name: str, model: CameraModel, bodies: Mapping[str, Body]) -> list[Lens]:
-    """Return all lenses of a camera.
+    """Return the lenses of a camera, with their faces and thermal data.
 
     Parameters
     ----------
@@ -152,13 +152,13 @@ TERMS = 15
 
 @dataclass(frozen=True, eq=False)
 class _Response:
-    """Response of a body's F faces to gradients of 1 K/m along its x, y and z.
+    """Response of a body's optical faces to temperature gradients of 1 K/m along its x, y and z.
 
     Attributes
     ----------
     terms : Mapping[str, tuple[int, ...]]
         Body of each face -> Noll indices of its figure terms.
-    numbers : ndarray
+    numbers : (n, 3) ndarray
         Rotation vector, shift and figure terms of one face after the other, in radians and metres; a column per
         gradient.
     """
@@ -168,7 +168,7 @@ class _Response:
 
     @classmethod
     def of(cls, units: Sequence[Mapping[str, FaceChange]]) -> _Response:
-        """Return the response from the changes of all faces by the three unit gradients."""
+        """Return the response computed from the changes of all faces due to the three unit gradients."""
         terms = {face: tuple(sorted({j for unit in units for j in unit[face].figure})) for face in units[0]}
         numbers = [
             [
@@ -181,7 +181,18 @@ class _Response:
         return cls(terms, np.array(numbers).T)
 
     def to(self, gradient: np.ndarray) -> dict[str, list[Motion | None]]:
-        """Return the motions of the faces by gradients (S, 3), K/m; None in a state without a gradient."""
+        """Return the motions of the faces due to temperature gradients in S states.
+
+        Parameters
+        ----------
+        gradient : (S, 3) ndarray
+            Gradients along the body's axes, in K/m.
+
+        Returns
+        -------
+        dict[str, list[Motion or None]]
+            Body of each face -> its S motions; None in a state without a gradient.
+        """
         rows, bent = matvec(self.numbers, gradient).tolist(), np.any(gradient, axis=1).tolist()
         out: dict[str, list[Motion | None]] = {}
         start = 0
@@ -198,7 +209,7 @@ class _Response:
 
 
 Held = tuple[ElasticBody, Kinematic]
-"""Finite elements of a body and their support."""
+"""Finite elements of a body and the kinematic support that holds it."""
 _Field = TypeVar("_Field", Temperature, Temperatures)
 _Moves = Mapping[str, Sequence[Motion | None]]
 """Body path -> its motion in each state, None where it has none."""
@@ -229,13 +240,13 @@ class _Carried:
     lenses : tuple[Lens, ...]
         The lenses.
     bodies : tuple[Body, ...]
-        The other bodies.
+        The N other bodies.
     mount : (N, 3) ndarray
-        Mounts of those bodies in their own frames, in metres.
+        Points at which those bodies are held, in their own frames, in metres.
     place : (N, 3) ndarray
-        Mounts in the carrier's frame, in metres.
+        The same points in the carrier's frame, in metres.
     inward : (N, 3, 3) ndarray
-        Rotations from the carrier's frame to theirs.
+        Rotation matrices from the carrier's frame to theirs.
     """
 
     lenses: tuple[Lens, ...]
@@ -250,7 +261,7 @@ class ThermalModel:
 
     Parameters
     ----------
-    instrument
+    instrument : Instrument
         The instrument.
     """
 
@@ -300,9 +311,9 @@ class ThermalModel:
         return out
 
     def _owner(self, path: str) -> str | None:
-        """Return the solid or lens that a body belongs to, or None.
+        """Return the path of the solid or lens that a body belongs to, or None.
 
-        Of nested solids it is the outermost, whose pieces the others are; a lens is represented by its first face.
+        Of nested solids it is the outermost, of which the others are parts; a lens is represented by its first face.
         """
         if path not in self._owners:
             outermost = next((p for p in reversed(list(_upward(path))) if p in self.solids), None)
@@ -310,18 +321,18 @@ class ThermalModel:
         return self._owners[path]
 
     def _pieces(self, path: str) -> list[Solid]:
-        """Return a solid and the solids that are pieces of it."""
+        """Return a solid and the solids that are parts of it."""
         return [solid for piece, solid in self.solids.items() if self._owner(piece) == path]
 
     def fields(self, temperatures: Mapping[str, _Field], pieces: bool = True) -> dict[str, _Field]:
-        """Return every heated body's field in its own frame, specified or inherited.
+        """Return path of each heated body -> its temperature field in its own frame, specified or inherited.
 
         Parameters
         ----------
         temperatures : Mapping[str, Temperature or Temperatures]
             Fields of the bodies that have one of their own.
         pieces : bool
-            Whether bodies that are pieces of a solid or a lens are included.
+            Whether bodies that are parts of a solid or a lens are included.
         """
         out: dict[str, _Field] = {}
         for path, body in self._bodies.items():
@@ -380,7 +391,7 @@ class ThermalModel:
             )
 
     def known(self, path: str) -> TemperatureRange:
-        """Return the temperatures for which the data of a body's material hold: expansion and, for glass, index."""
+        """Return the temperature range in which the data of a body's material hold: expansion and, for glass, index."""
         data = self.materials[path].known
         if path in self.solids and self.solids[path].transparent:
             thermal = glass(self.solids[path].material).thermal
@@ -398,11 +409,14 @@ class ThermalModel:
         return float(self.reference + field.change + np.min(self.extent(path) @ np.array(field.gradient)))
 
     def hottest(self, path: str, field: Temperature) -> float:
-        """Return the highest absolute temperature of a field on a body, in kelvin, as ``coldest`` does the lowest."""
+        """Return the highest absolute temperature of a field on a body, in kelvin.
+
+        It is evaluated at the corners of optics, and at the origin of other bodies.
+        """
         return float(self.reference + field.change + np.max(self.extent(path) @ np.array(field.gradient)))
 
     def extent(self, path: str) -> np.ndarray:
-        """Return points that enclose a body, (P, 3), in metres, cached because a series needs them often."""
+        """Return P points that enclose a body, (P, 3), in its frame, in metres; cached for series of states."""
         if path not in self._extents:
             if path in self.solids:
                 own = self._placed.pose(path).inverse()
@@ -424,12 +438,12 @@ class ThermalModel:
         motions: State | None = None,
         progress: Callable[[str], None] = lambda path: None,
     ) -> State:
-        """Return the perturbed state: thermal motions, with the given other motions on top.
+        """Return the perturbed state in which bodies have given temperatures, with other motions on top.
 
         Parameters
         ----------
         temperatures : Mapping[str, Temperature]
-            Body path -> field in its own frame.
+            Path of each heated body -> temperature field in its own frame.
         motions : State or None
             Other motions, which act on top of the thermal motion of the same body.
         progress : callable
@@ -444,14 +458,14 @@ class ThermalModel:
         motions: Sequence[State],
         progress: Callable[[str], None] = lambda path: None,
     ) -> list[State]:
-        """Return S perturbed states at once, as ``state`` returns one.
+        """Return S perturbed states at once, in which bodies have given temperatures.
 
         Parameters
         ----------
         temperatures : Mapping[str, Temperatures]
-            Body path -> its fields in the S states, in its own frame.
+            Path of each heated body -> its temperature fields in the S states, in its own frame.
         motions : sequence of State
-            Other motions in each state.
+            Other motions in each state, which act on top of the thermal motion of the same body.
         progress : callable
             Function called with the path of each body whose finite-element solution begins.
         """
@@ -467,7 +481,7 @@ class ThermalModel:
         return compose_each([[*heat, more] for heat, more in zip(thermal, motions, strict=True)], self._bodies)
 
     def _warmed(self, path: str, field: Temperatures, progress: Callable[[str], None]) -> list[_Moves]:
-        """Return the motions by a body's fields: of its faces, then of the body itself and of what it carries."""
+        """Return the motions that a body's temperature fields cause: of its faces, of itself and of what it carries."""
         if path in self.lenses:
             return self._warmed_lens(self.lenses[path], field, progress)
         body, data = self._bodies[path], self.materials[path]
@@ -504,7 +518,7 @@ class ThermalModel:
         return [out]
 
     def _carried_by(self, path: str) -> _Carried:
-        """Return the bodies mounted on a body, cached."""
+        """Return the bodies mounted on a body, from a cache."""
         if path not in self._carried:
             bodies = [body for body in self._bodies.values() if body.parent == path]
             lenses = [self.lenses[body.path] for body in bodies if body.path in self.lenses]
@@ -522,7 +536,7 @@ class ThermalModel:
         return self._inside[path]
 
     def _warmed_lens(self, lens: Lens, field: Temperatures, progress: Callable[[str], None]) -> list[_Moves]:
-        """Return the motions and index changes that a lens's fields cause."""
+        """Return the motions and index changes of a lens that its temperature fields cause."""
         assert lens.glass is not None
         here = (self.reference + field.change).tolist()
         motions = [lens.expanded(expansion) for expansion in (lens.glass.expansion * field.at(lens.middle)).tolist()]
@@ -535,7 +549,7 @@ class ThermalModel:
         ]
 
     def _indices(self, path: str, field: Temperatures) -> Iterator[tuple[float, tuple[float, float, float]]]:
-        """Yield changes of index at a solid's origin, and their gradients, in 1/m."""
+        """Yield, for each state, the change of index at a solid's origin and the gradient of the index, in 1/m."""
         kind, wavelength = glass(self.solids[path].material), self.instrument.spec.autocollimator.wavelength
         at_rest = kind.vacuum_index(wavelength, self.reference)
         for here, gradient in zip((self.reference + field.change).tolist(), field.gradient, strict=True):
@@ -543,7 +557,22 @@ class ThermalModel:
             yield kind.vacuum_index(wavelength, here) - at_rest, triple(slope * gradient)
 
     def _bent(self, path: str, gradient: np.ndarray, progress: Callable[[str], None]) -> list[_Moves]:
-        """Return the motions of a body's faces by gradients (S, 3), K/m; an empty list if nothing bends it."""
+        """Return the motions of a body's faces due to temperature gradients in S states.
+
+        Parameters
+        ----------
+        path : str
+            Path of the body.
+        gradient : (S, 3) ndarray
+            Gradients along the body's axes, in K/m.
+        progress : callable
+            Function called with the path of the body when its finite-element solution begins.
+
+        Returns
+        -------
+        list
+            One mapping from body to its motions; empty if nothing bends the body.
+        """
         if self.materials[path].expansion == 0.0 or not np.any(gradient):
             return []
         if path not in self._responses:
@@ -556,13 +585,22 @@ class ThermalModel:
         return next(e.surface for e in self.instrument.assembly.elements.values() if e.body == face)
 
     def face_radii(self, path: str) -> dict[str, float]:
-        """Return the radius of the disk of the figure terms of each optical face of a body, in metres."""
+        """Return each optical face of a body -> radius of the disk on which its figure terms are defined, in metres."""
         return {face: self.surface(face).figure_disk(own).radius for face, (own, _) in self.faces_of(path).items()}
 
     def index_path(self, path: str, field: Temperature, rest: float) -> float:
-        """Return the largest optical path by ``rest`` kelvin beside a linear field in a body's glass, in metres.
+        """Return the largest change of optical path that residual temperatures may cause in a body's glass, in metres.
 
         The path goes there and back along the body's longest side; it is 0 for bodies that are not glass.
+
+        Parameters
+        ----------
+        path : str
+            Path of the body.
+        field : Temperature
+            Linear temperature field of the body, at which dn/dT is taken.
+        rest : float
+            Largest departure of the temperature from that field, in kelvin.
         """
         if path not in self.solids or not self.solids[path].transparent:
             return 0.0
@@ -571,7 +609,7 @@ class ThermalModel:
         return float(abs(slope) * rest * 2.0 * np.max(np.ptp(self.extent(path), axis=0)))
 
     def faces_of(self, path: str) -> Mapping[str, tuple[Aperture, Pose]]:
-        """Return aperture and nominal pose, in the frame of a mirror or a solid, of each of its optical faces."""
+        """Return each optical face of a mirror or a solid -> its aperture and its nominal pose in the body's frame."""
         if path in self.mirrors:
             return {path: (self._aperture(path), Pose())}
         if path in self.lenses:
@@ -597,7 +635,7 @@ class ThermalModel:
         Returns
         -------
         tuple[ElasticBody, Kinematic] or None
-            None for a body without finite elements: one without a shape, or of several pieces.
+            None for a body without finite elements: one without a shape, or made of several parts.
         """
         if path in self.mirrors:
             camera, name = self.mirrors[path]
@@ -625,15 +663,15 @@ class ThermalModel:
         return ElasticBody(polyhedron_mesh(corners, spacing), self._elastic_material(path)), Kinematic(support)
 
     def _elastic_material(self, path: str) -> Material:
-        """Return the elastic material of a body."""
+        """Return the material, with elastic constants, of a body's finite elements."""
         elastic = self.materials[path]
         assert isinstance(elastic, Material)
         return elastic
 
     def unit_displacements(self, path: str) -> Sequence[Displaced]:
-        """Return the displacements of a body's material by gradients of 1 K/m along its x, y and z, in its frame.
+        """Return the displacements of a body's material due to gradients of 1 K/m along its x, y and z, in its frame.
 
-        The temperature is zero at its middle.
+        The temperature change is zero at its middle.
 
         Parameters
         ----------
@@ -647,21 +685,24 @@ class ThermalModel:
         return held[0].solve_many([_unit_load(axis, about) for axis in range(3)], held[1])
 
     def _free(self, path: str, axis: int) -> Formula:
-        """Return the displacement of a free body by a gradient of 1 K/m, zero and irrotational at its mount."""
+        """Return the displacement field of a free body due to a temperature gradient of 1 K/m along an axis.
+
+        Displacement and rotation are zero at the point at which the body is held.
+        """
         about = self._bodies[path].pivots[_mount(self._bodies[path])]
         if path in self.lenses:
             about = triple(self.lenses[path].middle)
         return Formula(free_linear_field(self.materials[path].expansion, 0.0, np.eye(3)[axis], about))
 
     def changes(self, path: str, displaced: Displaced, terms: int = TERMS) -> dict[str, FaceChange]:
-        """Return the changes of a mirror's or a solid's optical faces by a displacement of its material.
+        """Return each optical face of a mirror or a solid -> its change when the body's material is displaced.
 
         Parameters
         ----------
         path : str
             Path of the body.
         displaced : Displaced
-            Displacement in its frame.
+            Displacement field in its frame, in metres.
         terms : int
             Highest Noll index of the figures.
         """
@@ -676,7 +717,7 @@ class ThermalModel:
         return self.instrument.cameras[camera].clear_aperture(name)
 
     def _mirror_outline(self, path: str) -> np.ndarray:
-        """Return points of the rim of a mirror's or face's clear aperture, (P, 3), in metres."""
+        """Return P points on the rim of a mirror's or lens face's clear aperture, (P, 3), in metres."""
         _, camera, name = path.split("/")
         model = self.instrument.cameras[camera]
         xy = model.clear_aperture(name).outline()
@@ -687,7 +728,17 @@ _THREE = tuple((float(np.cos(t)), float(np.sin(t))) for t in np.radians([90.0, 2
 
 
 def _within(corners: np.ndarray, middle: np.ndarray, arms: np.ndarray) -> float:
-    """Return the factor by which arms (N, 3) from the middle must shrink to end in a convex body; at most 1."""
+    """Return the factor, at most 1, by which vectors must be shortened to stay inside a convex body.
+
+    Parameters
+    ----------
+    corners : (P, 3) ndarray
+        P corners of the body, in metres.
+    middle : (3,) ndarray
+        Common start point of the vectors, in metres.
+    arms : (N, 3) ndarray
+        N vectors, in metres.
+    """
     sides = ConvexHull(corners).equations
     room, reach = -(sides[:, :3] @ middle + sides[:, 3]), arms @ sides[:, :3].T
     longest = np.min(np.where(reach > 0.0, room / np.where(reach > 0.0, reach, 1.0), np.inf))
@@ -695,18 +746,21 @@ def _within(corners: np.ndarray, middle: np.ndarray, arms: np.ndarray) -> float:
 
 
 def _mount(body: Body) -> str:
-    """Return the name of the pivot at which a body is held."""
+    """Return the name of the pivot at which a body is held: ``centre`` if it has one, else its origin."""
     return "centre" if "centre" in body.pivots else ORIGIN
 
 
 def _upward(path: str) -> Iterator[str]:
-    """Yield the path itself, its parent, and so on."""
+    """Yield a body's path, then its parent's, and so on up to the root."""
     while path:
         yield path
         path = path.rpartition("/")[0]
 
 
 def _unit_load(axis: int, about: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the temperature field of a gradient of 1 K/m along an axis."""
+    """Return the function from points to temperatures for a gradient of 1 K/m along an axis.
+
+    The temperature change is zero at the point ``about``.
+    """
     # The load is zero at the point about which the uniform part, the body's expansion, is taken.
     return lambda points: points[:, axis] - about[axis]

@@ -49,7 +49,7 @@ Focus = Literal["free"] | Annotated[float, Quantity(LENGTH, smallest="0 m", larg
 
 
 class ReadingsSpec(Spec):
-    """Base of all kinds of measurement.
+    """Base of all kinds of measurement of an instrument as built.
 
     Attributes
     ----------
@@ -209,7 +209,7 @@ class MtfReadingsSpec(ReadingsSpec):
 class DistortionReadingsSpec(ReadingsSpec):
     """Positions of images along the line CCD at known angles, which determine principal distance and distortion.
 
-    The zero of the angles is a free parameter.
+    The zero of the angles is unknown and is estimated.
 
     Attributes
     ----------
@@ -430,7 +430,7 @@ class MeasurementsSpec(Spec):
         return self
 
     def named(self) -> Iterator[tuple[str, str, ReadingsSpec]]:
-        """Iterate over kind, name and content of each measurement."""
+        """Iterate over kind (such as ``mtf``), name and content of each measurement."""
         for kind in type(self).model_fields:
             for name, measurement in getattr(self, kind).items():
                 yield kind, name, measurement
@@ -473,7 +473,7 @@ class MoveSpec(Spec):
     Attributes
     ----------
     by : dict[str, str | float]
-        Actuator -> amount of its move.
+        Actuator -> amount of its move, with its unit.
     """
 
     by: Annotated[dict[Name, Amount], AfterValidator(_some_amounts)]
@@ -485,7 +485,7 @@ class SimulatedInstrumentSpec(Spec):
     Attributes
     ----------
     law : {'normal', 'uniform'}
-        Probability distribution of its motions, with the covariance of the prior.
+        Probability distribution of the motions of its bodies, with the covariance of the prior.
     prior : str | None
         Disturbances file from which the instrument is drawn; by default that of the estimate.
     seed : int
@@ -519,9 +519,10 @@ class AsBuiltSpec(Spec):
     candidates : MeasurementsSpec
         Measurements that could be made next; the report compares their benefit.
     draws : int
-        Number of states drawn from the posterior and traced for the merits.
+        Number of random states of the instrument, drawn from the estimate and its covariance, that are traced for the
+        merits.
     seed : int
-        Seed of these draws.
+        Seed of these random states.
     simulate : SimulatedInstrumentSpec | None
         Simulated instrument instead of measured data; by default the data are measured.
     """
@@ -561,13 +562,13 @@ class AsBuiltSpec(Spec):
 
 
 def unknown_within(text: str, found: object, names: Mapping[str, Any], within: tuple[str, ...]) -> Problem:
-    """Return the problem of an unknown name at a key below."""
+    """Return the problem of a name, used at a key below this mapping, that does not exist."""
     problem = unknown(text, found, tuple(names))
     return Problem(problem.problem, problem.found, problem.allowed, problem.suggestion, within=within)
 
 
 class AsBuiltSetup(ExperimentSetup[AsBuiltSpec]):
-    """Estimate of an instrument as built, with its instrument and its prior.
+    """Estimate of an instrument as built, with the content of the instrument's and the prior's files.
 
     Attributes
     ----------
@@ -582,7 +583,7 @@ class AsBuiltSetup(ExperimentSetup[AsBuiltSpec]):
 
     @classmethod
     def parts(cls, test: AsBuiltSpec) -> dict[str, Any]:
-        """Return the nominal job, and the disturbances from which a simulated instrument is drawn."""
+        """Read the nominal job, and the disturbances from which a simulated instrument is drawn, by field."""
         base, simulated = resolve_on(test, test.instrument, test.prior), test.simulate
         if simulated is None or simulated.prior is None:
             return {"base": base}

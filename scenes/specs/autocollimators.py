@@ -129,12 +129,12 @@ class MirrorsSpec(Spec):
 
 
 class StandSpec(Spec):
-    """Half angle theta between the mirrors in the main series about each axis.
+    """Half of the angle between the two mirrors on the turntable in the main series about each axis.
 
     Attributes
     ----------
     X, Y, Z : float
-        Half angle theta for rotations about this axis, in radians.
+        Half of the angle between the mirrors for rotations about this axis, in radians.
     """
 
     X: HalfAngle
@@ -143,7 +143,7 @@ class StandSpec(Spec):
 
 
 class ProgrammeSpec(Spec):
-    """Programme of rotations.
+    """Programme of rotations of the turntable, of which the autocollimators take readings.
 
     Attributes
     ----------
@@ -167,7 +167,9 @@ class ProgrammeSpec(Spec):
 
 
 class BenchErrorsSpec(Spec):
-    """Standard deviations of the bench's errors, all independent and normally distributed, drawn from the seed.
+    """Standard deviations of the errors of the test set-up.
+
+    All errors are independent and normally distributed, and are drawn from the seed.
 
     Attributes
     ----------
@@ -205,7 +207,7 @@ class AutocollimatorTestSpec(TitledSpec):
     programme : ProgrammeSpec
         Programme of rotations.
     errors : BenchErrorsSpec
-        Errors of the bench.
+        Errors of the test set-up.
     """
 
     autocollimator: AutocollimatorSpec

@@ -114,7 +114,7 @@ PhotonRange = tuple[instruments.Photons, instruments.Photons]
 class BeamRangesSpec(Spec):
     """Ranges, [smallest, largest], in which the search may vary each beam of a monitor.
 
-    A quantity without a range keeps its value of the start.
+    A quantity without a range keeps its value in the instrument to start from.
 
     In a pair each beam exists four times, mirrored: at both ends of the line of both cameras.
 
@@ -208,9 +208,9 @@ class PrismChoiceSpec(Spec):
     Attributes
     ----------
     prism_180 : TransferChoiceSpec
-        Replacement of the start's lateral-transfer prism.
+        Replacement of the lateral-transfer prism of the instrument to start from.
     prism_0 : ShiftChoiceSpec
-        Replacement of the start's rhomboid.
+        Replacement of the rhomboid of the instrument to start from.
     """
 
     prism_180: TransferChoiceSpec
@@ -245,7 +245,7 @@ class MonitorGoalSpec(Spec):
 
     @property
     def wanted(self) -> dict[str, float]:
-        """Goals that the file sets, by name, in SI units."""
+        """Goals that the file sets: name -> largest standard deviation, in SI units."""
         return {name: value for name in type(self).model_fields if (value := getattr(self, name)) is not None}
 
 
@@ -288,7 +288,7 @@ class MonitorSearchSpec(Spec):
     changed : int
         Number of beams that each round tries.
     exact : int
-        Number of layouts that are modelled completely after the first draw and after each round.
+        Number of layouts that are modelled completely at the beginning and after each round.
     refine : int
         Largest number of steps by exact gradients that finally improve the best layout.
     starts : int
@@ -323,15 +323,15 @@ class MonitorDesignSpec(Spec):
     vary : BeamRangesSpec
         Ranges in which each beam may vary.
     prisms : Mapping[str, PrismChoiceSpec] | None
-        Name of your choice -> pair of prisms that a beam may have; by default those of the start.
+        Name of your choice -> pair of prisms that a beam may have; by default those of the instrument to start from.
     area_ccds : Mapping[str, AreaCcdChoiceSpec] | None
-        Name of your choice -> area CCD that all channels may have; by default that of the start.
+        Name of your choice -> area CCD that all channels may have; by default that of the instrument to start from.
     central_material : str | None
-        Glass of the central prism; by default that of the start.
+        Glass of the central prism; by default that of the instrument to start from.
     photons_per_frame : float | None
-        Photons of every spot per frame; by default those of the start.
+        Photons of every spot per frame; by default those of the instrument to start from.
     frames : int | None
-        Number of frames in a measurement; by default that of the start.
+        Number of frames in a measurement; by default that of the instrument to start from.
     goal : MonitorGoalSpec
         Standard deviations to be reached.
     limits : MonitorLimitsSpec
@@ -630,7 +630,7 @@ class CameraSpec(TitledSpec):
 
     @property
     def light(self) -> SpectrumSpec | None:
-        """Light for polychromatic image quality, None if there is none.
+        """Light for polychromatic image quality; None if the camera specifies none.
 
         It is the camera's spectrum, else that of its panchromatic band, else that of its first band.
         """
@@ -708,14 +708,15 @@ class CameraDesignSpec(Spec):
     vary : Mapping[str, tuple[{'radius', 'conic', 'A4', 'A6', 'A8', 'z'}, ...]]
         Name of a mirror, or ``image`` -> list of its variables.
     envelope : float | None
-        Largest extent along the parent axis over all mirrors and the image, relative to the start's; free by default.
+        Largest extent along the parent axis over all mirrors and the image, relative to that of the camera to start
+        from; free by default.
     clearance : float
         Smallest distance, in the plane of symmetry, of every beam from the edge of every mirror and of the focal plane
         that it passes, in metres.
     anamorphism : float | None
         Largest relative difference of the focal length along the line from that across it; free by default.
     steps : int
-        Number of steps in which the envelope is reduced from the start's to the goal's.
+        Number of steps in which the envelope is reduced from that of the camera to start from to the goal.
     starts : int
         Number of starting points: the camera itself with the envelope reduced in steps, the same at once, and others
         drawn at random about it. Each one leads to one local optimum.

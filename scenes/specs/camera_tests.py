@@ -148,6 +148,8 @@ class MountSpec(Spec):
 class MissetSpec(Spec):
     """Standard deviations of the initial misalignment of the focal-plane assembly relative to the optics.
 
+    X', Y' and Z' are the axes of the assembly: flight direction, line and normal.
+
     Attributes
     ----------
     rotate : tuple[float, float, float]

@@ -91,9 +91,10 @@ def no_such_time(time: float, times: Sequence[float], allowed: str) -> Problem:
 
 
 class TemperatureCourse(Spec):
-    """Temperature change of a body at each time of the course: change + gradient . r.
+    """Temperature change of a body at each time of the course.
 
-    It also applies to the bodies that it carries without an entry. A quantity that is left out is zero at all times.
+    It is `change` plus the scalar product of `gradient` and the position from the body's origin. It also applies to the
+    bodies that it carries without an entry. A quantity that is left out is zero at all times.
 
     Attributes
     ----------

@@ -83,17 +83,20 @@ class TemperatureSigmaSpec(Spec):
 
 
 class TimeLawSpec(Spec):
-    """Time law of a disturbance in a series of measurements.
+    """Time law of a disturbance in a series of measurements: how its values at different times are related.
 
-    The correlation between times t and t' is
+    Laws of random processes, by the correlation of the values at two times t and t':
 
-        white: 1 at the same time, 0 at any other; constant: 1. drift D: exp(-|t - t'| / D).  period T: cos(2 pi (t -
-        t') / T).  Both: their product.
+    - white: 1 at the same time, 0 at any other; constant: 1
+    - drift D: exp(-|t - t'| / D), with D the value of the key `drift`
+    - period P: cos(2 pi (t - t') / P); together with a drift, the product of both
 
-    The other laws are functions of time with a random amplitude; the standard deviation is that of the amplitude:
+    Laws of functions of the time t with a random amplitude, whose standard deviation is that of the disturbance:
 
-        trend S: (t - since) / S.  relaxation R: 1 - exp(-(t - since) / R) from `since` on, 0 before. event E: 1 from E
-        on, 0 before.  jump: an event at an unknown time; jump T: one in T on average.
+    - trend S: (t - since) / S
+    - relaxation R: 1 - exp(-(t - since) / R) from `since` on, 0 before
+    - event E: 1 from the time E on, 0 before
+    - jump: an event at an unknown time; jump J: one in a time J on average
 
     A trend can be multiplied by a period (a growing oscillation), an event by drift and period (a disturbance that
     begins at a known time).

@@ -29,9 +29,10 @@ HEAT_KEYS = ("table", "frame", "values", "unit", "field", "sha256")
 
 
 class TemperatureSpec(Spec):
-    """Temperature change of a body, and of the bodies that it carries without an entry: change + gradient .
+    """Temperature change of a body, linear in the position, and of the bodies that it carries without an entry.
 
-    r. It replaces the change that the body would inherit, even if it is zero.
+    At a point it is `change` plus the scalar product of `gradient` and the point's position from the body's origin. It
+    replaces the change that the body would inherit, even if it is zero.
 
     Attributes
     ----------
@@ -56,7 +57,9 @@ class TemperatureSpec(Spec):
 
 
 class TableTemperatureSpec(TemperatureSpec):
-    """Temperature change of a body: change + gradient . r, to which a table of nodes is added.
+    """Temperature change of a body: a linear field, to which a table of temperatures at nodes is added.
+
+    The linear field is `change` plus the scalar product of `gradient` and the position from the body's origin.
 
     Attributes
     ----------
