@@ -1,4 +1,4 @@
-"""Course: temperatures and motions of an instrument that change with time, from a job's file or a CSV table."""
+"""Course of a job: temperatures and motions of an instrument over time, from the job's file or a CSV table."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -85,7 +85,7 @@ def moment(time: float) -> str:
 
 
 def no_such_time(time: float, times: Sequence[float], allowed: str) -> Problem:
-    """Return the problem of a time, in seconds, that a course does not have."""
+    """Return the problem of a time, in seconds, that is not one of the times of a course."""
     near = min(times, key=lambda candidate: abs(candidate - time))
     return Problem("not one of the course's times", moment(time), allowed, moment(near))
 
@@ -131,11 +131,11 @@ class MotionCourse(Spec):
 
     @property
     def series(self) -> Mapping[str, tuple[Any, ...] | None]:
-        """Name of a quantity -> its values, one for each time."""
+        """Name of a quantity (rotate, shift, scale) -> its values, one for each time; None if the file has none."""
         return {"rotate": self.rotate, "shift": self.shift, "scale": self.scale}
 
     def at(self, k: int) -> "NodeMotion":
-        """Return the motion at time number ``k``."""
+        """Return the motion of the body at time number ``k`` of the course, counted from 0."""
         return NodeMotion(
             NO_MOTION if self.rotate is None else self.rotate[k],
             NO_MOTION if self.shift is None else self.shift[k],
@@ -155,11 +155,11 @@ class NodeMotion:
 
 
 class CourseSpec(Spec):
-    """Series of states: at each time the job's perturbation, with these temperatures and motions added.
+    """Series of states of an instrument at given times.
 
-    A body listed under `temperature` has its own temperature at all times, even where the value is 0 K, instead of that
-    of its carrier. Rotation vectors, shifts and scales are added, component by component, to those of `perturb` for the
-    same node.
+    At each time these temperatures and motions are added to the job's perturbation. A body listed under `temperature`
+    has its own temperature at all times, even where the value is 0 K, instead of that of its carrier. Rotation vectors,
+    shifts and scales are added, component by component, to those of `perturb` for the same node.
 
     Attributes
     ----------
@@ -228,7 +228,7 @@ class CourseSpec(Spec):
         return len(self.times) - 1 if number is None else number
 
     def fields(self, k: int) -> dict[str, Temperature]:
-        """Return node path -> temperature change by the course at time number ``k``."""
+        """Return node path -> temperature change that the course causes at time number ``k``, counted from 0."""
         return {
             path: Temperature(
                 table.change[k] if table.change is not None else 0.0,
@@ -238,7 +238,7 @@ class CourseSpec(Spec):
         }
 
     def motions(self, k: int) -> dict[str, NodeMotion]:
-        """Return node path -> motion by the course at time number ``k``."""
+        """Return node path -> motion that the course causes at time number ``k``, counted from 0."""
         return {path: moves.at(k) for path, moves in self.motion.items()}
 
     def key(self, path: str, k: int) -> tuple[str | int, ...]:
@@ -262,7 +262,7 @@ _HEAD = re.compile(r"(?:(?P<node>\S+) +)?(?P<what>[a-z]+)(?: +(?P<axis>[a-z]))? 
 
 @dataclass(frozen=True)
 class _Column:
-    """Contents of a column.
+    """Meaning of a column in the table of a course.
 
     Attributes
     ----------
@@ -361,7 +361,7 @@ def _column(head: str, file: str, line: int) -> _Column:
 def _put(
     data: dict[str, Any], lines: dict[KeyPath, int], column: _Column, k: int, text: str, where: tuple[int, int]
 ) -> None:
-    """Store a cell in the plain data of a course."""
+    """Store the number in a cell of the table in the plain data of a course, with its line."""
     line, count = where
     if column.what == TIME:
         data["times"][k] = text

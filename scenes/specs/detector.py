@@ -122,7 +122,10 @@ class DetectorSpec(TitledSpec):
 
 
 def require_detector(setup: Spec, key: KeyPath, name: str, detectors: Mapping[str, DetectorSpec]) -> None:
-    """Raise `InputError` at ``key`` unless a set-up has the data sheet; a config.yaml may have been edited."""
+    """Raise `InputError` at ``key`` unless the data sheet ``name`` is among a set-up's detectors.
+
+    It may be missing because a user has edited a config.yaml.
+    """
     if name not in detectors:
         allowed = names_text(detectors) or "a data sheet of that name in `detectors:`"
         raise setup.error("no such detector in this file", key, found=name, allowed=allowed)

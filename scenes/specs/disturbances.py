@@ -40,7 +40,7 @@ NONE = "none"
 
 
 def _spread(kind: units.Kind, largest: str) -> Quantity:
-    """Return the annotation of a standard deviation."""
+    """Return the field type of a standard deviation: a quantity of a kind with a largest value."""
     return Quantity(kind, smallest=f"0 {kind.units[0]}", largest=largest)
 
 
@@ -145,7 +145,7 @@ class TimeLawSpec(Spec):
 
     @property
     def text(self) -> str:
-        """Law in words."""
+        """Time law in words, for messages and reports."""
         parts: list[str] = [self.kind or ""]
         for name in (*_TIMES, "since"):
             time = getattr(self, name)
@@ -154,12 +154,12 @@ class TimeLawSpec(Spec):
 
 
 _TIMES = ("drift", "period", "trend", "relaxation", "event", "jump")
-"""Keys that define a law."""
+"""Keys of `time:` that define a time law."""
 _PRODUCTS = (
     *({"trend"}, {"trend", "period"}, {"relaxation"}, {"jump"}),
     *({"event"}, {"event", "drift"}, {"event", "period"}, {"event", "drift", "period"}),
 )
-"""Combinations of keys that are allowed, besides drift with period."""
+"""Combinations of keys of `time:` that are allowed, besides drift with period."""
 _LAWS = (
     "white, constant, jump, {drift: 6 h}, {period: 95 min}, {trend: 365 d}, {relaxation: 30 d, since: 0 h}, "
     "{event: 12 h}, {jump: 400 d}"
@@ -172,7 +172,7 @@ Reason = Annotated[Text, Field(min_length=1)]
 FigureSigmas = Annotated[dict[Term, FigureSigma], AfterValidator(FrozenMap)]
 TimeLaw = Annotated[TimeLawSpec, short_for("kind", str, schema=Literal["white", "constant", "jump"] | TimeLawSpec)]
 MOVES = ("shift", "rotate", "scale", "figure", "radius", "conic", "temperature", "index_gradient")
-"""Keys of a cause that hold standard deviations."""
+"""Keys of a cause that hold standard deviations of motions and changes."""
 
 
 def _check_matrix(rows: tuple[tuple[float, ...], ...], count: int, within: KeyPath = ()) -> None:
@@ -406,7 +406,7 @@ class JointSpec(Spec):
 
     @staticmethod
     def _row(path: Path, line: int, cells: list[str], count: int) -> list[float]:
-        """Return a row of correlations; raise `InputError` if it is invalid."""
+        """Return the numbers in a row of the correlation table; raise `InputError` if one is not a correlation."""
         allowed = f"{count} numbers from -1 to 1"
         if len(cells) != count:
             raise InputError(Issue("not a row of this table", str(path), line, (), f"{len(cells)} cells", allowed))
@@ -423,7 +423,7 @@ class JointSpec(Spec):
 
 
 class _CauseKeys(Spec):
-    """Keys of a cause, all optional."""
+    """Keys that a cause in a disturbances file may have, all optional."""
 
     bodies: Annotated[BodyPatterns | None, NOT_EMPTY] = None
     shift: Annotated[ShiftSigma | None, NOT_EMPTY] = None
@@ -442,7 +442,7 @@ class _CauseKeys(Spec):
 
 
 class CauseSpec(_CauseKeys):
-    """Cause of change: its bodies, and the standard deviation of each component of their motions.
+    """Cause of change, such as the launch: its bodies, and the standard deviations of their motions and changes.
 
     Components are independent unless `together` or `correlations` say otherwise.
 
@@ -492,16 +492,16 @@ class CauseSpec(_CauseKeys):
 
 
 class CauseChangeSpec(_CauseKeys):
-    """Change by a job of a cause in the disturbances file, key by key.
+    """Change, made by a job, of a cause in the disturbances file; only the keys given are replaced.
 
     A cause that the file does not have needs all keys that a cause needs.
 
     Attributes
     ----------
     bodies, shift, rotate, scale, figure, radius, conic, temperature, index_gradient
-        Replacement of this key of the cause; see there.
+        New value of this key, with the meaning and the unit that it has in a cause of the file.
     pivot, together, correlations, time, reason
-        Replacement of this key of the cause; see there.
+        New value of this key, with the meaning and the unit that it has in a cause of the file.
     """
 
     @property
@@ -645,7 +645,7 @@ AngleErrors = Annotated[
 
 
 class ErrorBudgetSpec(Spec):
-    """Error budget of a monitor, whose lines are the causes of the disturbances.
+    """Error budget of a monitor, which lists the error that each cause of disturbance contributes.
 
     Attributes
     ----------

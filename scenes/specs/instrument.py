@@ -108,7 +108,7 @@ class Channel:
         return f"{BASE}/{self.camera}/monitor/{self.name}/{prism}"
 
     def prism_elements(self, prism: str) -> str:
-        """Return the prefix of the names of the elements of one of ``PRISMS``."""
+        """Return the prefix of the names of the optical elements of one of the channel's ``PRISMS``."""
         return f"{self.key}/{prism}"
 
     @property
@@ -129,7 +129,7 @@ MadeOf = Annotated[str, Field(strict=True), Catalogued(lambda name: _spelt(name)
 
 
 def _spelt(name: str) -> str:
-    """Return a material's name in the spelling of the catalogue; an unknown name unchanged."""
+    """Return a material's name in the spelling of the catalogue; an unknown name is returned unchanged."""
     try:
         return material(name).name
     except KeyError:
@@ -152,7 +152,7 @@ def _check_faces(errors: Mapping[str, tuple[float, float]], reflector: Reflector
 
 
 def check_made(from_design: str, reflector: Reflector) -> None:
-    """Raise `Problem` for a material that a reflector cannot be made of."""
+    """Raise `Problem` if a reflector cannot be made of a material: glass for prisms, any material for frames."""
     names = GLASSES if reflector.transparent else MATERIALS
     if from_design not in names:
         what = "no such glass" if reflector.transparent else "no such material"
@@ -390,7 +390,7 @@ class ChannelSpec(Spec):
 
 @dataclass(frozen=True)
 class ChannelParts:
-    """Parts of a channel after the defaults of the monitor; see `ChannelSpec`."""
+    """Parts of a channel, with the monitor's parts where the channel has none of its own; keys as in `ChannelSpec`."""
 
     field: float
     pupil_offset: tuple[float, float]
@@ -437,7 +437,7 @@ class MountedCameraSpec(Spec):
 
     @property
     def mirrored(self) -> MountedCameraSpec:
-        """Camera with every beam through the opposite part of the pupil."""
+        """The same camera with all monitor beams through the opposite part of the pupil."""
         if self.pupil_offset is not None:
             x, y = self.pupil_offset
             return self.model_copy(update={"pupil_offset": (-x, -y)})
@@ -692,7 +692,7 @@ class AsBuiltInstrumentSpec(TitledSpec):
     disturbances: Ref | None = None
 
     def from_design(self, design: InstrumentSpec, disturbances: str | None = None) -> InstrumentSpec:
-        """Return this instrument, made from its design.
+        """Return the instrument as built: the designed one with these deviations.
 
         Parameters
         ----------
@@ -708,7 +708,7 @@ class AsBuiltInstrumentSpec(TitledSpec):
 
 
 def as_built_of(state: State) -> FrozenMap[str, PlainPerturbationSpec]:
-    """Return a state of an instrument in the form of `as_built`.
+    """Return the motions and shape changes of a state in the form of `as_built` in an instrument's file.
 
     Parameters
     ----------

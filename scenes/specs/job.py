@@ -102,12 +102,12 @@ class PerturbationSpec(PlainPerturbationSpec):
         )
 
     def uses(self) -> tuple[str, ...]:
-        """Return the actions that have an effect, deformation last."""
+        """Return the names of the changes that have an effect, such as ``shift``; ``deformation`` comes last."""
         return (*super().uses(), *(("deformation",) if self.deformation is not None else ()))
 
 
 def _some(images: tuple[str, ...]) -> tuple[str, ...]:
-    """Return every image once, the spots first."""
+    """Return the requested images without repetitions, the spots first."""
     if not images:
         raise Problem("nothing to render", "an empty list", "[spots]")
     return tuple(dict.fromkeys(("spots", *images)))
@@ -129,7 +129,7 @@ class StraySpec(Spec):
 
 
 def _switch(value: Any) -> Any:
-    """Replace `stray: true` by the defaults and `stray: false` by None."""
+    """Replace the value `true` of `stray` by a mapping of defaults, and `false` by None."""
     return {True: {}, False: None}[value] if isinstance(value, bool) else value
 
 
@@ -201,7 +201,7 @@ class AnalysisSpec(Spec):
 def pivot_problem(
     perturb: Mapping[str, PlainPerturbationSpec], course: CourseSpec, within: KeyPath = ()
 ) -> Problem | None:
-    """Return the problem of a course that rotates a node about another pivot than the job's perturbation.
+    """Return the problem of a course that rotates a node about a pivot that differs from the one in the perturbation.
 
     Parameters
     ----------
@@ -291,7 +291,7 @@ def _with_course(job: JobSpec) -> JobSpec:
 
 
 def with_tables(job: JobSpec) -> JobSpec:
-    """Return the job with its tables read.
+    """Return the job with the content, or the checksums, of the tables to which it refers.
 
     The content of the course's table replaces the reference to it. The tables of nodes and of finishes get their
     absolute paths and checksums.

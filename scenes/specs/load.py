@@ -62,7 +62,13 @@ def _instrument_file(reference: str | Path, owner: Spec | None, key: KeyPath) ->
 
 
 def load_error_budget(name_or_path: str | Path) -> ErrorBudgetSpec:
-    """Read an error budget; arguments and errors as in `load_instrument`."""
+    """Read an error budget, given by its name in the library or its path.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read or is not valid, or there is no such file.
+    """
     return load_named(ErrorBudgetSpec, BUDGETS, name_or_path)
 
 
@@ -127,7 +133,22 @@ _OTHERS = {"job", "study", "test", "detector", "camera"}
 
 
 def load_disturbances(reference: str | Path, owner: Spec | None = None, key: KeyPath = ()) -> DisturbancesSpec:
-    """Read a disturbances file; arguments and errors as in `load_instrument`."""
+    """Read a disturbances file.
+
+    Parameters
+    ----------
+    reference : str | Path
+        Name in the library, path, or the mapping itself, as in a file of the twin.
+    owner : Spec | None
+        Specification that has the reference; None for a path from the current folder.
+    key : KeyPath
+        Key of the reference in the owner.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read or is not valid, or there is no such file.
+    """
     return load_named(DisturbancesSpec, DISTURBANCES, reference, owner, key).with_tables()
 
 
@@ -176,7 +197,22 @@ def load_cameras(instrument: InstrumentSpec) -> FrozenMap[str, CameraSpec]:
 
 
 def load_camera(reference: str | Path, owner: Spec | None = None, key: KeyPath = ()) -> CameraSpec:
-    """Read a camera; arguments and errors as in `load_instrument`."""
+    """Read a camera's file.
+
+    Parameters
+    ----------
+    reference : str | Path
+        Name in the library, path, or the mapping itself, as in a file of the twin.
+    owner : Spec | None
+        Specification that has the reference; None for a path from the current folder.
+    key : KeyPath
+        Key of the reference in the owner.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read or is not valid, or there is no such file.
+    """
     text = read_reference(CAMERAS, reference, owner, key)
     if isinstance(text.data, dict) and DESIGN in text.data:
         problem = "an instrument as built is not a prescription of a camera"
@@ -186,14 +222,32 @@ def load_camera(reference: str | Path, owner: Spec | None = None, key: KeyPath =
 
 
 def load_detector(reference: str | Path, owner: Spec | None = None, key: KeyPath = ()) -> DetectorSpec:
-    """Read a detector's data sheet; arguments and errors as in `load_instrument`."""
+    """Read a detector's data sheet.
+
+    Parameters
+    ----------
+    reference : str | Path
+        Name in the library, path, or the mapping itself, as in a file of the twin.
+    owner : Spec | None
+        Specification that has the reference; None for a path from the current folder.
+    key : KeyPath
+        Key of the reference in the owner.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read or is not valid, or there is no such file.
+    """
     return load_named(DetectorSpec, DETECTORS, reference, owner, key)
 
 
 def load_autocollimator_test(name_or_path: str | Path = "principle_experiment") -> AutocollimatorSetup:
-    """Read a test with two autocollimators and the data sheet of their CCDs.
+    """Read a test with two autocollimators, by name or path, and the data sheet of their CCDs.
 
-    Arguments and errors as in `load_instrument`.
+    Raises
+    ------
+    InputError
+        The file cannot be read or is not valid, or there is no such file.
     """
     spec = load_named(AutocollimatorTestSpec, LAB, name_or_path)
     key = ("autocollimator", "area_ccd", "detector")
@@ -235,9 +289,12 @@ def load_camera_under_test(test: TestType) -> tuple[TestType, CameraSpec]:
 
 
 def load_band_detectors(camera: CameraSpec) -> FrozenMap[str, DetectorSpec]:
-    """Return the data sheets of a camera's line CCDs by the references of the bands.
+    """Return reference of each band -> data sheet of its line CCD.
 
-    Errors as in `load_instrument`.
+    Raises
+    ------
+    InputError
+        The file cannot be read or is not valid, or there is no such file.
     """
     bands = camera.bands.items()
     return FrozenMap({b.detector: load_detector(b.detector, camera, ("bands", name, "detector")) for name, b in bands})
@@ -270,7 +327,7 @@ def load_named(
 
 
 def _names(folders: tuple[str, ...]) -> list[str]:
-    """Return all names in folders of the library, those of the first folder first."""
+    """Return the names of all files in some folders of the library, those of the first folder first."""
     return list(dict.fromkeys(name for folder in folders for name in library_names(folder)))
 
 
@@ -311,7 +368,13 @@ def read_reference(
 def find_named(
     folder: str, reference: str | Path, owner: Spec | None, key: KeyPath, others: tuple[str, ...] = ()
 ) -> Path:
-    """Return the file to which a name or a path leads; arguments and errors as in `read_reference`."""
+    """Return the path of the file to which a name in the library or a path leads.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read or is not valid, or there is no such file.
+    """
     path = reference_path(folder, reference, owner)
     folders = (folder, *others)
     if path is None:
@@ -325,7 +388,13 @@ def find_named(
 
 
 def portable_reference(folder: str, reference: str, owner: Spec, key: KeyPath, others: tuple[str, ...] = ()) -> str:
-    """Return a reference that is valid from any folder; arguments and errors as in `read_reference`."""
+    """Return a reference that is valid from any folder: a library name, an absolute path, or a mapping.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read or is not valid, or there is no such file.
+    """
     if isinstance(reference, Inline):
         return reference.placed(owner.source, key)
     path = find_named(folder, reference, owner, key, others)

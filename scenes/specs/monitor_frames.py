@@ -27,7 +27,7 @@ from scenes.yaml.units import MOMENT, parse_quantity
 from scenes.yaml.yaml_file import LARGEST_BYTES
 
 ALL = "all"
-"""Name that stands for all channels."""
+"""Key instead of a channel's name for files that hold for all channels."""
 MOST_FILES, MOST_TIMES = 10_000, 1000
 
 
@@ -91,7 +91,7 @@ class GeometrySpec(Spec):
 
 
 class MeasurementSpec(Spec):
-    """Measurement of a monitor by frames before and after a change.
+    """Measurement of a monitor: changes of the cameras from frames recorded before and after.
 
     Attributes
     ----------
@@ -207,7 +207,7 @@ class MeasurementSpec(Spec):
 
 
 def per_channel(files: Any, channel: str) -> tuple[str, ...]:
-    """Return the files for one channel, or those for all; empty if there are none.
+    """Return the files for one channel, or the files for all channels; empty if there are none.
 
     Parameters
     ----------
@@ -227,7 +227,7 @@ _TIME_HEAD = re.compile(r"time *\[(?P<unit>[^\[\]]+)\]")
 
 
 class MeasurementSetup(ExperimentSetup[MeasurementSpec]):
-    """Measurement with the content of its references; the paths of its files are absolute.
+    """Measurement with the content of the files to which it refers; paths of frames are absolute.
 
     Attributes
     ----------
@@ -242,7 +242,7 @@ class MeasurementSetup(ExperimentSetup[MeasurementSpec]):
 
     @classmethod
     def parts(cls, test: MeasurementSpec) -> dict[str, Any]:
-        """Return the instrument's model, the data sheet, and the measurement with absolute paths."""
+        """Read the instrument's model and the data sheet, and make the paths of frames absolute; by field."""
         model = None if test.instrument is None else _model(test, test.instrument)
         if test.detector is not None:
             detector = load_detector(test.detector, test, ("detector",))
@@ -328,7 +328,10 @@ def _paths(spec: Spec, key: KeyPath, files: Iterable[str], base: Path) -> tuple[
 def _found(
     spec: MeasurementSpec, path: Path, channels: tuple[str, ...]
 ) -> tuple[dict[str, ChannelFramesSpec], tuple[float, ...]]:
-    """Return the frames in a folder or a table, and the times of a series; no times for a single state."""
+    """Return channel -> frames listed in a folder or a table, and the times of a series, in seconds.
+
+    There are no times for a single state.
+    """
     if is_file(path) and path.suffix.lower() == ".csv":
         return read_frame_table(path, channels)
     if is_file(path):

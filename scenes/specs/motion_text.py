@@ -26,9 +26,9 @@ KINDS = {
     "temperature": "DIFFERENCE",
     "gradient": "x|y|z DIFFERENCE/LENGTH",
 }
-"""Kind of a perturbation -> the rest of its text."""
+"""Kind of a perturbation -> form of the text after the kind, such as `x|y|z LENGTH`."""
 PURE = ("conic", "index")
-"""Kinds whose amounts are pure numbers."""
+"""Kinds of perturbation whose amounts are numbers without a unit."""
 NOTHING = {"shift": "0 um", "rotate": "0 arcsec", "gradient": "0 K/m"}
 """Kind of a vector -> value of the components that no text sets."""
 FORMS = (
@@ -143,16 +143,16 @@ def key_below(kind: str, axis: str) -> tuple[str | int, ...]:
 
 
 def put(keys: dict[str, Any], kind: str, axis: str, value: Any, nothing: Any) -> None:
-    """Store a component in a node's perturbation.
+    """Store one component, such as shift z, in the mapping of a node's perturbation.
 
     Parameters
     ----------
     keys : dict[str, Any]
         Perturbation, which is extended.
     kind : str
-        Kind as in ``key_below``.
+        Kind of the perturbation, one of ``KINDS``.
     axis : str
-        Axis as in ``key_below``.
+        ``x``, ``y`` or ``z``, a figure's term, or empty.
     value : Any
         Value of the component.
     nothing : Any
@@ -178,7 +178,9 @@ def _pure(kind: str, quantity: str, text: str) -> float:
 
 
 def perturbation_in_words(texts: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Return ``perturb`` of a job's file for a list of texts. Nodes keep the names of the texts.
+    """Return the mapping `perturb` of a job's file that a list of texts describes.
+
+    Nodes keep the names of the texts.
 
     Parameters
     ----------

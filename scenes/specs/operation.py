@@ -38,7 +38,7 @@ ENDINGS: Mapping[str, tuple[Kind, str]] = FrozenMap(
         "percent": (SCALE, "percent"),
     }
 )
-"""Suffix of a quantity's key -> kind of quantity and its unit."""
+"""Suffix of a quantity's key, such as `arcsec` -> kind of quantity and its unit."""
 MOST_REQUIREMENTS, MOST_CAUSES = 100, 100
 Span = Annotated[float, Quantity(MOMENT, above_zero=True, largest="1000000 h")]
 Causes = Annotated[
@@ -96,22 +96,22 @@ class RequirementSpec(Spec):
 
     @property
     def group(self) -> str:
-        """Name of a camera, ``intersection_angle`` or ``ground``."""
+        """Group of the quantity: name of a camera, ``intersection_angle`` or ``ground``."""
         return self.quantity.split()[0]
 
     @property
     def key(self) -> str:
-        """Key of the reading, which ends in its unit."""
+        """Key of the estimated quantity, such as ``d_alpha_arcsec``, which ends in its unit."""
         return self.quantity.split()[1]
 
     @property
     def name(self) -> str:
-        """Group and key, separated by a space."""
+        """Full name of the quantity: group and key, separated by a space."""
         return f"{self.group} {self.key}"
 
     @property
     def largest(self) -> float:
-        """Limit in the unit in which the key ends."""
+        """Largest absolute value allowed, as a number in the unit in which the key ends."""
         kind, unit = self._kind
         return parse_quantity(self.limit, kind) / parse_quantity(f"1 {unit}", kind)
 
@@ -165,7 +165,7 @@ class OperationSpec(Spec):
 
 
 class OperationSetup(Spec):
-    """Plan with the content of its references, so that one text documents the analysis of a record.
+    """Plan of operation with the content of all files to which it refers.
 
     Attributes
     ----------
@@ -180,7 +180,7 @@ class OperationSetup(Spec):
 
     @property
     def disturbances(self) -> DisturbancesSpec:
-        """Expected disturbances."""
+        """Expected disturbances of the instrument over the mission."""
         assert self.model.disturbances is not None  # a plan requires them
         return self.model.disturbances
 
@@ -197,9 +197,12 @@ def read_operation(path: str | Path) -> OperationSetup:
 
 
 def resolve_operation(spec: OperationSpec) -> OperationSetup:
-    """Return a plan with the content of its references, which are valid from any folder.
+    """Return a plan of operation with the content of all files to which it refers.
 
-    Errors as in `read_operation`.
+    Raises
+    ------
+    InputError
+        A file cannot be read or is not valid, or an event refers to a cause that does not exist.
     """
     update: dict[str, str] = {}
     for key, folder, others in (("instrument", INSTRUMENTS, ("cameras",)), ("disturbances", DISTURBANCES, ())):

@@ -32,15 +32,27 @@ from scenes.yaml.yaml_file import read_yaml
 
 
 def load_three_line_camera(reference: str | Path, owner: Spec | None = None, key: KeyPath = ()) -> ThreeLineCameraSpec:
-    """Read a three-line payload; arguments and errors as in `load_instrument`."""
+    """Read the file of a three-line payload.
+
+    Parameters
+    ----------
+    reference : str | Path
+        Name in the library, path, or the mapping itself, as in a file of the twin.
+    owner : Spec | None
+        Specification that has the reference; None for a path from the current folder.
+    key : KeyPath
+        Key of the reference in the owner.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read or is not valid, or there is no such file.
+    """
     return load.load_named(ThreeLineCameraSpec, load.PAYLOADS, reference, owner, key)
 
 
 def _line_detectors(camera: ThreeLineCameraSpec) -> FrozenMap[str, DetectorSpec]:
-    """Return the data sheets of a payload's line CCDs by the references of its image sections.
-
-    Errors as in `load_instrument`.
-    """
+    """Return reference of each image section of a payload -> data sheet of the line CCD."""
     sections: list[tuple[KeyPath, LineImageSpec | None]] = [(("image",), camera.image)]
     sections += [(("lines", name, "image"), line.image) for name, line in camera.lines.items()]
     return FrozenMap(
