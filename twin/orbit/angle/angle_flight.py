@@ -54,7 +54,8 @@ class AngleCamera:
     cameras : Mapping[str, LineCamera]
         Line -> camera as it is in orbit.
     trace : Mapping[str, float]
-        Angle -> its change by `twin.monitor.truth.trace_truth`, in radians; only for the two cameras of a pair.
+        Angle -> its change by exact ray trace (`twin.monitor.truth.trace_truth`), in radians; only for the two cameras
+        of a pair.
     """
 
     laboratory: Mapping[str, LineCamera]
@@ -172,7 +173,7 @@ class Measurement:
 
     @classmethod
     def of(cls, laboratory: LineAngles, station: Station, strips: Mapping[str, Strip]) -> Measurement:
-        """Return the measurement of a station and points, with the laboratory's interior of the lines' pixels.
+        """Return the measurement of a station and points, with the laboratory's interior orientation of the lines.
 
         Parameters
         ----------
@@ -230,8 +231,8 @@ class AnglePass(LineAngles):
     laboratory : Mapping[str, LineCamera]
         Line -> camera as it was measured before launch.
     trace : Mapping[str, float]
-        Angle -> its change by `twin.monitor.truth.trace_truth`, in radians; empty where no trace of two cameras gives
-        it.
+        Angle -> its change by exact ray trace (`twin.monitor.truth.trace_truth`), in radians; empty for lines that are
+        not the two cameras of a traced pair.
     height : Mapping[str, (n,) ndarray for n points]
         Line -> heights of its points above the ellipsoid, in metres.
     """

@@ -432,7 +432,7 @@ def _geometry_figure(run: SimulatedAngleRun) -> Figure:
 
 
 def _sensitivity_figure(run: SimulatedAngleRun, shows: list[tuple[str, str]]) -> Figure:
-    """Draw the difference between resection and planes against errors of 0 to 10 m."""
+    """Draw the angles of resection minus those of planes against errors of 0 to 10 m of station or ground points."""
     rows = {(row.what, row.axis): row for row in run.table}
     figure = svg.new_figure(3.2 * ((len(shows) + 1) // 2))
     grid = figure.subplots((len(shows) + 1) // 2, min(len(shows), 2), sharey=True, squeeze=False)

@@ -149,7 +149,7 @@ its sigma from the observations alone.
 
 
 def block_report(run: BlockRun) -> Report:
-    """Return the report of a block adjustment."""
+    """Return the report of a block adjustment: accuracy on the ground, contribution of each sensor, and tests."""
     return Report(
         "Block adjustment", *_verdict(run), _facts(run), _summary(run), _sections(run), warnings=_warnings(run)
     )

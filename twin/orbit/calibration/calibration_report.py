@@ -24,19 +24,18 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import CalibrationSetup
 
 _FEW = 30
-"""Smallest number of degrees of freedom of the check points' intersections for which a small p-value is worth a
-warning.
+"""Smallest number of degrees of freedom of the check points' intersections at which a small p-value raises a warning.
 """
 _LEAST_CHANCE = 1e-3
 """p-value of the check points' intersections below which there is a warning."""
 _WIDE = 2.0
-"""Factor on the sigmas of a line's image points above which there is a warning."""
+"""Factor by which the residuals enlarge the sigmas of a line's image points above which there is a warning."""
 _MANY = 0.1
-"""Share of image points above which rejections raise a warning."""
+"""Share of rejected image points above which there is a warning."""
 
 
 def calibration_report(run: CalibrationRun) -> Report:
-    """Return the report of a calibration in orbit."""
+    """Return the report of a calibration in orbit: errors by scheme, parameters, fields, biases and warnings."""
     setup = run.setup
     plan, height = (values_of(run.before, what).mean() for what in ("plan_rms", "height_rms"))
     limits = setup.test.limits

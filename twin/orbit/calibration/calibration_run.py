@@ -123,8 +123,8 @@ class CalibrationRun:
     before : Mapping[str, CheckErrors]
         Errors at the check points with the laboratory's camera, by field.
     schemes : Mapping[str, Mapping[str, CheckErrors]]
-        Scheme, counted from "1" -> field -> errors at its check points; in the last scheme each field uses its own
-        parameters.
+        Scheme (set of fields whose parameters are averaged), counted from "1" -> field -> errors at its check points;
+        in the last scheme each field uses its own parameters.
     scheme_means : SchemeMeans or None
         Means of the errors over the fields; None where there is only one scheme of averaged parameters.
     latitude : tuple of LatitudeFit

@@ -29,7 +29,7 @@ from twin.orbit.images.patch import WRONG
 from twin.orbit.images.point_report import SORTS, points_png
 
 _SCALES = {"rad": (ARCSEC, "arcsec"), "rad/s": (1e-3 * ARCSEC, "mas/s"), "m": (1.0, "m")}
-"""Unit of an unknown in files -> size of the unit of tables, and its name."""
+"""Unit of an unknown in result files -> unit of the tables of the report, as its size in SI units and its name."""
 MOSTLY = 0.5
 """Share of an unknown's variance above which the prior of the launch determines it, not the points."""
 Rows = list[tuple[Cell, ...]]
@@ -68,7 +68,7 @@ def _figure(run: CalibrationRun, name: str, title: str, caption: str) -> SvgFigu
 
 
 def scheme_names(run: CalibrationRun) -> list[str]:
-    """Return the names of the schemes with the fields that they average; the last scheme averages nothing."""
+    """Return the names of the schemes, each a list of fields whose parameters are averaged; the last averages none."""
     names = [f"{k + 1}: {', '.join(s)}" for k, s in enumerate(run.campaign.spec.schemes)]
     return [*names, f"{len(names) + 1}: each field its own"]
 

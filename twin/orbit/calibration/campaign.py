@@ -157,10 +157,10 @@ class PassData:
 
     @property
     def phase(self) -> float:
-        """Time from a whole multiple of the attitude's reading interval to a reading, in seconds.
+        """Time from the nearest whole multiple of the attitude's reading interval to a reading, in seconds.
 
-        Readings of the orbit can differ from their own multiples by half their interval at most. The model of shared
-        noise neglects this: its variance is then that of another place between two readings.
+        Readings of the orbit can differ from their own multiples by half their interval at most. The model of noise
+        that readings share neglects this: its variance is then that of another point of time between two readings.
         """
         path = next(iter(self.sensors.values())).trajectory
         if not isinstance(path, TabulatedTrajectory):
@@ -582,7 +582,7 @@ class FieldPass:
         return replace(self, control_ground=ground, control=replace(self.control, ground=ground))
 
     def later(self, seconds: float) -> FieldPass:
-        """Return the pass with rays of the station and attitude `seconds` later; image points are not changed.
+        """Return the pass with rays from the station and attitude `seconds` later; image points do not change.
 
         Beyond the end of the readings, the motion is continued by reflecting that before the exposure.
         """

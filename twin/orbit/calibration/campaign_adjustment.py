@@ -85,9 +85,10 @@ def _rate_priors(campaign: Campaign, passes: Sequence[FieldPass], common: Sequen
 
 
 def calibrated_alone(campaign: Campaign, flight: FieldPass) -> Adjustment:
-    """Calibrate one field by itself, with paper 003's twelve unknowns without those that the gauge holds.
+    """Calibrate one field by itself, with paper 003's unknowns other than those that the gauge holds.
 
-    A rate of the attitude is added where the attitude drifts.
+    Paper 003 has twelve: principal distance and principal point of three lines, and the attitude biases about three
+    axes. A rate of the attitude is added where the attitude drifts.
 
     Parameters
     ----------

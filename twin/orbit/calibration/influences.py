@@ -254,7 +254,7 @@ def datum_rows(campaign: Campaign) -> tuple[DatumRow, ...]:
 
 
 def _warned(campaign: Campaign, change: Mapping[str, float], size: float) -> float | None:
-    """Return the size of an error above which `unexpected_changes` reports it, in metres or seconds.
+    """Return the size of an error, in metres or seconds, above which `unexpected_changes` reports its effect.
 
     Parameters
     ----------

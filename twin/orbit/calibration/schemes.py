@@ -149,7 +149,7 @@ class Repeats:
 
 
 def values_of(errors: Mapping[str, CheckErrors], what: str) -> np.ndarray:
-    """Return the (fields,) RMS errors of one attribute of `RMS`, in metres."""
+    """Return one kind of RMS error, an attribute of `RMS`, of every field, as an array in metres."""
     return np.array([getattr(e, what) for e in errors.values()])
 
 
@@ -549,7 +549,8 @@ def without_monitor(campaign: Campaign) -> Treatment:
 def with_monitor(campaign: Campaign) -> Treatment:
     """Adjust a campaign with the monitor's readings.
 
-    The readings are observations where a field is calibrated, and correct the cameras where it is tested.
+    The readings enter the calibration of a field as observations, and correct the cameras when its check points are
+    intersected.
     """
 
     def drifted(flight: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray) -> CheckErrors:

@@ -26,7 +26,7 @@ from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.measured.pass_measurements import ImagePoints, listed
 
 _ROUNDS = 3
-"""Largest number of rounds in which the sigmas of image points are rescaled."""
+"""Largest number of rounds in which the adjustment is repeated with rescaled sigmas of image points."""
 _SETTLED = 1.05
 """Factor on the sigmas of all lines together below which no factor is applied; factors below 1 are never applied.
 Errors that the three lines' matches with one template have in common do not show in residuals, because they move the

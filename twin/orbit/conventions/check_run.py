@@ -118,7 +118,7 @@ class ValueTest:
 
     @property
     def possible(self) -> bool:
-        """True where the points do not exclude the value."""
+        """True where the points do not exclude this value of the convention."""
         return self.excess < DECIDED
 
 
@@ -272,7 +272,7 @@ def _best_reading(
 
 
 def _key(changes: Changes) -> frozenset[str]:
-    """Return a key of changes that does not depend on their order."""
+    """Return a key for dictionaries of a set of changed conventions that does not depend on their order."""
     return frozenset(f"{name}={value}" for name, value in changes)
 
 

@@ -333,7 +333,7 @@ def _turned(c: PassConventions) -> tuple[tuple[str, str, str], ...]:
 
 
 def _seconds(value: float) -> str:
-    """Return an offset in seconds as text."""
+    """Return an offset of the times, in seconds, as text for readers."""
     return f"{value:+g} s" if value else "none"
 
 
@@ -428,7 +428,7 @@ def changed(stated: PassConventions, changes: Changes) -> PassConventions:
 _TURN, _SHIFT, _DELAY, _RISE = 1e-5, 10.0, 1e-3, 10.0
 """Steps of the numerical derivatives: radians, metres, seconds, metres."""
 _TICKS = 1000
-"""Number of lines of the sensor, which only divide its time."""
+"""Number of lines of the auxiliary sensor, which only divide its span of time."""
 
 
 class ImpossibleError(ValueError):

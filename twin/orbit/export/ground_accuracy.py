@@ -28,7 +28,7 @@ from twin.orbit.flight.line_camera import LineCamera, corrected_line
 from twin.orbit.flight.sensor import OffsetPlatform, Sensor
 
 _GRID = (13, 13)
-"""Lines and pixels of an image at which errors are computed; they are smooth."""
+"""Number of lines and pixels of the grid over an image at which errors are computed; they vary smoothly."""
 _MOVED = 1.0
 """Step of the derivatives with respect to position, in metres."""
 _TURNED = 1e-6
@@ -375,8 +375,8 @@ _STEPS = (1e-7, 1e-7, 1e-7, 1e-6)
 while its coordinates are rounded to 1e-9 m.
 """
 _CHANGE_GRID = (3, 9)
-"""Lines and pixels of an image at which errors due to a camera's change are computed; they are smooth along a line and
-hardly change along the track.
+"""Number of lines and pixels of the grid over an image at which errors due to a camera's change are computed; they are
+smooth along a line and hardly change along the track.
 """
 
 

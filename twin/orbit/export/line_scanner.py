@@ -40,7 +40,7 @@ _FEWEST, _MOST = 64, 8192
 _PIXELS = 33
 """Number of positions along the line at which directions are compared; they are smooth to 1e-10 of a pixel."""
 _ROUNDS = 4
-"""Number of alternations between rotations and the common camera."""
+"""Number of alternations between fitting the rotations at all nodes and the camera that they share."""
 _CUBIC = (0, 2, 5, 9)
 """Indices of the terms 1, y, y^2 and y^3 among the distortion's ten; a line has no extent in x for the others."""
 
@@ -95,7 +95,7 @@ class EffectiveCamera:
 
 
 _NEWTON = 12
-"""Number of Newton steps that invert the distortion."""
+"""Number of Newton steps that invert the lens distortion."""
 
 
 def _power(coefficients: Array, at: Array) -> Array:

@@ -37,7 +37,7 @@ from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.platform_files import DimapScene
 
 _COMPARED = (15, 15, 3)
-"""Lines, pixels and heights at which polynomials are compared."""
+"""Number of lines, pixels and heights of the grid on which polynomials are compared with the rigorous model."""
 
 
 def with_quality(run: Export, uncertainty: CameraUncertainty | None, points: ControlPoints | None) -> Export:

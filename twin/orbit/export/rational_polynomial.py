@@ -31,7 +31,7 @@ from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.xml_file import Element, first_lines, numbers, read_xml, text_lines
 
 _GRID = (24, 24, 9)
-"""Lines, pixels and heights of the fit; the checks lie between them."""
+"""Number of lines, pixels and heights of the grid of the fit; the points at which it is checked lie between."""
 
 
 def sensor_polynomial(
@@ -233,7 +233,7 @@ def _from_tiff(path: Path) -> RationalPolynomial:
 _SLOPE_STEP = 10.0
 """Step of a derivative on the ground, in metres; polynomials are linear to 1e-9 over it."""
 _CORRECTED_GRID = (21, 21, 7)
-"""Lines, samples and heights to which corrected polynomials are fitted."""
+"""Number of lines, samples and heights of the grid to which corrected polynomials are fitted."""
 _GROUND_GRID = 5
 """Number of lines and of samples at which errors on the ground are computed."""
 _UNLIKELY = 0.05

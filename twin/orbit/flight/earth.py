@@ -202,7 +202,7 @@ class Earth:
 
     @classmethod
     def from_spec(cls, spec: EarthSpec) -> Earth:
-        """Make the Earth from the `earth` section of an input file."""
+        """Return the Earth with the UT1 and polar motion of the `earth` section of an input file."""
         return cls(spec.ut1_utc, spec.polar_motion)
 
     def rotation(self, epoch: str, first: float, last: float) -> EarthRotation:

@@ -74,7 +74,7 @@ class LightEffects:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the effects that are on, for reports."""
+        """Names of the effects that are on, as text for reports."""
         on = {"light time": self.light_time, "aberration": self.aberration, "refraction": self.refraction}
         return tuple(name for name, is_on in on.items() if is_on)
 

@@ -38,7 +38,7 @@ _ABSOLUTE = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3]) * 1e-5
 _LONGEST_STEP = 60.0
 """Longest integration step, in seconds."""
 _MOST_KEPT = 1 << 14
-"""Largest number of times whose positions and velocities an orbit caches until others are requested."""
+"""Largest number of times for which an orbit keeps positions and velocities in its cache."""
 _POLAR_RADIUS = EQUATORIAL_RADIUS * (1.0 - FLATTENING)
 
 
@@ -240,7 +240,7 @@ def _local_time(right_ascension: float, angle: float, ut1: tuple[float, float]) 
 
 
 def _solve(state: np.ndarray, end: float, tolerance: float) -> Any:
-    """Integrate a state (6,) at the epoch to the time `end`, seconds, and return the dense solution."""
+    """Integrate a state (position, velocity) at the epoch to the time `end`, s; return the dense solution."""
     forces = tuple(FORCES.values())
 
     def derivative(t: float, y: np.ndarray) -> np.ndarray:

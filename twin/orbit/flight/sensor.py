@@ -22,7 +22,7 @@ from twin.orbit.flight.light_effects import SPEED_OF_LIGHT, LightEffects, aberra
 from twin.orbit.flight.line_camera import LineCamera, LineTimes
 
 _MOST_STEPS = 30
-"""Largest number of Newton steps."""
+"""Largest number of Newton steps of the search for the line and pixel that see a ground point."""
 _ARRIVED = 1e-7
 """Length of the last Newton step, in pixels and lines, below which the search ends.
 

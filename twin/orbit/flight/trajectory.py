@@ -42,9 +42,11 @@ _RESOLVED = 10.0
 _LEAST, _MOST = 64, 4096
 """Smallest and largest number of sinusoids of a band."""
 _AT_ONCE = 4_000_000
-"""Largest number of phases held in memory at a time."""
+"""Largest number of phases of sinusoids that are evaluated at a time, to bound memory."""
 _MOMENTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
-"""Numbers of moments within a collection that are tried in turn."""
+"""Numbers of moments within a light collection that are tried in turn, until the image's position and smear are exact
+enough.
+"""
 
 
 @dataclass(frozen=True, eq=False)

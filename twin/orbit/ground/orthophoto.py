@@ -3,8 +3,8 @@
 Orthophoto and elevation model carry the same error in plan, a constant shift and a smooth part: the ground shown at a
 position of the map lies at that position minus the error.
 
-The reflectance is drawn: a fractal for wild vegetation, fields in blocks of one direction each, roads. It is kept in
-cells and used as the cubic B-spline of the cells' numbers, whose spectrum falls with sinc^4 of frequency times the
+The reflectance is drawn: a fractal for wild vegetation, fields in blocks of one direction each, roads. It is stored as
+numbers on a grid of cells and used as their cubic B-spline, whose spectrum falls with sinc^4 of frequency times the
 cells' side: what a camera or an orthophoto samples is defined at every position, and has nothing left near the sampling
 frequencies.
 """
@@ -47,7 +47,7 @@ _SHIFT_BITS = 4
 _ROWS = 512
 """Number of rows processed at a time, to bound memory."""
 _SPARE = 4
-"""Number of cells beyond the requested ground."""
+"""Number of cells by which the drawn ground extends beyond the requested extent."""
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,7 @@ _MARGIN = 50.0
 
 
 class Map(Protocol):
-    """Interface of a georeferenced raster."""
+    """Interface of a georeferenced raster: an orthophoto's grey values or an elevation model's heights."""
 
     @property
     def values(self) -> np.ndarray:

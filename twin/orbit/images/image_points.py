@@ -97,7 +97,7 @@ the rest.
 _STEP = 50.0
 """Height interval over which the mapping to the ground is taken as linear, in metres."""
 _FOLLOWED = 8
-"""Number of iterations of the height.
+"""Number of iterations in which a look's height above the ground is found.
 
 Each reduces the error by a factor of 0.2 or less: the terrain's slope times the tangent of the look's angle from the
 vertical.
@@ -257,9 +257,9 @@ CONSENSUS = 100
 SOURCE = 101
 """Status of a tie point in the frame in which it was chosen, where its position is its definition."""
 _MASK = 16
-"""Grid step, in pixels of an orthophoto, of the test that every line sees a point."""
+"""Step, in pixels of the orthophoto, of the grid on which it is tested whether every line sees the ground."""
 _GROUND_TURNS = 12
-"""Number of iterations of a look's ground point."""
+"""Number of iterations in which the point where a look meets the ground is found."""
 _RISE = 10.0
 """Height difference over which the displacement due to height is taken as linear, in metres."""
 Kind = Literal["map", "tie"]
@@ -349,7 +349,7 @@ class MatchedLine:
 
     @property
     def rejections(self) -> Mapping[str, int]:
-        """Number of points not accepted by reason, the most frequent first."""
+        """Number of points that were not accepted for each reason, the most frequent reason first."""
         count = Counter(int(code) for code in self.status[~self.accepted])
         return {status_text(code): number for code, number in count.most_common()}
 

@@ -117,7 +117,7 @@ def how_measured(spec: ImagePointsSpec, known: str) -> str:
 
 
 def points_section(patch: Patch, points: PatchPoints, spec: ImagePointsSpec) -> Section:
-    """Return the report section on a patch's points: numbers, figures and listing."""
+    """Return the report section on the points measured in a patch: numbers, figures and listing."""
     shown = point_artefacts(patch, points, found_table(points), _true(patch, points))
     return Section("Measured points", (how_measured(spec, "the measured sensor"),), shown)
 

@@ -38,7 +38,7 @@ _HEIGHTS = 4
 _MET = 1e-4
 """Tolerance, in metres, of the height difference between look and terrain at their intersection."""
 _MOST_STEPS = 40
-"""Largest number of secant steps."""
+"""Largest number of secant steps in which the point where a look meets the terrain is found."""
 
 
 class SteepTerrainError(PhysicalError, ValueError):
@@ -220,7 +220,7 @@ MARGIN = 24
 LARGEST_ERROR = 0.002
 """Largest error of interpolated positions relative to the rigorous sensor on the terrain, in pixels."""
 _NEAR = 2
-"""Number of points beyond the samples for cubic interpolation."""
+"""Number of samples beyond the computed ones that cubic interpolation needs on each side."""
 BORDER = MARGIN + _NEAR + 1
 """Smallest number of lines and pixels between a window and the ends of an image."""
 _SAMPLES_AT_ONCE = 4_000_000

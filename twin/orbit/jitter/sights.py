@@ -505,7 +505,7 @@ def _pixel(camera: LineCamera) -> float:
 def _pairs(
     lines: Mapping[str, _Line], order: list[str], count: int, residual: Mapping[str, np.ndarray]
 ) -> tuple[dict[tuple[str, str], tuple[float, float, float]], dict[tuple[str, str], tuple[np.ndarray, np.ndarray]]]:
-    """Return the gaps of all pairs of lines, and the disparities of neighbouring lines without their smooth parts."""
+    """Return the time gaps of all pairs of lines, and the disparities of neighbouring lines without smooth parts."""
     gaps, pairs = {}, {}
     for a, b in combinations(order, 2):
         _, mine, theirs = np.intersect1d(lines[a].point, lines[b].point, return_indices=True)

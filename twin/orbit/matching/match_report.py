@@ -76,7 +76,7 @@ def _images(run: Match) -> Section:
 
 
 def _warnings(run: Match) -> tuple[str, ...]:
-    """Return warnings on the search range and the accuracy of the datum."""
+    """Return warnings on displacements near the search range and on the accuracy of the maps' datum."""
     texts, reach = [], run.setup.test.points.reach
     for group in run.points.sorts.values():
         for name, line in group.lines.items():

@@ -59,7 +59,7 @@ _MOST_TERMS = 8
 """Largest number of terms of a polynomial."""
 _DAY = 86400.0
 _SAMPLES = 240
-"""Number of samples of a polynomial attitude: a cubic spline through them is right to 1e-12 rad for a rotation of 30
+"""Number of samples of a polynomial attitude: a cubic spline through them is accurate to 1e-12 rad for a rotation of 30
 deg.
 """
 _MARGIN = 0.05

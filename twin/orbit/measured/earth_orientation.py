@@ -26,7 +26,9 @@ from twin.orbit.measured.xml_file import first_lines, numbers, text_lines
 WHAT = "a table of Earth orientation: finals2000A or C04 as the IERS gives them, or CSV"
 """Description of the file for error messages."""
 _RATE_STEP = 1.0
-"""Half step of the difference for the rotation rate, in seconds: rounding is 1e-16 rad/s, curvature far less."""
+"""Half step of the difference quotient of the rotation rate, in seconds: the error due to rounding is 1e-16 rad/s, that
+due to curvature far less.
+"""
 _COLUMNS = (
     Column("mjd", least=FIRST_DAY, most=LAST_DAY),
     Column("ut1_utc", TIME, least=-1.0, most=1.0),

@@ -69,7 +69,7 @@ COLUMNS: Mapping[str, tuple[Column, ...]] = {
         Column("correlation", needed=False, least=-0.999999, most=0.999999),
     ),
 }
-"""Columns of each table of a pass, by its key; `tie_points` has those of `image_points`."""
+"""Columns that each table of a pass must have, by the table's key; `tie_points` has those of `image_points`."""
 _SIGMAS = (("sigma",), ("plan_sigma", "height_sigma"), ("x_sigma", "y_sigma", "z_sigma"))
 """Alternative sets of columns for the sigmas of ground coordinates."""
 _EARTH_AXES = np.array([6_378_137.0, 6_378_137.0, 6_356_752.314])

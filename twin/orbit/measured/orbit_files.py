@@ -225,7 +225,7 @@ _COVARIANCE = ("COVARIANCE_START", "COVARIANCE_STOP")
 
 @dataclass
 class _Segment:
-    """Metadata and data of a segment of a CCSDS message, with their lines in the file."""
+    """Metadata and data of a segment of a CCSDS message, with their line numbers in the file."""
 
     keys: dict[str, tuple[str, int]] = field(default_factory=dict)
     rows: list[list[str]] = field(default_factory=list)

@@ -295,7 +295,7 @@ def _instants(file: str, clock: Readings, scale: str, offset: float) -> Instants
 
 
 def _stated(spec: Any, key: str, in_spec: str | None, in_file: str | None, what: str) -> str:
-    """Return a convention that spec or file specifies; InputError if neither does or they differ."""
+    """Return the convention that the spec or the file specifies; raise InputError if neither does or they differ."""
     if in_spec is None and in_file is None:
         raise spec.error(f"{what} is not specified, neither by the file nor here", (key,), allowed=f"`{key}:` here")
     if in_spec is not None and in_file is not None and in_spec != in_file:

@@ -54,8 +54,8 @@ def states_of(
     numbers : sequence of int, optional
         Indices of the times; all by default.
     only : tuple of str, optional
-        "temperature" or "motion", and the node of the course to which it is limited. The other nodes of the course then
-        have temperatures of 0 K, so that nothing is inherited; the key `perturb` still applies.
+        "temperature" or "motion", and the only node that then has it. The other nodes of the file's tables over time
+        have temperature changes of 0 K, so that nothing is inherited; the key `perturb` still applies.
 
     Raises
     ------
@@ -325,7 +325,7 @@ class MonitorSeries:
         return np.array(gains)
 
     def readings(self, measured: Measured, numbers: Sequence[int]) -> Readings:
-        """Return the changes estimated from the shifts of each state alone.
+        """Return the changes of the two cameras, estimated from the shifts of the spots in each state alone.
 
         Parameters
         ----------

@@ -128,7 +128,7 @@ def _smoothed_figure(run: MonitorRun) -> Figure:
 
 
 def _interval_figure(run: MonitorRun) -> Figure:
-    """Draw the RMS error in height against the interval."""
+    """Draw the RMS error in height against the interval between measurements of the monitor."""
     figure, (axes,) = _panels(3.6, 1, False, "interval between measurements [min]")
     minutes, intervals = np.array(list(run.intervals)) / 60.0, run.intervals.values()
     curves = [
@@ -156,7 +156,7 @@ def _interval_figure(run: MonitorRun) -> Figure:
 
 
 def _parts_figure(run: MonitorRun) -> Figure:
-    """Draw the height error of the corrected cameras by its parts."""
+    """Draw the mean height error of the corrected cameras over time, split into its causes (`PARTS`)."""
     minutes = run.times / 60.0
     figure, (axes,) = _panels(3.8, 1)
     axes.plot(minutes, run.cases["interval"].camera, color=svg.INK, lw=1.6, label="together, with the file's interval")

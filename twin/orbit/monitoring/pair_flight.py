@@ -38,7 +38,7 @@ HALF_SPAN = 60.0
 apart from 500 km are 70 s apart.
 """
 _SPARE = 2
-"""Number of candidates per ground point; those that a line does not see are dropped."""
+"""Number of candidates drawn per ground point; those that one of the lines does not see are dropped."""
 _MIDDLE = 1e-3
 """Tolerance, in seconds, to which the two views are placed at equal times before and after; a satellite moves 8 m in
 it.
@@ -57,7 +57,7 @@ def rms(values: np.ndarray) -> float:
 
 
 def motions_at(spec: OrbitMonitorSpec, time: float, only: str | None = None) -> State:
-    """Return the motions of the file at a time.
+    """Return the motions of the instrument's nodes that the file specifies at a time.
 
     Parameters
     ----------
@@ -307,7 +307,7 @@ def view_check_points(
 
 @dataclass(frozen=True, eq=False)
 class OrbitAndAttitude:
-    """True and measured orbit and attitude.
+    """Orbit and attitude of a simulated satellite, as they are and as they are measured.
 
     Attributes
     ----------
