@@ -1,4 +1,4 @@
-"""Report of an optimised camera: before and after, its layout, the wavefront error over the field, and the new file."""
+"""Report of an optimised camera: numbers before and after, layout, wavefront error over the field, new file."""
 
 from __future__ import annotations
 

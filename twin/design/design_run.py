@@ -1,4 +1,4 @@
-"""Optimisation of a camera's prescription with exact Jacobians from several starts, and the contents of design.json."""
+"""Optimisation of a camera's prescription with exact Jacobians from several starts, and its result file."""
 
 from __future__ import annotations
 

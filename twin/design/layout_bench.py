@@ -52,7 +52,7 @@ class Seen:
     Attributes
     ----------
     shared : (D, M) ndarray
-        Spot shifts, px, due to one standard deviation of each independent motion of the bodies that all beams share.
+        Spot shifts, px, due to independent motions, of unit variance, of the bodies that all beams share.
     own : (D, D) ndarray
         Covariance of the spot shifts, px^2, due to the motions of this beam's own bodies and to image noise.
     parameters : (4 K, M) ndarray
@@ -102,9 +102,9 @@ class BeamFacts:
 
     @cached_property
     def planes(self) -> list[np.ndarray]:
-        """Planes of the faces of each of its prisms, (F, 4) each: outward normal and distance from the origin.
+        """Planes of the faces of each of its prisms, (F, 4) each: normal n and offset d of n x + d = 0.
 
-        Array dimensions: F faces.
+        n is a unit vector that points outwards in the base frame, d is in metres. Array dimensions: F faces.
         """
         return [ConvexHull(corners).equations for corners in self.bodies]
 

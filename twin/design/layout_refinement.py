@@ -229,11 +229,12 @@ ORDER = 6
 _WEIGHTS = {2: {1: 1.0 / 2.0}, 4: {1: 8.0 / 12.0, 2: -1.0 / 12.0}, 6: {1: 45.0 / 60.0, 2: -9.0 / 60.0, 3: 1.0 / 60.0}}
 """Order -> number of steps -> weight of a central difference (Fornberg, Math. Comp. 51, 699, 1988)."""
 _JUMP = {4: {1: 4.0 / 3.0, 2: -1.0 / 3.0}, 6: {1: 1.5, 2: -0.6, 3: 0.1}}
-"""Order -> number of steps k -> weight of f(k h) + f(-k h) - 2 f(0), with f a function and h the step, to detect jumps.
+"""Order -> number of steps k -> weight of the second difference f(k h) + f(-k h) - 2 f(0), to detect jumps of f.
 
-The weighted sum tends to zero for a smooth f, extrapolated by even powers. Of a jump J anywhere within the steps it
-keeps a part that, divided by h, bounds the effect of J on the central difference. For order 6 the part and the effect
-are J and 0.62 J for a jump at the first step, J/2 and 0.13 J at the second, J/10 and 0.02 J at the third.
+f is a function of a layout parameter and h the step. The weighted sum tends to zero for a smooth f, extrapolated by
+even powers. Of a jump J anywhere within the steps it keeps a part that, divided by h, bounds the effect of J on the
+central difference. For order 6 the part and the effect are J and 0.62 J for a jump at the first step, J/2 and 0.13 J at
+the second, J/10 and 0.02 J at the third.
 """
 
 

@@ -1,4 +1,4 @@
-"""Connected pages, and the scheduling of their requests: of each page only the latest requested state is computed.
+"""Connected pages and the scheduling of their requests: only each page's latest requested state is computed.
 
 A slider sends faster than states can be computed, and a slow connection receives more slowly than they are computed. So
 there is one slot for a page's next state and one for its next answer, and a later one replaces an earlier one. No queue

@@ -1,4 +1,4 @@
-"""Knobs of the live twin: adjustable motions of an instrument, a study's factors, and the resulting perturbations.
+"""Knobs of the live twin: adjustable motions of bodies, factors of a study, and the resulting perturbations.
 
 A knob has the name of its motion in scripts and in a course's tables: ``base/forward/M2 shift z``. Its value is a
 number in the knob's unit; it has exactly the effect of a job's file that contains this number with this unit, to the

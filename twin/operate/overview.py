@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from twin.operate.record.history import History
 
 KIND = "monitor"
-"""Kind of the monitor's readings in the record."""
+"""Value of an entry's kind, in the record, for the readings of the monitor."""
 _BATCH = 400
 """Number of rows in one query."""
 

@@ -12,7 +12,7 @@ class _Study(ModuleType):
     """Callable package, so that ``python -m twin.study`` and ``twin.study(...)`` have one name."""
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
-        """See `twin.study.scripted.study`."""
+        """Run a study from a script; the arguments are those of `twin.study.scripted.study`."""
         # imported late, since parts of the package do not need it
         from twin.study.scripted import study
 

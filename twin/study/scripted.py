@@ -54,9 +54,9 @@ class Spread:
     Attributes
     ----------
     key : KeyPath
-        Its position below ``perturb``.
+        Key path of the number below ``perturb`` of the job.
     factor : dict
-        Its distribution, in the form of a study's file.
+        Distribution of the number, as a study's file states it.
     """
 
     key: KeyPath
@@ -223,7 +223,7 @@ def config_text(
     design: str,
     responses: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> str:
-    """Return the text of the study's config.yaml; arguments and errors as in `study`."""
+    """Return the text of the config.yaml of a scripted study; it takes the arguments of `study`."""
     spreads: list[Spread] = []
     middle: dict[str, Any] = {}
     for node, keys in _by_node(vary).items():

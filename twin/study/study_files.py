@@ -27,7 +27,7 @@ ROLE = "role"
 
 
 def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
-    """Return factors, responses, their sigmas and the failed runs as a data set by run.
+    """Return factors, responses, their sigmas and the failed runs as an xarray data set with the dimension ``run``.
 
     The data set depends neither on the time nor on the workers of the computation. Every variable has the attributes
     ``units`` (empty for pure numbers and texts), ``role`` and, for factors and responses, ``key``, its position in the
@@ -86,7 +86,7 @@ def _path(key: tuple[str | int, ...]) -> str:
 
 
 def _as_table(ending: str, data: xr.Dataset) -> bytes | None:
-    """Return the data set as a table with a line for each run; None if a package is missing."""
+    """Return the data set as a table file with a line for each run; None if a package is missing."""
     columns = []
     for name in (RUN, *map(str, data.data_vars)):
         about = data[name].attrs
@@ -105,13 +105,14 @@ _FORMATS: dict[str, Callable[[xr.Dataset], bytes | None]] = {
     **{ending: partial(_as_table, ending) for ending in ("csv", "parquet")},
 }
 FORMATS = ExtensionTable("study_formats", _FORMATS)
-"""Suffix of a file study.SUFFIX -> function that makes its contents; None if a package is missing. A new format is
-added here.
+"""Suffix of a data file of a study -> function that makes its contents, or None if a package is missing.
+
+A new format is added here.
 """
 
 
 def summary(data: xr.Dataset, plan: Plan) -> dict[str, Any]:
-    """Return the contents of study.json without the times: statistics of each response over the runs that did not fail.
+    """Return the contents of study.json but the times: statistics of each response over the successful runs.
 
     They are mean, standard deviation and quantiles; null where there are no values.
 

@@ -253,8 +253,8 @@ class InverseLimits:
 def default_losses(bench: ToleranceBench, nominal: np.ndarray) -> np.ndarray:
     """Return the loss by which one tolerance may degrade each merit, SI, (M,).
 
-    It is the specified loss, or the margin between the nominal camera and the requirement over the square root of the
-    number of tolerances; NaN where there is no margin.
+    The loss is the one specified in the file, or the margin between the nominal camera and the requirement over the
+    square root of the number of tolerances; NaN where there is no margin.
 
     Array dimensions: M merits.
     """

@@ -168,7 +168,7 @@ def _further(run: ToleranceRun) -> list[str]:
 
 
 def _scaled(value: float, result: MeritResult, decimals: int | None = None) -> Cell:
-    """Return a value in the merit's unit, with decimals according to its standard deviation."""
+    """Return a merit's value in its reporting unit, with decimals according to its standard deviation."""
     size = merit_unit(result.merit)[1]
     if not np.isfinite(value):
         return None

@@ -146,7 +146,7 @@ class ToleranceRun:
     allocation : Allocation or None
         Allocated limits; None if no allocation is requested.
     judged : Yield or None
-        Share of independent cameras with these limits that meet all requirements.
+        Share of independent cameras with the allocated limits that meet all requirements; None without an allocation.
     jobs : dict
         Worst cameras as files of jobs, by name.
     warnings : tuple of str

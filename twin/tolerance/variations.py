@@ -61,7 +61,7 @@ class BodyMove:
 
 @dataclass(frozen=True, eq=False)
 class VariedParameter:
-    """Varied parameter of a tolerance budget.
+    """Varied parameter of a tolerance budget: a motion, temperature or shape change of bodies, per unit.
 
     Attributes
     ----------

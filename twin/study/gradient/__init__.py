@@ -1,1 +1,1 @@
-"""The Jacobian of a study's responses by its factors."""
+"""Jacobian of a study's responses with respect to its factors."""

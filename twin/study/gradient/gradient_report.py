@@ -121,7 +121,7 @@ def verdict(gradient: Gradient) -> tuple[str, tuple[str, ...]]:
 
 
 def _response_table(gradient: Gradient) -> Table:
-    """Return the dominant factor of each response, its derivative, and the agreement of AD with finite differences."""
+    """Return the table of each response's dominant factor, its derivative, and the error of finite differences."""
     rows: list[list[Cell]] = []
     change, relative = gradient.change, gradient.relative
     for i, response in enumerate(gradient.responses):
@@ -165,7 +165,7 @@ def _response_table(gradient: Gradient) -> Table:
 
 
 def _factor_rows(gradient: Gradient) -> Table:
-    """Return the table of the factors."""
+    """Return the table of the factors: value in the base, spread, and step of the finite differences."""
     rows: list[list[Cell]] = []
     for k, factor in enumerate(gradient.factors):
         keys = [*factor.spec.places, *(scale.key for scale in factor.spec.scales)]
@@ -184,15 +184,15 @@ def _factor_rows(gradient: Gradient) -> Table:
 MOST_BARS = 8
 """Largest number of bars in a panel."""
 LINEAR = 1e-3
-"""Share of a response's largest change below which the colour scale is linear."""
+"""Share of a response's largest change per spread, below which the logarithmic colour scale becomes linear."""
 NEGLIGIBLE = 1e-3
-"""Share of a response's largest change below which no bar is drawn."""
+"""Share of a response's largest change per spread, below which no bar is drawn for a factor."""
 
 
 def _normalised(gradient: Gradient) -> np.ndarray:
-    """Return the changes per spread (R, F) relative to each response's largest; zero where no factor moves it.
+    """Return each response's change due to the spread of each factor, (R, F), relative to its largest change.
 
-    Array dimensions: R responses, F factors.
+    Zero where no factor moves the response. Array dimensions: R responses, F factors.
     """
     change = gradient.change
     largest = np.max(np.abs(change), axis=1, initial=0.0, keepdims=True)
@@ -200,7 +200,7 @@ def _normalised(gradient: Gradient) -> np.ndarray:
 
 
 def _heat_map(gradient: Gradient) -> Figure:
-    """Plot the normalised changes as colours, responses along x, factors down."""
+    """Plot each response's normalised change due to each factor's spread as colours: responses along x, factors down."""
     shares = _normalised(gradient).T
     rows, columns = shares.shape
     figure = svg.new_figure(2.1 + 0.21 * max(rows, 4))
@@ -224,7 +224,7 @@ def _heat_map(gradient: Gradient) -> Figure:
 
 
 def _tornado(gradient: Gradient) -> Figure:
-    """Plot for each response the largest changes per spread."""
+    """Plot for each response the largest changes due to the spread of a factor."""
     moved = [i for i in range(len(gradient.responses)) if np.any(gradient.change[i])]
     largest = [_largest(gradient.change[i]) for i in moved]
     figure, grid = svg.panels([0.85 + 0.2 * len(indices) for indices in largest] or [1.5], 2)
@@ -253,13 +253,14 @@ def _bars(axes: Axes, gradient: Gradient, i: int, order: np.ndarray) -> None:
 
 
 DOUBTFUL = 0.01
-"""Change by Richardson's extrapolation, as a share of a response's largest change, beyond which differences are
-reported as inaccurate.
+"""Correction by Richardson's extrapolation beyond which finite differences are reported as inaccurate.
+
+It is a share of the response's largest change per spread of a factor.
 """
 
 
 def _unit_text(response: str, factor: str) -> str:
-    """Return the unit of a derivative."""
+    """Return the unit of a derivative of a response with respect to a factor as text."""
     if not factor:
         return response or "1"
     return f"{response or '1'}/{factor}" if "/" not in factor else f"{response or '1'}/({factor})"
@@ -298,7 +299,7 @@ GRADIENT: Record[Gradient] = Record(
 
 
 def _whole_table(gradient: Gradient) -> Table:
-    """Return every entry of the Jacobian, one row each."""
+    """Return the table of every derivative of the Jacobian, one row for each response and factor."""
     values = GRADIENT(gradient)
     keys = ("units", "method", "ad", "differences", "relative", "difference_error", "step", "change")
     rows = [
@@ -311,7 +312,7 @@ def _whole_table(gradient: Gradient) -> Table:
 
 
 def _doubtful(gradient: Gradient) -> list[str]:
-    """Return the responses whose finite differences are not accurate to 1 %.
+    """Return the responses whose finite differences are not accurate to 1 % of the largest change.
 
     Causes are noise, or a kink or bend within the step.
     """
@@ -325,7 +326,7 @@ def _doubtful(gradient: Gradient) -> list[str]:
 
 
 def run_gradient(file: Path, options: cli.Options) -> None:
-    """Read a study, differentiate it at its base, write gradient.json, gradient.csv and a report, and print the result.
+    """Read a study, differentiate it at its base job's values, write the Jacobian and a report, and print it.
 
     Parameters
     ----------

@@ -47,12 +47,15 @@ from twin.study.runs.render_base import PERTURB, JobMaker, run_results
 from twin.study.runs.setup import StudySetup
 
 CAP = {"shift": 1e-3, "rotate": 3e-4, "scale": 1e-3, "figure": 1e-6}
-"""Largest steps of the finite differences, SI: they move the beam on the mirrors by a few millimetres at most."""
+"""Largest steps of the finite differences by kind of motion: metres, radians or pure numbers.
+
+Such a step moves the beam on the mirrors by a few millimetres at most.
+"""
 ROUNDING = 1e-9
-"""Share of a motion's size below which a motion is rounding error of a composition of motions."""
+"""Size of a motion, relative to the motions that it is composed of, below which it is rounding error."""
 
 Slopes = Mapping[ElementaryMotion, float]
-"""Derivative of each elementary motion with respect to a factor."""
+"""Derivative of the amount of each elementary motion (one body, kind and axis) with respect to a factor."""
 
 
 def motion_slopes(about: State, state: Callable[[float], State], step: float) -> Slopes | None:
@@ -101,7 +104,7 @@ below 1e-11."""
 SIGHT_SHARE = 5e-3
 """Largest step of directions as a share of half the field along a line.
 
-The derivative of a principal distance, which is a fit over that field, has a relative error of its fourth power.
+The principal distance is a fit over that field; the relative error of its derivative is the fourth power of this share.
 """
 
 
@@ -124,7 +127,7 @@ class Chain:
     experiment: MonitorExperiment
 
     def spots(self, states: Sequence[State]) -> np.ndarray:
-        """Return the spot positions (S, C, 2), row and column, px from the first pixel's centre.
+        """Return the spot positions in S states, (S, C, 2): row and column, px from the first pixel's centre.
 
         Array dimensions: S states, C spots.
 
@@ -138,7 +141,7 @@ class Chain:
         return self.experiment.path.coarse.mean_spots(states)
 
     def sight(self, states: Sequence[State]) -> np.ndarray:
-        """Return the directions of the line CCDs' points, (S, cameras, points, 3).
+        """Return the lines of sight of the line CCDs' points in S states, (S, cameras, points, 3), unit vectors.
 
         Array dimensions: S states.
 
@@ -151,7 +154,7 @@ class Chain:
 
     @cached_property
     def reach(self) -> float:
-        """Step of directions of lines of sight for the formulas, radians; smaller for a narrow field."""
+        """Length of the step by which directions of lines of sight are changed, radians; smaller for a narrow field."""
         ends = self.experiment.sight.nominal[:, 0, [0, -1]]
         half = 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)
         return float(min(SIGHT_REACH, SIGHT_SHARE * np.min(half)))
@@ -185,10 +188,10 @@ class Chain:
     def moved(
         self, state: State, at: tuple[np.ndarray, np.ndarray], spots: np.ndarray, sight: np.ndarray
     ) -> tuple[list[dict[str, Any]], float]:
-        """Return four outcomes about a state along derivatives of its spots and directions, and the step.
+        """Return the results at four steps from a state along given derivatives of its spots and lines of sight.
 
-        ``at`` holds the spots and directions of the state; the derivatives have the shapes (C, 2) and (cameras, points,
-        3).
+        The length of the step is returned too. ``at`` holds the spots and directions of the state; ``spots`` and
+        ``sight`` are their derivatives, of shapes (C, 2) and (cameras, points, 3).
 
         Array dimensions: C spots.
         """
@@ -201,7 +204,7 @@ class Chain:
 
 
 SHARES = (1.0, -1.0, 0.5, -0.5)
-"""Multiples of a step at which values for ``extrapolated`` are taken."""
+"""Multiples of a step from the base at which values are taken for Richardson's extrapolation."""
 
 
 def extrapolated(values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
@@ -221,7 +224,7 @@ def extrapolated(values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarra
 def sight_gradient(
     instrument: Instrument, backend: Backend, motions: Sequence[ElementaryMotion], about: State
 ) -> np.ndarray:
-    """Return the derivative of the directions of ``twin.monitor.truth.LineSight.trace``.
+    """Return the derivatives of the lines of sight of the line CCDs' points with respect to motions of bodies.
 
     Parameters
     ----------
@@ -237,7 +240,7 @@ def sight_gradient(
     Returns
     -------
     (cameras, M, LINE_POINTS, 3) ndarray
-        Derivatives in the world frame, per radian, metre or unit.
+        Derivatives of the unit direction vectors in the world frame, per radian, metre or unit of the motion.
 
     Raises
     ------
@@ -296,9 +299,9 @@ class GradientFactor:
     value : float
         Value in the base.
     spread : float
-        Sigma of a normal distribution, else half of the range of its values; in its unit.
+        Sigma of a normal distribution, otherwise half of the range of its values; in the factor's unit.
     spread_of : str
-        Description of the spread.
+        Description of the spread in words.
     """
 
     setup: StudySetup
@@ -341,7 +344,7 @@ class GradientFactor:
         return self.setup.study.factors[self.name]
 
     def values(self, value: float) -> tuple[tuple[KeyPath, Any], ...]:
-        """Return place and value of everything that the factor changes when it has this value.
+        """Return key and value of each entry of the base job that the factor sets when it has this value.
 
         Raises
         ------
@@ -382,24 +385,24 @@ MOVE = 2.0
 TURN = 1e-4
 """Rotation of a line of sight by the step of a motion, radians, where there are no spots; about ten pixels."""
 PART = 0.5
-"""Step of other factors, in units of their spreads."""
+"""Step of the finite differences with respect to factors that are no motions, in units of their spreads."""
 QUALITY_PART = 0.1
-"""Step for image quality, in units of the factor's spread.
+"""Step of the finite differences for responses of image quality, in units of the factor's spread.
 
 It is small because image quality is far from linear (a wavefront error is a root of squares); it is traced without
 noise.
 """
 TOGETHER = 8
-"""Number of factors whose differences are traced at once."""
+"""Number of factors whose finite differences are traced at once."""
 SMALL = 1e-3
-"""Share of a response's largest entry, both per spread, to which the error of smaller entries is related.
+"""Share of a response's largest change per spread, to which the errors of smaller changes are related.
 
 Entries that are zero by symmetry have no significant digits. An entry of a response that is a difference counts as much
 as the larger of its two terms, since their common digits cancel.
 """
 AD, TRACED, WHOLE = "ad", "traced differences", "differences of the whole job"
 AD_PART = "automatic differentiation"
-"""Name of this part of the work in the progress display; the other parts are named after their method."""
+"""Name of the automatic differentiation in the progress display; the other parts are named after their method."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -421,11 +424,12 @@ class Gradient:
     error : (R, F) ndarray
         Correction of the differences by Richardson's extrapolation.
     scale : (R, F) ndarray
-        Size of the terms of which an entry is the difference; the entry's own size where there is one term.
+        Size of the derivatives' terms: of the larger term where a response is a difference of two numbers, otherwise of
+        the derivative itself.
     step : (R, F) ndarray
         Steps of the differences, in the factor's unit.
     method : (R, F) ndarray of str
-        Method of the best value.
+        Method by which the best available derivative was computed.
     """
 
     factors: tuple[GradientFactor, ...]
@@ -447,16 +451,16 @@ class Gradient:
         return cls(factors, names, units, ad, differences, error, scale, step, np.full(shape, WHOLE, object))
 
     def put(self, rows: Sequence[int], k: int, values: np.ndarray, step: float, method: str) -> None:
-        """Fill in the differences with respect to factor k in selected rows from their values (4, rows)."""
+        """Fill in the finite differences of selected responses with respect to factor k from four values each."""
         self.differences[rows, k], self.error[rows, k] = extrapolated(values, step)
         self.step[rows, k] = step
         self.method[rows, k] = method
 
     @property
     def best(self) -> np.ndarray:
-        """Derivatives (R, F): by automatic differentiation where available, else by differences.
+        """Derivatives (R, F) of the responses with respect to the factors, by AD if available, else by differences.
 
-        Array dimensions: R responses, F factors.
+        AD is automatic differentiation. Array dimensions: R responses, F factors.
         """
         return np.where(np.isnan(self.ad), self.differences, self.ad)
 
@@ -470,9 +474,10 @@ class Gradient:
 
     @property
     def relative(self) -> np.ndarray:
-        """Relative deviation of the differences from AD, (R, F), NaN without AD; see ``SMALL`` for small entries.
+        """Relative deviation of the finite differences from automatic differentiation, (R, F); NaN without the latter.
 
-        Array dimensions: R responses, F factors.
+        Deviations of small derivatives are relative to ``SMALL`` times the largest one. Array dimensions: R responses,
+        F factors.
         """
         spread = np.array([factor.spread for factor in self.factors])
         size = self.scale * spread
@@ -483,13 +488,13 @@ class Gradient:
 
     @property
     def worst(self) -> float | None:
-        """Largest of ``relative``, None without AD."""
+        """Largest relative deviation of finite differences from automatic differentiation; None without the latter."""
         return float(np.nanmax(self.relative)) if np.any(~np.isnan(self.ad)) else None
 
 
 @dataclass(frozen=True)
 class _GradientResponse:
-    """Response with the keys of its number and of the number that is subtracted.
+    """Response of a study, with the key of its number and, if it is a difference, of the subtracted number.
 
     Attributes
     ----------
@@ -585,7 +590,10 @@ def _spot_responses(resolved: ResolvedJob) -> list[_GradientResponse]:
 
 @dataclass(eq=False)
 class _Traced:
-    """Part of the Jacobian that needs no image; ``slopes`` are those of the factors that only move bodies."""
+    """Part of the Jacobian that needs no image.
+
+    ``slopes`` holds the derivatives of the elementary motions with respect to those factors that only move bodies.
+    """
 
     setup: StudySetup
     maker: JobMaker
@@ -693,7 +701,10 @@ class _Traced:
         return sizes
 
     def _values(self, chain: Chain, factor: GradientFactor, step: float, rows: Sequence[int]) -> np.ndarray:
-        """Return the responses of the four jobs beside the base, (4, rows)."""
+        """Return the selected responses of four jobs beside the base, (4, responses), for one factor.
+
+        The factor differs from its value in the base by the step times ``SHARES``.
+        """
         jobs = [self._job(factor, share * step) for share in SHARES]
         same = all(place[:2] == PERTURB for place, _ in factor.values(factor.value))
         try:

@@ -21,7 +21,7 @@ from twin.study.report.study_statistics import (
 )
 
 BAD_MODEL = 0.8
-"""Cross-validated R² below which a polynomial chaos model is called poor."""
+"""Cross-validated R² below which the report calls the polynomial chaos model of a response poor."""
 
 
 def design_title(kind: str) -> str:
@@ -74,7 +74,7 @@ def warnings(analysis: StudyAnalysis) -> list[str]:
 
 
 def _reason(doubt: str) -> str:
-    """Return the beginning of a doubt without numbers and names of spots, so that equal reasons can be counted."""
+    """Return the beginning of a run's warning without numbers and names of spots, so that equal ones can be counted."""
     head, _, rest = doubt.partition("; ")
     if "fit of the spots" in head:
         return f"the fit of spots is not good: {rest.partition(':')[0].partition('. ')[0]}"
@@ -156,7 +156,7 @@ def _round_up(count: int) -> int:
 LEAST_SHARE = 0.02
 """Share of the variance below which a factor is not named."""
 LINEAR = 0.5
-"""Share of the variance below which a linear model describes a response poorly."""
+"""Share of the variance explained by the linear model, below which the report says that it describes poorly."""
 
 
 def conclusions(analysis: StudyAnalysis) -> list[str]:
@@ -384,7 +384,7 @@ def plural(count: int, noun: str) -> str:
 
 
 def normality_text(response: Response, about: Description) -> str | None:
-    """Return a sentence on the shape of the distribution; None if it was not tested."""
+    """Return a sentence on whether a response is normally distributed; None if it was not tested."""
     if about.normality is None or about.mean is None or about.std is None:
         return None
     test = about.normality

@@ -1,4 +1,4 @@
-"""Variance-based sensitivity indices of Sobol, first order and total, and the orthonormal bases of polynomial chaos."""
+"""Variance-based (Sobol) sensitivity indices, first order and total, with bases for polynomial chaos."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOST_LEVELS = 20
 
 
 class _NoBasis(Exception):
-    """No basis can be made for a factor; the text gives the reason."""
+    """Error that no polynomial basis can be made for a factor; the text gives the reason."""
 
 
 def axis_functions(axis: tuple[Factor, ...], good: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
@@ -63,7 +63,7 @@ def axis_functions(axis: tuple[Factor, ...], good: np.ndarray, degree: int) -> t
 
 
 def _text_weights(axis: tuple[Factor, ...], levels: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return the probability of every level: its frequency in a list, or among the drawn rows of a table."""
+    """Return the probability of every text value of a factor: its frequency in a list, or among rows of a table."""
     if len(axis) == 1:
         listed = [_text(value) for value in axis[0].spec.scalars()]
         names = [str(value) for value in np.unique(axis[0].values)[levels[:, 0]]]
@@ -131,7 +131,10 @@ def _by_recurrence(
 
 
 def _of_table(table: np.ndarray, values: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the polynomials of several columns that belong together, orthonormal over the rows of the table."""
+    """Return orthonormal polynomials of several columns of a table that vary together, at given values.
+
+    They are orthonormal over the rows of the table.
+    """
     middle, scale = table.mean(axis=0), np.maximum(np.ptp(table, axis=0), np.finfo(float).tiny)
     nodes, x = (table - middle) / scale, (values - middle) / scale
     powers = [p for p in np.ndindex(*[degree + 1] * table.shape[1]) if 0 < sum(p) <= degree]
@@ -177,14 +180,14 @@ RUNS_PER_TERM = 2.5
 RESAMPLES = 1000
 """Number of bootstrap resamples for the intervals."""
 HARMONICS = 10
-"""Number of harmonics that RBD-FAST sums."""
+"""Number of harmonics whose power RBD-FAST (random balance designs) sums."""
 MANY_FAILED = 0.05
-"""Share of runs without a number beyond which the others do not represent the specified distributions."""
+"""Share of runs without a number, beyond which the other runs do not represent the specified distributions."""
 DISAGREE = 3.0
-"""Distance of the RBD-FAST index from the interval of polynomial chaos at which they disagree, times the root of the
-number of runs.
+"""Distance of the RBD-FAST index from the interval of the polynomial chaos index, from which the two disagree.
 
-It is five standard deviations of RBD-FAST for smooth responses of 100 to 300 runs.
+It is multiplied by the root of the number of runs, and is five standard deviations of RBD-FAST for smooth responses of
+100 to 300 runs.
 """
 
 
@@ -203,7 +206,7 @@ class Index:
     check : float or None
         First-order index by RBD-FAST, which needs no model; None where it cannot be used.
     agrees : bool or None
-        True if that lies within the interval of ``first``, apart from its noise; None without it.
+        True if ``check`` lies within the interval of ``first``, apart from its noise; None without ``check``.
     """
 
     factors: tuple[str, ...]
@@ -237,8 +240,8 @@ class Indices:
     rest : float
         Share of the variance that the model does not explain; 0 for a grid.
     noise : float or None
-        Share of the variance that the runs report as noise, see `noise_share`; None without. It may exceed 1 by chance
-        where only noise varies.
+        Share of the variance that the runs report as noise; None if they report none. It may exceed 1 by chance where
+        only noise varies.
     """
 
     method: str
@@ -252,7 +255,7 @@ class Indices:
 
 @dataclass(frozen=True)
 class NoIndices:
-    """Reason why there are no indices."""
+    """Reason, as text, why sensitivity indices cannot be computed for a response."""
 
     reason: str
 
@@ -323,7 +326,7 @@ def _of_grid(axes: Sequence[tuple[Factor, ...]], values: np.ndarray) -> tuple[In
 
 
 def _cells(axes: Sequence[tuple[Factor, ...]]) -> np.ndarray:
-    """Return the index of the combination of values of each run, (runs,)."""
+    """Return for each run the index of its combination of the factors' values, (runs,)."""
     factors = [factor for axis in axes for factor in axis]
     if not factors:
         return np.zeros(0, int)
@@ -332,7 +335,7 @@ def _cells(axes: Sequence[tuple[Factor, ...]]) -> np.ndarray:
 
 
 def _between(cells: np.ndarray, values: np.ndarray) -> float:
-    """Return the variance of the means of the cells."""
+    """Return the variance, over the runs, of the mean value of each run's cell (combination of factor values)."""
     if len(cells) == 0:
         return 0.0
     counts = np.bincount(cells)
@@ -349,11 +352,11 @@ class _Chaos:
     Attributes
     ----------
     terms : (m, axes) ndarray of int
-        For each coefficient but the constant the index of the function of each axis, 0 for none.
+        For each term the index of its basis function of each axis (group of factors), 0 for the constant.
     coefficients : (m,) ndarray
         Coefficients of the terms.
     q, r : ndarray
-        QR decomposition of the design matrix (n, m + 1).
+        QR decomposition of the design matrix (n, m + 1), whose first column is the constant.
     held_out : float
         Leave-one-out cross-validated R².
     rest : float
@@ -418,7 +421,7 @@ class _Chaos:
         return cls(axes, terms, coefficients[1:], y, q, r, degree, held_out, rest / total, good)
 
     def indices(self, noise: float, seed: int, missing: np.ndarray) -> tuple[Index, ...]:
-        """Return the indices of every axis, the largest total first.
+        """Return the sensitivity indices of every axis (group of factors), the largest total index first.
 
         Parameters
         ----------
@@ -450,8 +453,8 @@ class _Chaos:
     def _with_missing(self, low: np.ndarray, high: np.ndarray, missing: np.ndarray) -> list[np.ndarray]:
         """Widen intervals (2, axes) for any responses of the missing runs within the range of the others.
 
-        A run of N that departs from the polynomials by d, where the part of an axis is p, changes the variance of the
-        axis by 2 p d / N, and by at most d^2 / N in addition.
+        Of N runs, one whose response departs from the polynomials by d, and in which the terms of an axis sum to p,
+        changes the variance of the axis by 2 p d / N, and by at most d^2 / N in addition.
         """
         functions = [axis_functions(axis, missing, HIGHEST_DEGREE)[0] for axis in self.axes]
         terms = _columns(functions, self.terms)[:, 1:] * self.coefficients
@@ -507,11 +510,11 @@ class _Chaos:
         return np.clip(self._parts(self._squares) / whole, 0.0, 1.0)
 
     def _resampled(self, noise: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return bootstrapped indices, (b, 2, axes) each, without and with the residual variance that is not noise.
+        """Return bootstrapped first-order and total indices, without and with the residual variance that is not noise.
 
-        Pairs of factors and response are resampled, so that coefficients and total variance vary as between studies.
-        Each run is weighted by a Poisson variable of mean 1; the coefficients change to first order by the
-        leave-one-out influence of each run.
+        Both arrays have the shape (resamples, 2, axes). Pairs of factors and response are resampled, so that
+        coefficients and total variance vary as between studies. Each run is weighted by a Poisson variable of mean 1;
+        the coefficients change to first order by the leave-one-out influence of each run.
         """
         n, m = len(self.y), len(self.terms)
         out, rest = self._fit_rest
@@ -540,7 +543,7 @@ class _Chaos:
 
 
 def _columns(functions: Sequence[np.ndarray], terms: np.ndarray) -> np.ndarray:
-    """Return the constant and the products of functions (n, m + 1) that terms (m, axes) name.
+    """Return the design matrix (n, m + 1): the constant, and the products of basis functions that ``terms`` name.
 
     Array dimensions: n runs, m terms.
     """
@@ -552,7 +555,10 @@ def _columns(functions: Sequence[np.ndarray], terms: np.ndarray) -> np.ndarray:
 
 
 def _terms(degrees: Sequence[np.ndarray], degree: int, norm: float, runs: int) -> np.ndarray | None:
-    """Return products of functions with degrees (sum d^norm)^(1/norm) <= degree; None if there are too many."""
+    """Return products of basis functions with (sum d^norm)^(1/norm) <= degree, d being the degree of each factor.
+
+    None if there are too many for the number of runs.
+    """
     most = min(MOST_TERMS, int(runs / RUNS_PER_TERM))
     terms = []
     for term in _products(degrees, 0, degree**norm + 1e-9, norm):
@@ -574,7 +580,7 @@ def _products(degrees: Sequence[np.ndarray], axis: int, remaining: float, norm: 
 
 
 def _rbd_fast(axis: tuple[Factor, ...], good: np.ndarray, y: np.ndarray) -> float | None:
-    """Return the first-order index of a factor by random balance designs (SALib); None for texts, lists and few runs.
+    """Return a factor's first-order index by random balance designs (SALib); None for texts, lists, few runs.
 
     Source: Tarantola, Gatelli and Mara, Reliability Engineering and System Safety 91, 717 (2006); bias correction of
     Tissot and Prieur, ibid. 107, 205 (2012).

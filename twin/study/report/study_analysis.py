@@ -31,7 +31,7 @@ class ParetoFront:
     runs : (m,) ndarray of int
         Numbers of the runs on the front, from the best x to the best y.
     x, y : (m,) ndarray
-        Their values.
+        Values of the pair in these runs.
     ranks : (n,) ndarray of int
         Rank of every run: 0 on the front, 1 on the front of the remaining runs, and so on; -1 without numbers.
     knee : int or None
@@ -69,7 +69,7 @@ def pareto_front(spec: ParetoSpec, x: np.ndarray, y: np.ndarray) -> ParetoFront:
 
 
 def ranks_of(costs: np.ndarray) -> np.ndarray:
-    """Return the ranks (n,) of (n, 2) costs by non-dominated sorting.
+    """Return the Pareto rank (n,) of each run from its two costs (n, 2), by non-dominated sorting.
 
     Rank 0 holds the points that no other point dominates, rank 1 those that only points of rank 0 dominate, and so on.
     Equal points share a rank.
@@ -97,7 +97,7 @@ def ranks_of(costs: np.ndarray) -> np.ndarray:
 
 
 def knee(costs: np.ndarray) -> int | None:
-    """Return the index of the point of a front (m, 2) that lies farthest below the line through its ends.
+    """Return the index of the point of a Pareto front (m, 2) that lies farthest below the line through its ends.
 
     The front is sorted by the first cost, and both costs are scaled to its range. None for fewer than three different
     points, or if no point lies below the line by more than rounding.
@@ -149,28 +149,29 @@ class Requirement:
 
     @property
     def share(self) -> float | None:
-        """Share of the runs with a value that meet it; None without any."""
+        """Share of the runs with a value that meet the requirement; None without any."""
         return self.met / self.count if self.count else None
 
     @property
     def most(self) -> int:
-        """Number of runs that would meet it if all runs without a value did."""
+        """Number of runs that would meet the requirement if all runs without a value did."""
         return self.met + self.runs - self.count
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """Shares of all runs if none, and if all, of those without a value meet it; None if all runs have a value.
+        """Smallest and largest possible share of all runs that meet the requirement; None if all have a value.
 
-        Failure may be correlated with the value that a run would have given, so that the interval of the others does
-        not hold for all runs.
+        At the limits none, or all, of the runs without a value meet it. Failure may be correlated with the value that a
+        run would have given, so that the interval of the others does not hold for all runs.
         """
         return None if self.count == self.runs else (self.met / self.runs, self.most / self.runs)
 
     @property
     def bounds_interval(self) -> tuple[float, float] | None:
-        """Interval from the lower limit of the lower bound to the upper limit of the upper bound, in a drawn design.
+        """Confidence interval of the share that meets the requirement, whatever the runs without a value would give.
 
-        It holds for any values of the runs without one.
+        It reaches from the lower confidence limit of the smallest possible share to the upper one of the largest; None
+        in a grid.
         """
         if self.bounds is None or (self.interval is None and self.count):
             return None
@@ -260,11 +261,11 @@ class Convergence:
     values : (m,) ndarray
         The statistic of the first runs.
     low, high : (m,) ndarray
-        Ends of its interval, NaN where open.
+        Ends of the statistic's confidence interval, NaN where open.
     relative : float or None
         Half-width of the last interval in units of sigma; None if it is open.
     enough : bool
-        True if that is below the goal.
+        True if ``relative`` is below the goal.
     needed : int or None
         Approximate number of runs that reaches the goal; None if it cannot be estimated.
     """
@@ -330,7 +331,7 @@ class StudyAnalysis:
     effects : dict
         Main effects of a grid; empty in drawn designs.
     noise : dict
-        Noise shares of the responses whose noise the runs report.
+        Share of each response's variance that the runs report as noise.
     indices : dict
         Sensitivity indices; empty if the study does not request them.
     convergences : dict
@@ -468,7 +469,7 @@ CONVERGENCE: Record[Convergence] = Record(
 
 @dataclass(frozen=True, eq=False)
 class _ResponseAnalysis:
-    """Response, or reported sigma of one, with its analysis."""
+    """Response, or reported sigma of one, with the analysis of the study that it belongs to."""
 
     found: StudyAnalysis
     of: Response

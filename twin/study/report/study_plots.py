@@ -29,7 +29,7 @@ LONGEST = 18
 
 
 def finish(axes: Axes, x_ticks: int | None = 6, y_ticks: int | None = 5) -> None:
-    """Format the axes of a panel; None leaves the ticks of an axis unchanged."""
+    """Format the axes of a panel with at most the given numbers of ticks; None leaves an axis unchanged."""
     svg.gridded(axes)
     if x_ticks is not None:
         axes.xaxis.set_major_locator(MaxNLocator(x_ticks, steps=STEPS))
@@ -271,7 +271,7 @@ def _bars(axes: Axes, factor: Factor, other: Factor | None, response: Response) 
 
 
 def scatter_figure(analysis: StudyAnalysis, pairs: Sequence[tuple[str, str]]) -> Figure:
-    """Plot the pairs that the study requests."""
+    """Plot one quantity against another for the pairs of factors and responses that the study's file requests."""
     wide = min(len(pairs), 3)
     figure, grid = svg.panels([3.5] * len(pairs), wide)
     for axes, (x_name, y_name) in zip(grid, pairs, strict=True):
@@ -294,7 +294,7 @@ _WAYS = {"min": "small is good", "max": "large is good"}
 
 
 def pareto_figure(analysis: StudyAnalysis) -> Figure:
-    """Plot for each pair all runs, the front and its knee."""
+    """Plot for each requested pair all runs, the Pareto front and its knee."""
     figure, grid = svg.panels([3.9] * len(analysis.fronts), min(len(analysis.fronts), 2))
     for axes, front in zip(grid, analysis.fronts, strict=True):
         x, y = analysis.runs.find(front.spec.x), analysis.runs.find(front.spec.y)
@@ -321,17 +321,17 @@ MOST_BARS = 10
 
 
 def _bar_panels(rows: Sequence[int]) -> tuple[Figure, list[Axes]]:
-    """Return panels whose heights fit their bars, two beside each other."""
+    """Return a figure with two columns of panels whose heights fit their numbers of bars."""
     return svg.panels([0.95 + 0.3 * max(row, 2) for row in rows], min(2, len(rows)))
 
 
 def with_tornado(analysis: StudyAnalysis) -> list[Response]:
-    """Return the responses and sigmas with effects to draw."""
+    """Return the responses and reported sigmas for which the tornado figure has bars."""
     return [r for r in analysis.runs.everything if analysis.effects[r.name] or analysis.linear[r.name] is not None]
 
 
 def tornado_figure(analysis: StudyAnalysis) -> Figure:
-    """Plot the swing of each response over each factor, the largest first."""
+    """Plot for each response its change over the range of each factor, the largest first, as bars."""
     responses = with_tornado(analysis)
     rows = [min(len(analysis.effects[r.name]) or _effects(analysis, r.name), MOST_BARS) for r in responses]
     figure, grid = _bar_panels(rows)
@@ -393,7 +393,7 @@ def with_indices(analysis: StudyAnalysis) -> list[Response]:
 
 
 def indices_figure(analysis: StudyAnalysis) -> Figure:
-    """Plot first-order and total index of each factor."""
+    """Plot the first-order and the total sensitivity index of each factor, for each response."""
     responses = with_indices(analysis)
     parts = [analysis.indices[r.name] for r in responses]
     rows = [min(2 * len(part.axes), 2 * MOST_BARS) for part in parts if isinstance(part, Indices)]
@@ -421,7 +421,7 @@ MOST_RESPONSES, MOST = 3, 6
 
 
 def chosen(analysis: StudyAnalysis) -> list[Series]:
-    """Return the first three responses that vary, and the most influential factors, as many as fit."""
+    """Return the series of the scatter matrix: the first three varying responses, and the most influential factors."""
     responses = [r for r in analysis.runs.responses if not r.constant][:MOST_RESPONSES]
     weight = {factor.name: 0.0 for factor in analysis.runs.factors}
     for response in responses:

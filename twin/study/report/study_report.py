@@ -85,7 +85,7 @@ def report_files(
     files: Sequence[str] = ("study.nc", "study.csv"),
     input_warnings: Sequence[str] = (),
 ) -> StudyReport:
-    """Return the report with the contents of all its files; arguments as in ``write_report``."""
+    """Return the report of a study's data set with the contents of all its files, without writing them."""
     analysis = StudyAnalysis.of(StudyRuns.of(data, study))
     (head, more), runs = words.verdict(analysis), analysis.runs
     about = (
@@ -160,7 +160,7 @@ MOST_FRONT = 50
 
 
 def sections(analysis: StudyAnalysis) -> list[Section]:
-    """Return all sections that have contents, in the order of the page."""
+    """Return all sections of the report that have contents, in the order of the page."""
     candidates = (
         _requirements(analysis),
         _distributions(analysis),
@@ -175,7 +175,7 @@ def sections(analysis: StudyAnalysis) -> list[Section]:
 
 
 def _response_table(analysis: StudyAnalysis) -> Table:
-    """Return the statistics of the responses and of their reported sigmas."""
+    """Return the table of mean, standard deviation, quantiles and range of each response and of its reported sigma."""
     heads = ("response", "unit", "runs", "mean", "std", "median", "95%", "99.7%", "min", "max")
     rows: list[list[Cell]] = []
     for r in analysis.runs.everything:

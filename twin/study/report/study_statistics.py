@@ -44,7 +44,7 @@ class Series:
 
     @property
     def label(self) -> str:
-        """Name with unit."""
+        """Name with its unit, for the label of an axis."""
         return f"{self.name}, {typeset(self.unit)}" if self.unit else self.name
 
     @property
@@ -85,7 +85,7 @@ class Response(Series):
     Attributes
     ----------
     noise : (runs,) ndarray or None
-        Standard deviation by noise alone that each run reports; None without.
+        Standard deviation due to noise alone that each run reports; None if the runs report none.
     of : str
         For a reported standard deviation treated as a response, the response to which it belongs; empty for responses.
     """
@@ -131,7 +131,8 @@ class StudyRuns:
     messages : tuple of str
         Reason of each failure, (runs,).
     doubts : tuple of str
-        Reason why sigma does not hold in a run, (runs,), empty where it holds; an empty tuple for commands without it.
+        Reason why the reported sigma is not valid in a run, (runs,), empty where it is; an empty tuple for commands
+        that report none.
     """
 
     study: StudySpec
@@ -169,7 +170,7 @@ class StudyRuns:
 
     @property
     def kind(self) -> str:
-        """Kind of the design."""
+        """Kind of the design: a grid, Latin hypercube, Sobol or Monte Carlo."""
         return self.study.design.kind
 
     @property
@@ -208,7 +209,7 @@ CONFIDENCE = 0.95
 LEAST = 20
 """Smallest number of runs from which distributions are tested and sensitivity indices computed."""
 UNLIKELY = 0.01
-"""Significance level of the test of normality."""
+"""p-value below which the test of normality rejects a normal distribution."""
 TAILS = (0.00135, 0.99865)
 """Probabilities of a normal distribution at -3 and +3 sigma."""
 
@@ -217,7 +218,10 @@ Interval = tuple[float | None, float | None]
 
 @dataclass(frozen=True)
 class Estimate:
-    """Number with its confidence interval; an end is None where the runs do not determine it."""
+    """Number with its confidence interval.
+
+    An end of the interval is None where the runs do not determine it.
+    """
 
     value: float
     interval: Interval = (None, None)
@@ -341,8 +345,8 @@ def mean_interval(values: np.ndarray) -> Interval:
 def std_interval(values: np.ndarray) -> Interval:
     """Return the interval of the standard deviation (n - 1) of (n,) values; open below four values.
 
-    It is symmetric in the logarithm, whose variance (k - (n-3)/(n-1)) / (4n) follows from the kurtosis k of the values;
-    for a normal distribution it equals the chi-square interval for large n.
+    It is symmetric in the logarithm, whose variance (k - (n-3)/(n-1)) / (4n) follows from the kurtosis k (3 for a
+    normal distribution) of n values; for a normal distribution it equals the chi-square interval for large n.
 
     Array dimensions: n runs.
     """
@@ -395,7 +399,9 @@ def normality(values: np.ndarray) -> Normality | None:
 
 
 FALSE_ALARM = 1e-6
-"""Probability per response that a correctly reported noise is called impossible, where it causes all of the variance.
+"""Probability, for each response, that a correctly reported noise is called impossible.
+
+It holds where noise causes all of the variance.
 """
 
 
@@ -425,10 +431,11 @@ class NoiseShare:
 
 
 def noise_share(response: Response, study: StudySpec) -> NoiseShare | None:
-    """Return the noise share of a response; None if no noise is reported, it is common to all runs, or nothing varies.
+    """Return the share of a response's variance that its reported noise explains; None if that is not defined.
 
-    The sum of squares of independent normal noise has a chi-square distribution; where the noise differs between runs,
-    its degrees of freedom are those of Satterthwaite, Biometrics Bulletin 2, 110 (1946).
+    It is not defined if no noise is reported, all runs share their noise, or nothing varies. The sum of squares of
+    independent normal noise has a chi-square distribution; where the noise differs between runs, its degrees of freedom
+    are those of Satterthwaite, Biometrics Bulletin 2, 110 (1946).
 
     Parameters
     ----------
@@ -511,7 +518,7 @@ class LinearModel:
     effects : tuple of Effect
         Effect of each factor that varies, the largest swing first.
     cannot : tuple of str
-        Names of factors whose effects the runs do not separate.
+        Names of factors whose effects the runs do not separate from those of other factors.
     """
 
     r2: float
@@ -580,9 +587,9 @@ def linear_model(factors: Sequence[Factor], response: Response) -> LinearModel |
 
 
 def _columns(factor: Factor, good: np.ndarray) -> np.ndarray:
-    """Return the columns (n, m) of a factor: standardised numbers, or for a text one indicator per further value.
+    """Return a factor's columns of the design matrix, (n, m): standardised numbers, or indicators of text values.
 
-    Array dimensions: n runs, m columns.
+    A factor with texts has one column of 0 and 1 for each value but the first. Array dimensions: n runs, m columns.
     """
     values = factor.values[good]
     if factor.numeric:
@@ -596,7 +603,7 @@ def _columns(factor: Factor, good: np.ndarray) -> np.ndarray:
 def _effect(
     factor: Factor, good: np.ndarray, y: np.ndarray, coefficient: np.ndarray, moved: np.ndarray, t: float
 ) -> Effect:
-    """Return the effect of a factor from its coefficients.
+    """Return the effect of a factor on a response from its coefficients in the linear model.
 
     ``moved`` (m, n) is the influence of each run on each coefficient, ``t`` the quantile of Student's distribution.
 
@@ -634,7 +641,7 @@ def _span(factor: Factor, values: np.ndarray) -> tuple[float, float]:
 
 
 def _largest_difference(means: np.ndarray, moved: np.ndarray, t: float) -> Estimate:
-    """Return the largest difference of two of (m,) means, the first of which is 0 by definition.
+    """Return the largest difference between two of m means (m,), with its interval; the first mean is 0.
 
     The interval covers all pairs simultaneously (Bonferroni), so that it remains valid for the largest.
 
@@ -655,7 +662,10 @@ def _estimate(value: float, moved: np.ndarray, scale: float, t: float) -> Estima
 
 
 def _rank_interval(rank: float, n: int) -> Interval:
-    """Return Fisher's interval of a rank correlation, with the variance (1 + r^2/2)/(n - 3) of Bonett and Wright."""
+    """Return Fisher's confidence interval of a rank correlation of n pairs.
+
+    Its variance is that of Bonett and Wright, (1 + r^2/2)/(n - 3), with r the rank correlation.
+    """
     if n < 10:
         return None, None
     if abs(rank) > 1.0 - 1e-12:

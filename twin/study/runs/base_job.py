@@ -1,4 +1,4 @@
-"""Base job of a study: a tree of values that runs change, the evaluation of runs, and the responses that are kept."""
+"""Base job of a study: the data that runs change, the evaluation of runs, and the responses that are kept."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class Run:
     number : int
         Number of the run, from 0.
     values : tuple of tuple
-        Place and value of everything that the factors change in the base's tree.
+        Key and value of each entry of the base job that the factors set.
     seed : int or None
-        Seed of its noise; None for the base's.
+        Seed of the run's noise; None for the base job's seed.
     """
 
     number: int
@@ -62,18 +62,18 @@ Outcome = Mapping[str, Any] | Failure
 
 
 class BaseJob(Protocol):
-    """Command that a study can vary."""
+    """Command that a study can vary: how its file is read, and how its runs are evaluated."""
 
     @property
     def model(self) -> type[Spec]:
-        """Model of its config.yaml."""
+        """Class (data model) of the job's config.yaml."""
 
     @property
     def block(self) -> int:
         """Number of consecutive runs that are always evaluated together, on any worker."""
 
     def resolve(self, file: Path | str) -> Spec:
-        """Read its file, or a name in the library, with everything it refers to; raise InputError."""
+        """Read the job's file, or a name in the library, with everything it refers to; raise InputError."""
 
     def check(self, tree: Tree, backend: Backend) -> None:
         """Check what needs the built instrument; called once, in a worker, before the study; raise InputError."""
@@ -86,26 +86,27 @@ class BaseJob(Protocol):
 
 
 PHYSICS = (InputError, PhysicalError, MeasurementError)
-"""Errors of a run that is physically impossible: incompatible values, lost light, a fit without convergence. Any other
-error is a fault of the program and stops the study.
+"""Errors of a run that is physically impossible: incompatible values, lost light, a fit without convergence.
+
+Any other error is a fault of the program and stops the study.
 """
 
 
 @dataclass(frozen=True)
 class ProcedureBase:
-    """Test as a base job, run after run; only its numbers are computed.
+    """Laboratory test or other procedure as the base job of a study; only its numbers are computed, run by run.
 
     Attributes
     ----------
     procedure : Procedure
-        The test.
+        The test that is varied.
     """
 
     procedure: Procedure
 
     @property
     def model(self) -> type[Spec]:
-        """Model of the test's set-up."""
+        """Class (data model) of the test's set-up."""
         return self.procedure.model
 
     @property
@@ -146,11 +147,11 @@ def one_line(error: Exception) -> str:
 
 
 Tree = dict[str, Any]
-"""Plain data of a model: mappings, lists and single values."""
+"""Plain data of a job: nested mappings, lists and single values."""
 
 
 def with_place(tree: Tree, model: type[Spec], key: KeyPath, neutral: bool = False) -> Tree:
-    """Return the tree in which ``key`` leads to a single value; missing optional parts are created with their defaults.
+    """Return a job's plain data in which ``key`` leads to a value; missing optional parts get their defaults.
 
     Parameters
     ----------
@@ -190,14 +191,14 @@ def with_place(tree: Tree, model: type[Spec], key: KeyPath, neutral: bool = Fals
 
 
 def is_neutral(tree: Tree, model: type[Spec], key: KeyPath) -> bool:
-    """Return True if everything that ``with_place`` adds for ``key`` has the same effect as its absence.
+    """Return True if what ``with_place`` adds to reach ``key`` has the same effect as its absence.
 
     Parameters
     ----------
     tree : dict
         Plain data of a ``model``.
     model : type of Spec
-        Model of the tree.
+        Data model (class) of the plain data.
     key : KeyPath
         Keys and list indices from the root, which must exist in the model.
     """
@@ -254,14 +255,14 @@ def _is_model(annotation: Any) -> bool:
 
 
 def with_values(tree: Tree, values: Iterable[tuple[KeyPath, Any]]) -> Tree:
-    """Return the tree with other values at existing places; unchanged parts are shared with ``tree``.
+    """Return a job's plain data with new values at existing keys; unchanged parts are shared with ``tree``.
 
     Parameters
     ----------
     tree : dict
         Plain data; not changed.
     values : iterable of tuple
-        Place and value of everything that changes.
+        Key path and new value of each entry that changes.
     """
     out = dict(tree)
     copied = {id(out)}
@@ -279,12 +280,12 @@ def with_values(tree: Tree, values: Iterable[tuple[KeyPath, Any]]) -> Tree:
 
 
 def leaf(tree: Any, key: KeyPath) -> Any:
-    """Return the value at ``key`` of results.
+    """Return the value at a key path of results.
 
     Parameters
     ----------
-    tree : Any
-        Plain data.
+    tree : dict or list
+        Results as nested mappings and lists.
     key : KeyPath
         Keys and list indices from its root.
 
@@ -318,15 +319,15 @@ class BlockResult:
     values : (n, R) ndarray
         Responses in the study's order, NaN in failed runs and where there is no number.
     sigmas : (n, R) ndarray
-        Their standard deviations, NaN where none is requested.
+        Total standard deviations of the responses, NaN where none is requested.
     noises : (n, R) ndarray
-        Their standard deviations by noise alone, NaN where none is requested.
+        Standard deviations of the responses due to noise alone, NaN where none is requested.
     messages : tuple of str
         Reason of each failure, (n,), empty for a run that did not fail.
     seconds : float
         Computing time on the worker.
     doubts : tuple of str
-        Reason why sigma does not hold in a run that did not fail, (n,), empty where it holds.
+        Reason why the sigma of a run that did not fail is not valid, (n,), empty where it is.
     """
 
     values: np.ndarray
@@ -357,7 +358,7 @@ class BlockResult:
     def of(
         cls, outcomes: Sequence[Outcome], responses: Mapping[str, ResponseSpec], seconds: float = 0.0
     ) -> BlockResult:
-        """Return the responses of outcomes."""
+        """Return the block's responses, taken from the outcomes of its runs."""
         values = np.full((len(outcomes), len(responses)), np.nan)
         sigmas, noises = (np.full(values.shape, np.nan) for _ in range(2))
         messages: list[str] = []
@@ -397,11 +398,11 @@ class BlockResult:
 
 
 CONTRADICTED = "the shifts of the spots contradict the prior on disturbances"
-"""Reason why sigma does not hold although the fits of the spots are good."""
+"""Reason why a run's sigma is not valid although the fits of its spots are good."""
 
 
 def _doubt(outcome: Mapping[str, Any]) -> str:
-    """Return the reason why the recovered sigmas do not hold, without its numbers; empty where they hold."""
+    """Return the reason why the sigmas of a run are not valid, without its numbers; empty where they are."""
     recovered = outcome.get("recovered", {})
     course = outcome.get("course", {}).get("sigma_holds", [])
     if not isinstance(recovered, Mapping) or (recovered.get("sigma_holds", True) and all(course)):

@@ -33,11 +33,14 @@ BLOCKS = "blocks.journal"
 LONGEST_REPEAT = 4.0
 """Time, seconds, beyond which the first block is not evaluated a second time for a better estimate."""
 _ALONE = threading.Lock()
-"""Lock by which a worker with several threads evaluates one block at a time: Dr.Jit's state belongs to the process."""
+"""Lock by which a worker with several threads evaluates one block at a time.
+
+The state of the library Dr.Jit belongs to the process.
+"""
 
 
 class OtherProgramError(Exception):
-    """The worker runs another version of the program than the study was started with."""
+    """Error that a worker runs a different version of the program from the one the study was started with."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +72,9 @@ class Pilot:
     Attributes
     ----------
     result : BlockResult
-        Result of the block; its time is that of a second evaluation, with everything compiled and calibrated.
+        Result of the block; its computing time is that of a second evaluation, with everything compiled and calibrated.
     sample : dict or None
-        All results of the first run that did not fail, None if all did.
+        All results of the first run that did not fail; None if all runs failed.
     start_seconds : float
         Time that the first evaluation took longer than the second.
     memory : float
@@ -339,7 +342,7 @@ def check_responses(setup: StudySetup, sample: Any) -> None:
     ----------
     setup : StudySetup
         The study.
-    sample : Any
+    sample : dict
         Results of one run, by file.
 
     Raises
@@ -364,12 +367,12 @@ def check_responses(setup: StudySetup, sample: Any) -> None:
 
 
 def _check_noise(setup: StudySetup, sample: Any, name: str, path: KeyPath) -> None:
-    """Raise InputError if the noise of a response is a total standard deviation beside which that of noise exists.
+    """Raise InputError if a response's ``noise`` names a total sigma although the results have one due to noise.
 
     Raises
     ------
     InputError
-        The key is that of a total standard deviation.
+        The key names a total standard deviation.
     """
     index = max((k for k, part in enumerate(path) if isinstance(part, str)), default=0)
     named = str(path[index])

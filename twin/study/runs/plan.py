@@ -1,4 +1,4 @@
-"""Plan of a study: values of its factors in every run, values that scale with them, and memory needed."""
+"""Plan of a study: values of its factors in every run, values that scale with them, memory needed."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def run_count(study: StudySpec) -> int:
 
 
 def draw(study: StudySpec) -> dict[str, np.ndarray]:
-    """Return the value of each factor in every run, (runs,): numbers in the factor's unit, or indices into a list.
+    """Return each factor's value in every run, (runs,): numbers in the factor's unit, or indices into its list.
 
     The last axis of a grid changes fastest. Distributions are sampled by the inverse of their distribution function, so
     that low-discrepancy designs keep their uniformity.
@@ -100,10 +100,9 @@ def _quantile(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
 
 
 FAR = 5.0
-"""Distance of the nearer limit from the mean, in sigmas, beyond which the truncated normal distribution is computed
-with logarithms.
+"""Distance from mean to nearer limit, in sigmas, from which a truncated normal is computed in logarithms.
 
-There the probability between the limits loses its digits.
+Beyond it the probability between the limits loses its digits in ordinary arithmetic.
 """
 
 
@@ -144,14 +143,14 @@ def extremes(factor: FactorSpec) -> list[float]:
 
 @dataclass(frozen=True, eq=False)
 class Scaling:
-    """Values of the base that scale with factors; several factors may scale one of them.
+    """Values of the base job that scale with factors; several factors may scale one of them.
 
     Attributes
     ----------
     base : dict
-        Place -> number and unit in the base; an integer where the base has one.
+        Key path -> number and unit in the base job; an integer where the base has one.
     ratio : dict
-        Place -> multiplier of the number in every run, (runs,).
+        Key path -> multiplier of the number in every run, (runs,).
     """
 
     base: Mapping[KeyPath, tuple[float | int, str]]
@@ -165,7 +164,7 @@ class Scaling:
 
 
 def scaled(number: tuple[float | int, str], ratio: float) -> Any:
-    """Return number and unit times a ratio, in the form of a tree.
+    """Return a quantity times a ratio, as a job's file writes it.
 
     Parameters
     ----------
@@ -182,14 +181,14 @@ def scaled(number: tuple[float | int, str], ratio: float) -> Any:
 
 
 def ratios(factor: FactorSpec, tree: Tree, values: np.ndarray, unit: str) -> dict[KeyPath, np.ndarray]:
-    """Return the multipliers of the values that scale with a factor: place -> array like ``values``.
+    """Return the multipliers of the values that scale with a factor, by key path, each of the shape of ``values``.
 
     Parameters
     ----------
     factor : FactorSpec
         Factor with its ``scales``.
     tree : dict
-        Tree of the base.
+        Plain data of the base job.
     values : ndarray
         Values of the factor.
     unit : str
@@ -222,14 +221,14 @@ def _nominal(factor: FactorSpec, tree: Tree, unit: str) -> float:
 
 
 def number_at(base: Tree, place: KeyPath, unit: str) -> float:
-    """Return the number that the base has at the place of a factor, in a unit.
+    """Return the number that the base job has at a factor's key, in a unit.
 
     Parameters
     ----------
     base : dict
-        Tree of the base, without values of factors.
+        Plain data of the base job, without values of factors.
     place : KeyPath
-        Place of the factor.
+        Key path of the factor.
     unit : str
         Unit of the factor's numbers, empty for pure numbers.
 
@@ -255,8 +254,8 @@ def number_in(value: Any, unit: str) -> float | None:
 
     Parameters
     ----------
-    value : Any
-        Value in a tree.
+    value : str, float, int or other plain value
+        Value in a job's plain data.
     unit : str
         Unit, empty for pure numbers.
     """
@@ -267,7 +266,7 @@ def number_in(value: Any, unit: str) -> float | None:
 
 
 def number_of(value: Any) -> tuple[float | int, str]:
-    """Return number and unit of a value of the tree, the unit empty for a pure number.
+    """Return number and unit of a value in a job's plain data; the unit is empty for a pure number.
 
     Raises
     ------
@@ -284,7 +283,7 @@ def number_of(value: Any) -> tuple[float | int, str]:
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """Values of one factor.
+    """Values of one factor in all runs of a study.
 
     Attributes
     ----------
@@ -301,7 +300,7 @@ class Column:
     values: np.ndarray
 
     def cell(self, run: int) -> Any:
-        """Return the value in a run in the form of the base's tree."""
+        """Return the factor's value in a run as a job's file writes it."""
         value = self.values[run].item()
         return with_unit(value, self.unit) if self.unit else value
 
@@ -394,7 +393,7 @@ class Plan:
         return np.array([int(word) >> 1 for word in words], np.int64)
 
     def run(self, number: int) -> Run:
-        """Return one run."""
+        """Return one run: its number, its values for the base job, and its seed."""
         factors = self.setup.study.factors
         values = {place: c.cell(number) for c in self.columns for place in factors[c.name].places}
         self.scaling.apply(values, number)
@@ -459,7 +458,7 @@ def _like(setup: StudySetup, name: str, sampled: np.ndarray) -> np.ndarray:
 
 
 def _telling(column: Column, limits: list[float]) -> list[Any]:
-    """Return the values of a factor that are validated: all texts and switches, smallest and largest number."""
+    """Return the values of a factor that have to be validated: all texts and switches, smallest and largest number."""
     if column.values.dtype.kind in "US":
         return list(dict.fromkeys(column.values.tolist()))
     if column.values.dtype.kind == "b":
@@ -473,7 +472,7 @@ def _telling(column: Column, limits: list[float]) -> list[Any]:
 STARTED = 110e6
 """Memory for writing the report of a study of any size, beside the imported program, bytes."""
 CELL = 120.0
-"""Memory per number of a run for computation, data set and text table, bytes."""
+"""Memory in bytes for each number of a run: computation, data set and text table together."""
 _KEPT = 5
 """Number of bookkeeping columns of every study: number, failed, message, doubt, seed."""
 

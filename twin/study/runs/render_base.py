@@ -37,7 +37,7 @@ from twin.study.runs.base_job import PHYSICS, Failure, Outcome, Run, Tree, one_l
 def run_results(
     resolved: ResolvedJob, experiment: MonitorExperiment, state: State, truth: Truth, recovery: Recovery | None = None
 ) -> dict[str, Any]:
-    """Return ``truth`` and, with a monitor, ``recovered``, as in truth.json and recovered.json.
+    """Return the contents of truth.json and, with a monitor, of recovered.json, for one state.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def _run_together(
     runs : sequence of MonitorRun
         Runs to be evaluated together.
     before : callable
-        Function from number of frames and seed to frames of the nominal state, (C, frames, rows, columns).
+        Takes number of frames and seed, and returns the frames of the nominal state, (C, frames, rows, columns).
 
     Returns
     -------
@@ -117,7 +117,7 @@ def _run_together(
 
 
 _PATTERN_FRAMES = 8
-"""Number of frames whose memory equals that of the fixed pattern of their CCDs."""
+"""Number of frames that need as much memory as the fixed pattern (pixel offsets and gains) of their CCDs."""
 
 
 def _traced_together(experiment: MonitorExperiment, runs: Sequence[MonitorRun]) -> list[Outcome]:
@@ -137,8 +137,9 @@ def _traced_together(experiment: MonitorExperiment, runs: Sequence[MonitorRun]) 
 
 
 BLOCK = 25
-"""Number of runs in a block. A run's last digits depend on the runs of its block, and so neither on the number of
-workers nor on interruptions.
+"""Number of runs in a block, which are evaluated together.
+
+A run's last digits depend on the runs of its block, and so neither on the number of workers nor on interruptions.
 """
 KEPT = 4
 """Number of calibrated instruments that a worker keeps."""
@@ -170,7 +171,7 @@ class RenderBase:
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
         """Return the outcome of every run: ``truth`` and ``recovered``, and further results on request.
 
-        These are ``quality``, and the results of a course, stray light or targets.
+        The further results are ``quality`` (image quality), and those of a series of states, stray light or targets.
         """
         if self._maker is None or self._maker.tree is not tree:  # the same object from block to block
             self._maker = JobMaker(tree)
@@ -234,7 +235,7 @@ class RenderBase:
         return name, self._experiments[name]
 
     def _frames_before(self, name: str, experiment: MonitorExperiment, frames: int, seed: int) -> np.ndarray:
-        """Return the frames before, kept between runs because runs with common noise share them."""
+        """Return the frames before the perturbation, cached because runs with common noise share them."""
         key = (name, frames, seed)
         if key not in self._before:
             self._before[key] = experiment.frames_before(frames, seed)
@@ -255,7 +256,7 @@ def _qualities(
 
 
 def _alone(resolved: ResolvedJob, backend: Backend) -> Outcome:
-    """Return the outcome of a job with more than one state, or with more than spots."""
+    """Return the outcome of a job with several states, or with results other than monitor spots."""
     from twin.main_job.render_job import render_job
 
     run = render_job(resolved, backend)
@@ -328,5 +329,5 @@ def read_job(tree: Tree) -> ResolvedJob:
 
 
 def _needs_more(job: JobSpec) -> bool:
-    """Return True if a job has a course, stray light or targets, which are not computed for many states at once."""
+    """Return True if a job has a series of states, stray light or targets, which are computed run by run."""
     return job.course is not None or job.render.stray is not None or bool(job.render.target_images)

@@ -29,9 +29,15 @@ from twin.study.runs.base_job import BaseJob, ProcedureBase, Tree, is_neutral, w
 
 PROGRAM = "twin.study"
 BY_NAME = ("instrument", "disturbances")
-"""Keys of a job that name files whose contents are in the resolved base; changing the name would have no effect."""
+"""Keys of a job that name files whose contents are in the resolved base job.
+
+Changing such a name would have no effect.
+"""
 WORDS = ("name", "description", "limits", "report")
-"""Keys of a study that affect no number; they, names and units of responses may be changed when a study is resumed."""
+"""Keys of a study that affect no number.
+
+They, names and units of responses may be changed when a study is resumed.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +49,7 @@ class StudySetup:
     study : StudySpec
         Specification in the study's file, with the values of the tables.
     tree : dict
-        Plain data of the resolved base with an entry at the place of every factor. If the base has no value there and
+        Plain data of the resolved base job with an entry at the key of every factor. If the base has no value there and
         absence has the same effect as a value, that value is used; else one of the factor's.
     base : dict
         The same without values of factors: an entry exists only if the base has one, or one with the same effect as its
@@ -56,7 +62,7 @@ class StudySetup:
 
     @cached_property
     def job(self) -> BaseJob:
-        """Base job."""
+        """Base job of the study: the command that its runs repeat."""
         return _job(self.study.base.command)
 
     def to_yaml(self) -> str:
@@ -94,7 +100,7 @@ class StudySetup:
         return replace(issue, file=source.file, line=source.line(key), key=(*source.prefix, *key))
 
     def factor_at(self, place: KeyPath) -> tuple[str, KeyPath] | None:
-        """Return name and key of the factor that changes ``place`` of the base, or something above or below it."""
+        """Return name and key of the factor that sets the value at ``place`` of the base job, or one above or below it."""
         for name, factor in self.study.factors.items():
             scaled = [(scale.key, ("scales", k)) for k, scale in enumerate(factor.scales)]
             for changed, where in (*((p, factor.key_of(k)) for k, p in enumerate(factor.places)), *scaled):
@@ -104,7 +110,7 @@ class StudySetup:
         return None
 
     def blamed(self, error: InputError, prefix: KeyPath = ()) -> InputError:
-        """Return an error in the base's tree placed at the factor that caused it; other errors unchanged."""
+        """Return an error in the base job's data placed at the factor that caused it; other errors unchanged."""
         issues = []
         for issue in error.issues:
             factor = self.factor_at((*prefix, *issue.key))
@@ -167,7 +173,7 @@ def _resolved(yaml: yaml_file.YamlFile) -> StudySetup:
 
 
 def _again(yaml: yaml_file.YamlFile) -> StudySetup:
-    """Return the study of a config.yaml."""
+    """Return the study that a config.yaml of an earlier study holds."""
     known = ("study", "base")
     for key in yaml.data:
         if key not in known:
@@ -218,7 +224,7 @@ def _placed(study: StudySpec, tree: Tree) -> StudySetup:
 
 
 def _inherited(base: Tree, place: KeyPath) -> bool:
-    """Return whether a place belongs to a temperature that a body takes from a warmed body that carries it."""
+    """Return whether a key belongs to a temperature that a body takes from the warmed body that carries it."""
     if place[:2] != ("job", "perturb") or place[3:4] != ("temperature",):
         return False
     perturb, node = base["job"].get("perturb", {}), str(place[2])
@@ -243,7 +249,7 @@ def _refuse_names(study: StudySpec, place: KeyPath) -> None:
 
 
 def _unset(tree: Tree, factor: FactorSpec) -> list[KeyPath]:
-    """Return the places of a factor that have no value yet."""
+    """Return the key paths of a factor that have no value in the base job yet."""
     out = []
     for place in factor.places:
         node: Any = tree
@@ -285,7 +291,9 @@ def _with_tables(study: StudySpec) -> StudySpec:
 LARGEST_TABLE = 100_000_000
 """Largest size of a table's file, bytes."""
 MOST_CELLS = 90_000
-"""Largest number of cells of all tables together: config.yaml of the study holds them, at most 100 000 keys and values.
+"""Largest number of cells of all tables together.
+
+The config.yaml of the study holds them, with at most 100 000 keys and values.
 """
 
 
