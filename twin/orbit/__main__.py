@@ -37,7 +37,7 @@ PROGRAM = "twin.orbit"
 
 
 class Correction(StrEnum):
-    """Correction of an image that control points determine."""
+    """Kind of the correction of an image that control points determine, as an option's choices."""
 
     shift = "shift"
     affine = "affine"

@@ -450,7 +450,7 @@ def fly(setup: AngleSetup, camera: AngleCamera, seed: np.random.SeedSequence) ->
 
 
 def _interior(camera: LineCamera, pixel: np.ndarray) -> dict[str, Any]:
-    """Return the laboratory's interior of a line's pixels (N,), one for each of N points, as fields of a `Measurement`.
+    """Return the laboratory's geometry of a line's N pixels (N,) as fields of a `Measurement`.
 
     Tangents count across the line (forward) and along it (to the right) in the body's axes pitched to the line's
     centre; the angle within the line is positive to the right.

@@ -389,7 +389,7 @@ def _moved(what: str) -> str:
 
 
 def _panels(run: SimulatedAngleRun) -> dict[str, list[tuple[str, str]]]:
-    """Return the panels of each figure, (moved quantity, angle), in the paper's order: Fig. 3, Figs. 4 and 5."""
+    """Return the panels of each figure, as (quantity with an error, angle), in the paper's order: Figs. 3 to 5."""
     pairs = run.flight.pairs
     out = {"station": [("station", name) for name in pairs]}
     return out | {f"{name}-points": [(line, name) for line in pair] for name, pair in pairs.items()}

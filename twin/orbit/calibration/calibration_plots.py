@@ -116,7 +116,7 @@ def _schemes_figure(run: CalibrationRun) -> Figure:
 
 
 def _latitude_figure(run: CalibrationRun) -> Figure:
-    """Draw the bias of every field with its sigma, the truth where it is known, and the fit against latitude."""
+    """Draw each field's attitude bias with its sigma, the truth where it is known, and the fit against latitude."""
     figure = svg.new_figure(3.9)
     campaign, passes = run.campaign, run.campaign.passes
     latitude = np.array([p.latitude for p in passes])

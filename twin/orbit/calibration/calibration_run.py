@@ -81,7 +81,10 @@ _TIE = 1.7e5
 
 @dataclass(frozen=True, eq=False)
 class FieldResult:
-    """Calibration of a single field, with paper 003's twelve unknowns.
+    """Calibration of a single field, with the twelve unknowns of paper 003.
+
+    The unknowns are principal distance f and principal point x, y of three lines, and the attitude biases roll, pitch,
+    yaw.
 
     Attributes
     ----------

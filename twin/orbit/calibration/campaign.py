@@ -177,11 +177,11 @@ class PassData:
         return next(iter(self.sensors.values())).earth
 
     def pixels_per_line(self, name: str) -> float:
-        """Return the displacement in x of the focal plane per image line, in pixels, at the middle of an image.
+        """Return the displacement along the track in the focal plane per image line, at an image's middle, in px.
 
-        It is the distance in the focal plane, at one moment, between the ground points that neighbouring lines see
-        at the pass's mean height. Where lines are spaced as pixels are, it is 1 at nadir and about cos^2 of the look
-        angle for a line that looks ahead.
+        It is the distance in the focal plane, at one moment, between the ground points that neighbouring lines see at
+        the pass's mean height. Where lines are spaced as pixels are, it is 1 at nadir and about cos^2 of the look angle
+        for a line that looks ahead.
         """
         sensor, model = self.sensors[name], self.models[name]
         middle = np.full(2, 0.5 * (sensor.lines - 1))
@@ -371,7 +371,9 @@ class PassTruth:
     drift: Mapping[str, np.ndarray] = FrozenMap({})
 
     def bias_at(self, time: float) -> np.ndarray:
-        """Return the (3,) true roll, pitch and yaw at a time, in radians, without slow errors.
+        """Return the true roll, pitch and yaw at a time, (3,), in radians.
+
+        Errors of the readings that vary slowly with time are not part of it.
 
         Parameters
         ----------

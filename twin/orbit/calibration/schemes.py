@@ -143,7 +143,7 @@ class Repeats:
     height: np.ndarray
 
     def met(self, plan: float, height: float) -> np.ndarray:
-        """Return the (schemes,) share of campaigns in which every field is within the limits, given in metres."""
+        """Return each scheme's share of campaigns in which every field is within the limits, given in metres."""
         good = np.all((self.plan <= plan) & (self.height <= height), axis=2)
         return np.asarray(good.mean(axis=0))
 

@@ -367,7 +367,7 @@ _GRID = (37, 41)
 
 
 def _image(camera: EffectiveCamera, seconds: Array, ground: Array) -> Array:
-    """Return the image of N ground points at given times, (N, 2), in pixels off the line and along it."""
+    """Return the image of N ground points at given times: distance from the line and position along it, (N, 2), px."""
     rotation = Rotation.from_quat(_lagrange(camera.seconds, _quaternions(camera.rotation), seconds))
     look = rotation.apply(ground - _lagrange(camera.seconds, camera.station, seconds))
     ideal = 1e3 * camera.focal_length * look[:, :2] / look[:, 2:]
