@@ -99,7 +99,10 @@ class RigidMotion:
 
     @property
     def line_turn(self) -> float:
-        """Rotation of the line CCD (the Y' axis) about +Z', projected on the X'Y' plane, in radians."""
+        """Angle by which the motion rotates the line CCD (the Y' axis) about +Z', in radians.
+
+        The rotated line is projected on the X'Y' plane.
+        """
         line = self.matrix[:, 1]
         return float(np.arctan2(-line[0], line[1]))
 
@@ -491,7 +494,7 @@ class ShimPlan:
 
     @property
     def level_coupling(self) -> float:
-        """Error of the line's level without rotation and slide, about +Z', in radians."""
+        """Rotation of the line about +Z' that remains if shims alone are used, in radians."""
         return self.shims_only.line_turn - self.wanted.line_turn
 
     def focus_error(self, position: ArrayLike) -> Array:

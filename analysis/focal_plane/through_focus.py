@@ -148,7 +148,7 @@ class _Lobe:
         return np.asarray(present.sum(axis=1))
 
     def _values(self) -> tuple[Array, Array]:
-        """Return the curve (B, Z) and its derivatives with respect to p, x0 and a, (B, Z, 3)."""
+        """Return the values of B fitted curves at Z positions, and derivatives with respect to p, x0, a, (B, Z, 3)."""
         distance = self.x - self.x0[:, None]
         p, a = self.p[:, None], self.a[:, None]
         u = a * distance**2

@@ -73,13 +73,15 @@ from analysis.statistics import gain
 from analysis.turntable.dividing_error import CalibrationSeries
 
 _POWER = {"constant": (0, 1.0), "principal_distance": (1, 1.0), "principal_point": (2, -1.0), "radial3": (3, 1.0)}
-"""Power of tan W and sign of each term."""
+"""Power of tan W, with W the angle from the line's centre, and sign, of each term of the image position."""
 TERMS = tuple(_POWER)
-"""Names of the terms."""
+"""Names of the terms of the model: constant, principal distance, principal point and radial distortion."""
 _WIDEST = np.pi / 4
 """Largest plausible angle, in radians: line cameras see a few degrees, and larger values are probably in degrees."""
 _SINGULAR = 1e-9
-"""Smallest determinant of (2) relative to its first product; one part in 1e9 leaves six correct digits."""
+"""Smallest determinant of the normal equations of eq. (2), relative to the product of their diagonal elements; a
+determinant of 1e-9 leaves six correct digits.
+"""
 
 
 class OrientationError(MeasurementError, ValueError):
@@ -87,7 +89,7 @@ class OrientationError(MeasurementError, ValueError):
 
 
 def readings(position: ArrayLike, angle: ArrayLike) -> tuple[Array, Array]:
-    """Return validated L and W as float64 arrays of the same shape (..., N).
+    """Return validated image positions (metres) and angles (radians) as float64 arrays of one shape (..., N).
 
     Raises
     ------
@@ -126,18 +128,18 @@ def readings(position: ArrayLike, angle: ArrayLike) -> tuple[Array, Array]:
 def distortion(
     position: ArrayLike, angle: ArrayLike, principal_distance: ArrayLike, principal_point: ArrayLike = 0.0
 ) -> Array:
-    """Return the distortion (..., N) of each point, in metres: paper 004, eq. (1).
+    """Return the distortion of each of N points, in metres: D = L - f tan W + p tan^2 W (paper 004, eq. 1).
 
     Parameters
     ----------
     position : (..., N) array_like
-        Image positions, in metres.
+        Image positions L of the N points, in metres.
     angle : (..., N) array_like
-        Angles, in radians.
+        Angles W of their directions, in radians.
     principal_distance : (...) array_like
-        Principal distance of each set, in metres.
+        Principal distance f of each set of points, in metres.
     principal_point : (...) array_like
-        Principal point of each set, in metres.
+        Principal point p of each set of points, in metres.
 
     Raises
     ------
@@ -152,7 +154,7 @@ def distortion(
 
 
 def principal_distance_and_point(position: ArrayLike, angle: ArrayLike) -> tuple[Array, Array]:
-    """Return principal distance f and principal point p, each (...), in metres: paper 004, eq. (2).
+    """Return the principal distance f and principal point p of smallest distortion, in metres (paper 004, eq. 2).
 
     Parameters
     ----------
@@ -238,7 +240,9 @@ def principal_point(position: ArrayLike, angle: ArrayLike, principal_distance: A
 
 
 def design(angle: ArrayLike, terms: Sequence[str]) -> Array:
-    """Return the derivatives dL/d(term) (..., P) at angles (...), in radians.
+    """Return the derivatives of the image position with respect to P terms of the model, at angles in radians.
+
+    Positions and terms are in metres; the result has shape (..., P) for angles (...).
 
     Raises
     ------
@@ -253,7 +257,7 @@ def design(angle: ArrayLike, terms: Sequence[str]) -> Array:
 
 
 def slope(angle: ArrayLike, terms: Sequence[str], values: ArrayLike) -> Array:
-    """Return dL/dW (...), in m/rad, of the model with these terms and values at angles (...).
+    """Return the derivative of the image position with respect to the angle, in m/rad, of a fitted model.
 
     Parameters
     ----------
@@ -314,7 +318,7 @@ def _check_separable(columns: Array, names: tuple[str, ...], angle: Array) -> No
 
 
 def _noise_matrix(values: ArrayLike, count: int, name: str) -> Array:
-    """Return a covariance (N, N) from a covariance (N, N) or from sigmas (N,) or ().
+    """Return the covariance (N, N) of N values from their covariance, their sigmas (N,) or one common sigma.
 
     Parameters
     ----------
@@ -347,7 +351,7 @@ def _noise_matrix(values: ArrayLike, count: int, name: str) -> Array:
 
 
 def _noise_root(noise: Array) -> Array:
-    """Return the Cholesky factor of a covariance (N, N): solve(root, x) has unit covariance.
+    """Return the lower Cholesky factor of a covariance (N, N), with which errors are whitened.
 
     Raises
     ------
@@ -380,7 +384,7 @@ class PointReport:
     observable : bool
         True if the sigma of p, or of a p fitted in addition to the other terms, is at most `POINT_TOLERANCE`.
     statement : str
-        Sentence that states this with numbers.
+        Sentence that reports the result with its sigma.
     """
 
     observable: bool
@@ -454,7 +458,7 @@ _WORST_DISTANCE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class InteriorOrientation:
-    """Fit over N points with P terms.
+    """Interior orientation of a line camera: P terms fitted to N points.
 
     Attributes
     ----------
@@ -473,7 +477,7 @@ class InteriorOrientation:
     residual : (N,) ndarray
         Position minus model, in metres.
     chi_square : float
-        Least sum of squares in the metric of the noise.
+        Smallest sum of squared residuals weighted by the inverse covariance of the noise.
     degrees_of_freedom : int
         Degrees of freedom of the chi-square, N - P.
     point : PointReport
@@ -643,21 +647,24 @@ def fit_interior_orientation(
 
 
 LINE_TERMS = ("axis", "principal_distance", "principal_point", "k1")
-"""Names of the unknowns of the line model; the last three are keys of a payload's line."""
+"""Names of the unknowns of the line model: reading of the camera's Z axis, principal distance, principal point, radial
+distortion. The last three are keys of a line in a payload file.
+"""
 _STEPS = 20
 """Largest number of Gauss-Newton steps."""
 
 
 @dataclass(frozen=True, eq=False)
 class LineOrientation:
-    """Fit of the line model, `LINE_TERMS`.
+    """Parameters of the line model of a camera (`LINE_TERMS`) with their covariance.
 
     Attributes
     ----------
     values : (4,) ndarray
-        Values, in rad, m, m, 1/m^2.
+        Reading of the camera's Z axis (rad), principal distance f (m), principal point y0 (m) and radial distortion k1
+        (1/m^2).
     covariance : (4, 4) ndarray
-        Covariance, in these units.
+        Covariance of the values, in these units.
     """
 
     values: Array
@@ -665,12 +672,16 @@ class LineOrientation:
 
     @property
     def sigma(self) -> Array:
-        """Standard deviations (4,) of the values."""
+        """Standard deviations of the four values, in rad, m, m, 1/m^2."""
         return np.sqrt(np.diagonal(self.covariance))
 
 
 def _model(values: Array, position: Array) -> tuple[Array, Array, Array]:
-    """Return W (N,), its derivatives with respect to the values (N, 4), and dL/dW (N,)."""
+    """Return the angle of each of N image positions, and its derivatives, by the line model.
+
+    Returned are angles W (N,) in radians, their derivatives with respect to the four values (N, 4), and the derivatives
+    of position with respect to angle (N,), in m/rad.
+    """
     axis, f, point, k1 = values
     u = position - point
     tangent = u * (1.0 + k1 * u**2) / f
@@ -717,14 +728,15 @@ def line_orientation(fit: InteriorOrientation) -> LineOrientation:
 
 
 CALIBRATED = ("constant", "principal_distance", "principal_point")
-"""Terms to which distortion refers: eq. (2) with a constant."""
+"""Names of the terms that are subtracted to obtain the distortion: those of eq. (2), with a constant."""
 SMOOTH = (*CALIBRATED, "radial3")
-"""Terms of the smooth model, whose residual measures the scatter of the points."""
+"""Names of the terms of the smooth model (with radial distortion), whose residuals measure the scatter of the points.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Spots:
-    """Spots on the line CCD.
+    """Located spots of N points in S repeated sets on the line CCD.
 
     Attributes
     ----------
@@ -797,7 +809,7 @@ def locate_spots(
 
 @dataclass(frozen=True, eq=False)
 class PointMeans:
-    """Sets reduced to one measurement per point.
+    """Repeated measurements of N points in S sets, reduced to one per point.
 
     Attributes
     ----------
@@ -814,7 +826,7 @@ class PointMeans:
     sigma: Array
 
     def mean(self, values: Array) -> Array:
-        """Return the mean over the sets that are kept, (N, S) to (N,)."""
+        """Return the mean of values (N, S) over the kept sets of each point, (N,)."""
         return np.asarray(np.mean(values, axis=1, where=self.keep))
 
 
@@ -876,14 +888,14 @@ def _white(fitted: Callable[[float], InteriorOrientation]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Distortion:
-    """Distortion with one kind of angles (as read, or compensated).
+    """Distortion of a line camera, measured with one kind of turntable angles (as read, or compensated).
 
     Attributes
     ----------
     angle : (N, S) ndarray
-        Angle W of each exposure, in radians.
+        Angle W of each exposure of N points in S sets, in radians.
     position : (N, S) ndarray
-        Position L, in metres.
+        Image position L of each exposure, in metres.
     means : PointMeans
         Reduction of the sets.
     fit : InteriorOrientation
@@ -946,12 +958,12 @@ class Distortion:
 
     @property
     def zero(self) -> float:
-        """Angle at which the line's middle is imaged, from the constant, in radians."""
+        """Angle of the direction that images to the middle of the line, from the fitted constant, in radians."""
         return -self.fit.value("constant") / self.fit.value("principal_distance")
 
     @property
     def rms_over_sets(self) -> Array:
-        """RMS (N,) of each point's distortion over the kept sets, each fitted by itself, in metres.
+        """RMS of each of N points' distortion over the kept sets, each set fitted separately, in metres.
 
         The values are named after Table 2 of paper 004.
         """

@@ -130,7 +130,10 @@ class AngleFit:
 
     @property
     def effective_parameters(self) -> float:
-        """Effective number of parameters, the trace of the weights at the points."""
+        """Effective number of parameters of the fit.
+
+        It is the sum of the derivatives of each prediction at a point with respect to the value of that point.
+        """
         return float(np.trace(self.weights(self.angle)))
 
     def step_at(self, angle: ArrayLike) -> Array:
@@ -678,14 +681,14 @@ class CalibrationSeries:
 
     @property
     def averaging_alone(self) -> float:
-        """Largest RMS of a mean without rejection, max(rms_before / sqrt(n)), in radians."""
+        """Largest standard deviation of an angle's mean over all repeats: max(rms_before / sqrt(n)), in radians."""
         if self.present is not None:
             return float(np.max(self.rms_before / np.sqrt(self.counts)))
         return float(np.max(self.rms_before) / np.sqrt(self.repeats))
 
     @property
     def mean_rms(self) -> float:
-        """Largest RMS of a mean of the kept comparisons, max(rms_after / sqrt(n)), in radians."""
+        """Largest standard deviation of an angle's mean over kept repeats: max(rms_after / sqrt(n)), in radians."""
         return float(np.max(self.rms_after / np.sqrt(self.keep.sum(axis=1))))
 
     @cached_property

@@ -17,7 +17,7 @@ from twin.framework.data_files import csv_table
 
 MINUS = "\N{MINUS SIGN}"
 SAME = 1e-6
-"""Rounding threshold of numbers per unit motion (arcsec, µm): smaller ones are shown as 0."""
+"""Absolute value below which a number per unit motion (per arcsec or µm) is taken as rounding error and shown as 0."""
 SYMBOLS = {"d_alpha": "Δα", "d_beta": "Δβ", "d_gamma": "Δγ", "d_f": "Δf"}
 """Symbols of the changes of a camera in tables, figures and sentences. The unit follows in brackets, with the micro
 sign: Δα [arcsec], Δf [µm]. Keys of files are plain letters with the unit at the end: d_alpha_arcsec, d_f_um.
@@ -136,7 +136,7 @@ def plain(value: float, digits: int = 5) -> str:
 
 
 def residual(value: float, sigma: float) -> float | None:
-    """Return the normalised residual value / sigma, or None if sigma is zero."""
+    """Return a residual divided by its standard deviation, or None if that is zero."""
     return value / sigma if sigma > 0 else None
 
 
@@ -173,14 +173,14 @@ class DecimalNumber(float):
 
 
 class Marked(str):
-    """Text of a table cell with a second line, a style, a key for programs and a hint.
+    """Text of a table cell, with an optional second line, CSS class, key for programs and tooltip.
 
     Attributes
     ----------
     below : str
         Second, smaller line.
     look : str
-        Class of the style sheet that sets the cell off: ``truth``, ``near``, ``far``, ``wrong``, or a verdict.
+        CSS class of the cell: ``truth``, ``near``, ``far``, ``wrong``, or a verdict.
     key : str
         Name by which programs find the cell in a page.
     hint : str
@@ -200,14 +200,14 @@ class Marked(str):
 
 
 def residual_cell(text: str, ratio: float | None, key: str, hint: str = "") -> Marked:
-    """Return a cell with a reading and, below it, its residual in sigma, marked if the residual exceeds FAR.
+    """Return a cell with a measured value and, below it, its residual in sigma, marked if that exceeds `FAR`.
 
     Parameters
     ----------
     text : str
-        Formatted reading.
+        Formatted measured value.
     ratio : float | None
-        (reading - truth) / sigma; None without noise.
+        (measured value - truth) / sigma; None without noise.
     key : str
         Name by which programs find the cell.
     hint : str
@@ -263,7 +263,7 @@ class Artefact:
 
     @property
     def shown_caption(self) -> str:
-        """Caption shown in the report, or a note that replaces it."""
+        """Caption shown in the report; for a figure that could not be drawn, a note instead."""
         return self.caption
 
     def content(self) -> bytes:
@@ -342,7 +342,7 @@ class Table(Artefact):
 
     @property
     def download(self) -> Table | None:
-        """Table given as ``full``, or this table if its cells are plain numbers and texts."""
+        """Table with all digits for download: ``full`` if there is one, or this table if its cells are plain."""
         if self.full is not None or any(isinstance(cell, Marked) for row in self.rows for cell in row):
             return self.full
         return self
@@ -360,7 +360,7 @@ class Table(Artefact):
 
     @property
     def cells(self) -> list[list[Marked]]:
-        """Rows as marked cells, for a page."""
+        """Rows as the text of cells with their styles, for an HTML page."""
         return [[cell if isinstance(cell, Marked) else Marked(cell_text(cell)) for cell in row] for row in self.shown()]
 
     @property
@@ -415,7 +415,7 @@ class Data(Artefact):
 
 @dataclass(frozen=True, eq=False)
 class Text(Artefact):
-    """Paragraph of a report beside its figures and tables: ``caption``, with a list of ``points`` below it."""
+    """Paragraph of a report: its text is ``caption``, followed by a list of ``points``."""
 
     kind: ClassVar[str] = "txt"
     points: Sequence[str] = ()
@@ -427,7 +427,7 @@ class Text(Artefact):
 
 @dataclass(frozen=True, eq=False)
 class Piece(Artefact):
-    """Part of a page as HTML that this program wrote, with all user texts in it escaped."""
+    """Part of a report's page given as HTML, which this program made, with all user texts in it escaped."""
 
     kind: ClassVar[str] = "html"
     markup: Markup
@@ -467,7 +467,7 @@ class Undrawn(Artefact):
 
 @dataclass(frozen=True, eq=False)
 class CameraFile(Data):
-    """Camera as a file of the library; ``data`` is its YAML text."""
+    """Camera specification as a YAML file that can be added to the library; ``data`` is its text."""
 
     kind: ClassVar[str] = "yaml"
 

@@ -94,17 +94,20 @@ Command = Callable[..., None]
 
 
 def program(**more: Any) -> typer.Typer:
-    """Return a Typer program without commands, with the settings that all programs share; ``more`` goes to Typer."""
+    """Return a Typer application without commands, with the settings that all programs share.
+
+    Further arguments go to Typer.
+    """
     return typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False, **more)
 
 
 def unnamed(meant: Callable[[Sequence[str]], str]) -> type[TyperGroup]:
-    """Return the class of a program that works without naming its subcommand.
+    """Return a class for Typer programs whose subcommand may be omitted.
 
     Parameters
     ----------
     meant : callable
-        Function of the words after the program, the first of which is not a subcommand, that returns the subcommand.
+        Function that chooses the subcommand from the arguments if the first of them is not a subcommand.
     """
 
     class Group(TyperGroup):
@@ -181,7 +184,7 @@ class InputErrorText(Exception):
 
 
 class Incomplete(Exception):
-    """Work that could not be completed although the request is valid; the message gives the reason.
+    """Error for work that could not be completed although the request is valid; the message gives the reason.
 
     Attributes
     ----------
@@ -221,7 +224,7 @@ def check_backend(name: str) -> None:
 
 
 def no_results_kept() -> str:
-    """Return the message of a command that keeps nothing when it is interrupted."""
+    """Return the message of a command that keeps no results when it is interrupted."""
     return "nothing was kept"
 
 
@@ -319,12 +322,14 @@ def heartbeat(console: Console, says: Callable[[], str], silent: bool, seconds: 
 LONG = 300.0
 """Remaining time above which the expected duration is announced once, in seconds."""
 _PACE_SECONDS = 5.0
-"""Time after which the pace of a part can be estimated, in seconds: the first pieces also compile."""
+"""Time after which the speed of a part of the work can be estimated, in seconds: its first steps also include
+compilation.
+"""
 
 
 @dataclass
 class WorkProgress:
-    """Progress of a piece of work; the work calls ``advance``."""
+    """Progress of a command's work, which reports to it by calling ``advance``."""
 
     part: str = "start"
     done: int = 0
@@ -333,20 +338,20 @@ class WorkProgress:
     before: int = 0
 
     def advance(self, part: str, done: int, total: int) -> None:
-        """Record that ``done`` of ``total`` pieces of a part are done."""
+        """Record that ``done`` of ``total`` steps of a part of the work are done."""
         if part != self.part or done < self.done:
             self.begun, self.before = time.monotonic(), done
         self.part, self.done, self.total = part, done, total
 
     @property
     def left(self) -> float:
-        """Estimated remaining time of the part, in seconds, from its pace so far; 0 if no piece is done yet."""
+        """Remaining time of the current part, in seconds, estimated from its speed so far; 0 if no step is done."""
         spent, pieces = time.monotonic() - self.begun, self.done - self.before
         return spent * (self.total - self.done) / pieces if pieces > 0 else 0.0
 
     @property
     def long(self) -> bool:
-        """True if the pace of the part is known and its remaining time exceeds LONG."""
+        """True if the remaining time of the current part is known and exceeds `LONG`."""
         return time.monotonic() - self.begun > _PACE_SECONDS and self.left > LONG
 
     def __str__(self) -> str:
@@ -367,7 +372,7 @@ def time_text(seconds: float | None) -> str:
 
 
 def progress_columns(width: int) -> tuple[progress.ProgressColumn, ...]:
-    """Return the columns of a progress display: description (``width`` letters), bar, elapsed and remaining time."""
+    """Return the columns of a progress display: description of ``width`` letters, bar, elapsed and remaining time."""
     return (
         progress.SpinnerColumn(),
         progress.TextColumn(f"{{task.description:{width}}}", markup=False),

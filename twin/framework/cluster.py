@@ -32,7 +32,7 @@ LOST_SECONDS = 10.0
 WORKER_SECONDS = 60.0
 """Time to wait for the first worker, and for a replacement of the last one, in seconds."""
 LEAST_MEMORY = 0.5e9
-"""Least memory of a worker process, in bytes: interpreter, libraries, an instrument with its calibration."""
+"""Smallest memory that a worker process needs, in bytes: interpreter, libraries, an instrument with its calibration."""
 RETRIES = 2
 """Number of times that a task is given to another worker after its worker died."""
 SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
@@ -172,7 +172,7 @@ def local_workers(count: int) -> Iterator[Workers]:
 
 @contextmanager
 def _cluster(count: int, folder: Path) -> Iterator[Workers]:
-    """Start local workers that write below the folder ``place``."""
+    """Start local worker processes that write their files below the folder ``folder``."""
     import dask
     from distributed import Client, LocalCluster
     from distributed.security import Security
@@ -421,7 +421,7 @@ def _differences(client: Client) -> list[str]:
 
 
 def _program() -> tuple[dict[str, str], str]:
-    """Return the versions of the packages, and the checksum of the program's source files."""
+    """Return the versions of the installed packages, and one checksum of the program's source files."""
     return provenance.versions(), provenance.source_digest()
 
 

@@ -168,7 +168,7 @@ def progress_shown(errors: Console, silent: bool) -> Iterator[Advance]:
 
 
 def _advance(bar: Progress, state: cli.WorkProgress, say: Callable[[str], None]) -> Advance:
-    """Return an ``Advance`` that shows every part of the work as a line."""
+    """Return a progress function (``Advance``) that shows every part of the work as a bar in the terminal."""
     parts: dict[str, TaskID] = {}
     long: set[str] = set()
 
@@ -212,7 +212,7 @@ def add_tests(app: typer.Typer, program: str, apart: Collection[str] = ()) -> No
 
 
 def _add_unusable(app: typer.Typer, command: str, error: EntryPointError) -> None:
-    """Add a test of another distribution that cannot be loaded, with the reason as its help."""
+    """Add a placeholder for a test of another package that cannot be loaded, with the reason as its help text."""
 
     @app.command(command, help=str(error), context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
     def unusable() -> None:

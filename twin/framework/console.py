@@ -43,7 +43,7 @@ PROGRAMS = {
     "schema": ("scenes.schema", "JSON Schemas of the YAML files, for editors"),
     "doctor": ("twin.doctor", "check that this machine can run the twin"),
 }
-"""First word of the command -> the module that runs, and its description in one line."""
+"""For each first word after ``camtwin``, the module that runs and its description in one line."""
 COMPLETE = "_CAMTWIN_COMPLETE"
 """Environment variable by which a shell asks for completions."""
 _BEFORE = __name__.removesuffix("twin.framework.console")
@@ -52,7 +52,7 @@ _BEFORE = __name__.removesuffix("twin.framework.console")
 
 @cache
 def parser(program: str) -> Any:
-    """Return the Click command of a program with its parser; of a program with subcommands, the group.
+    """Return the Click command (or group of subcommands) that parses the arguments of a program.
 
     A program has a Typer application ``app`` or a function ``main``.
     """
