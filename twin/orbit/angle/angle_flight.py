@@ -129,7 +129,7 @@ def _changed_state(spec: OrbitAngleSpec, instrument: Instrument) -> State:
 _LINE_TIME = 1e-3
 """Time per image line, in seconds; only the middle of a single line is used."""
 LEAST_SIGMA = 1e-3
-"""Sigma of points without errors, in metres: an adjustment needs weights."""
+"""Sigma assumed for points that are simulated without errors, in metres, because an adjustment needs weights."""
 _LEAST_CONVERGENCE = np.radians(1.0)
 """Smallest angle between lines, in radians, at which heights are intersected: below it one arcsecond is half a
 kilometre and more.
@@ -246,7 +246,7 @@ class AnglePass(LineAngles):
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """Lines of the angles, in the order of the camera's file."""
+        """Names of the lines that an angle uses, in the order of the camera's file."""
         return tuple(self.pixel)
 
     @property

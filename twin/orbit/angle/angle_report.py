@@ -33,16 +33,16 @@ METHOD_NAMES = {
 EFFECT_NAMES = {"light_time": "light time", "all": "all three", "datum": "shift of all points"}
 """Name in reports of effects whose key is not their name."""
 _FALSE_ALARM = 1e-4
-"""Probability that a plane of good points raises a warning."""
+"""Probability that a plane whose points are correct raises a warning."""
 _GREEK = {"alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ"}
 COLOURS = (svg.BLUE, svg.GREEN, svg.VERMILION, svg.ORANGE, svg.PURPLE, svg.SKY)
-"""Colours of the lines, in their order."""
+"""Colours of the camera's lines in figures, in the order of the lines."""
 _LEAST_ARC = np.radians(5.0)
 """Smallest angle whose arc is drawn in the figure of the geometry, in radians."""
 
 
 def greek_names(names: Iterable[str]) -> list[str]:
-    """Return the names of angles as reports write them."""
+    """Return the names of angles as reports write them, with Greek letters."""
     return [_GREEK.get(name, name.replace("_", " ")) for name in names]
 
 

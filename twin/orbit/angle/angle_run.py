@@ -157,7 +157,7 @@ class Scatter:
 
     @classmethod
     def of(cls, passes: Sequence[PlaneAngles] | Sequence[AlongTrackAngles], truth: Mapping[str, float]) -> Scatter:
-        """Return the scatter of one method's estimates about the truth, in radians."""
+        """Return the estimates of one method over the passes, with their predicted covariance and the true angles."""
         covariance = np.mean([estimate.covariance for estimate in passes], axis=0)
         return cls(tuple(truth), np.array([estimate.values for estimate in passes]), covariance, values_of(truth))
 
@@ -221,7 +221,7 @@ class PassAngles:
 
     @property
     def pairs(self) -> Mapping[str, tuple[str, str]]:
-        """Two lines of each angle."""
+        """Names of the two lines of each angle, by the angle's name."""
         return self.laboratory.pairs
 
 
@@ -279,17 +279,17 @@ class SimulatedAngleRun(AngleRun):
 
     @property
     def measurement(self) -> Measurement:
-        """Measurement of the pass that is shown."""
+        """Measurement of the simulated pass that the report shows in full."""
         return self.passes[0].measurement
 
     @property
     def estimate(self) -> Estimate:
-        """Estimate from the pass that is shown."""
+        """Estimate of the angles from the simulated pass that the report shows in full."""
         return self.passes[0].estimate
 
     @property
     def shown(self) -> np.random.SeedSequence:
-        """Random stream of the errors of the pass that is shown."""
+        """Random stream of the errors of the simulated pass that the report shows in full."""
         return _streams(self.seed)[1]
 
     @property
@@ -539,7 +539,7 @@ def _degrees(names: Iterable[str], values: Iterable[float]) -> ByAngle:
 
 
 def _with_sigmas(names: Iterable[str], angles: PlaneAngles | AlongTrackAngles | FrameRow) -> ByAngle:
-    """Return angles in degrees, then their sigmas in arcseconds."""
+    """Return the values of the angles in degrees, then their sigmas in arcseconds, by keys with the unit."""
     names = tuple(names)
     return _degrees(names, angles.values) | _by_angle([f"{n}_arcsec_sigma" for n in names], angles.sigma / ARCSEC)
 
@@ -652,5 +652,5 @@ _MEASURED: Record[AngleRun] = Record(ANGLE.meaning, ANGLE["measured"])
 
 
 def angle_numbers(run: AngleRun) -> dict[str, Any]:
-    """Return the content of angle.json without its reference frames."""
+    """Return the numbers that angle.json contains: angles, sigmas, changes and tests."""
     return ANGLE(run) if isinstance(run, SimulatedAngleRun) else _MEASURED(run)

@@ -206,7 +206,7 @@ def _summary(run: BlockRun) -> Table:
 
 
 def _sections(run: BlockRun) -> tuple[Section, ...]:
-    """Return the sections of the report; docs/block.md explains them."""
+    """Return the sections of the report: errors by sensor, network, cameras and tests of the error laws."""
     groups = GROUP.table(
         "groups",
         "Observations and laws",

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _LEAST_CHECK = 2
 """Smallest number of check points from which errors are computed."""
 _OBSERVED = 3e3
-"""Memory per image point of a block that is simulated and adjusted, in bytes."""
+"""Memory that an image point of a simulated block needs in simulation and adjustment, in bytes."""
 Rejected = tuple[tuple[str, str], ...]
 """Point and scene of each image point that was rejected as a gross error."""
 DATUM_ALARM = 1e-3
@@ -167,7 +167,7 @@ class BlockRun:
 
     @property
     def used(self) -> tuple[str, ...]:
-        """Sensors of the adjustment."""
+        """Names of the sensors whose measurements the adjustment uses."""
         return self.adjustment.assembly.block.sensors
 
     @property

@@ -83,7 +83,7 @@ def figure_svg(name: str, run: CalibrationRun) -> str:
 
 
 def _schemes_figure(run: CalibrationRun) -> Figure:
-    """Draw the RMS in plan and in height of every field, by scheme."""
+    """Draw the RMS errors in plan and in height at every field's check points, by scheme."""
     figure = svg.new_figure(4.3)
     panels = figure.subplots(1, 2)
     names, spec = list(run.schemes), run.campaign.spec

@@ -27,7 +27,7 @@ _FEW = 30
 """Smallest number of degrees of freedom of the check points' intersections at which a small p-value raises a warning.
 """
 _LEAST_CHANCE = 1e-3
-"""p-value of the check points' intersections below which there is a warning."""
+"""p-value of the chi-square of the check points' intersections below which there is a warning."""
 _WIDE = 2.0
 """Factor by which the residuals enlarge the sigmas of a line's image points above which there is a warning."""
 _MANY = 0.1
@@ -135,7 +135,7 @@ def _warnings(run: CalibrationRun) -> tuple[str, ...]:
 
 
 def _measured_facts(setup: MeasuredCalibrationSetup, run: CalibrationRun) -> tuple[tuple[str, str], ...]:
-    """Return the rows of the table of facts of a calibration on measurements."""
+    """Return names and values of the table of input quantities of a calibration on measurements."""
     test, conventions = setup.test, setup.data.conventions
     errors, gps = test.errors.star_tracker, test.errors.gps
     angles = ", ".join(format_quantity(v, ANGLE) for v in errors.noise)

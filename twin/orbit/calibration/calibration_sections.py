@@ -91,7 +91,7 @@ def summary(run: CalibrationRun) -> Table:
 
 
 def scheme_summary(means: SchemeMeans | None) -> str:
-    """Return a sentence on how averaging changes the errors in plan and height."""
+    """Return a sentence on how averaging the parameters of several fields changes the errors in plan and height."""
     if means is None:
         return "There is only one scheme of averaged parameters, so schemes are not compared."
     plan, spread, height = means.plan, means.plan_spread, means.height
@@ -347,7 +347,7 @@ def _monitoring(run: CalibrationRun) -> Section:
 
 
 def strip_gain(run: CalibrationRun) -> str:
-    """Return a sentence on the errors with and without tie points."""
+    """Return a sentence on the check points' errors with and without the adjustment of passes on tie points."""
     assert run.strips is not None
     scheme = list(run.schemes)[-2]
     old, new = (FieldErrors.pooled(e[scheme].values()) for e in (run.schemes, run.strips.schemes))

@@ -173,7 +173,7 @@ class PassData:
 
     @property
     def earth(self) -> Earth:
-        """Ellipsoid of the sensors."""
+        """Ellipsoid and rotation of the Earth that the sensors use."""
         return next(iter(self.sensors.values())).earth
 
     def pixels_per_line(self, name: str) -> float:
@@ -532,7 +532,7 @@ class FieldPass:
 
     @property
     def truth(self) -> PassTruth:
-        """Truth of a simulated pass; AssertionError for a measured one."""
+        """Truth of a simulated pass; raises AssertionError for a measured one."""
         assert self.known_truth is not None, "the truth of a measured pass is not known"
         return self.known_truth
 
@@ -644,13 +644,13 @@ class Campaign:
 
     @property
     def truth(self) -> Mapping[str, LineModel]:
-        """True cameras by line; AssertionError for measured passes."""
+        """True camera of each line, by name of the line; raises AssertionError for measured passes."""
         assert self.known_truth is not None, "the truth of a measured campaign is not known"
         return self.known_truth
 
     @property
     def simulated(self) -> OrbitCalibrationSpec:
-        """Content of the test file of a simulation; AssertionError for measured passes."""
+        """Content of the test file of a simulation; raises AssertionError for measured passes."""
         from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 
         assert isinstance(self.spec, OrbitCalibrationSpec), "this campaign was measured"
@@ -663,7 +663,7 @@ class Campaign:
 
     @property
     def inner(self) -> tuple[str, ...]:
-        """Names of the unknowns of the interior orientation."""
+        """Names of the unknowns of the interior orientation: f, x and y of every line."""
         return interior_names(self.lines)
 
     @property
@@ -710,7 +710,7 @@ class Campaign:
         return replace(self, passes=passes)
 
     def later(self, seconds: float) -> Campaign:
-        """Return the campaign with all lines exposed `seconds` later."""
+        """Return the campaign with all lines exposed `seconds` later, but the same image points."""
         return replace(self, passes=tuple(p.later(seconds) for p in self.passes))
 
     def shifted(self, datum: tuple[float, float, float]) -> Campaign:
@@ -779,7 +779,7 @@ def interior_names(lines: Sequence[str]) -> tuple[str, ...]:
 
 
 def line_model(payload: ThreeLineCameraSpec, name: str) -> LineModel:
-    """Return the analysis's model of a line of the payload."""
+    """Return the analysis's camera model of one line of the payload, as the laboratory measured it."""
     line = payload.lines[name]
     to_body = about_axis(1, line.look) @ rotation_matrix(np.array(line.rotate))
     half = 0.5 * payload.pixels_of(name) * payload.pitch_of(name)

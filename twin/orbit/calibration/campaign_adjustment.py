@@ -266,7 +266,7 @@ class LatitudeFit:
         return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
     def curve(self, latitude: np.ndarray) -> np.ndarray:
-        """Return the fitted bias at latitudes in radians, in radians."""
+        """Return the fitted attitude bias, in radians, at latitudes, in radians."""
         return np.asarray(self.amplitude * np.sin(latitude - self.reference) + self.constant)
 
 

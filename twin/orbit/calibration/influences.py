@@ -36,7 +36,7 @@ UNDETECTED_SIGMAS = 3.0
 due to a drift that the residuals show in only half of all cases.
 """
 _STEP_ALARM = 1e-4
-"""False-alarm probability of all steps of a run together."""
+"""Probability of a false alarm in any of the tests of steps between chips of a run."""
 _TRIAL_TIME = 0.01
 """Delay of the line times that is tested, in seconds; 70 m on the ground."""
 _TRIAL_SHIFT = 100.0
@@ -121,7 +121,7 @@ class DatumRow:
 
     @property
     def size(self) -> float:
-        """Size of the shift, in metres, or of the delay, in seconds."""
+        """Size of the tested shift, in metres, or of the tested delay, in seconds."""
         return abs(self.late) or float(np.linalg.norm(self.shift))
 
     @property
@@ -158,7 +158,7 @@ class UnexpectedChange:
 
     @property
     def ratio(self) -> float:
-        """Absolute change over its expected standard deviation."""
+        """Absolute change divided by its expected standard deviation."""
         return abs(self.change) / self.expected
 
 
@@ -338,7 +338,7 @@ class AttitudeDrift:
 
     @classmethod
     def of(cls, campaign: Campaign, fit: Adjustment) -> Self:
-        """Return the drift test of an adjustment of all fields."""
+        """Return the effect and the test of an attitude drift, from an adjustment of all fields."""
         seconds = float(np.mean([p.seconds_apart for p in campaign.passes]))
         effect = detectable = undetected = None
         rate_p_value = None
@@ -454,7 +454,7 @@ def _joints(campaign: Campaign) -> tuple[tuple[str, float], ...]:
 
 
 def step_warnings(numbers: tuple[ChipStep, ...]) -> list[str]:
-    """Return a warning with the significant steps, if there are any."""
+    """Return a warning that lists the significant steps between chips, if there are any."""
     detected = [n for n in numbers if n.detected]
     if not detected:
         return []

@@ -74,7 +74,7 @@ class FieldErrors:
 
     @classmethod
     def mean(cls, errors: Mapping[str, CheckErrors]) -> FieldErrors:
-        """Return the means of the fields' RMS errors."""
+        """Return the means over the fields of their RMS errors in plan and in height."""
         return cls(*(float(values_of(errors, what).mean()) for what in RMS))
 
 
@@ -411,7 +411,7 @@ def strip_check_errors(
 
 
 FACTORS = (0.0, 0.5, 1.0, 2.0, 4.0)
-"""Sizes of the simulated drift relative to that of the file."""
+"""Factors by which the simulated drift of the cameras differs from that of the file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -471,7 +471,7 @@ class Monitoring:
     metres: float
 
     def at(self, factor: float) -> DriftSize:
-        """Return the errors for one factor of the drift."""
+        """Return the errors for the cameras' drift of the file times one of the `FACTORS`."""
         return next(s for s in self.sizes if s.factor == factor)
 
 
@@ -541,7 +541,7 @@ def _treatment(
 
 
 def without_monitor(campaign: Campaign) -> Treatment:
-    """Adjust a campaign as if no camera drifted."""
+    """Adjust a campaign as if no camera drifted, and return the errors at its check points."""
     alone = {p.name: calibrated_alone(campaign, p) for p in campaign.passes}
     return _treatment(campaign, simultaneous(campaign), scheme_errors(campaign, alone))
 

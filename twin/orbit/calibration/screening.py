@@ -110,7 +110,7 @@ def require_correct_names(campaign: Campaign) -> None:
 
 
 def _without_mislabelled(campaign: Campaign) -> tuple[Campaign, dict[str, Rejected]]:
-    """Return the campaign without mislabelled points, and these points by field."""
+    """Return the campaign without image points of wrongly named ground points, and the points removed, by field."""
     passes, gross = [], {}
     for flight in campaign.passes:
         wrong, wrong_check = mislabelled_points(campaign, flight)

@@ -167,7 +167,7 @@ def check_report(run: Check) -> Report:
 
 
 def _verdict(run: Check) -> tuple[str, tuple[str, ...]]:
-    """Return the verdict and the sentences after it."""
+    """Return the verdict of the check, and the sentences that follow it in the report."""
     best, stated = run.best.fit, run.stated_fit
     if run.verdict == "none" or best is None:
         left = "the points cannot have been imaged under any of them" if best is None else (
@@ -192,7 +192,7 @@ def _verdict(run: Check) -> tuple[str, tuple[str, ...]]:
 
 
 def _undetermined(answers: tuple[ValueTest, ...]) -> bool:
-    """Return whether more than one value of a convention is possible."""
+    """Return whether the points allow more than one value of a convention."""
     return sum(test.possible for test in answers) > 1
 
 
@@ -262,7 +262,7 @@ def _ranking(run: Check) -> Table:
 
 
 def _conventions(run: Check) -> Section:
-    """Return the report section on each convention by itself."""
+    """Return the report section that tests each convention with the others held at their best values."""
     rows: list[tuple[Cell, ...]] = []
     for name, answers in run.answers.items():
         convention = TESTED_CONVENTIONS[name]

@@ -54,13 +54,13 @@ _FITS = 9.0
 small.
 """
 _ROUGH_POINTS = 8
-"""Number of points of each line in the first, rough comparison."""
+"""Number of points of each line in the rough comparison that precedes the fits."""
 _CANDIDATES = 40
 """Number of interpretations that are fitted after the rough comparison."""
 _ROUNDS = 3
 """Number of search rounds; each adds two conventions that may be wrong."""
 _WRONG_SHARE = 1e-6
-"""False-alarm rate of a point that is rejected as a gross error."""
+"""Probability that a correct point is rejected as a gross error."""
 _MOST_WRONG = 0.3
 """Largest share of points that may be rejected as gross errors."""
 

@@ -50,9 +50,10 @@ _LINES = (
     Column("date_time", text=True, needed=False),
 )
 _AROUND = 120.0
-"""Duration of orbit and attitude kept before and after the lines, in seconds: time scales differ by 70 s."""
+"""Duration of orbit and attitude kept before and after the times of the lines, in seconds: time scales differ by 70 s.
+"""
 _LEAST_AROUND = 12
-"""Smallest number of readings kept before and after the lines."""
+"""Smallest number of readings of orbit and attitude kept before and after the times of the lines."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,7 +371,7 @@ TESTED_CONVENTIONS: Mapping[str, TestedConvention] = FrozenMap(
         ),
     }
 )
-"""Conventions that a check tests, by name."""
+"""Conventions that a check tests, with their possible values, by name."""
 
 
 def alternatives(stated: PassConventions, quaternions: bool) -> dict[str, tuple[Any, ...]]:
@@ -710,7 +711,7 @@ def line_times(
 
 
 def spread(count: int, most: int) -> np.ndarray:
-    """Return at most `most` evenly spread indices of `count`."""
+    """Return at most `most` evenly spread indices of a sequence of `count` items."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
 
 

@@ -149,7 +149,7 @@ def quality_warnings(quality: Quality) -> tuple[str, ...]:
 
 
 def control_section(control: Mapping[str, ControlledPolynomial]) -> Section:
-    """Return the section with corrections and residuals of every line."""
+    """Return the report section with each line's correction by control points and its residuals."""
     rows: list[tuple[Cell, ...]] = []
     points: list[tuple[Cell, ...]] = []
     for name, line in control.items():
@@ -207,7 +207,7 @@ def _map_title(name: str) -> str:
 
 
 def _figure(maps: Mapping[str, AccuracyMap]) -> Figure:
-    """Draw a panel for each accuracy map."""
+    """Draw CE90 over the scene in a panel for each accuracy map."""
     panels = [(f"CE90, {_map_title(name)}", accuracy, accuracy.ce90) for name, accuracy in maps.items()]
     panels += [
         (f"LE90, {_map_title(name)}", accuracy, accuracy.le90) for name, accuracy in maps.items() if name == TOGETHER

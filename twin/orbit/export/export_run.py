@@ -88,7 +88,7 @@ class ControlledPolynomial:
 
     @property
     def rejected_points(self) -> list[str]:
-        """Names of the points that lie beyond their covariances."""
+        """Names of the points whose residuals are too large for their covariances."""
         return [str(name) for name in self.names[~self.correction.used]]
 
 
@@ -211,7 +211,7 @@ class SceneSource:
 
     @property
     def folder(self) -> None:
-        """Run folder: None, since a scene has none."""
+        """None: a scene has no run folder."""
         return None
 
     @property
@@ -550,7 +550,7 @@ def _pitch(setup: AngleSetup, name: str) -> float:
 
 
 _PROBE = 1e-3
-"""Time over which the motion of an image is computed, in seconds."""
+"""Time over which the motion of the image is computed to get the line time, in seconds."""
 
 
 def _line_time(line: LineCamera, trajectory: Trajectory, earth: Any, time: float) -> float:

@@ -35,11 +35,11 @@ RATE = 2.0 * np.pi * 1.00273781191135448 / DAY
 """Rotation rate of the Earth, in rad/s (IERS Conventions 2010, eq. 5.15)."""
 
 _NODE_STEP = 3600.0
-"""Interval of the interpolation nodes of the celestial pole, in seconds."""
+"""Interval of the nodes at which the celestial pole is computed for interpolation, in seconds."""
 _NODES_AROUND = 3
 """Number of interpolation nodes beyond each end of the span."""
 _DIFFERENCE_STEP = 600.0
-"""Half step of the central difference of the celestial pole, in seconds."""
+"""Half step of the central difference that gives the celestial pole's rate, in seconds."""
 
 
 @contextmanager

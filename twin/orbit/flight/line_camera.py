@@ -154,7 +154,7 @@ TRACED_POINTS = 49
 _NOISE = 1e-14
 """Relative size below which terms of a traced series are rounding and are dropped (one pixel is 1e-6 rad)."""
 _PLANE_POINTS = 1001
-"""Number of pixels to which the plane of a whole line is fitted."""
+"""Number of evenly spread pixels to which the plane of a whole line is fitted."""
 _LOOK_TERMS = 12
 """Number of Chebyshev terms for the tangent of a look angle within 30 deg over one CCD.
 

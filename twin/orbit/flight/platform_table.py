@@ -26,7 +26,7 @@ _SPLINE_ERROR = 1e-3
 _FOURTH_DERIVATIVE = 1.1e-5
 """Fourth derivative of a coordinate of a low circular orbit, in m/s^4: r n^4 at 300 km, with the Earth's rotation."""
 _LAGRANGE_NODES = 10
-"""Number of readings through which Lagrange's polynomial goes."""
+"""Number of readings through which an interpolating Lagrange polynomial goes."""
 _LEAST_ROWS = 12
 """Smallest number of readings for which every fourth reading still defines a curve."""
 _GROWS = 4.0
@@ -221,25 +221,25 @@ class TabulatedTrajectory:
         return covered
 
     def position(self, seconds: Any) -> np.ndarray:
-        """Return the position in the ITRS, in metres; (...) -> (..., 3)."""
+        """Return the position in the ITRS at times (...), (..., 3), in metres."""
         return np.asarray(self._position(self._checked(seconds)))
 
     def velocity(self, seconds: Any) -> np.ndarray:
-        """Return the velocity relative to the rotating Earth in axes of the ITRS, in m/s; (...) -> (..., 3)."""
+        """Return the velocity relative to the rotating Earth in axes of the ITRS at times (...), (..., 3), in m/s."""
         return np.asarray(self._velocity(self._checked(seconds)))
 
     def inertial_velocity(self, seconds: Any) -> np.ndarray:
-        """Return the velocity relative to the stars in axes of the ITRS, in m/s; (...) -> (..., 3)."""
+        """Return the velocity relative to the stars in axes of the ITRS at times (...), (..., 3), in m/s."""
         return np.asarray(self.velocity(seconds) + earth_rotation_velocity(self.position(seconds)))
 
     def body_to_itrs(self, seconds: Any) -> np.ndarray:
-        """Return the axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
+        """Return the axes of the body as columns at times (...), (..., 3, 3): x_itrs = matrix @ x_body."""
         t = self._checked(seconds)
         matrix = Rotation.from_quat(self._quaternion(np.ravel(t))).as_matrix()
         return np.asarray(matrix).reshape(*t.shape, 3, 3)
 
     def orbital_to_itrs(self, seconds: Any) -> np.ndarray:
-        """Return the axes of the orbital frame by the measured orbit as columns, (...) -> (..., 3, 3)."""
+        """Return the axes of the measured orbit's orbital frame as columns at times (...), (..., 3, 3)."""
         motion = self.position(seconds), self.velocity(seconds), self.inertial_velocity(seconds)
         return self.law.orbital_to_itrs(*motion)
 

@@ -188,7 +188,7 @@ class Attitude:
 
     @classmethod
     def from_spec(cls, spec: AttitudeSpec) -> Attitude:
-        """Make the attitude law of an input file."""
+        """Return the attitude law that an input file specifies."""
         return cls(spec.nadir == "geodetic", spec.steering == "yaw", spec.offset)
 
     def orbital_to_itrs(self, position: np.ndarray, velocity: np.ndarray, inertial_velocity: np.ndarray) -> np.ndarray:
@@ -262,7 +262,7 @@ def readings(first: float, last: float, interval: float) -> np.ndarray:
 
 
 def _noise(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence) -> Series:
-    """Return white noise of standard deviation sigma at each reading."""
+    """Return a function of time that interpolates white noise of standard deviation sigma at each reading."""
     return CubicSpline(time, sigma * np.random.default_rng(seed).standard_normal((time.size, 3)))
 
 
@@ -312,11 +312,11 @@ class MeasurementErrors:
     rate: np.ndarray
 
     def position(self, seconds: np.ndarray) -> np.ndarray:
-        """Return position errors along the orbital frame's axes, in metres; (...) -> (..., 3)."""
+        """Return position errors along the orbital frame's axes at times (...), (..., 3), in metres."""
         return _sum(self.position_terms, seconds)
 
     def velocity(self, seconds: np.ndarray) -> np.ndarray:
-        """Return velocity errors along the orbital frame's axes, in m/s; (...) -> (..., 3)."""
+        """Return velocity errors along the orbital frame's axes at times (...), (..., 3), in m/s."""
         return _sum(self.velocity_terms, seconds)
 
     def attitude(self, seconds: np.ndarray, latitude: np.ndarray) -> np.ndarray:
@@ -451,23 +451,23 @@ class Trajectory:
         return self.orbit.last
 
     def position(self, seconds: Any) -> np.ndarray:
-        """Return the position in the ITRS, in metres; (...) -> (..., 3)."""
+        """Return the position in the ITRS at times (...), (..., 3), in metres."""
         return self._motion(seconds)[0]
 
     def velocity(self, seconds: Any) -> np.ndarray:
-        """Return the velocity relative to the rotating Earth in axes of the ITRS, in m/s; (...) -> (..., 3)."""
+        """Return the velocity relative to the rotating Earth in axes of the ITRS at times (...), (..., 3), in m/s."""
         return self._motion(seconds)[1]
 
     def inertial_velocity(self, seconds: Any) -> np.ndarray:
-        """Return the velocity relative to the stars in axes of the ITRS, in m/s; (...) -> (..., 3)."""
+        """Return the velocity relative to the stars in axes of the ITRS at times (...), (..., 3), in m/s."""
         return self._motion(seconds)[2]
 
     def orbital_to_itrs(self, seconds: Any) -> np.ndarray:
-        """Return the true axes of the orbital frame as columns, (...) -> (..., 3, 3)."""
+        """Return the true axes of the orbital frame as columns at times (...), (..., 3, 3)."""
         return self.attitude.orbital_to_itrs(*self.orbit.itrs(seconds))
 
     def body_to_itrs(self, seconds: Any) -> np.ndarray:
-        """Return the axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
+        """Return the axes of the body as columns at times (...), (..., 3, 3): x_itrs = matrix @ x_body."""
         true = self.orbit.itrs(seconds)
         body = self.attitude.body_to_itrs(*true)
         if self.jitter is not None:

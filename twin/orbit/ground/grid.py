@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.scene import TerrainSpec
 
 _EARTH = Earth()
-"""Ellipsoid; the orientation of this Earth is not used."""
+"""Earth whose ellipsoid is used; its orientation is not."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def _root_of_covariance(count: int, step: float) -> np.ndarray:
 
 
 def _white_spectrum(shape: tuple[int, int], seed: np.random.SeedSequence) -> np.ndarray:
-    """Return the spectrum of unit white noise on a grid."""
+    """Return the Fourier transform of white noise of unit variance on a grid."""
     noise = np.random.Generator(np.random.SFC64(seed)).standard_normal(shape, dtype=np.float32)
     return np.asarray(fft.rfft2(noise, workers=cores()))
 
@@ -254,7 +254,7 @@ class SplineGrid:
         return csr_array((weight.ravel(), (row, column.ravel())), shape=(len(position), count))
 
     def _require_inside(self, east: np.ndarray, north: np.ndarray) -> None:
-        """Raise UnphysicalError if positions lie outside the domain."""
+        """Raise UnphysicalError if positions lie outside the grid of a spline without continuation."""
         west_end, east_end, south_end, north_end = self.reach
         low, high = (np.min(east), np.min(north)), (np.max(east), np.max(north))
         if not (low[0] >= west_end and high[0] <= east_end and low[1] >= south_end and high[1] <= north_end):
@@ -332,7 +332,7 @@ class Terrain:
 
     @classmethod
     def fractal(cls, spec: TerrainSpec, side: float, seed: np.random.SeedSequence) -> Terrain:
-        """Draw a terrain with a power law as its spectrum."""
+        """Draw a fractal terrain, whose amplitude spectrum is a power law."""
         count = 64
         while count * spec.post < 1.5 * side and count < _MOST_POSTS:
             count *= 2

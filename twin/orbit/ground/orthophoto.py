@@ -37,15 +37,15 @@ _WILD = 2.5
 _BLOCK = 8.0
 """Side of a block of fields of one direction, in units of the mean side of a field."""
 _LANE = 0.97
-"""Share of a field's side between the lanes that separate fields."""
+"""Share of the side of an agricultural field between the lanes that separate fields."""
 _ROAD_WIDTH = 8.0
 """Width of a road, in metres."""
 _ROAD_BRIGHTNESS = 1.8
 """Reflectance of a road relative to the mean."""
 _SHIFT_BITS = 4
-"""Fractional bits of polygon coordinates in OpenCV."""
+"""Number of fractional bits of polygon coordinates in OpenCV's drawing functions."""
 _ROWS = 512
-"""Number of rows processed at a time, to bound memory."""
+"""Number of rows of the ground's grid processed at a time, to bound memory."""
 _SPARE = 4
 """Number of cells by which the drawn ground extends beyond the requested extent."""
 
@@ -61,7 +61,7 @@ class Extent:
 
     @property
     def side(self) -> float:
-        """Longer side, metres."""
+        """Length of the longer side of the rectangle, in metres."""
         return max(self.east - self.west, self.north - self.south)
 
     def grown(self, by: float) -> Extent:
@@ -83,7 +83,7 @@ class Extent:
 
 
 def around(extents: Sequence[Extent]) -> Extent:
-    """Return the smallest extent that contains all of them."""
+    """Return the smallest extent that contains all the given extents."""
     return Extent(
         min(e.west for e in extents),
         max(e.east for e in extents),
@@ -236,11 +236,11 @@ def _draw_roads(
 SCALE = 10_000.0
 """Grey value of an orthophoto for an apparent reflectance of 1."""
 _PER_LENGTH = 8.0
-"""Number of cells of the smooth error in plan in its correlation length."""
+"""Number of grid cells, per correlation length, of the maps' smooth error in plan."""
 _ROWS_AT_ONCE = 256
 """Number of rows of a map sampled at a time, to bound memory."""
 _MARGIN = 50.0
-"""Margin of the smooth error's grid about the true ground, in metres."""
+"""Margin about the true ground of the grid of the maps' smooth error in plan, in metres."""
 
 
 class Map(Protocol):
@@ -256,7 +256,7 @@ class Map(Protocol):
 
     @property
     def spacing(self) -> float:
-        """Distance of rows and columns on the ground, metres."""
+        """Spacing of rows and of columns on the ground, in metres."""
 
     def east_north(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return east and north, in metres, at real-valued rows and columns, which are broadcast together."""

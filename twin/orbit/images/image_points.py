@@ -266,7 +266,7 @@ Kind = Literal["map", "tie"]
 
 
 POINTS_REMEDY = "a larger patch, a smaller reach or template, or more points"
-"""Advice with a PointsError."""
+"""Remedy that messages of a PointsError give to the user."""
 
 
 class PointsError(PhysicalError, ValueError):
@@ -326,12 +326,12 @@ class MatchedLine:
 
     @property
     def median_shift(self) -> np.ndarray:
-        """Median displacement from predicted to measured of the accepted, lines and pixels, (2,)."""
+        """Median displacement of the accepted points from predicted to measured, in lines and pixels, (2,)."""
         return np.asarray(np.median((self.place - self.predicted)[self.accepted], axis=0))
 
     @property
     def median_sigma(self) -> np.ndarray:
-        """Median sigma of the accepted, lines and pixels, (2,)."""
+        """Median standard deviation of the accepted positions, in lines and pixels, (2,)."""
         return np.asarray(np.median(np.sqrt(np.diagonal(self.covariance[self.accepted], axis1=1, axis2=2)), axis=0))
 
     def measured(self, rows: np.ndarray, point: np.ndarray) -> ImagePoints:

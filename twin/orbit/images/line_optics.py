@@ -297,7 +297,7 @@ def _with(sensor: Sensor, jitter: Jitter | None) -> Sensor:
 
 
 def _collection(sensor: Sensor, optics: LineOptics) -> Collection:
-    """Return the light collection of a TDI line."""
+    """Return the light collection of a TDI line: when and how long its stages collect light."""
     return Collection.of(optics.ccd.band.tdi, sensor.line_time)
 
 

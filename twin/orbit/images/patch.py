@@ -339,7 +339,7 @@ def _recorded(
 WRONG_PIXELS, WRONG_SIGMAS, WRONG_FLOOR = 3.0, 5.0, 1.0
 """Limits of the error of a right match: 3 pixels, and 5 of its sigmas plus 1 pixel."""
 WRONG = f"more than {WRONG_PIXELS:g} px off, or more than {WRONG_SIGMAS:g} sigmas and {WRONG_FLOOR:g} px"
-"""Definition of a wrong match, for readers."""
+"""Definition of a wrong match, as a text for reports."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -384,7 +384,7 @@ class LineComparison:
 
     @property
     def p_value(self) -> float:
-        """Probability of a chi-square as large or larger."""
+        """Probability of a chi-square at least as large if the covariances are right."""
         return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
 

@@ -158,7 +158,7 @@ def found_table(points: PatchPoints) -> Table:
 
 
 def _true(patch: Patch, points: PatchPoints) -> Table:
-    """Return the table of measured points compared with the truth."""
+    """Return the table that compares the measured points with their true image positions."""
     rows = {name: COMPARED(line) for name, line in flat(points, lambda quantity: judged(patch, quantity)).items()}
     caption = (
         f"Wrong: {WRONG}; counted among all measured points, those that passed the matching, and those that passed the "

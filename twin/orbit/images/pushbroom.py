@@ -224,9 +224,9 @@ _NEAR = 2
 BORDER = MARGIN + _NEAR + 1
 """Smallest number of lines and pixels between a window and the ends of an image."""
 _SAMPLES_AT_ONCE = 4_000_000
-"""Largest number of ground samples in a strip, to bound memory."""
+"""Largest number of ground samples processed at a time, to bound memory."""
 _CHECKS = 400
-"""Number of samples at which the interpolation is checked."""
+"""Number of samples at which the interpolation of positions is compared with the rigorous sensor."""
 
 
 GroundImage = Callable[[np.ndarray, np.ndarray], np.ndarray]

@@ -87,7 +87,7 @@ def _modulus(values: np.ndarray) -> np.ndarray:
 
 
 def _transfer_figure(run: Simulation) -> Figure:
-    """Draw the modulation transfer along line and track, with its factors."""
+    """Draw each line's modulation transfer along the line and along the track, with its factors."""
     figure = new_figure(3.4)
     panels = figure.subplots(1, 2, sharey=True)
     frequency = np.linspace(0.0, 0.5, 101)
@@ -246,7 +246,7 @@ def simulation_report(run: Simulation) -> Report:
 
 
 def map_facts(raster: Raster, note: str, heights: bool = False) -> FrameFacts:
-    """Return the tags of a map's GeoTIFF."""
+    """Return the text tags that the GeoTIFF of a map carries."""
     longitude, latitude, *steps = list(GEOREFERENCE(raster).values())[3:]
     return FrameFacts(note=note, georeference=MapGeoreference(longitude, latitude, steps[0], steps[1], heights))
 

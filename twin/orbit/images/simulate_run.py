@@ -138,7 +138,7 @@ class Simulation(SimulatedFlight):
 
     @property
     def laboratory(self) -> ThreeLineCameraSpec:
-        """Camera as measured before launch."""
+        """Camera as the laboratory measured it before launch."""
         return self.setup.camera
 
 
@@ -386,7 +386,7 @@ MATCH_COUNTS = {
     "wrong_accepted": "wrong ones among those that passed the consensus",
     "right_rejected_by_consensus": "right matches that the consensus rejected",
 }
-"""Meaning of each count of points in one line."""
+"""Meaning of each count of matched points in one line, by its result key."""
 
 COMPARED: Record[LineComparison] = Record(
     "Points of one kind in one line compared with the truth; RMS and mean of those that are not wrong.",
@@ -413,7 +413,7 @@ def _grid(shape: tuple[int, ...]) -> tuple[Array, Array]:
 
 
 def _true_grid(patch: Patch, name: str) -> dict[str, Any]:
-    """Return true ground points of a grid of a line's image."""
+    """Return the true ground points that a grid of positions in a line's image sees."""
     row, column = _grid(patch.images[name].frame.shape)
     line, pixel = patch.images[name].image_point(row, column)
     return {"line": line, "pixel": pixel, "itrs_m": patch.true_point(name, row, column)}

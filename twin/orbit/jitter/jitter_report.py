@@ -21,9 +21,9 @@ _MOST, _SIGMAS = 4000, 5.0
 _COURSE, _ROWS = 0.02, 5000
 """Least time between rows of the attitude table, in seconds, and largest number of its rows."""
 _MOST_WRONG = 0.3
-"""Share of rejected observations above which there is a warning."""
+"""Share of observations rejected as gross errors above which there is a warning."""
 _NAMED = 8
-"""Largest number of aliases that are listed."""
+"""Largest number of alias frequencies of an oscillation that are listed."""
 _FIT = 1.3
 """Ratio of the scatter of the residuals to the sigmas of the points above which there is a warning."""
 

@@ -36,7 +36,7 @@ TEST_FILE = "jitter.yaml"
 _WRONG = 20.0
 """Largest error that a simulated wrong match gets, in pixels."""
 _SPARE = 1.3
-"""Number of candidates drawn per point; some lie beyond an edge of a line."""
+"""Number of candidates drawn per point, because some lie beyond an edge of a line."""
 _REMEDY = "points that several lines see, spread over the strip; a larger `height_sigma` or another `height`"
 
 

@@ -93,7 +93,7 @@ class SteadyPlatform:
         return self._series(self.position_series, seconds)
 
     def velocity(self, seconds: Any) -> np.ndarray:
-        """Return the velocity relative to the rotating Earth in axes of the ITRS, in m/s; (...) -> (..., 3)."""
+        """Return the velocity relative to the rotating Earth in axes of the ITRS at times (...), (..., 3), in m/s."""
         first, last = self.span
         return self._series(chebyshev.chebder(self.position_series) * (2.0 / (last - first)), seconds)
 
@@ -102,7 +102,7 @@ class SteadyPlatform:
         return np.asarray(self.velocity(seconds) + earth_rotation_velocity(self.position(seconds)))
 
     def body_to_itrs(self, seconds: Any) -> np.ndarray:
-        """Return the axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
+        """Return the axes of the body as columns at times (...), (..., 3, 3): x_itrs = matrix @ x_body."""
         t = np.asarray(seconds, np.float64)
         rotation = (
             Rotation.from_rotvec(self._series(self.rotation_series, t).reshape(-1, 3))

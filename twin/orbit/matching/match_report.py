@@ -1,4 +1,4 @@
-"""Report of points measured in a user's images."""
+"""Report of points measured in a user's images: verdict, facts, counts and warnings."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def match_report(run: Match) -> Report:
 
 
 def _verdict(run: Match) -> tuple[str, tuple[str, ...]]:
-    """Return the verdict and the sentences after it."""
+    """Return the verdict of the measurement, and the sentences that follow it in the report."""
     role = run.measurements.ground.role
     counts = [f"{int(np.sum(role == name))} {name}" for name in ("control", "check", "tie") if np.any(role == name)]
     displacements = [

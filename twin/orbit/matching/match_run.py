@@ -59,7 +59,7 @@ _BORDER = 5
 _SPARE = 300.0
 """Margin of the map about the images' ground, in metres, beside the search range, for errors of camera and platform."""
 _PIXEL = 30.0
-"""Bytes per pixel of an image, with the part of the maps that it shows."""
+"""Memory that a pixel of an image needs, with the part of the maps that it shows, in bytes."""
 
 
 @dataclass(frozen=True, eq=False)

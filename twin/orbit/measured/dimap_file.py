@@ -56,7 +56,7 @@ _PERIOD: Mapping[str, float] = FrozenMap(
 _LENGTH: Mapping[str, float] = FrozenMap({"micrometer": 1e-6, "um": 1e-6, "mm": 1e-3, "m": 1.0})
 """Metres per unit of a detector's pixel size, by name of the unit."""
 _MOST_TERMS = 8
-"""Largest number of terms of a polynomial."""
+"""Largest number of terms of a polynomial in a DIMAP file."""
 _DAY = 86400.0
 _SAMPLES = 240
 """Number of samples of a polynomial attitude: a cubic spline through them is accurate to 1e-12 rad for a rotation of 30
@@ -68,7 +68,7 @@ _NEAR = 0.1
 """Longest extrapolation of an orbit beyond its readings, in seconds: the third derivative of its positions makes 2 um.
 """
 _LINES_OFF = 3.0
-"""Largest disagreement of times and number of lines, in lines."""
+"""Largest allowed disagreement between the duration of the image and its number of lines, in lines."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,7 +347,7 @@ def _moment(element: Element) -> Readings:
 
 
 def _times(time: Element, lines: int) -> tuple[Readings, float]:
-    """Return the exposure of the first line, and the line period in seconds."""
+    """Return the exposure time of the first line, as a clock reading, and the line period in seconds."""
     span = time.one("Time_Range")
     first, last = _moment(span.one("START")), _moment(span.one("END"))
     stamp = time.one("Time_Stamp", "LINE_PERIOD")

@@ -241,9 +241,9 @@ def _c04(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
 
 
 _FINAL = {"x": (134, 144), "y": (144, 154), "UT1-UTC": (154, 165), "dX": (165, 175), "dY": (175, 185)}
-"""Columns of Bulletin B, which is final; later days have Bulletin A alone."""
+"""Character columns of Bulletin B in finals2000A, by quantity; it is final, and later days have Bulletin A alone."""
 _FINALS = {"MJD": (7, 15), "x": (18, 27), "y": (37, 46), "UT1-UTC": (58, 68), "dX": (97, 106), "dY": (116, 125)}
-"""Columns of Bulletin A."""
+"""Character columns of Bulletin A in finals2000A, by quantity."""
 
 
 def _finals(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:

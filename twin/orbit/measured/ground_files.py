@@ -140,7 +140,7 @@ def _covariance(spec: GroundFileSpec, file: str, rows: _Rows, itrs: np.ndarray, 
 
 
 def _unique(file: str, ids: Sequence[str], lines: Sequence[int | None]) -> None:
-    """Raise InputError if a name occurs twice."""
+    """Raise InputError if a name of a ground point occurs twice."""
     seen: set[str] = set()
     for name, line in zip(ids, lines, strict=True):
         if name in seen:
@@ -149,7 +149,7 @@ def _unique(file: str, ids: Sequence[str], lines: Sequence[int | None]) -> None:
 
 
 def _role(file: str, role: str, line: int | None, key: tuple[str | int, ...] = ("role",)) -> str:
-    """Return the role, or raise InputError if it is neither control nor check."""
+    """Return the role of a point, or raise InputError if it is neither control nor check."""
     if role not in ROLES[:2]:
         raise InputError(Issue("unknown role", file, line, key, shown(role), names_text(ROLES[:2])))
     return role

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.measurements import RasterFileSpec
 
 LARGEST_PART = 100_000_000
-"""Largest number of pixels read at once."""
+"""Largest number of pixels of a raster that are read at once."""
 _DRIVERS = ("GTiff", "GTX", "COG")
 """GDAL drivers of plain grids; other drivers open files and addresses that a raster names."""
 
@@ -572,7 +572,7 @@ class UserMap:
         return MapPart(shown, part.valid, self.raster, first, frame, self.to_geographic, float(np.sqrt(area)))
 
     def _heights(self, part: MapPart) -> np.ndarray:
-        """Return heights above the ellipsoid, in metres."""
+        """Return the heights of a part of an elevation model above the ellipsoid, in metres."""
         values = part.values.astype(np.float64)
         if self.geoid is not None:
             rows, columns = (np.arange(n, dtype=float) for n in values.shape)

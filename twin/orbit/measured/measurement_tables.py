@@ -44,7 +44,7 @@ _PLACE = tuple(Column(axis, LENGTH, least=-_FAR, most=_FAR) for axis in "xyz")
 _SPEED = tuple(Column(f"v{axis}", SPEED, needed=False, least=-_FAST, most=_FAST) for axis in "xyz")
 _QUATERNION = tuple(Column(f"q{k}", least=-1.001, most=1.001) for k in range(1, 5))
 _LARGE = 1e6
-"""Largest sigma of a coordinate, in metres."""
+"""Largest sigma of a ground coordinate that is plausible, in metres."""
 _CORRELATIONS = ("correlation_xy", "correlation_xz", "correlation_yz")
 COLUMNS: Mapping[str, tuple[Column, ...]] = {
     "platform": (_TIME, *_PLACE, *_SPEED, *_QUATERNION),
@@ -426,7 +426,7 @@ def campaign_files(passes: Sequence[PassMeasurements], camera: Mapping[str, Any]
 
 
 def _pass_tables(measured: PassMeasurements) -> dict[str, str]:
-    """Return the text of each table of a pass by its key, with all digits."""
+    """Return the text of each table of a pass, by the table's key, with all digits of its numbers."""
     platform = measured.platform
     orbit = {"time [s]": platform.orbit_time, **_columns(("x [m]", "y [m]", "z [m]"), platform.position)}
     if platform.velocity is not None:
@@ -492,7 +492,7 @@ def _images(images: Mapping[str, ImagePoints], ground: GroundPoints, chosen: np.
 
 
 def _columns(names: Sequence[str], values: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the columns of an array by their names."""
+    """Return the columns of an array as a mapping, name -> column."""
     return dict(zip(names, values.T, strict=True))
 
 

@@ -28,7 +28,7 @@ Frame = Literal["ITRS", "GCRS", "EME2000", "TEME"]
 Scalar = Literal["last", "first"]
 Turns = Literal["body_to_frame", "frame_to_body"]
 FRAMES: tuple[str, ...] = get_args(Frame)
-"""Reference frames that can be read."""
+"""Names of the reference frames that can be read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,9 +215,9 @@ def require_earth_fixed_velocity(orbit: OrbitReadings) -> None:
 
 
 INERTIAL_VELOCITY = "the velocities are inertial, larger than those of the Earth-fixed positions by omega x P"
-"""Problem text of inertial velocities with Earth-fixed positions."""
+"""Error text for inertial velocities given with Earth-fixed positions."""
 EARTH_FIXED_VELOCITY = "velocities relative to the same axes as the positions, or none"
-"""Text of the allowed velocities."""
+"""Error text that says which velocities are allowed."""
 
 
 _COVARIANCE = ("COVARIANCE_START", "COVARIANCE_STOP")

@@ -94,7 +94,7 @@ class GroundPoints:
         )
 
     def taken(self, keep: ArrayLike) -> GroundPoints:
-        """Return the points that a mask or index selects."""
+        """Return the ground points that a mask or an array of indices selects."""
         where = np.asarray(keep)
         return GroundPoints(self.ids[where], self.itrs[where], self.covariance[where], self.role[where])
 
@@ -147,7 +147,7 @@ class ImagePoints:
         return cls(which, at, along, spread)
 
     def taken(self, keep: ArrayLike) -> ImagePoints:
-        """Return the image points that a mask or index selects."""
+        """Return the image points that a mask or an array of indices selects."""
         where = np.asarray(keep)
         return ImagePoints(self.point[where], self.line[where], self.pixel[where], self.covariance[where])
 
@@ -157,7 +157,7 @@ class ImagePoints:
         return cls(*(np.concatenate([getattr(part, attribute.name) for part in parts]) for attribute in fields(cls)))
 
     def numbered(self, first: int) -> ImagePoints:
-        """Return these image points with their ground points counted from ``first``."""
+        """Return these image points with the index of each ground point increased by ``first``."""
         return replace(self, point=self.point - first)
 
 

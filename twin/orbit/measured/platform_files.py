@@ -52,7 +52,7 @@ _TURN = (
     *(Column(name, ANGLE, needed=False) for name in _ANGLES),
 )
 _LARGEST_ERROR = 0.01
-"""Largest error of positions between readings, in metres."""
+"""Largest interpolation error of positions between readings that is accepted, in metres."""
 _EME2000_FROM_GCRS = np.asarray(erfa.bp06(2451545.0, 0.0)[0])
 """Frame bias, rotation GCRS -> EME2000 (IERS Conventions 2010, section 5.5.4)."""
 

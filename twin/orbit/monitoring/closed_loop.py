@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import MonitorSetup
 
 FOCUS_FIELDS = (0.7, 0.0, -0.7)
-"""Fields at which the focus is computed, as shares of half the line."""
+"""Positions on the line at which the focus is computed, from its middle, as shares of half its length."""
 _READ = 1e-3
 """Approximate standard deviation of a spot coordinate in one reading, in pixels."""
 _SMALL = 1e-6
@@ -101,7 +101,7 @@ class Corrector:
 
     @property
     def unit(self) -> tuple[str, float]:
-        """Unit in which positions are reported, and its size in SI units."""
+        """Unit in which positions of the mechanism are reported: its name, and its size in SI units."""
         key = "um" if self.spec.kind_of("step").si == "m" else "arcsec"
         return key, 1e-6 if key == "um" else ARCSEC
 

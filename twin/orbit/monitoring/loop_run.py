@@ -176,7 +176,7 @@ def imaged_pair(
 _FEWEST = 8
 """Smallest number of points from which a mean height and its scatter are computed."""
 _TRANSMISSION = 0.8
-"""Transmission of a lens, mean over the spectrum: the default of payloads."""
+"""Transmission of the lens of a rendered line image, mean over the spectrum: the default of payloads."""
 
 
 def _optics(setup: MonitorSetup, name: str, defocus: float) -> LineOptics:
@@ -351,7 +351,7 @@ class LoopRun:
 
     @property
     def stable(self) -> bool:
-        """True if all loops together are stable."""
+        """True if all loops, acting together, are stable."""
         return self.radius < DECAYING
 
     @property

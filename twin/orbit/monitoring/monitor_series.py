@@ -163,7 +163,7 @@ class Measured:
 
     @classmethod
     def of(cls, recoveries: Sequence[Recovery], noise: SeriesNoise | None, truth: Sequence[Truth]) -> Measured:
-        """Join the recoveries of successive groups of states."""
+        """Join the measured spots of successive groups of states."""
         positions = [np.stack([recovery.before, recovery.after]) for recovery in recoveries]
         evidence = SpotEvidence.joined([recovery.evidence for recovery in recoveries if recovery.evidence is not None])
         spread = np.concatenate([recovery.shift_covariance for recovery in recoveries])

@@ -28,7 +28,7 @@ from twin.orbit.monitoring.monitoring_run import Cause, MonitorRun, Smoothing
 from twin.orbit.monitoring.pair_flight import CaseErrors, rms
 
 MOST_MOTIONS = 8
-"""Largest number of motions listed for a mode."""
+"""Largest number of motions listed for an unobservable mode."""
 
 
 def _unsigned(values: Array | None) -> Array | None:
@@ -423,5 +423,5 @@ CLOSED: Record[LoopRun] = Record(
 
 
 def monitor_numbers(run: MonitorRun | LoopRun) -> dict[str, Any]:
-    """Return the numbers of a run as monitor.json holds them."""
+    """Return the numbers that monitor.json contains: changes, angle, heights and their errors."""
     return CLOSED(run) if isinstance(run, LoopRun) else MONITOR(run)

@@ -195,7 +195,7 @@ def _course_figure(run: LoopRun) -> Figure:
 
 
 def _positions_figure(run: LoopRun) -> Figure:
-    """Draw the positions of the mechanisms."""
+    """Draw the commanded positions of the mechanisms over the orbit."""
     units = list(dict.fromkeys(corrector.unit[0] for corrector in run.model.correctors))
     figure, panels = _panels(1.0 + 2.2 * len(units), len(units), False, "time [min]; dotted: at the end of a range")
     minutes = run.closed.course.times / 60.0

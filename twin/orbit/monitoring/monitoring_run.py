@@ -94,7 +94,7 @@ class Conversion:
 
     @property
     def of_angle(self) -> float:
-        """Height change for 1 arcsec of the angle, half from each camera, in metres."""
+        """Height change for a change of the intersection angle by 1 arcsec, half from each camera, in metres."""
         first, second = self.traced.values()
         return 0.5 * (first - second)
 
@@ -121,7 +121,7 @@ class Scatter:
 
     @property
     def spread(self) -> float:
-        """Standard deviation over the repeats, in metres."""
+        """Standard deviation of the mean height over the repeated measurements, in metres."""
         return float(np.std(self.heights, ddof=1))
 
     @property
@@ -133,7 +133,7 @@ class Scatter:
 
     @property
     def agrees(self) -> bool:
-        """True if spread / sigma lies within the limits."""
+        """True if the ratio of observed to predicted standard deviation lies within the limits."""
         low, high = self.limits
         return low < self.spread / self.sigma < high
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.monitor import OrbitMonitorSpec
 
 TOO_FAR = "temperatures and motions that keep the beams on the mirrors and the spots on their CCDs"
-"""Remedy where light is lost or a spot cannot be measured."""
+"""Remedy that messages give where light is lost or a spot cannot be measured."""
 HALF_SPAN = 60.0
 """Time of the orbit before and after each time of the test that its images cover, in seconds; two views 53 degrees
 apart from 500 km are 70 s apart.
@@ -137,7 +137,7 @@ class CaseErrors:
 
     @property
     def worst(self) -> float:
-        """Largest RMS error in height of a single time, in metres."""
+        """Largest of the RMS errors in height at the single times, in metres."""
         return float(self.height.max())
 
 
