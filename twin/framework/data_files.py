@@ -39,9 +39,11 @@ from dataclasses import field
 
 CONVENTIONS = "CF-1.11"
 UDUNITS_NAMES: Mapping[str, str] = FrozenMap({"deg": "degree", "mas": "milliarcsec"})
-"""Unit as the program writes it -> as UDUNITS does; units that are neither here nor in COUNTS are the same in both."""
+"""Spelling of a unit in UDUNITS for each unit that this program spells differently; units that are neither here nor in
+COUNTS are the same in both.
+"""
 COUNTS = frozenset(("px", "waves", "DN", "photons"))
-"""Units that count something; UDUNITS does not know them."""
+"""Units of counts (pixels, waves, grey values, photons), which UDUNITS does not know."""
 WRITER = "space-camera-twin"
 
 
@@ -56,9 +58,9 @@ class GridData:
     Attributes
     ----------
     variables : mapping
-        Name -> variable of real numbers.
+        Variables of real numbers, by name.
     coords : mapping
-        Name -> coordinates of an axis, real numbers or texts.
+        Coordinates along each axis, real numbers or texts, by the name of the axis.
     attrs : mapping
         Attributes of the file, including ``title``.
     """
@@ -101,7 +103,7 @@ def netcdf(data: xr.Dataset | GridData) -> bytes:
 
 
 def _grid_file(data: GridData) -> bytes:
-    """Return the same bytes that xarray writes for this data."""
+    """Return a netCDF-4 file of the data as bytes, the same that xarray would write."""
     import h5netcdf
     import h5py
 
@@ -210,7 +212,7 @@ def _harmless(cell: Any) -> Any:
 
 
 SPOT_STRETCH = 30.0
-"""Steepness of the asinh stretch that shows faint diffraction rings beside a spot's core."""
+"""Steepness of the asinh grey scale (dimensionless) that shows faint diffraction rings beside a spot's core."""
 
 ENLARGE = 4
 """Magnification of small pictures."""
@@ -219,7 +221,7 @@ LARGEST_ENLARGED = 600
 
 
 class Georeference(Protocol):
-    """Georeference of an image."""
+    """Interface of an image's georeference, which gives the GeoTIFF tags of the file."""
 
     def tags(self) -> list[tuple[Any, ...]]:
         """Return tags in the form that tifffile accepts: code, type, count, value, written once per file."""
@@ -267,7 +269,7 @@ class FrameFacts:
     exposure : float | None
         Exposure time of each frame, in seconds.
     times : tuple of float | None
-        Time of each frame in the course, in seconds.
+        Time of each frame from the start of the time series, in seconds.
     note : str
         Further remarks.
     georeference : Georeference | None
@@ -282,7 +284,7 @@ class FrameFacts:
     georeference: Georeference | None = None
 
     def page(self, k: int) -> dict[str, Any]:
-        """Return the known facts of frame number ``k`` as plain data."""
+        """Return what is known about frame number ``k`` (camera, pitch, exposure, time) as plain data."""
         known = {
             "camera": self.camera or None,
             "frame": k + 1,
@@ -308,7 +310,7 @@ def tiff(frames: np.ndarray, facts: FrameFacts) -> bytes | memoryview:
     Parameters
     ----------
     frames : (N, H, W) ndarray of uint16 or float
-        Recorded frames.
+        Grey values of N frames of H rows and W columns.
     facts : FrameFacts
         Description of the frames.
 
@@ -346,22 +348,22 @@ def tiff(frames: np.ndarray, facts: FrameFacts) -> bytes | memoryview:
 
 
 FRAME_FORMATS = ExtensionTable[Callable[[np.ndarray, FrameFacts], bytes | memoryview]]("frame_formats", {"tiff": tiff})
-"""File extension -> function that writes (N, H, W) uint16 frames and their description in this format. New formats are
-added here.
+"""Functions that write N frames of H x W grey values, (N, H, W) uint16, and their description, by file extension. New
+formats are added here.
 """
 
 
 def frame_files(
     name: str, frames: np.ndarray, facts: FrameFacts, stretch: float | None = SPOT_STRETCH
 ) -> Iterator[tuple[str, bytes | memoryview]]:
-    """Yield (path, content) of all files that a run folder has of recorded frames: every format, and a picture.
+    """Yield path and content of the files that a run folder stores of recorded frames: all formats, and a picture.
 
     Parameters
     ----------
     name : str
         Name of the frames.
     frames : (N, H, W) ndarray of uint16
-        Recorded frames.
+        Recorded grey values of N frames of H rows and W columns.
     facts : FrameFacts
         Description of the frames.
     stretch : float | None
@@ -373,7 +375,7 @@ def frame_files(
 
 
 def preview(frames: np.ndarray, stretch: float | None = SPOT_STRETCH) -> np.ndarray:
-    """Return a magnified 8-bit picture of the mean of (N, H, W) frames.
+    """Return a magnified 8-bit picture of the mean of N frames of H rows and W columns, (N, H, W).
 
     ``stretch`` is the steepness of an asinh grey scale; None gives a linear one.
     """
@@ -387,7 +389,7 @@ def preview(frames: np.ndarray, stretch: float | None = SPOT_STRETCH) -> np.ndar
 
 
 def preview_png(frames: np.ndarray, stretch: float | None = SPOT_STRETCH) -> bytes:
-    """Return ``preview`` as a PNG file."""
+    """Return a magnified 8-bit picture of the mean of frames (N, H, W), as the bytes of a PNG file."""
     return bytes(cv2.imencode(".png", preview(frames, stretch))[1].tobytes())
 
 
@@ -398,12 +400,12 @@ FITS_UNITS: Mapping[str, str] = FrozenMap(
         **{"K/m": "K/m", "m/s": "m/s", "1/m": "m-1", "1/mm": "mm-1", "DN": "adu", "px": "pixel", "photons": "photon"},
     }
 )
-"""Unit as the program writes it -> as FITS 4.0 does, for the units that FITS has."""
+"""Spelling of each unit in FITS 4.0, by its spelling in this program, for the units that FITS has."""
 ASCII_SIGNS: Mapping[str, str] = FrozenMap(
     {"Δ": "d ", "σ": "sigma", "χ²": "chi2", "µ": "u", "\N{GREEK SMALL LETTER MU}": "u", "α": "alpha", "β": "beta"}
     | {"γ": "gamma", "°": "deg", "±": "+-", "×": "x", "\N{MINUS SIGN}": "-", "…": "..."}
 )
-"""Signs used in reports -> their replacement where only ASCII is allowed."""
+"""Replacement of each sign used in reports where only ASCII is allowed."""
 
 
 class MissingPackage(Exception):
@@ -455,7 +457,7 @@ class DataColumn:
 
 @dataclass(frozen=True, eq=False)
 class DataTable:
-    """Table for other programs.
+    """Table with units and descriptions of its columns, to be written in formats of other programs.
 
     Attributes
     ----------
@@ -466,7 +468,7 @@ class DataTable:
     columns : tuple of DataColumn
         Columns of one length with different names.
     facts : mapping of str to str
-        Further facts: name -> text.
+        Further facts about the table, texts by name.
     """
 
     name: str
@@ -571,6 +573,6 @@ def _fits(table: DataTable) -> bytes:
 TABLE_FORMATS = ExtensionTable[Callable[[DataTable], bytes]](
     "table_formats", {"csv": _csv, "parquet": _parquet, "fits": _fits}
 )
-"""File extension -> function that writes a table in this format; it may raise MissingPackage. New formats are added
+"""Functions that write a table, by file extension of the format; they may raise MissingPackage. New formats are added
 here.
 """

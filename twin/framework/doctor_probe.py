@@ -16,7 +16,9 @@ import numpy as np
 import optics  # noqa: F401  (names the LLVM library before drjit is imported)
 
 ULPS = 8
-"""Tolerance of the kernel's results against NumPy, in spacings of float64: the last bits of atan2 may differ."""
+"""Largest accepted difference of the test kernel's results from NumPy's, in spacings of float64: the last bits of atan2
+may differ.
+"""
 
 
 def kernel(backend: str = "llvm") -> dict[str, Any]:

@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 PARTIAL = ".partial"
-"""Extension of a file that is being written."""
+"""Extension of the temporary name of a file that is being written."""
 PARTIAL_NAME = r"\.[^/]+\.[0-9a-f]{8}\.partial"
 """Pattern of the name of a file that is being written; its random token keeps two processes that write the same file
 apart.
@@ -216,10 +216,10 @@ def _handled(asked: Iterable[int], handler: Callable[[int, object], None]) -> It
 
 @contextmanager
 def exit_on_terminate() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end the program as an exception, as Ctrl-C does, so that a partial run folder is removed.
+    """Let SIGTERM and SIGHUP raise an exception, as Ctrl-C does, so that a partial run folder is removed.
 
-    The exception that leaves the block is always that of the signal: compiled modules turn one that arrives while they
-    are imported or call back into an exception of their own, and clean-up may fail after it.
+    The exception that leaves the block is always the one that the signal raised: compiled modules turn one that arrives
+    while they are imported or call back into an exception of their own, and clean-up may fail after it.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

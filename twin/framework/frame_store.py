@@ -21,16 +21,16 @@ from numpy.typing import DTypeLike, NDArray
 from analysis.spots.centroid import mean_frames
 
 IN_MEMORY = PART = 1 << 26
-"""Largest size of a state's frames that are kept in memory (larger ones are in a file), and size of one part of a
-reduction, in bytes.
+"""Largest size, in bytes, of frames that are kept in memory (larger ones are in a file), and size of the parts in which
+sums and maxima over frames are computed.
 """
 
 
 def resident_bytes(size: float) -> float:
-    """Return the memory that frames of ``size`` bytes take.
+    """Return the resident memory, in bytes, that frames of ``size`` bytes take.
 
-    Frames in memory take all of it; frames in a file take half of a part, since only one of the two states (before and
-    after) is worked on at a time.
+    Frames in memory take their whole size; frames in a file take half of a part, since only one of the two states
+    (before and after) is worked on at a time.
     """
     return size if size <= IN_MEMORY else 0.5 * PART
 
@@ -101,7 +101,7 @@ def _map_of(frames: Any) -> mmap.mmap | None:
 
 
 def parts(frames: np.ndarray) -> Iterator[tuple[tuple[int, ...], np.ndarray]]:
-    """Yield parts of (..., N, H, W) frames: index of the image, and (n, H, W) of its frames."""
+    """Yield parts of stored frames (..., N, H, W): index of the image, and n of its N frames, (n, H, W)."""
     count, each = frames.shape[-3], frames.itemsize * frames.shape[-2] * frames.shape[-1]
     length = max(1, PART // each)
     for index in np.ndindex(*frames.shape[:-3]):
@@ -111,7 +111,7 @@ def parts(frames: np.ndarray) -> Iterator[tuple[tuple[int, ...], np.ndarray]]:
 
 
 def mean_of(frames: NDArray[np.uint16]) -> NDArray[np.float64]:
-    """Return the mean over the frame axis, (..., N, H, W) to (..., H, W), equal to that of ``mean_frames``."""
+    """Return the mean over N frames of H x W pixels, (..., N, H, W) to (..., H, W), without loading all of them."""
     if not in_file(frames):
         return mean_frames(frames)
     total = np.zeros((*frames.shape[:-3], *frames.shape[-2:]), np.int64)
@@ -121,7 +121,7 @@ def mean_of(frames: NDArray[np.uint16]) -> NDArray[np.float64]:
 
 
 def largest_of(frames: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """Return the maximum over the frame axis, (..., N, H, W) to (..., H, W)."""
+    """Return the maximum of each pixel over N frames of H x W pixels, (..., N, H, W) to (..., H, W)."""
     if not in_file(frames):
         return np.asarray(np.max(frames, axis=-3))
     out = np.zeros((*frames.shape[:-3], *frames.shape[-2:]), frames.dtype)
@@ -139,7 +139,7 @@ class FileBuffer(io.BufferedRandom):
 
     @property
     def name(self) -> str:
-        """Empty name."""
+        """Empty text, since the file has no name."""
         return ""
 
     def fileno(self) -> int:

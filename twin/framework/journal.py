@@ -1,4 +1,4 @@
-"""Journal of finished pieces of a command's work, an append-only file from which an interrupted command continues."""
+"""Journal of finished parts of a command's work, an append-only file from which an interrupted command continues."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from twin.framework import durable, owned_files, provenance
 from twin.framework.run_folder import RunFolderError, reason
 
 UNREADABLE = (ValueError, KeyError, TypeError, AttributeError, RecursionError)
-"""Exceptions raised by a line that this program has not written although its checksum is right."""
+"""Exceptions raised on reading a line that has a right checksum but was not written by this program."""
 
 
 class Journal:
-    """Context manager over a file with one line for each finished piece of work.
+    """Journal of a command's work: a file with one line for each finished part (piece) of it, as a context manager.
 
     A piece is on the disk (``fsync``) when ``keep`` returns. Every line begins with its own checksum, so that a line
     that was partly written at a power failure, or damaged later, is detected and skipped. The first line identifies the
@@ -94,7 +94,7 @@ class Journal:
                 self._out.close()
 
     def keep(self, pieces: Mapping[str, Any]) -> None:
-        """Append finished pieces with their keys."""
+        """Append finished parts of the work with their keys, and write them through to the disk."""
         if self.file is not None and pieces:
             lines = [{"of": key, "is": _encoded(piece)} for key, piece in pieces.items()]
             try:
@@ -141,7 +141,7 @@ class Journal:
 
 
 def read_pieces(content: bytes, classes: Sequence[type[Any]]) -> tuple[Any, dict[str, Any], int]:
-    """Read the content of a journal.
+    """Read the finished parts of work from the content of a journal.
 
     Parameters
     ----------
@@ -188,13 +188,13 @@ def _checksum(text: bytes) -> bytes:
 
 
 def _changes(before: Mapping[str, str], now: Mapping[str, str], describe: Callable[[str, str, str], str]) -> list[str]:
-    """Return a text for each entry that differs between two mappings."""
+    """Return a description of each entry (such as a package version) that differs between two mappings."""
     pairs = [(name, before.get(name, "missing"), now.get(name, "missing")) for name in sorted({*before, *now})]
     return [describe(name, old, new) for name, old, new in pairs if old != new]
 
 
 def _encoded(value: Any) -> Any:
-    """Return a piece as plain data that keep every bit."""
+    """Return a result as plain data for JSON that preserve every bit of its numbers."""
     if isinstance(value, np.ndarray):
         data = base64.b64encode(np.ascontiguousarray(value).tobytes()).decode("ascii")
         return {"array": str(value.dtype), "shape": list(value.shape), "data": data}
@@ -211,7 +211,7 @@ def _encoded(value: Any) -> Any:
 
 
 def _decoded(value: Any, classes: Mapping[str, type[Any]]) -> Any:
-    """Return the piece that was encoded as plain data."""
+    """Return the result that was encoded as plain data, as dataclasses and arrays again."""
     if isinstance(value, list):
         return tuple(_decoded(item, classes) for item in value)
     if not isinstance(value, dict):

@@ -16,7 +16,9 @@ from packaging.markers import Marker
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "supply" / "lock"
 """Folder of the lock files beside the source; an installed wheel has none."""
 LAYERS = ("install", "runtime", "live", "test", "peers")
-"""Lock files in order. Each has only the packages that it adds; the peers are installed in a folder of their own."""
+"""Names of the lock files, in the order of installation. Each has only the packages that it adds; the peers are
+installed in a folder of their own.
+"""
 _PIN = re.compile(r"([A-Za-z0-9._-]+)==([^\s;\\]+)\s*(?:;\s*(.*?))?\s*\\?$")
 _HASH = re.compile(r"--hash=sha256:([0-9a-f]{64})\s*\\?$")
 
@@ -27,7 +29,7 @@ class LockError(Exception):
 
 @dataclass(frozen=True)
 class Locked:
-    """Package of a lock file.
+    """Package with its version and checksums as a lock file lists it.
 
     Attributes
     ----------

@@ -40,8 +40,8 @@ arrays that the heap keeps.
 def free_memory() -> float:
     """Return the memory that this process may still use, in bytes.
 
-    It is the value of the environment variable, else the least of the system's free memory and what the control group
-    and process limits leave; infinite if none of them is known.
+    It is the value of the environment variable, or else the smallest of the system's free memory and what the control
+    group and process limits leave; infinite if none of them is known.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def _number(file: Path) -> float:
 
 
 def _of_limits() -> float:
-    """Return the memory that the limit of the address space (``ulimit -v``) leaves, in bytes."""
+    """Return the memory that the limit of the address space (``ulimit -v``) still allows, in bytes."""
     most = resource.getrlimit(resource.RLIMIT_AS)[0]
     if most == resource.RLIM_INFINITY:
         return float("inf")
@@ -162,7 +162,7 @@ def largest(fits: Callable[[int], bool], most: int, least: int = 0) -> int:
 
 
 class Owner(Protocol):
-    """Source of a number: a part of a file (`Spec`), or the options of a command."""
+    """Interface of the source of a number: a part of a file (`Spec`), or the options of a command."""
 
     def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> Exception:
         """Return an error about the number, for the caller to raise."""
@@ -171,7 +171,7 @@ class Owner(Protocol):
 
 @dataclass(frozen=True)
 class Lowered:
-    """Number of a file or an option that determines the memory of a job.
+    """Number, in a file or an option, that can be lowered to reduce the memory of a job.
 
     Attributes
     ----------
@@ -209,7 +209,7 @@ def require_memory(
     started : float
         Memory beside that of ``lower``, in bytes.
     shares : str
-        Part of the message on the shares of the memory.
+        Text for the message that says what takes which part of the memory.
     file_limit : float
         Memory that the job's own file allows, in bytes.
     limit_key : str

@@ -24,7 +24,7 @@ KEPT_LOCK = ".lock"
 """File that a command holds locked in the folder of its intermediate results for ``--resume``."""
 
 NAMED = 5
-"""Largest number of files that a message names."""
+"""Largest number of file names that a message lists."""
 
 
 def first_names(names: Sequence[str], most: int = NAMED) -> str:
@@ -111,7 +111,7 @@ def _beside(target: Path, token: str) -> dict[str, Path]:
 
 
 class Unfinished:
-    """Hidden names beside a folder that belong to this process until ``close``.
+    """Hidden temporary names beside a folder, reserved for this process until ``close``.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def sweep(folder: Path, replaced: Callable[[Path, Path], bool] = lambda former, 
 
 
 def _clear(target: Path, paths: dict[str, Path], replaced: Callable[[Path, Path], bool]) -> None:
-    """Remove the hidden names of a dead process beside a target."""
+    """Remove or restore the hidden files and folders that a dead process left beside a target."""
     partial, former = paths[PARTIAL], paths[OLD]
     if partial.is_dir() and not partial.is_symlink():
         if (partial / MANIFEST).exists() and target.exists() and not former.exists():

@@ -82,7 +82,7 @@ _CODE = re.compile("`([^`]+)`")
 
 @cache
 def _template() -> Template:
-    """Return the template of the page."""
+    """Return the Jinja template of a report's HTML page."""
     loader = FileSystemLoader(str(files(__package__)))
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -184,7 +184,7 @@ def write_artefacts(artefacts: Iterable[Artefact], folder: run_folder.RunFolder)
 
 
 def links(names: Iterable[str]) -> Markup:
-    """Return links to files of the run folder, for the last table of a page."""
+    """Return HTML links to files of the run folder, for the last table of a page."""
     return Markup(", ").join(Markup('<a href="{0}">{0}</a>').format(name) for name in names)
 
 

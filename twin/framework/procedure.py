@@ -29,7 +29,7 @@ def silent(part: str, done: int, total: int) -> None:
 
 
 class BenchError(PhysicalError):
-    """Failure of a test on the bench, with the key of its file to change and the remedy.
+    """Failure of a simulated test, with the key in the test's file that should be changed, and the remedy.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class BenchError(PhysicalError):
 def performed(
     procedure: Procedure, setup: ExperimentSetup[Any], backend: Backend, seed: int, advance: Advance = silent
 ) -> tuple[Any, tuple[str, ...]]:
-    """Run a test.
+    """Run a test with one seed and return its results and warnings.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def performed(
     seed : int
         Seed of all random numbers.
     advance : Advance
-        Called with the progress.
+        Function that is called with the progress.
 
     Returns
     -------
@@ -71,7 +71,7 @@ def performed(
     Raises
     ------
     InputError
-        The input is invalid, or the test failed on the bench; the error is at the key that can change it, and warnings
+        The input is invalid, or the simulated test failed; the error is at the key that can change it, and warnings
         about the input are added since they may give the reason.
     """
     input_warnings: tuple[str, ...] = ()
@@ -90,7 +90,7 @@ def performed(
 
 
 def seeded(procedure: Procedure, setup: Any, seed: int | None) -> tuple[Any, int, dict[str, Any]]:
-    """Return a set-up with the seed of its run, this seed, and the facts about both for the run folder.
+    """Return the set-up with the seed that the run uses, that seed, and entries about both for the run folder.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ class Session:
     backend : Backend
         Backend of the ray trace.
     advance : Advance
-        Shows the progress to the user.
+        Function that shows the progress to the user.
     started : float
         Start time, in seconds since the epoch.
     clock : float

@@ -46,7 +46,10 @@ PACKAGES = (
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python, the packages (``not installed`` if missing) and extensions of the program."""
+    """Return the versions of Python, of the packages in `PACKAGES` and of extensions of the program, by name.
+
+    A missing package has the text ``not installed``.
+    """
     return {
         "python": platform.python_version(),
         **{package: _version(package) or "not installed" for package in PACKAGES},
@@ -95,7 +98,7 @@ ENDINGS = (".css", ".csv", ".html", ".j2", ".js", ".json", ".py", ".svg", ".tdm"
 
 
 def _program_files(endings: tuple[str, ...]) -> dict[str, str]:
-    """Return path -> SHA-256 of the packages' files with these extensions.
+    """Return the SHA-256 of the packages' files with these file extensions, by path.
 
     Packages of other distributions that extend tables are included; paths are relative to the parent of each package.
     """
@@ -116,7 +119,7 @@ def _extensions() -> Iterator[Path]:
 
 @cache
 def sources() -> dict[str, str]:
-    """Return source file -> checksum, as this process first read the files; comments and docstrings count.
+    """Return the checksum of every source file, by path, as this process first read it; comments count.
 
     To ignore them every file would have to be parsed, which takes a second or two for every command, and the program is
     rarely edited in the middle of a study.
@@ -132,7 +135,7 @@ def _checksum(path: Path) -> str:
 
 
 def source_digest() -> str:
-    """Return one checksum for all ``sources``."""
+    """Return one checksum for all source files of the program."""
     return hashlib.sha256(json.dumps(sources(), sort_keys=True).encode()).hexdigest()
 
 
@@ -247,7 +250,7 @@ def _processor() -> str:
 
 
 def _simd() -> list[str]:
-    """Return the instruction sets that NumPy uses."""
+    """Return the names of the processor's vector instruction sets that NumPy uses."""
     configuration: Any = np.show_config(mode="dicts")
     extensions = configuration.get("SIMD Extensions", {})
     return [*extensions.get("baseline", []), *extensions.get("found", [])]
@@ -279,7 +282,7 @@ class SelfCheck:
 
     @property
     def holds(self) -> bool | None:
-        """True if the value is within the limit, None without a limit."""
+        """True if the value is within the limit, False if not, None without a limit."""
         return None if self.limit is None else bool(self.value <= self.limit)
 
     def to_dict(self) -> dict[str, Any]:
@@ -289,11 +292,13 @@ class SelfCheck:
 
 CHI_SQUARE, WITHIN = re.compile(r"(^|_)chi_square$|^relative_error$|^worst_relative$"), ("chi_square_limit", "limit")
 VERDICT = re.compile(r"(^|_)(agrees?|converged|holds?|settled|stable)$")
-"""Pattern of the keys of truth values that judge a result: where one is False, the numbers or their sigmas are not
+"""Pattern of the keys of true/false values that judge a result: where one is False, the numbers or their sigmas are not
 reliable.
 """
 CANDIDATES = re.compile(r"(^|\.)(intervals|starts)\[").search
-"""Finds lists in a path whose entries are judged one by one; the result beside them has its own verdict."""
+"""Function that finds, in the path of a verdict, lists of candidates (intervals, starts), whose own verdicts do not
+judge the result.
+"""
 _OF_TRUTH = "0 for yes, 1 for no"
 MOST_CHECKS = 50
 """Largest number of checks recorded for one run."""
@@ -302,8 +307,8 @@ MOST_CHECKS = 50
 def checks_in(numbers: Mapping[str, Any]) -> tuple[SelfCheck, ...]:
     """Return the self-checks in the numbers of a run.
 
-    They are the chi-squares of fits (with their limits, where given), relative errors, and truth values of convergence,
-    agreement and validity.
+    They are the chi-squares of fits (with their limits, where given), relative errors, and true/false values of
+    convergence, agreement and validity.
 
     Parameters
     ----------
@@ -362,7 +367,7 @@ def inputs_in(tree: Any, paths: Iterable[Path] = ()) -> dict[str, str]:
     Returns
     -------
     dict of str to str
-        Absolute path -> SHA-256; for a folder, those of all its files.
+        SHA-256 by absolute path; for a folder, those of all its files.
     """
     out: dict[str, str] = {}
     for path in (*map(Path, dict.fromkeys(_paths(tree))), *paths):
@@ -377,7 +382,7 @@ MOST_FILES = 10_000
 
 
 def _files(place: Path) -> Iterable[Path]:
-    """Return the files at a path: itself, or all files of a folder."""
+    """Return the file at a path, or all files of the folder there."""
     try:
         if place.is_file():
             return (place,)

@@ -37,9 +37,9 @@ _PER_SI: Mapping[str, float] = FrozenMap(
     }
     | {"percent": 1e2, "ppm": 1e6, "urad": 1e6, "mrad": 1e3}
 )
-"""Unit -> number of these units in one SI unit; units that are missing here and below are not converted."""
+"""Number of units in one SI unit, by the name of the unit; units that are missing here and below are not converted."""
 _SI: Mapping[str, float] = FrozenMap({"arcsec": ARCSEC, "arcmin": ARCMIN, "mas": 1e-3 * ARCSEC})
-"""Unit -> its size in radians: a division rounds only once."""
+"""Size of each unit of angle in radians; a division by it rounds only once."""
 
 
 def in_unit(value: Any, unit: str) -> Any:
@@ -114,7 +114,7 @@ class Quantity(Generic[S]):
 
     @property
     def below(self) -> Record[Any] | None:
-        """Record whose quantities are below the key, also as rows; None for a plain value."""
+        """Record of the quantities nested below the key; None for a plain value."""
         owner = getattr(self.of, "__self__", None)
         return self.record or (owner if isinstance(owner, Record) else None)
 
@@ -147,7 +147,7 @@ class Quantity(Generic[S]):
 
 
 def _sources(sources: Any) -> list[Any]:
-    """Return the sources of a record as a list, from None, one source, a list, or a nested mapping of sources."""
+    """Return the objects that a record describes as a list, from None, one object, a list or nested mappings."""
     several = list(sources.values()) if isinstance(sources, Mapping) else sources
     if isinstance(several, list):
         return [source for nested in several for source in _sources(nested)]
@@ -155,7 +155,7 @@ def _sources(sources: Any) -> list[Any]:
 
 
 def _by_name(record: Record[Any], sources: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the record of every source of a nested mapping."""
+    """Return the record's numbers for every object of a nested mapping, under the same names."""
     return {
         k: _by_name(record, source) if isinstance(source, Mapping) else record(source) for k, source in sources.items()
     }
@@ -190,7 +190,7 @@ class Record(Generic[S]):
 
     @property
     def headed(self) -> list[str]:
-        """Keys of the quantities that have a head for tables."""
+        """Keys of the quantities that have a column head for tables."""
         return [quantity.key for quantity in self.quantities if quantity.head]
 
     def __call__(self, source: S) -> dict[str, Any]:
@@ -228,7 +228,7 @@ class Record(Generic[S]):
     def flat(self) -> Record[S]:
         """Return the record of the rows of a table.
 
-        It has the quantities with a head, including those of nested records with a head.
+        It has the quantities with a column head, including those of nested records that have one.
         """
         quantities: list[Quantity[Any]] = []
         for quantity in self:
@@ -242,7 +242,7 @@ class Record(Generic[S]):
         return Record(self.meaning, *quantities)
 
     def _chosen(self, keys: Sequence[str]) -> list[Quantity[S]]:
-        """Return the quantities of these keys, or all."""
+        """Return the quantities of the given keys, or all if there are none."""
         return [self[key] for key in keys] if keys else list(self.quantities)
 
     def table(
@@ -324,7 +324,10 @@ class Record(Generic[S]):
     def data_table(
         self, name: str, title: str, rows: Sequence[Mapping[str, Any]], keys: Sequence[str] = ()
     ) -> DataTable:
-        """Return a table for other programs, with units and meanings; see `table` for the parameters."""
+        """Return a table for other programs, with the units and descriptions of its columns.
+
+        The parameters are those of `table`.
+        """
         columns = (
             DataColumn.of(quantity.key, [row.get(quantity.key) for row in rows], quantity.unit, quantity.meaning)
             for quantity in self._chosen(keys)
@@ -333,7 +336,7 @@ class Record(Generic[S]):
 
 
 def _below(row: Mapping[str, Any], key: str) -> Any:
-    """Return the value in a row under a key, whose dots lead into nested mappings; None if there is none."""
+    """Return a value of nested mappings by a key with dots, such as ``fit.sigma``; None if there is none."""
     for name in key.split("."):
         row = (row or {}).get(name)  # type: ignore[assignment]
     return row

@@ -19,7 +19,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.procedures import PROCEDURES
 
 _FIRST = 2
-"""Version of the keys of a test that defines its frames itself."""
+"""Version of the keys of a test that defines its reference frames itself (not in reference_frames.json)."""
 _READ = json.loads((files(__package__) / "reference_frames.json").read_text("utf-8"))
 _VERSIONS: Mapping[str, int] = FrozenMap({kind: said["version"] for kind, said in _READ["files"].items()})
 FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
@@ -28,7 +28,7 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
         for kind, said in _READ["files"].items()
     }
 )
-"""Kind of file -> quantity -> its reference frame."""
+"""Description of the reference frame of each quantity, by kind of file and quantity."""
 
 
 def described(kind: str, data: Mapping[str, Any]) -> dict[str, Any]:

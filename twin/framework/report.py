@@ -88,17 +88,17 @@ class Report:
     sections : tuple of Section
         Further sections.
     images : mapping of str to ndarray
-        Name -> recorded frames, uint16 (frames, rows, columns).
+        Recorded frames by name, uint16 (frames, rows, columns).
     warnings : tuple of str
         Warnings to read before using the numbers.
     image_facts : mapping of str to FrameFacts
-        Name of images -> description of these frames; it may lack some.
+        Descriptions of these frames by name; some may be missing.
     code : int
         Exit code of a command whose result is an exit code.
     conclusions : tuple of str
         Conclusions from the numbers, one sentence each, shown before all tables.
     files : mapping of str to bytes
-        Path in the run folder -> content, for files that no page shows.
+        Contents of files that no page shows, by path in the run folder.
     checks : tuple of SelfCheck
         Self-checks of the run; empty to take those in its numbers.
     """
@@ -183,15 +183,15 @@ def with_warnings(report: Report, warnings: tuple[str, ...]) -> Report:
 
 
 SECTIONS = ExtensionTable[Callable[[Any], Section | None]]("report_sections", {})
-"""Kind of run and name of the section, ``focus skew`` -> function of the run's results that returns the section, or
-None. The kind is ``render`` for the main job, and for a test the name of its file of numbers: ``focus``, ``angle``.
-A section comes before the one on how to reproduce the run; its artefacts are in the run folder. New sections are
-added here.
+"""Functions that add a section to a report, by kind of run and name of the section, such as ``focus skew``. Each takes
+the run's results and returns the section, or None. The kind is ``render`` for the main job, and for a test the name
+of its file of numbers: ``focus``, ``angle``. A section comes before the one on how to reproduce the run; its
+artefacts are in the run folder. New sections are added here.
 """
 
 
 def further_sections(kind: str, run: Any) -> tuple[Section, ...]:
-    """Return the added sections of a run of this kind, in the order of SECTIONS.
+    """Return the sections that extensions add to the report of this kind of run, in the order of `SECTIONS`.
 
     Parameters
     ----------

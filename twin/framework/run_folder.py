@@ -23,7 +23,7 @@ from twin.framework.owned_files import MANIFEST
 from twin.framework.provenance import Checksum, Provenance, versions
 
 _WAITING = f".{MANIFEST}{owned_files.PARTIAL}"
-"""Name of the manifest until all files that it lists are on the disk."""
+"""Temporary name of the manifest until all files that it lists are on the disk."""
 
 
 class RunFolderError(Exception):
@@ -32,7 +32,7 @@ class RunFolderError(Exception):
 
 @dataclass(frozen=True)
 class Numbered:
-    """First free name of STEM-001, STEM-002, ..., chosen when the folder is put in place.
+    """Path of a run folder with the first free name of STEM-001, STEM-002, ..., chosen when the run is complete.
 
     Attributes
     ----------
@@ -257,7 +257,7 @@ class Manifest(BaseModel):
     test : str
         Kind of the test, ``focus``.
     gradient : bool
-        True if the run differentiates a study.
+        True if the run computes derivatives of a study's results.
     again : list of str
         Words of the command, without ``python -m``, that repeats the run from its own folder; empty if no command can.
     started_in : str
@@ -289,9 +289,9 @@ class Manifest(BaseModel):
     checks : list of dict
         Self-checks of the run, see `twin.framework.provenance.SelfCheck`.
     inputs : dict of str to str
-        Absolute path of every file that the run read outside its folder -> checksum.
+        Checksum of every file that the run read outside its folder, by absolute path.
     sha256 : dict of str to str
-        Path in the folder of every file of the run except the manifest -> checksum.
+        Checksum of every file of the run except the manifest, by path in the folder.
     digest : str | None
         Checksum of all other entries, see `seal`.
     """
@@ -324,7 +324,7 @@ class Manifest(BaseModel):
 
     @property
     def kind(self) -> str:
-        """Program and kind of the test."""
+        """Name of the program and kind of the test, as one text."""
         return f"{self.program} {self.test}".strip()
 
 
@@ -336,10 +336,10 @@ def _ours(named: dict[str, str]) -> dict[str, str]:
 
 
 class FilesOfRun(Protocol):
-    """Folder into which the files of a run are written."""
+    """Interface of a folder into which the files of a run are written."""
 
     def write_json(self, name: str, data: Any) -> None:
-        """Write plain data."""
+        """Write plain data as a JSON file."""
 
     def checksums(self) -> dict[str, str]:
         """Return the SHA-256 of every file of the run so far."""
@@ -511,7 +511,7 @@ def reason(error: OSError) -> str:
 JOURNAL = ".journal"
 """Extension of a file with finished pieces of work, see `twin.framework.journal`."""
 _KEPT = re.compile(rf"{re.escape(owned_files.KEPT_LOCK)}|[^/]+{re.escape(JOURNAL)}|{PARTIAL_NAME}")
-"""Pattern of the files that commands keep in such a folder."""
+"""Pattern of the names of files that commands keep in a folder of intermediate results."""
 
 
 class KeptWork:

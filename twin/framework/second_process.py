@@ -26,7 +26,9 @@ from optics.numerics.backend import cores
 MOST_TASKS = 256
 """Largest number of tasks: a task number is one byte."""
 _HEAD = struct.Struct("=QB")
-"""Header of a batch of tasks: its size in bytes, and the number of its tasks that only the second process does."""
+"""Binary header of a batch of tasks: its size in bytes, and the number of its tasks that are for the second process
+alone.
+"""
 PATIENCE = 120.0
 """Time that the command, once idle, waits for the second process before it repeats the task itself, in seconds."""
 
@@ -103,7 +105,7 @@ class SecondProcess:
             pass  # the second process has ended
 
     def results(self) -> dict[str, Any]:
-        """Return name -> result of every task. Raises the exceptions of the tasks."""
+        """Return the result of every task by its name; exceptions of tasks are raised here."""
         names, results = list(self._tasks), {}
         if self._child:
             self._close_pipes()
@@ -205,7 +207,7 @@ class SecondProcess:
 
 
 def _turns(pipe: int) -> Iterator[int]:
-    """Yield numbers of tasks that no other process has taken, until there are no more."""
+    """Yield the numbers of tasks that no other process has taken yet, until none is left."""
     while True:
         select.select([pipe], (), ())
         try:

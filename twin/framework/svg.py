@@ -107,7 +107,7 @@ def _ticks_cached(figure: Figure) -> Iterator[None]:
 
 
 def _cached_functions(axis: Any) -> tuple[Callable[[], Any], Callable[[Any, Any], Any]]:
-    """Return the two functions of an axis with a cache of their last results."""
+    """Return the tick function and the label-box function of an axis, each with a cache of its last result."""
     update, boxes = axis._update_ticks, axis._get_ticklabel_bboxes
     cache: dict[str, Any] = {}
 
@@ -135,7 +135,7 @@ def _cached_functions(axis: Any) -> tuple[Callable[[], Any], Callable[[Any, Any]
 
 
 def look(name: str) -> AbstractContextManager[None]:
-    """Return a context with the figure style; ``name`` makes the SVG's identifiers unique and reproducible."""
+    """Return a context manager that sets the figures' style; ``name`` makes an SVG's identifiers unique."""
     import matplotlib
 
     style: Any = {**_STYLE, "svg.hashsalt": name}

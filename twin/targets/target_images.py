@@ -39,15 +39,17 @@ from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.target_path import LocalMap, TargetPath
 
 WORST_CHANGE = 5e-4
-"""Largest accepted change of an MTF by a rule of more wavelengths."""
+"""Largest accepted change of an MTF when more wavelengths are used in the quadrature over the band."""
 
 LARGEST_RULE = 65
-"""Wavelengths of the last rule; if the MTF still changes there, none is given."""
+"""Number of wavelengths of the finest quadrature rule over a band; if the MTF still changes there, it is an error."""
 
 
 @dataclass(frozen=True, eq=False)
 class BandPupils:
-    """Pupils of one image, all referred to one of its points, so that lateral colour blurs it.
+    """Pupil functions of one image at the wavelengths of a band.
+
+    All refer to the same image point, so that lateral colour blurs the image.
 
     Attributes
     ----------
@@ -75,18 +77,18 @@ class BandPupils:
 
     @property
     def light(self) -> float:
-        """Fraction of the light that is not blocked."""
+        """Fraction of the pupil's light that is not blocked, mean over the band, 0 to 1."""
         if len(self.pupils) == 1:
             return self.pupils[0].light
         return float(np.dot(self.weights, [pupil.light for pupil in self.pupils]) / np.sum(self.weights))
 
     def transfer(self, frequency: np.ndarray, defocus: np.ndarray) -> np.ndarray:
-        """Return the optical transfer function, complex (Z, M); arguments as for ``polychromatic_transfer``."""
+        """Return the optical transfer function over the band at M frequencies and Z defocus values, complex (Z, M)."""
         pupil = self.pupils if len(self.pupils) > 1 else self.pupils[0]
         return polychromatic_transfer(pupil, frequency, self.wavelengths, self.weights, defocus)
 
     def table(self) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-        """Return a function that interpolates the in-focus transfer function at many frequencies.
+        """Return a function that interpolates the in-focus transfer function at arrays of spatial frequencies.
 
         The function takes fx, fy (cycles/m) of one shape and returns complex values of that shape.
         """
@@ -113,11 +115,11 @@ def wavelengths_enough(
     spectrum : SpectrumSpec
         Spectrum of the light.
     first : int
-        Number of wavelengths of the first rule.
+        Number of wavelengths to start with.
     values : callable
         Function of the number of wavelengths that returns MTF values, or other numbers of this kind.
     largest : int
-        Number of wavelengths of the last rule.
+        Largest number of wavelengths that is tried.
 
     Raises
     ------
@@ -145,13 +147,13 @@ DIRECTIONS = (ALONG, TRACK)
 """Directions in which the MTF is measured: along the line, and along the track."""
 
 DIRECTION_NAMES: Mapping[str, str] = {ALONG: "along the line", TRACK: "along the track"}
-"""Directions in the words of reports."""
+"""Names of the directions in reports."""
 
 EDGE_RUNS: Mapping[str, Literal["x", "y"]] = {ALONG: "y", TRACK: "x"}
-"""Direction -> axis of the image along which its edge runs."""
+"""Axis of the image along which the edge runs that measures the MTF in each direction."""
 
 FREQUENCIES = 97
-"""Number of samples of a transfer function from 0 to the cut-off."""
+"""Number of samples of a transfer function from frequency 0 to the cut-off."""
 
 DEFOCUS_STEP = 25e-6
 """Step of the table over defocus, in metres. The phase of the transfer function of an F/9 beam changes by one cycle in
@@ -159,7 +161,7 @@ DEFOCUS_STEP = 25e-6
 """
 
 TABLE_REACH = 0.6e-3
-"""Largest defocus of the table, in metres; a few images beyond it are computed one by one."""
+"""Largest absolute defocus of the table of transfer functions, in metres; images beyond it are computed singly."""
 
 
 def knife_edge(direction: str, angle: float) -> HalfPlane:
@@ -171,12 +173,12 @@ def knife_edge(direction: str, angle: float) -> HalfPlane:
 
 @dataclass(frozen=True, eq=False)
 class EdgeOptics:
-    """Optical transfer function along one direction at one site, over defocus.
+    """Optical transfer function along one direction at one field position, as a function of defocus.
 
     Attributes
     ----------
     light : BandPupils
-        Pupils of the site in the band's light.
+        Pupils of the field position at the band's wavelengths.
     band : BandSpec
         Band of the light.
     normal : (2,) ndarray
@@ -184,7 +186,7 @@ class EdgeOptics:
     cutoff : float
         Cut-off frequency of the shortest wavelength, in cycles/m.
     table : BSpline
-        Spline over defocus of the samples at ``frequencies``, complex as (real, imaginary).
+        Spline over defocus of the transfer function at ``frequencies``, as real and imaginary parts.
     """
 
     light: BandPupils
@@ -197,7 +199,10 @@ class EdgeOptics:
     def build(
         cls, light: PupilFunction | BandPupils, band: BandSpec, normal: np.ndarray, extent: float = TABLE_REACH
     ) -> EdgeOptics:
-        """Compute the table for defocus up to +-reach, in metres; a single pupil serves all of the band's light."""
+        """Compute the transfer functions for defocus up to +-``extent``, in metres.
+
+        A single pupil serves all wavelengths of the band.
+        """
         light = BandPupils.alike(light, band) if isinstance(light, PupilFunction) else light
         cutoff = float(light.shortest.cutoff(normal[None], band.spectrum.ends[0])[0])
         steps = max(int(np.ceil(extent / DEFOCUS_STEP)), 3)
@@ -207,16 +212,19 @@ class EdgeOptics:
 
     @property
     def pupil(self) -> PupilFunction:
-        """Pupil of the site; with one pupil per wavelength, that of the shortest."""
+        """Pupil of the field position; with one pupil per wavelength, that of the shortest."""
         return self.light.shortest
 
     @property
     def frequencies(self) -> np.ndarray:
-        """Samples along the normal, in cycles/m."""
+        """Non-negative frequencies along the edge's normal at which the transfer function is sampled, in cycles/m."""
         return np.linspace(0.0, self.cutoff, FREQUENCIES)
 
     def at(self, defocus: float, frequency: np.ndarray) -> np.ndarray:
-        """Return the complex transfer function at non-negative frequencies along the normal, in cycles/m."""
+        """Return the complex transfer function at a defocus, in m, and frequencies along the normal, in cycles/m.
+
+        Frequencies are not negative.
+        """
         if abs(defocus) <= self.table.t[-1]:
             samples = self.table(defocus)
         else:
@@ -226,21 +234,24 @@ class EdgeOptics:
 
 
 def _samples(light: BandPupils, normal: np.ndarray, cutoff: float, defocus: np.ndarray) -> np.ndarray:
-    """Return real and imaginary part at evenly spaced frequencies, (Z, FREQUENCIES, 2)."""
+    """Return the transfer function at Z defocus values and evenly spaced frequencies, (Z, FREQUENCIES, 2).
+
+    The last axis holds the real and the imaginary part.
+    """
     frequency = np.linspace(0.0, cutoff, FREQUENCIES)[:, None] * normal
     values = light.transfer(frequency, defocus)
     return np.stack([values.real, values.imag], axis=-1)
 
 
 _ROUND_CUTOFF = 10e3
-"""Step to which cut-offs are rounded up, in cycles/m."""
+"""Step to which cut-off frequencies are rounded up, in cycles/m."""
 _ROUND_REACH = 4.0
-"""Step to which extents are rounded up, in pixels."""
+"""Step to which the extents of computed images are rounded up, in pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeImager:
-    """Images of one edge at one site as a line CCD records them.
+    """Imager of one knife edge at one field position, as a line CCD records it.
 
     Attributes
     ----------
@@ -257,19 +268,19 @@ class EdgeImager:
     region: int
 
     def transfer(self, defocus: float, frequency: np.ndarray) -> np.ndarray:
-        """Return the complex transfer function of optics, pixel, diffusion and TDI along the normal."""
+        """Return the complex transfer function of optics, pixel, diffusion and TDI along the edge's normal."""
         x, y = self.optics.normal
         return self.optics.at(defocus, frequency) * self.ccd.transfer(frequency * x, frequency * y)
 
     def mtf(self, defocus: float, frequency: float) -> float:
-        """Return the modulus of ``transfer`` at one frequency, in cycles/m.
+        """Return the MTF of optics and detector at a defocus, in metres, and one frequency, in cycles/m.
 
         It is the true value for comparison with a measurement.
         """
         return float(np.abs(self.transfer(defocus, np.array([frequency])))[0])
 
     def image(self, defocus: float, offset: float) -> np.ndarray:
-        """Return the fraction of the white signal in every pixel, (region, region).
+        """Return the image of the edge, as fractions of the signal of a white area, (region, region).
 
         Parameters
         ----------
@@ -295,7 +306,9 @@ PLACES = {"left": 1.0, "centre": 0.0, "right": -1.0}
 """Positions on the line as fractions of its usable half; left is the +Y' end."""
 
 MARGIN = 0.02
-"""Fraction of the line's pixels kept between each end and the nominal windows, so that an image can move."""
+"""Distance between each end of the line and the nominal windows, as a fraction of the line's pixels, so that an image
+can move.
+"""
 
 BAR_TILT = float(np.radians(7.0))
 """Tilt of the bars' normal from the axis, in radians: within the group every sampling phase occurs four times, even in
@@ -306,7 +319,7 @@ BAR_SHARE = 0.45
 """Side of the bar group, as a fraction of the region's side."""
 
 CLEARANCE = 6.0
-"""Margin of the group around the measured part, in pixels."""
+"""Margin between the border of the bar group and the part of it that is measured, in pixels."""
 
 _FOCUS = 1e-6
 """Defocus range of the edges' tables, in metres; they are used at 0 only."""
@@ -318,7 +331,7 @@ class TargetLostError(PhysicalError):
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Position on a camera's line in one state.
+    """Image of a target at one position on a camera's line CCD, in one state of the camera.
 
     Attributes
     ----------
@@ -357,7 +370,7 @@ class View:
         return self.light.shortest
 
     def transfer(self, frequency: np.ndarray) -> np.ndarray:
-        """Return the transfer function of traced pupil and detector at frequencies (M, 2), cycles/m, complex (M,)."""
+        """Return the complex transfer function of optics and detector at M frequencies (along, across), in cycles/m."""
         optics = self.light.transfer(frequency, np.zeros(1))[0]
         return np.asarray(optics * self.ccd.transfer(frequency[:, 0], frequency[:, 1]))
 
@@ -368,23 +381,23 @@ class View:
         return EdgeImager(optics, self.ccd, self.region)
 
     def edge_image(self, imager: EdgeImager) -> np.ndarray:
-        """Return the fraction of the white signal in every pixel, (region, region)."""
+        """Return the image of a knife edge, as fractions of the signal of a white area, (region, region)."""
         return imager.image(0.0, float(self.offset @ imager.optics.normal))
 
     def image(self, target: Target) -> np.ndarray:
-        """Return the fraction of the white signal in every pixel of a target of finite shapes, (region, region)."""
+        """Return the image of a target of finite shapes, as fractions of a white area's signal, (region, region)."""
         half = 0.5 * (self.region - 1) * self.band.pitch
         x, y = (Grid(float(-half - shift), self.band.pitch, self.region) for shift in self.offset)
         # rounding and the guard band of the series give values down to -1e-6
         return np.maximum(target_image(target.mapped(self.local), self._transfer, self._cutoff, x, y), 0.0)
 
     def _transfer(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
-        """Return the transfer function of optics and detector."""
+        """Return the complex transfer function of optics and detector at frequencies fx, fy, in cycles/m."""
         return np.asarray(self._table(fx, fy) * self.ccd.transfer(fx, fy))
 
     @cached_property
     def _table(self) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-        """Interpolated transfer function of the optics."""
+        """Function that interpolates the optics' transfer function at frequencies fx, fy, in cycles/m."""
         return self.light.table()
 
     @cached_property
@@ -398,7 +411,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class BarDesign:
-    """Bars at the centre of a window with the Nyquist frequency on the nominal image, and the region measured.
+    """Bar target whose nominal image has the Nyquist frequency, and the region of the image that is measured.
 
     Attributes
     ----------
@@ -437,18 +450,18 @@ class BarDesign:
         return cls(target, frequency, nominal, (sides, sides))
 
     def seen(self, view: View) -> np.ndarray:
-        """Return the frequency on the image of a view, (2,), in cycles/m."""
+        """Return the bars' frequency vector (along, across) in the image of a view, in cycles/m."""
         return np.asarray(np.linalg.solve(view.local.jacobian.T, self.frequency))
 
     @property
     def per_pixel(self) -> tuple[float, float]:
-        """Nominal frequency, of magnitude 0.5 cycles/pixel: (down the column, along the row)."""
+        """Nominal frequency vector of the bars, of magnitude 0.5 cycles/pixel: (down the column, along the row)."""
         along, across = 0.5 * self.nominal / float(np.hypot(*self.nominal))
         return float(across), float(along)
 
 
 def usable_pixels(pixels: int, region: int) -> float:
-    """Return the range of the windows' centres on a line, in pixels; not positive if they do not fit."""
+    """Return the length of the line over which centres of windows may lie, in pixels; not positive if none fits."""
     return (1.0 - 2.0 * MARGIN) * pixels - region
 
 
@@ -484,7 +497,7 @@ class TargetCamera:
         self.directions = path.directions(self.places)
 
     def views(self, state: State) -> dict[str, View]:
-        """Return the view of every position in a state.
+        """Return the view of every position on the line (left, centre, right) in a state of the camera.
 
         Raises
         ------
@@ -503,7 +516,7 @@ class TargetCamera:
     def _lights(self, state: State, hits: np.ndarray, count: int | None = None) -> list[BandPupils]:
         """Return the pupils of every position in the band's light.
 
-        With lenses there is one for each wavelength of the rule of ``count``, or of the number that the MTF needs.
+        With lenses there is one pupil for each of ``count`` wavelengths, or of the number that the MTF needs.
         """
         band = self.ccd.band
         if not lenses(self.path.model.spec):
@@ -527,7 +540,7 @@ class TargetCamera:
         return wavelengths_enough(self.ccd.band.spectrum, len(band_wavelengths(self.ccd.band)[0]), at_nyquist)
 
     def _view(self, name: str, hit: np.ndarray, nominal: np.ndarray, light: BandPupils, local: LocalMap) -> View:
-        """Return the view of one position."""
+        """Return the view of one position from its traced chief ray, pupils and local mapping."""
         band, shift = self.ccd.band, hit - nominal
         half = 0.5 * (self.region - 1)
         middle = hit[0] / band.pitch + 0.5 * (band.pixels - 1)

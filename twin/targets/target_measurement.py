@@ -32,7 +32,7 @@ NYQUIST = 0.5
 
 @dataclass(frozen=True, eq=False)
 class TargetReading:
-    """MTF from one target.
+    """MTF measured from the image of one target, with the true MTF.
 
     Attributes
     ----------
@@ -43,8 +43,8 @@ class TargetReading:
     at_nyquist : tuple of float
         Frequency of the result called MTF at Nyquist, (along, track), in cycles/pixel.
     true_axis : float
-        Value of ``true_nyquist`` without the target's tilt, at the Nyquist frequency along the line or along the track:
-        that of image quality at this position.
+        True MTF without the target's tilt, exactly along the line or along the track at the Nyquist frequency; it
+        equals that of image quality at this position.
     """
 
     reason: str
@@ -55,14 +55,14 @@ class TargetReading:
 
 @dataclass(frozen=True, eq=False)
 class EdgeReading(TargetReading):
-    """MTF from one knife edge.
+    """MTF measured from the image of one knife edge, with the true MTF.
 
     Attributes
     ----------
     measured : EdgeMtf | None
         Result from the frames; None if they cannot be measured.
     frequency : (F,) ndarray
-        Frequencies along the edge's normal, in cycles/m.
+        F frequencies along the edge's normal, in cycles/m.
     true : (F,) ndarray
         MTF of the traced pupil and the detector at these frequencies.
     """
@@ -78,14 +78,14 @@ class EdgeReading(TargetReading):
 
     @property
     def nyquist_bias(self) -> float | None:
-        """Mean increase of the measured MTF at the Nyquist frequency by noise."""
+        """Mean increase of the measured MTF at the Nyquist frequency due to noise; None if it was not measured."""
         edge = self.measured
         return None if edge is None else float(np.interp(NYQUIST, edge.frequency, edge.noise_bias))
 
 
 @dataclass(frozen=True, eq=False)
 class BarReading(TargetReading):
-    """MTF from one bar target near the Nyquist frequency.
+    """MTF measured from the image of one bar target near the Nyquist frequency, with the true MTF.
 
     Attributes
     ----------
@@ -108,11 +108,11 @@ class TargetShots:
     Attributes
     ----------
     frames : mapping of str to ndarray
-        Name of the image -> grey values, uint16 (N, H, W).
+        Grey values of N frames of H x W pixels, uint16 (N, H, W), by name of the image.
     column : int
         Position of the windows' first pixels on the line.
     edges, bars : mapping
-        Direction -> reading; empty if not rendered.
+        Measurements by direction; empty if the target was not rendered.
     light_lost : float
         Fraction of the light that bodies in the beam block.
     """
@@ -145,7 +145,7 @@ class PlaceTargets:
 
     @property
     def shots(self) -> dict[str, TargetShots]:
-        """Images by the names of the states in files and results."""
+        """Images and measurements by the names of the states, as in files and results."""
         return {"before": self.before, "after": self.after}
 
 
@@ -187,7 +187,7 @@ class TargetRun:
     obstruction: bool = True
 
     def images(self) -> Iterator[tuple[str, str, np.ndarray, FrameFacts]]:
-        """Yield every image: stem of its file, name, frames (N, H, W) and their description."""
+        """Yield every image: stem of its file, name, N frames (N, H, W) and their description."""
         for camera, targets_of_camera in self.cameras.items():
             for place, targets in targets_of_camera.places.items():
                 for when, shots in targets.shots.items():
@@ -250,7 +250,7 @@ class TargetRun:
 
 
 def _directions(targets: PlaceTargets, say: Any) -> dict[str, Any]:
-    """Return direction -> before/after -> result of ``say`` for the readings."""
+    """Return the results of ``say`` for the measurements, by direction and by state (before, after)."""
     out: dict[str, Any] = {}
     for when, shots in targets.shots.items():
         for direction in sorted({*shots.edges, *shots.bars}):
@@ -296,7 +296,7 @@ LARGEST_FRAMES = 400_000_000
 """Largest number of pixels of all frames together, which stay in memory: 0.8 GB."""
 
 EVEN_FIELDS = {"dark": 0.0, "bright": 1.0}
-"""Even fields recorded with bars, as fractions of the white signal."""
+"""Uniform fields that are recorded with bars, as fractions of the signal of a white area."""
 
 _PATTERN, _EXPOSURE = 3, 4
 """Random streams of the job's seed, beside those of the monitor."""
@@ -479,7 +479,7 @@ def on_axis(view: View, direction: str) -> float:
 
 
 def read_edge(view: View, direction: str, normal: np.ndarray, mean: np.ndarray, frames: int) -> EdgeReading:
-    """Measure the mean (H, W) of frames of a knife edge with this normal, and compute the true MTF."""
+    """Measure the MTF from the mean (H, W) of frames of a knife edge, and compute the true MTF."""
     frequency = CURVE / view.band.pitch
     wanted = np.append(frequency, NYQUIST / view.band.pitch)
     true = np.abs(view.transfer(wanted[:, None] * normal))
@@ -497,7 +497,7 @@ def read_edge(view: View, direction: str, normal: np.ndarray, mean: np.ndarray, 
 def read_bars(
     view: View, direction: str, design: BarDesign, mean: np.ndarray, dark: np.ndarray, bright: np.ndarray, frames: int
 ) -> BarReading:
-    """Measure the mean of frames of a bar target, and compute the true MTF.
+    """Measure the MTF from the mean of frames of a bar target, and compute the true MTF.
 
     Parameters
     ----------

@@ -37,13 +37,18 @@ from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, coloured, l
 from scenes.models.shadow import ImagingShadows, PupilEdges, TracedBeams
 
 RINGS = 14
-"""Rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond those of mirrors and figures."""
+"""Number of rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond those of mirrors and figures.
+"""
 
 MORE_RINGS = 28
-"""Rings of the quadrature for a vignetted pupil whose wavefront polynomials through fewer rays do not fit."""
+"""Number of rings of the quadrature for a vignetted pupil whose wavefront is not described by polynomials fitted to
+fewer rays.
+"""
 
 SMOOTH = 1e-6
-"""Largest rms residual of the eikonal beyond the polynomials of a smooth wavefront, in wavelengths."""
+"""Largest RMS difference between the traced optical path and its polynomial for a wavefront to count as smooth, in
+wavelengths.
+"""
 
 WORST_PLACED = 5e-3
 """Largest fraction of the quadrature's rays that the outlines of edges may misjudge: four rays, close to an edge."""
@@ -62,7 +67,7 @@ class LocalMap:
     scale : float
         Largest target coordinate, in metres; coordinates are divided by it.
     coefficients : (terms, 2) ndarray
-        Coefficients of the monomials of ``_monomials``.
+        Coefficients of the monomials of the scaled target coordinates, for along and across, in metres.
     residual : float
         Largest distance of the traced chief rays from the polynomial, in metres.
     """
@@ -84,7 +89,7 @@ class LocalMap:
 @shows("position [mm]", "path [m]", "valid")
 @dataclass(frozen=True, eq=False)
 class LineRays:
-    """Rays of F beams, N each, at the line CCD, in its own frame: X' along the track, Y' along the line.
+    """Rays of F beams, N each, at the line CCD, in its frame: X' along the track, Y' along the line.
 
     Attributes
     ----------
@@ -95,7 +100,7 @@ class LineRays:
     valid : (F, N) ndarray of bool
         False if an aperture stops the ray.
     size : float
-        Size of the line CCD relative to nominal.
+        Thermal scale of the line CCD: its size relative to nominal.
     """
 
     position: np.ndarray
@@ -106,7 +111,7 @@ class LineRays:
 
 
 def _monomials(q: np.ndarray) -> np.ndarray:
-    """Return the monomials of the local mapping."""
+    """Return the monomials of two scaled target coordinates, of which the local mapping is a polynomial."""
     powers = [(a - b, b) for a in range(MAP_ORDER + 1) for b in range(a + 1)]
     return np.stack([q[..., 0] ** a * q[..., 1] ** b for a, b in powers], axis=-1)
 
@@ -165,7 +170,7 @@ class TargetPath:
         return self.model.line_principal_distance if self.collimator is None else self.collimator.focal_length
 
     def directions(self, places: np.ndarray, state: State | None = None) -> np.ndarray:
-        """Return the directions of light, world, (F, 3), imaged at positions (F, 2) of the line CCD.
+        """Return the directions of light, world frame, (F, 3), imaged at F positions (F, 2) on the line CCD.
 
         Positions are (along, across), in metres.
 
@@ -187,7 +192,7 @@ class TargetPath:
         return np.asarray(-sight[0])
 
     def coloured(self, state: State, wavelength: float) -> State:
-        """Return the state as it acts on light of another wavelength, in metres.
+        """Return the state with the refractive indices of the lenses at a given wavelength, in metres.
 
         See ``scenes.models.camera_model.coloured``.
 
@@ -199,10 +204,10 @@ class TargetPath:
         return coloured(self.model.spec, self.root, state, wavelength)
 
     def places(self, state: State, directions: np.ndarray) -> np.ndarray:
-        """Return where chief rays of directions (F, 3) hit the line CCD, (F, 2) (along, across).
+        """Return the positions (along, across) at which F chief rays hit the line CCD, (F, 2), in metres.
 
-        Positions are in metres of the nominal CCD: in these coordinates the pixel pitch is constant when the CCD
-        expands.
+        ``directions`` (F, 3) are those of the light. Positions are in metres of the nominal CCD: in these coordinates
+        the pixel pitch is constant when the CCD expands.
 
         Raises
         ------
@@ -214,16 +219,16 @@ class TargetPath:
         return np.asarray(rays.position[:, 0, 1::-1] / rays.size)
 
     def rays(self, state: State, directions: np.ndarray, points: np.ndarray, edges: bool = True) -> LineRays:
-        """Trace rays of beams of directions (F, 3), world, through points of the stop in units of its radius.
+        """Trace rays of F beams through points of the stop to the line CCD.
 
         Parameters
         ----------
         state : State
             State of the assembly.
         directions : (F, 3) ndarray
-            Directions of the light.
+            Directions of the light, world frame.
         points : (N, 2) ndarray
-            Points of the stop; without ``edges`` also one set for each beam, (F, N, 2).
+            Points of the stop in units of its radius; without ``edges`` also one set for each beam, (F, N, 2).
         edges : bool
             True if edges of the camera's surfaces and bodies in the beams stop rays.
 
@@ -255,9 +260,9 @@ class TargetPath:
         return LineRays(position, leaving, path, valid, float(systems.size[0]))
 
     def shadow_pieces(self, state: State, directions: np.ndarray) -> np.ndarray:
-        """Return the shadows of bodies in beams of directions (F, 3), (F, K, V, 2).
+        """Return the shadows of bodies in F beams as K convex polygons of V vertices each, (F, K, V, 2).
 
-        They are convex polygons on the stop's unit disk.
+        Vertices are on the stop's unit disk; ``directions`` (F, 3) are those of the light.
 
         Raises
         ------
@@ -291,7 +296,7 @@ class TargetPath:
         target_shift: float = 0.0,
         wavelength: float | None = None,
     ) -> tuple[PupilFunction, ...]:
-        """Return the pupil of the image of each direction (F, 3), about its own position (F, 2) on the line CCD.
+        """Return the pupil function of the image of each of F directions, about its position on the line CCD.
 
         Its lengths are in the units of ``places``.
 
@@ -331,7 +336,7 @@ class TargetPath:
     def _field(
         self, rays: ImagingRays, systems: SystemBatch, places: np.ndarray, wavelength: float, target_shift: float = 0.0
     ) -> PupilField:
-        """Return the field of traced beams in the pupil, along the line CCD and across; arguments as for ``pupils``."""
+        """Return the optical path and amplitude of traced beams in the pupil, for images along and across the line."""
         origin = systems.size[:, None] * np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
         collimator = self.collimator
         incoming = None if collimator is None else lambda point: collimator.path(point, target_shift)
@@ -342,12 +347,12 @@ class TargetPath:
     def vignetted_pupils(
         self, state: State, directions: np.ndarray, places: np.ndarray, wavelength: float | None = None
     ) -> tuple[VignettedPupil, ...]:
-        """Return pupils of a camera with edges for ``optics.waves.line_transfer``.
+        """Return pupil functions of a camera whose surface edges vignette its beams, for ``line_transfer``.
 
         Arguments and exceptions are those of ``pupils``.
 
-        A smooth wavefront needs no more nodes than that of a free pupil; any other is traced at those of ``nodes``,
-        and at more if polynomials through these do not fit it.
+        A smooth wavefront needs no more nodes than that of a free pupil; any other is traced at those of ``nodes``, and
+        at more if polynomials through these do not fit it.
         """
         colour = self.model.spec.wavelength if wavelength is None else wavelength
         for nodes, tolerance in ((quadrature.disk(RINGS), SMOOTH), (self.nodes, VIGNETTED_RESIDUAL)):
@@ -360,7 +365,7 @@ class TargetPath:
     def _cut_pupils(
         self, state: State, directions: np.ndarray, places: np.ndarray, colour: float, nodes: PupilNodes
     ) -> tuple[VignettedPupil, ...]:
-        """Return vignetted pupils traced at some nodes."""
+        """Return vignetted pupils from rays traced through given nodes of the stop."""
         state = self.coloured(state, colour)
         placed, systems, rays = self._imaging(state, directions, nodes)
         owner = np.zeros(len(directions), dtype=int)
@@ -389,13 +394,13 @@ class TargetPath:
         return vignetted
 
     def shadows_on_stop(self, state: State, directions: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return the shadows of edges of the camera's surfaces and of bodies in beams of directions (F, 3).
+        """Return the shadows that surface edges and bodies cast in F beams of given directions (F, 3).
 
         Returns
         -------
         tuple of (ndarray, float)
-            Convex polygons on the stop's unit disk that do not overlap, (F, K, V, 2), and the accuracy of their
-            fractions of its area.
+            K convex polygons of V vertices on the stop's unit disk for each beam, (F, K, V, 2), which do not overlap;
+            and the accuracy of the fraction of the stop's area that they cover.
 
         Raises
         ------
@@ -410,7 +415,7 @@ class TargetPath:
     def _taken(
         self, placed: PlacedBodies, systems: SystemBatch, rays: ImagingRays, directions: np.ndarray
     ) -> tuple[np.ndarray | None, float]:
-        """Return ``shadows_on_stop`` of traced beams; None for free ones."""
+        """Return the shadows on the stop in traced beams, and their accuracy; None if nothing blocks the beams."""
         owner = np.zeros(len(directions), dtype=int)
         beams = TracedBeams(self.assembly, placed, owner, systems, rays, directions, self.nodes)
         shadows = None if self.shadows is None else self.shadows.cast(beams).pieces
@@ -421,7 +426,7 @@ class TargetPath:
         return converged_shadows(edges.outlines, len(directions), other_shadows)
 
     def local_map(self, state: State, direction: np.ndarray, extent: float) -> LocalMap:
-        """Return the mapping of target coordinates up to ``reach``, in metres, about a direction (3,) of the light."""
+        """Return the mapping of target coordinates up to ``extent``, in metres, about a direction (3,) of the light."""
         along, across = self._target_axes(direction)
         step = np.linspace(-extent, extent, MAP_POINTS)
         points = np.stack([a.ravel() for a in np.meshgrid(step, step)], axis=-1)
@@ -434,7 +439,7 @@ class TargetPath:
         return LocalMap(extent, terms, residual)
 
     def _target_axes(self, direction: np.ndarray) -> np.ndarray:
-        """Return the directions in which light rotates when its image moves along +Y' and +X', (2, 3).
+        """Return the changes of the light's direction that move its image along +Y' and +X', unit vectors (2, 3).
 
         With the camera's Z toward the scene, light that travels along -Z + t has its image at +f t; the second axis,
         direction x Y, is then near the camera's X.
@@ -442,12 +447,12 @@ class TargetPath:
         return transverse_axes(direction, self._axes[:, 1])
 
     def _launch(self, directions: np.ndarray) -> np.ndarray:
-        """Return points of the beams before the first mirror, world, (F, 3)."""
+        """Return a start point of each of F beams before the first surface, world frame, in metres, (F, 3)."""
         first = self.assembly.nominal_pose(f"{self.root}/{self.model.mirrors[0]}").translation
         return np.asarray(first - LAUNCH_DISTANCE * directions)
 
     def _systems(self, state: State, count: int, placed: PlacedBodies | None = None) -> tuple[SystemBatch, SystemBatch]:
-        """Return the systems to the line CCD and to the stop, once for every direction."""
+        """Return the optical systems to the line CCD and to the stop, repeated ``count`` times for a batch of beams."""
         placed = self.assembly.place([state]) if placed is None else placed
         zeros = np.zeros(count, dtype=int)
         systems, to_stop = (
