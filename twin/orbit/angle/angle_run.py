@@ -652,5 +652,5 @@ _MEASURED: Record[AngleRun] = Record(ANGLE.meaning, ANGLE["measured"])
 
 
 def angle_numbers(run: AngleRun) -> dict[str, Any]:
-    """Return the numbers that angle.json contains: angles, sigmas, changes and tests."""
+    """Return the numbers that angle.json contains, without its description of the reference frames."""
     return ANGLE(run) if isinstance(run, SimulatedAngleRun) else _MEASURED(run)

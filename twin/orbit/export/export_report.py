@@ -207,7 +207,7 @@ def _map_title(name: str) -> str:
 
 
 def _figure(maps: Mapping[str, AccuracyMap]) -> Figure:
-    """Draw CE90 over the scene in a panel for each accuracy map."""
+    """Draw maps of CE90 in metres, and of LE90 for intersected points, in a panel each."""
     panels = [(f"CE90, {_map_title(name)}", accuracy, accuracy.ce90) for name, accuracy in maps.items()]
     panels += [
         (f"LE90, {_map_title(name)}", accuracy, accuracy.le90) for name, accuracy in maps.items() if name == TOGETHER

@@ -267,14 +267,20 @@ def _noise(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence) ->
 
 
 def _walk(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence) -> Series:
-    """Return a random walk, zero at the time nearest to zero; sigma is its standard deviation after one second."""
+    """Return a function of time that interpolates a random walk at the readings.
+
+    It is zero at the reading nearest to time zero; sigma is its standard deviation after one second.
+    """
     steps = np.random.default_rng(seed).standard_normal((time.size, 3)) * np.sqrt(time[1] - time[0])
     course = np.cumsum(steps, axis=0)
     return CubicSpline(time, sigma * (course - course[int(np.argmin(np.abs(time)))]))
 
 
 def _drift(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence, correlation_time: float) -> Series:
-    """Return a stationary first-order Gauss-Markov process with correlation exp(-|dt| / correlation_time)."""
+    """Return a function of time that interpolates a stationary first-order Gauss-Markov process at the readings.
+
+    Its correlation over a time dt is exp(-|dt| / correlation_time); sigma is its standard deviation.
+    """
     draws = np.random.default_rng(seed).standard_normal((time.size, 3))
     correlation = np.exp(-(time[1] - time[0]) / correlation_time)
     draws[1:] *= np.sqrt(1.0 - correlation * correlation)

@@ -157,7 +157,7 @@ class ImagePoints:
         return cls(*(np.concatenate([getattr(part, attribute.name) for part in parts]) for attribute in fields(cls)))
 
     def numbered(self, first: int) -> ImagePoints:
-        """Return these image points with the index of each ground point increased by ``first``."""
+        """Return these image points with the indices of their ground points reduced by ``first``."""
         return replace(self, point=self.point - first)
 
 
