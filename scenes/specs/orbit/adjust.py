@@ -51,7 +51,8 @@ class LawSpec(Spec):
         correlation time `time`; orbital, cosine and sine of the period `time`; jitter, an oscillation of `frequency`
         whose amplitude and phase have the correlation time `time`.
     shared_by : {'pass', 'tracker', 'block'}
-        Validity of one random draw: each pass, all passes of a star tracker, or the whole block.
+        Extent over which the error has one random realisation: each pass (`pass`), all passes of a star tracker
+        (`tracker`), or the whole block (`block`).
     interval : float
         Interval between independent readings of `white`, or between the estimated values of `walk`, of `slow` and of
         the amplitudes of `jitter`, in seconds.
@@ -85,8 +86,9 @@ class AttitudeLawSpec(LawSpec):
     Attributes
     ----------
     sigma : tuple[float, float, float]
-        Standard deviation about body X, Y and Z, in radians: of a constant, a reading or an amplitude; of jitter as a
-        root mean square; of a rate per second; of the increment of a walk in a second.
+        Standard deviation about body X, Y and Z, in radians. Its meaning depends on the law: of the constant, of a
+        reading, or of an amplitude; for `jitter` the root mean square of the oscillation; for `rate` the change in a
+        second; for `walk` the increment in a second.
     """
 
     sigma: AngleSigmas
@@ -98,8 +100,9 @@ class OrbitLawSpec(LawSpec):
     Attributes
     ----------
     sigma : tuple[float, float, float]
-        Standard deviation along body X, Y and Z at the middle of the pass, in metres; its meaning by law is as for the
-        attitude.
+        Standard deviation along body X, Y and Z at the middle of the pass, in metres; its meaning depends on the law:
+        of the constant, of a reading, or of an amplitude; for `rate` the change in a second; for `walk` the increment
+        in a second.
     """
 
     sigma: Sigmas
@@ -234,7 +237,7 @@ class LaserSpec(Spec):
     pointing : float
         Standard deviation of the beam's direction about body X and Y, in radians.
     beam : float
-        Full divergence of the beam, in radians; the position in it to which the range belongs is unknown.
+        Full divergence of the beam, in radians; the direction within it to which the range belongs is unknown.
     """
 
     footprints: Annotated[Whole, Field(ge=1, le=1000)] = 5
@@ -304,13 +307,13 @@ class MonitorRecordSpec(Spec):
 
 
 def check_one_monitor(monitor: object, record: MonitorRecordSpec | None) -> None:
-    """Raise `Problem` if both a monitor and a record of one are given."""
+    """Raise `Problem` if a file has both `monitor` and `monitor_record`, two sources of the same changes."""
     if monitor is not None and record is not None:
         raise Problem("`monitor` and `monitor_record` are both given", None, "one of them", within=("monitor_record",))
 
 
 class OrbitAdjustSpec(PayloadTestSpec):
-    """Bundle adjustment of a block of scenes.
+    """Bundle adjustment of a simulated block of scenes.
 
     Attributes
     ----------
@@ -422,7 +425,7 @@ class OrbitAdjustSpec(PayloadTestSpec):
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Sensors of `SENSORS` that the block has."""
+        """Names in `SENSORS` of the sensors that the block has, such as `laser`."""
         has = {
             "ties": self.points.tie > 0,
             "control": self.points.control > 0,
@@ -455,9 +458,10 @@ class MonitoredSpec(MonitorReadingSpec):
     Attributes
     ----------
     angles
-        Standard deviations of d_alpha, d_beta and d_gamma, in radians.
+        Standard deviations of the rotations d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the
+        line of sight), in radians.
     principal_distance
-        Standard deviation of d_f, in metres.
+        Standard deviation of the change d_f of the principal distance, in metres.
     readings : Mapping[str, Mapping[str, CameraReadingSpec]]
         Pass -> line -> reading.
     """
@@ -516,6 +520,9 @@ class MeasuredAdjustSpec(MeasuredTestSpec):
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Sensors that can be excluded; whether the tables have points of a role is known only when they are read."""
+        """Names of the sensors that can be excluded.
+
+        Whether the tables have tie points or control points is known only when they are read.
+        """
         watched = self.monitor is not None or self.monitor_record is not None
         return ("ties", "control", "monitor") if watched else ("ties", "control")

@@ -13,7 +13,7 @@ from scenes.yaml.unit_fields import Quantity, Vector, Wavelength
 from scenes.yaml.units import DISTANCE, LENGTH, MOMENT
 
 LINES = ("forward", "nadir", "backward")
-"""Lines of a three-line camera."""
+"""Names of the lines of a three-line camera."""
 LEAST_POINTS = 3
 
 Moment = Annotated[float, Quantity(MOMENT, largest="240 h")]
@@ -26,7 +26,7 @@ Passes = Annotated[Whole, Field(ge=2, le=5000)]
 
 
 Change = Annotated[PlainPerturbationSpec, short_for("rotate", list)]
-"""Perturbation; `[1 arcsec, 4 arcsec, -3 arcsec]` means a rotation."""
+"""Perturbation of a body or line; a list `[1 arcsec, 4 arcsec, -3 arcsec]` means a rotation."""
 
 
 def _angles(angles: Mapping[str, tuple[str, str]] | None) -> Mapping[str, tuple[str, str]] | None:
@@ -43,14 +43,17 @@ Angles = Annotated[Named[tuple[Name, Name]] | None, AfterValidator(_angles)]
 
 
 def usual_angles(lines: Sequence[str]) -> Mapping[str, tuple[str, str]] | None:
-    """Return the default angles of a camera: those of three lines, or that of two lines; None for other cameras."""
+    """Return name of each default intersection angle -> its two lines; None for cameras without defaults.
+
+    Cameras with the lines forward, nadir and backward, and cameras with two lines, have defaults.
+    """
     if set(LINES) <= set(lines):
         return {"alpha": LINES[:2], "beta": LINES[1:]}
     return {"alpha": (lines[0], lines[1])} if len(lines) == 2 else None
 
 
 def check_ends(first: float, last: float, problem: str) -> None:
-    """Raise `Problem` for a part of a line, from one pixel to another, without length."""
+    """Raise `Problem` if the first pixel of a part of a line is not before the last one."""
     if not first < last:
         raise Problem(problem, f"first {first:g}, last {last:g}", "a last pixel after the first", within=("last",))
 
@@ -96,7 +99,8 @@ class TerrainSpec(Spec):
     relief : float
         Standard deviation of the heights about the mean, in metres.
     length : float
-        Correlation length of the heights along the strip, exp(-(distance/length)^2/2), in metres.
+        Correlation length of the heights along the strip, in metres: their correlation at a distance is
+        exp(-(distance/length)^2/2).
     """
 
     height: TerrainHeight = 0.0
@@ -138,12 +142,12 @@ class EffectsSpec(LightEffectsSpec):
 
 
 class AngleErrorsSpec(Spec):
-    """Measurement errors of the station and the ground points.
+    """Measurement errors of the satellite's position and of the ground points.
 
     Attributes
     ----------
     station : float
-        Standard deviation of each coordinate of the measured orbit, in metres.
+        Standard deviation of each coordinate of the measured satellite position, in metres.
     points : float
         Standard deviation of each coordinate of a ground point, matching and aerial triangulation together, in metres.
     datum : tuple[float, float, float]
@@ -184,9 +188,9 @@ class OrbitAngleSpec(PayloadTestSpec):
     effects : EffectsSpec
         Effects on the light path.
     errors : AngleErrorsSpec
-        Measurement errors of the station and the ground points.
+        Measurement errors of the satellite's position and of the ground points.
     passes : int
-        Number of repetitions with new random errors, from which the scatter is computed.
+        Number of repetitions with new random errors, from which the scatter of the angles is computed.
     seed : int
         Seed of all random numbers.
     """

@@ -14,7 +14,7 @@ from scenes.yaml.unit_fields import AngleSigmas, LengthSigma, Quantity, Vector
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT
 
 LEAST_TIES = 20
-"""Smallest number of tie points of a strip; with fewer most attitude readings would have no point near them."""
+"""Smallest number of tie points of a strip; with fewer, most attitude readings would have no point near them."""
 
 
 class CameraDriftSpec(Spec):
@@ -23,10 +23,10 @@ class CameraDriftSpec(Spec):
     Attributes
     ----------
     angles : tuple[float, float, float]
-        Standard deviations of d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the line of sight),
-        in radians.
+        Standard deviations of the rotations d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the
+        line of sight), in radians.
     principal_distance : float
-        Standard deviation of d_f, in metres.
+        Standard deviation of the change d_f of the principal distance, in metres.
     """
 
     angles: AngleSigmas = (0.0, 0.0, 0.0)
@@ -39,9 +39,10 @@ class MonitorReadingSpec(Spec):
     Attributes
     ----------
     angles : tuple[float, float, float]
-        Standard deviations of d_alpha, d_beta and d_gamma, in radians.
+        Standard deviations of the rotations d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the
+        line of sight), in radians.
     principal_distance : float
-        Standard deviation of d_f, in metres.
+        Standard deviation of the change d_f of the principal distance, in metres.
     """
 
     angles: Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, above_zero=True, largest="1 deg"))]
@@ -115,7 +116,9 @@ class FieldSpec(Spec):
 
 
 class PointsSpec(Spec):
-    """Ground points of every field at random positions in the nadir line's image. All three lines observe each of them.
+    """Ground points of every field at random positions in the nadir line's image.
+
+    All three lines observe each of them.
 
     Attributes
     ----------
@@ -236,8 +239,8 @@ class LaunchSpec(Spec):
     Attributes
     ----------
     bias : tuple[float, float, float]
-        Standard deviations of the angle between star trackers and cameras about body X, Y, Z, in radians; 0 if nothing
-        is known of it.
+        Standard deviations of the angle between star trackers and cameras about body X, Y, Z, in radians; 0 if it is
+        unknown.
     interior : float
         Standard deviation of principal distances and principal points, in metres.
     """
@@ -262,7 +265,10 @@ class MapLimitsSpec(Spec):
 
 
 def checked_schemes(schemes: Sequence[Sequence[str]], fields: Mapping[str, object]) -> None:
-    """Raise `Problem` unless there are schemes and each lists some of the fields once."""
+    """Raise `Problem` unless there is a scheme and each scheme lists fields that exist, each of them once.
+
+    A scheme is a list of fields whose calibration results are averaged.
+    """
     if not schemes:
         raise Problem("no schemes", "an empty list", "at least one list of fields", within=("schemes",))
     for scheme in schemes:

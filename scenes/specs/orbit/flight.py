@@ -91,7 +91,7 @@ PATTERN = r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}(:[0-9]{2}(\.[0-9]{1,6}
 
 
 def parse_utc(text: Any) -> str:
-    """Return the text of an instant after checking it; other formats and leap seconds are refused.
+    """Return the text of a UTC time after a check of its format; leap seconds are refused.
 
     Raises
     ------
@@ -121,7 +121,7 @@ UtcTime = Annotated[
         {"type": "string", "pattern": PATTERN, "description": ALLOWED, "examples": ["2011-03-05T03:05:00Z"]}
     ),
 ]
-"""Instant in UTC, ISO 8601 text ending in Z."""
+"""Time in UTC, as ISO 8601 text that ends in Z."""
 
 
 Latitude = Annotated[float, Quantity(ANGLE, largest="90 deg")]
@@ -216,7 +216,7 @@ class ElementsSpec(Spec):
 
 
 class StateSpec(Spec):
-    """State vector at the epoch.
+    """Position and velocity of the satellite at the epoch.
 
     Attributes
     ----------
@@ -264,7 +264,7 @@ class OrbitSpec(Spec):
         return self
 
     def misses(self, time: float) -> Problem | None:
-        """Return the problem of a time, in seconds from the epoch, outside the orbit data; None within them."""
+        """Return the problem of a time outside the orbit data, in seconds from the epoch; None if it is inside."""
         first, last = (format_quantity(end, MOMENT) for end in (-self.before, self.after))
         if -self.before < time < self.after:
             return None
@@ -396,7 +396,7 @@ class ErrorsSpec(Spec):
 
 
 class PayloadTestSpec(TitledSpec):
-    """Test of a payload.
+    """Base of tests of a payload (a set of line cameras).
 
     Attributes
     ----------

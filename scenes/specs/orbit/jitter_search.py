@@ -108,9 +108,11 @@ class BandPointsSpec(Spec):
     noise : float
         Standard deviation of an image coordinate, independent from line to line, in pixels.
     line_noise : dict[str, float]
-        Line -> true standard deviation where it differs from `noise`, which the measurements state for all lines.
+        Line -> true standard deviation, in pixels, where it differs from `noise`, which the analysis assumes for all
+        lines.
     rows : float | None
-        Time of flight between the rows on which the points lie, in seconds; by default they lie anywhere.
+        Time of flight between the rows across the track on which the points lie, in seconds; by default they lie
+        anywhere.
     row_spread : float
         Standard deviation of a point's time about its row, in seconds.
     height : float

@@ -37,9 +37,10 @@ _TOWARD: Mapping[str, tuple[int, int, int]] = {
 
 
 def body_axes_matrix(axes: tuple[str, str, str]) -> tuple[tuple[int, int, int], ...]:
-    """Return the matrix with v_file = matrix @ v_project.
+    """Return the matrix that converts a vector's components from the project's body axes to those of a file.
 
-    Its rows are the file's body x, y and z in the project's body axes.
+    The project's body axes are X forward, Y right, Z down; the rows of the matrix are the file's body x, y and z in
+    them.
     """
     return tuple(_TOWARD[axis] for axis in axes)
 
@@ -117,7 +118,8 @@ class AttitudeFileSpec(Spec):
     scalar : {'last', 'first'} | None
         Position of a quaternion's scalar part, the cosine of half the rotation angle.
     turns : {'body_to_frame', 'frame_to_body'} | None
-        Sense of the quaternion: transformation of the components of a vector by v' = q v q*.
+        Sense of the quaternion q: whether v' = q v q* transforms the components of a vector v from body axes to the
+        frame, or from the frame to body axes.
     body_axes : tuple[str, str, str]
         Directions of the file's body x, y and z in flight, as [forward, right, down].
     sequence : {'xyz', 'xzy', 'yxz', 'yzx', 'zxy', 'zyx'} | None
@@ -170,7 +172,7 @@ class PlatformFilesSpec(Spec):
 
 
 class _HeightsFileSpec(Spec):
-    """File with heights and their reference surface."""
+    """Base of files with heights: the reference surface of the heights, and the geoid if it is one."""
 
     file: Reference
     crs: Text | None = None
@@ -230,9 +232,9 @@ class RasterFileSpec(_HeightsFileSpec):
 
 
 _FILE_NAMES = ("file", "geoid", "earth_orientation")
-"""Keys of files in other formats."""
+"""Keys of specifications whose values are paths of files in other formats."""
 FILE_KEYS = ("platform", "orbit", "attitude", "lines", "ground", "image_points", "tie_points")
-"""Keys of a pass for its tables."""
+"""Keys of a pass whose values are its tables."""
 
 
 def with_absolute_files(
@@ -280,8 +282,8 @@ class QuaternionSpec(Spec):
     scalar : {'first', 'last'}
         Position of the scalar part (the cosine of half the rotation angle) among the four.
     turns : {'body_to_frame', 'frame_to_body'}
-        Sense of the quaternion: v' = q v q* transforms the components of a vector from body axes to the frame, or from
-        the frame to body axes.
+        Sense of the quaternion q: whether v' = q v q* transforms the components of a vector v from body axes to the
+        frame, or from the frame to body axes.
     """
 
     scalar: Literal["first", "last"]
@@ -366,7 +368,7 @@ class PassFilesSpec(Spec):
 
     @property
     def files(self) -> dict[str, str]:
-        """Key -> path of every table; without files of other formats."""
+        """Key -> path of each table of the pass; files in other formats are not included."""
         files = {name: getattr(self, name) for name in FILE_KEYS}
         return {name: file for name, file in files.items() if isinstance(file, str)}
 
@@ -452,21 +454,21 @@ class ReadingErrorsSpec(Spec):
 
     @property
     def switched_on(self) -> bool:
-        """True: measurements have errors."""
+        """True: real measurements always have errors; a simulation may switch them off."""
         return True
 
     @property
     def datum(self) -> tuple[float, float, float]:
-        """Known datum shift: zero, since the analysis would correct a known one."""
+        """Common shift of the control points that a simulation may have, in metres; zero for real measurements."""
         return (0.0, 0.0, 0.0)
 
 
 class FixedTestSpec(PayloadTestSpec):
-    """Test of a payload without random numbers."""
+    """Base of tests of a payload that use no random numbers."""
 
     @property
     def seed(self) -> int:
-        """Seed, without effect."""
+        """Seed of random numbers, without effect because the test uses none."""
         return 0
 
 

@@ -32,7 +32,7 @@ _EVEN = 1e-6
 _WHOLE = 1e-9
 """Tolerance, as a fraction of a step, for rounding a range to whole steps."""
 _KINDS: dict[str, Kind] = {"rotate": ANGLE, "shift": LENGTH}
-"""Kind of a mechanism's motion -> kind of quantity of its steps."""
+"""Kind of a mechanism's motion -> kind of quantity of its steps and range."""
 _QUANTITIES: dict[str, Kind] = {"d_alpha": ANGLE, "d_beta": ANGLE, "d_gamma": ANGLE, "d_f": LENGTH, "defocus": LENGTH}
 
 Span = Annotated[float, Quantity(MOMENT, smallest="0 s", largest="100000 h")]
@@ -41,7 +41,7 @@ Frames = Annotated[Whole, Field(ge=1, le=1000)]
 Repeats = Annotated[Whole, Field(ge=8, le=500)]
 Parameter = Literal["d_alpha", "d_beta", "d_gamma", "d_f"]
 PARAMETERS: tuple[Parameter, ...] = ("d_alpha", "d_beta", "d_gamma", "d_f")
-"""Changes of a camera that the monitor measures."""
+"""Names of the changes of a camera that the monitor measures: three rotations and the principal distance."""
 
 
 def _once(names: tuple[Parameter, ...]) -> tuple[Parameter, ...]:
@@ -86,7 +86,7 @@ class MotionSpec(Spec):
         return self
 
     def share(self, time: float) -> float:
-        """Return the fraction of `rotate` and `shift` at a time in seconds."""
+        """Return the fraction of `rotate` and `shift` that the motion has reached at a time in seconds."""
         passed = time - self.begin
         if self.period is not None:
             return math.sin(2.0 * math.pi * passed / self.period)
@@ -96,7 +96,7 @@ class MotionSpec(Spec):
 
     @property
     def full_motion(self) -> PlainPerturbationSpec:
-        """Full motion as a perturbation."""
+        """Motion at its full amount, as a perturbation of the body."""
         return PlainPerturbationSpec.model_construct(rotate=self.rotate, shift=self.shift, pivot=self.pivot)
 
 
@@ -153,10 +153,10 @@ class MonitorErrorsSpec(ErrorsSpec):
 
 
 class CorrectionSpec(Spec):
-    """Correction of one quantity of the posterior estimate.
+    """Correction of one estimated quantity of a camera, in a closed loop.
 
     At every reading the command changes by `gain` times the estimated remaining error of the quantity, divided by the
-    response of the quantity to the mechanism.
+    response of the quantity to the mechanism. The estimate is that of the estimator `posterior`.
 
     Attributes
     ----------
@@ -215,11 +215,11 @@ class CorrectionSpec(Spec):
 
     @property
     def motion(self) -> tuple[str, str, str, str]:
-        """Node, kind, axis and pivot of the mechanism; empty for none."""
+        """Node, kind, axis and pivot of the motion of the mechanism; empty texts if no body moves."""
         return ("", "", "", "") if self.mechanism is None else component_parts(self.mechanism)
 
     def kind_of(self, key: str) -> Kind:
-        """Return the kind of quantity of ``step``, ``range`` or ``dead_band``."""
+        """Return the kind of quantity (angle or length) of the key ``step``, ``range`` or ``dead_band``."""
         of_mechanism = self.mechanism is not None and key != "dead_band"
         return _KINDS[self.motion[1]] if of_mechanism else _QUANTITIES[self.quantity]
 
@@ -238,18 +238,21 @@ class CorrectionSpec(Spec):
 
     @property
     def smallest(self) -> float | None:
-        """Step, in rad or m."""
+        """Step of the mechanism, in rad or m; None if any amount is possible."""
         return self._size("step")
 
     @property
     def largest(self) -> float | None:
-        """Range to either side, in rad or m; for a mechanism with steps a whole number of them."""
+        """Range of the mechanism to either side, in rad or m; None if unlimited.
+
+        For a mechanism with steps it is a whole number of them.
+        """
         reach, step = self._size("range"), self._size("step")
         return reach if reach is None or step is None else step * math.floor(reach / step + _WHOLE)
 
     @property
     def band(self) -> float:
-        """Dead band, in rad or m of the quantity."""
+        """Dead band: remaining errors of the quantity below it are not corrected, in rad or m."""
         return self._size("dead_band") or 0.0
 
 
@@ -304,7 +307,9 @@ class LoopImagesSpec(Spec):
 
 
 class MechanismsSpec(Spec):
-    """Closed loop: mechanisms point and refocus by the monitor's readings. The results are compared with the open loop.
+    """Closed loop: mechanisms point and refocus the cameras by the monitor's readings.
+
+    The results are compared with those of the open loop.
 
     Attributes
     ----------
@@ -323,7 +328,9 @@ class MechanismsSpec(Spec):
 
 
 class OrbitMonitorSpec(TitledSpec):
-    """Height errors along an orbit with and without on-board monitoring, or with mechanisms controlled by its readings.
+    """Height errors along an orbit with and without on-board monitoring, or with a closed loop.
+
+    In a closed loop, mechanisms are controlled by the readings of the monitor.
 
     Attributes
     ----------
@@ -487,7 +494,7 @@ class OrbitMonitorSpec(TitledSpec):
 
     @property
     def step(self) -> float:
-        """Step between the times, in seconds."""
+        """Step between the times of the course, in seconds."""
         return self.times[1] - self.times[0]
 
     @property
@@ -498,7 +505,7 @@ class OrbitMonitorSpec(TitledSpec):
 
     @property
     def compared(self) -> tuple[float, ...]:
-        """Intervals of the comparison, ascending, seconds."""
+        """Intervals between measurements of the monitor that are compared, ascending, in seconds."""
         if self.intervals is not None:
             return tuple(sorted(set(self.intervals)))
         count = len(self.times) - 1
@@ -518,13 +525,19 @@ class OrbitMonitorSpec(TitledSpec):
         return self.reference
 
     def measured(self, interval: float) -> list[int]:
-        """Return the numbers of the measured times at this interval, counted from the reference to both sides."""
+        """Return the numbers of the times at which the monitor measures, every ``interval`` seconds.
+
+        They are counted from the reference time to both sides.
+        """
         steps = round(interval / self.step)
         return [k for k in range(len(self.times)) if (k - self.reference_index) % steps == 0]
 
     @property
     def job(self) -> JobSpec:
-        """Job of the monitor's images without `motion`; its issues are reported at the lines of this file."""
+        """Job that renders the monitor's images, without the motions of `motion`.
+
+        Its issues are reported at the lines of this file.
+        """
         frames = RenderSpec.model_construct(
             images=("spots",), targets=None, stray=None, frames=self.frames, seed=self.seed
         )

@@ -55,7 +55,7 @@ _SMALLEST = 1e-9
 
 
 def _apart(outlines: tuple[tuple[Corner, ...], ...]) -> tuple[tuple[Corner, ...], ...]:
-    """Raise `Problem` if polygons overlap or leave less than a tenth of the pupil."""
+    """Raise `Problem` if obstructions overlap or leave less than a tenth of the pupil free."""
     shapes = [np.array(outline, float)[None] for outline in outlines]
     shapes = [shape if area(shape)[0] > 0.0 else shape[:, ::-1] for shape in shapes]
     for k, one in enumerate(shapes):
@@ -125,7 +125,7 @@ class TerrainSpec(Spec):
         Rms of the heights about their mean, in metres; required for `fractal`, for `real` by default that of the model,
         121 m.
     exponent : float
-        Exponent of a fractal's amplitude spectrum; a larger one is smoother.
+        Exponent of a fractal's amplitude spectrum against spatial frequency; a larger one is smoother.
     post : float
         Spacing of a fractal's posts, in metres; between them the terrain is a cubic spline.
     longest : float
@@ -366,7 +366,7 @@ class PatchSpec(Spec):
     pixel : float
         Pixel of this line that images the patch's centre.
     time : float
-        Time at which it does, from the orbit's epoch, in seconds.
+        Time at which this pixel images the patch's centre, from the orbit's epoch, in seconds.
     lines, pixels : int
         Size of every image in this direction, in pixels.
     """

@@ -85,7 +85,7 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
 
     @classmethod
     def parts(cls, test: OrbitAngleSpec) -> dict[str, Any]:
-        """Return the payload, or the instrument with its cameras."""
+        """Read the payload, or the instrument with its cameras; return field -> content."""
         reference, key = test.camera, ("camera",)
         folders = (load.PAYLOADS, load.INSTRUMENTS)
         known = next((folder for folder in folders if load.reference_path(folder, reference, test) is not None), None)
@@ -101,7 +101,7 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
 
     @property
     def pixels(self) -> Mapping[str, int]:
-        """Line -> number of its pixels, in the order of the file."""
+        """Name of each line -> number of its pixels, in the order of the file."""
         if self.instrument is not None:
             return {name: self.cameras[m.camera].line.pixels for name, m in self.instrument.cameras.items()}
         assert self.camera is not None
@@ -109,7 +109,7 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
 
     @property
     def usual_pixels(self) -> int:
-        """Number of pixels of the standard line, in whose pixels the test has its positions."""
+        """Number of pixels of the standard line, on which the positions in the file are counted."""
         return self.camera.pixels if self.camera is not None else next(iter(self.pixels.values()))
 
     @property
@@ -119,7 +119,7 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
 
     @property
     def angles(self) -> Mapping[str, tuple[str, str]]:
-        """Angle -> its two lines, including the defaults."""
+        """Name of each intersection angle -> its two lines, including the defaults."""
         return self.test.angles or {}
 
     def checked(self) -> Self:
@@ -154,7 +154,7 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
 
 
 class PayloadSetup(ExperimentSetup[TestType], Generic[TestType]):
-    """Test of a payload with the payload.
+    """Test of a payload, with the content of the payload's file.
 
     Attributes
     ----------
@@ -168,13 +168,13 @@ class PayloadSetup(ExperimentSetup[TestType], Generic[TestType]):
 
     @classmethod
     def parts(cls, test: Any) -> dict[str, Any]:
-        """Return the payload, and the test with absolute paths."""
+        """Read the payload, and make the paths of the test absolute; return field -> content."""
         camera = load_three_line_camera(test.camera, test, ("camera",))
         return {"test": _placed(test), "camera": camera}
 
 
 class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
-    """In-orbit calibration with its camera.
+    """In-orbit calibration, with the content of its camera's file.
 
     Attributes
     ----------
@@ -186,12 +186,12 @@ class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
 
     @classmethod
     def parts(cls, test: OrbitCalibrationSpec) -> dict[str, Any]:
-        """Return the payload, and the data sheets of its line CCDs if images are rendered."""
+        """Read the payload, and the data sheets of its line CCDs if images are rendered, by field."""
         parts = super().parts(test)
         return parts if test.images is None else {**parts, "detectors": _line_detectors(parts["camera"])}
 
     def checked(self) -> Self:
-        """Check that the camera has the three lines, and that points and changes lie on them."""
+        """Check that the camera has the three lines, and that points and changes lie on them; return the set-up."""
         test, camera = self.test, self.camera
         if missing := [name for name in LINES if name not in camera.lines]:
             found = f"{names_text(tuple(camera.lines))} in {camera.name}"
@@ -220,7 +220,7 @@ class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
 
 
 class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
-    """Monitored stereo pair along its orbit with its instrument.
+    """Monitored stereo pair along its orbit, with the content of its instrument's files.
 
     Attributes
     ----------
@@ -246,7 +246,7 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
 
     @classmethod
     def parts(cls, test: OrbitMonitorSpec) -> dict[str, Any]:
-        """Return the instrument with its cameras, data sheets and disturbances."""
+        """Read the instrument with its cameras, data sheets and disturbances; return field -> content."""
         job = resolve_job(test.job)
         parts = {key: getattr(job, key) for key in ("instrument", "cameras", "detector", "disturbances")}
         if test.mechanisms is not None and test.mechanisms.images is not None:
@@ -255,7 +255,7 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
         return parts
 
     def checked(self) -> Self:
-        """Check that test and instrument fit together, and that there are disturbances for mechanisms to correct."""
+        """Check that test and instrument fit together; return the set-up."""
         _require_pair(self.test, self.instrument, self.cameras)
         if self.test.mechanisms is not None:
             _require_mechanisms(self, self.test.mechanisms)
@@ -263,7 +263,7 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
 
     @property
     def resolved(self) -> ResolvedJob:
-        """Job of the monitor's images with the content of its references."""
+        """Job of the monitor's images with the content of all files to which it refers."""
         return ResolvedJob.model_construct(
             job=self.test.job,
             instrument=self.instrument,
@@ -275,13 +275,13 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
 
     @property
     def pair(self) -> tuple[str, str]:
-        """Names of the two cameras."""
+        """Names of the two cameras of the stereo pair."""
         first, second = self.test.cameras or tuple(self.instrument.cameras)
         return first, second
 
 
 class SimulateSetup(PayloadSetup[OrbitSimulateSpec]):
-    """Simulation of images of a patch of ground with its camera.
+    """Simulation of images of a patch of ground, with the content of its camera's file.
 
     Attributes
     ----------
@@ -293,7 +293,7 @@ class SimulateSetup(PayloadSetup[OrbitSimulateSpec]):
 
     @classmethod
     def parts(cls, test: OrbitSimulateSpec) -> dict[str, Any]:
-        """Return the payload and the data sheets of its line CCDs."""
+        """Read the payload and the data sheets of its line CCDs; return field -> content."""
         parts = super().parts(test)
         return {**parts, "detectors": _line_detectors(parts["camera"])}
 
@@ -317,20 +317,20 @@ class SimulateSetup(PayloadSetup[OrbitSimulateSpec]):
 
 
 class JitterSetup(PayloadSetup[OrbitJitterSpec]):
-    """Search for jitter in a simulated pass with its camera."""
+    """Search for jitter in a simulated pass, with the content of its camera's file."""
 
     def checked(self) -> Self:
-        """Check that the camera has the lines."""
+        """Check that the camera has two or more of the lines in the file; return the set-up."""
         _require_several(self.test, self.test.lines, self.camera)
         _require_known("line", self.test, ("points", "line_noise"), self.test.points.line_noise, self.camera.lines)
         return self
 
 
 class AdjustSetup(PayloadSetup[OrbitAdjustSpec]):
-    """Block with its camera."""
+    """Bundle adjustment of a simulated block, with the content of its camera's file."""
 
     def checked(self) -> Self:
-        """Check that the camera has the lines, and the block the excluded sensors."""
+        """Check that the camera has the lines, and the block the excluded sensors; return the set-up."""
         for k, name in enumerate(self.test.lines):
             if name not in self.camera.lines:
                 raise self.test.error(unknown("no such line", name, self.camera.lines), ("lines", k))
@@ -339,20 +339,20 @@ class AdjustSetup(PayloadSetup[OrbitAdjustSpec]):
 
 
 class CheckSetup(PayloadSetup[measurements.OrbitCheckSpec]):
-    """Check of the conventions of a pass with its camera."""
+    """Check of the conventions of a pass, with the content of its camera's file."""
 
 
 class MatchSetup(PayloadSetup[measurements.OrbitMatchSpec]):
-    """Matching of points in a user's images with the camera."""
+    """Matching of points in a user's images, with the content of the camera's file."""
 
     def checked(self) -> Self:
-        """Check that the camera has the lines."""
+        """Check that the camera has the lines of the images; return the set-up."""
         _require_known("line", self.test, ("images",), self.test.images, self.camera.lines)
         return self
 
 
 class MeasuredPassesSetup(PayloadSetup[TestType], Generic[TestType]):
-    """Test on measurements with its camera.
+    """Base of tests on measurements of passes, with the content of the camera's file.
 
     Attributes
     ----------
@@ -364,20 +364,23 @@ class MeasuredPassesSetup(PayloadSetup[TestType], Generic[TestType]):
 
     @classmethod
     def measured_by(cls, keys: Mapping[str, Any]) -> bool:
-        """Return whether a file with these keys is such a test; `passes` of a simulation is a number."""
+        """Return whether a file with these keys is a test on measured passes.
+
+        In such a file `passes` is a mapping; in a simulation it is a number.
+        """
         return "data" in keys or "conventions" in keys or isinstance(keys.get("passes"), dict)
 
     @classmethod
     def parts(cls, test: Any) -> dict[str, Any]:
-        """Return the payload and the passes."""
+        """Read the payload and the description of the passes; return field -> content."""
         return {**super().parts(test), "data": data_of(test)}
 
 
 class MeasuredCalibrationSetup(MeasuredPassesSetup[measurements.MeasuredCalibrationSpec]):
-    """In-orbit calibration on measurements with its camera."""
+    """In-orbit calibration on measured passes, with the content of the camera's file."""
 
     def checked(self) -> Self:
-        """Check that the schemes refer to existing passes."""
+        """Check that the schemes refer to existing passes; return the set-up."""
         try:
             checked_schemes(self.test.schemes, self.data.passes)
         except Problem as problem:
@@ -386,28 +389,31 @@ class MeasuredCalibrationSetup(MeasuredPassesSetup[measurements.MeasuredCalibrat
 
 
 class MeasuredAngleSetup(MeasuredPassesSetup[measurements.MeasuredAngleSpec]):
-    """Intersection angles on measurements with the camera."""
+    """Intersection angles from measured passes, with the content of the camera's file."""
 
 
 class MeasuredJitterSetup(MeasuredPassesSetup[measurements.MeasuredJitterSpec]):
-    """Search for jitter on measurements with the camera."""
+    """Search for jitter in a measured pass, with the content of the camera's file."""
 
     def checked(self) -> Self:
-        """Check that the camera has the lines."""
+        """Check that the camera has two or more of the lines in the file; return the set-up."""
         _require_several(self.test, self.test.lines, self.camera)
         return self
 
 
 class MeasuredAdjustSetup(MeasuredPassesSetup[MeasuredAdjustSpec]):
-    """Block of measured passes with its camera."""
+    """Bundle adjustment of a block of measured passes, with the content of the camera's file."""
 
     @classmethod
     def measured_by(cls, keys: Mapping[str, Any]) -> bool:
-        """Return whether a file with these keys is such a block; a simulated one also has a mapping of passes."""
+        """Return whether a file with these keys is a block of measured passes.
+
+        A simulated block also has a mapping of passes.
+        """
         return "data" in keys or "conventions" in keys
 
     def checked(self) -> Self:
-        """Check that all passes, lines and sensors in the test exist."""
+        """Check that all passes, lines and sensors in the test exist; return the set-up."""
         test, passes = self.test, self.data.passes
         _require_known("pass", test, ("trackers",), test.trackers, passes)
         _require_known("line", test, ("changes",), test.changes, self.camera.lines)
@@ -423,7 +429,7 @@ AnyAdjust = AdjustSetup | MeasuredAdjustSetup
 AnyAngle = AngleSetup | MeasuredAngleSetup
 AnyCalibration = CalibrationSetup | MeasuredCalibrationSetup
 AnyJitter = JitterSetup | MeasuredJitterSetup
-"""Set-up of a simulated test or of one on measurements."""
+"""Set-up of a search for jitter, in a simulated or in a measured pass."""
 
 
 def _placed(test: Any) -> Any:
@@ -472,7 +478,7 @@ def data_of(test: measurements.MeasuredTestSpec) -> measurements.OrbitDataSpec:
 
 
 def without_sensors(setup: AnyAdjust, names: Sequence[str]) -> AnyAdjust:
-    """Return a block that is adjusted without further sensors.
+    """Return a block whose adjustment excludes further sensors.
 
     Parameters
     ----------
@@ -569,7 +575,7 @@ def _require_pair(test: OrbitMonitorSpec, instrument: InstrumentSpec, cameras: P
 
 
 _LEAST_ANGLE = 0.0174
-"""Smallest angle between the cameras of a stereo pair, in radians."""
+"""Smallest angle between the cameras of a stereo pair, in radians (1 deg)."""
 
 
 def _require_several(test: Spec, named: tuple[str, ...] | None, camera: ThreeLineCameraSpec) -> None:
@@ -588,7 +594,7 @@ _THREE_LINES = "a camera with lines forward, nadir and backward"
 
 
 def _require_places(test: Spec, changes: Iterable[str], camera: ThreeLineCameraSpec) -> None:
-    """Raise `InputError` for a change of a line that is defined by look angles."""
+    """Raise `InputError` for a change of the interior orientation of a line that is defined by look angles."""
     for name in changes:
         if name in camera.lines and camera.lines[name].by_look_angles:
             problem = f"{name} of {camera.name} is defined by look angles, which have no lens that could change"

@@ -68,10 +68,11 @@ class CcdSpec(Spec):
 class LineCameraSpec(Spec):
     """Line camera: its interior orientation and its mounting on the base.
 
-    The image is the real one, behind the lens: a point of the line at +y sees the scene at -Y. Its look in the camera's
-    axes is along (-(x - x0)(1 + d), -(y - y0)(1 + d), f) with d = k1 r^2 + k2 r^4, r from the principal point. Positive
-    d means that the point looks further out than an ideal projection (Brown, Photogramm. Eng. 37(8), 1971: the term is
-    added to the measured coordinates).
+    The image is the real one, behind the lens: a point of the line at +y sees the scene at -Y. Its line of sight in the
+    camera's axes is along (-(x - x0)(1 + d), -(y - y0)(1 + d), f), where (x, y) is the point on the focal plane, (x0,
+    y0) the principal point, f the principal distance, and d = k1 r^2 + k2 r^4 the distortion at the distance r from the
+    principal point. Positive d means that the point looks further out than an ideal projection (Brown, Photogramm. Eng.
+    37(8), 1971: the term is added to the measured coordinates).
 
     Attributes
     ----------
