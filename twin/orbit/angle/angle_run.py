@@ -101,7 +101,7 @@ class FrameRow:
     least_normal_z : float
         Smallest absolute z component of the unit normals; 0 for a vertical plane.
     warned : bool
-        True where the fit itself warns of its bias.
+        True where the fit warns that its angles are biased because a plane is nearly vertical.
     """
 
     frame: str

@@ -1,8 +1,9 @@
 """Simulated block of scenes with all its measurements, drawn from the error laws of the file.
 
 The readings of orbit and attitude are those of a smooth orbit; the true platform departs from them by random processes,
-each drawn by its own definition: readings interpolated by a cubic spline, sums of steps, amplitudes. The images are
-those of the rigorous sensor on the true platform, with cameras that have changed.
+each simulated by its definition: random readings interpolated by a cubic spline, random walks (sums of steps), or
+oscillations of random amplitude. The images are those of the rigorous sensor on the true platform, with cameras that
+have changed.
 """
 
 from __future__ import annotations

@@ -197,9 +197,9 @@ class Unknown:
     value : float
         Estimated value.
     sigma : float
-        Standard deviation with the unknowns that the gauge holds taken as exact; 0 where held.
+        Standard deviation if the unknowns that the gauge holds are exact; 0 for those held.
     sigma_with_gauge : float
-        Standard deviation that includes the uncertainty of the held unknowns after the launch.
+        Standard deviation that includes the uncertainty, after launch, of the unknowns that the gauge holds.
     prior_share : float
         Share of the variance that comes from the sigmas of launch and season and not from the points, 0 to 1.
     held : bool

@@ -123,7 +123,7 @@ def _without_mislabelled(campaign: Campaign) -> tuple[Campaign, dict[str, Reject
 
 
 def _with_light(campaign: Campaign, passes: tuple[FieldPass, ...]) -> Campaign:
-    """Return the campaign with the image points of `passes`, less the same effects on the light as before."""
+    """Return the campaign with the image points of `passes`, corrected for the same effects on the light as before."""
     removed = campaign.effects if campaign.spec.effects.corrected else NO_EFFECTS
     return replace(campaign, passes=passes).without_effects(removed)
 
@@ -307,9 +307,9 @@ class IntersectionFit:
     Attributes
     ----------
     chi_square : float
-        Sum over all check points.
+        Chi-square, summed over all check points.
     degrees_of_freedom : int
-        Two for each ray less three for each point.
+        Two for each ray minus three for each point.
     """
 
     chi_square: float

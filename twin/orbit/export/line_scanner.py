@@ -35,14 +35,16 @@ _TICK = 2.0**-20
 since the year 2000) exactly, but decimal fractions only to 6e-8 s, a thousandth of a line.
 """
 _SPARE = 6
-"""Number of nodes beyond either end of the image."""
+"""Number of nodes of the trajectory beyond either end of the image."""
 _FEWEST, _MOST = 64, 8192
 _PIXELS = 33
 """Number of positions along the line at which directions are compared; they are smooth to 1e-10 of a pixel."""
 _ROUNDS = 4
 """Number of alternations between fitting the rotations at all nodes and the camera that they share."""
 _CUBIC = (0, 2, 5, 9)
-"""Indices of the terms 1, y, y^2 and y^3 among the distortion's ten; a line has no extent in x for the others."""
+"""Indices of the terms 1, y, y^2 and y^3 among the ten coefficients of the sensor model's cubic distortion; a line has
+no extent in x, so that the others are zero.
+"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -300,7 +300,10 @@ def _element_state(spec: ElementsSpec, rotation: EarthRotation, ut1: tuple[float
 
 
 def _passing_state(spec: PassingSpec, earth: Earth, from_itrs: np.ndarray) -> np.ndarray:
-    """Return the state, (6,), of the osculating circle through a point; its declination gives argument and node."""
+    """Return position and velocity, (6,), at the epoch on the osculating circular orbit through a point.
+
+    The point's declination gives the argument of latitude and, with its right ascension, the node.
+    """
     position = from_itrs @ earth.ecef(spec.longitude, spec.latitude, spec.altitude)
     a = float(np.linalg.norm(position))
     z = position[2] / a

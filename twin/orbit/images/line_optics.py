@@ -3,7 +3,8 @@
 Frequencies are in cycles per pixel along the line and in cycles per line along the track. While the image of a point
 crosses the line it moves by `advance` pixels from one line to the next, less than one where the lens looks obliquely,
 and by `drift` pixels along it. With the pixel pitch p and the focal plane's transfer function T(fx, fy) (cycles/m along
-the line and along the track) an image sampled at lines and pixels thus has
+the line and along the track), an image sampled at lines and pixels thus has the transfer function H of the frequencies
+`pixel` (cycles/pixel) and `line` (cycles/line)
 
     H(pixel, line) = T(pixel/p, -(line + drift pixel)/(advance p)) x smear(line).
 

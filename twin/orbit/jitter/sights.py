@@ -172,7 +172,7 @@ class Sights:
         Number of points that two lines or more see.
     pairs : Mapping[tuple[str, str], tuple[ndarray, ndarray]]
         (first line, second line) -> times (n,) of the first sighting of n points, and disparities (n, 2) of the second
-        line against the first, across (pixels to the right) and along (lines later), less what ground and interior
+        line against the first, across (pixels to the right) and along (lines later), minus what ground and interior
         orientation explain; for figures.
     """
 
@@ -376,7 +376,10 @@ def _whitened_observations(
     prior: _Prior,
     search: JitterSearchSpec,
 ) -> tuple[Observations, dict[str, np.ndarray]]:
-    """Return whitened observations of the attitude, and measured minus expected positions (n, 2) by line, in pixels."""
+    """Return whitened observations of the attitude, and measured minus expected positions by line, in pixels.
+
+    Positions are (n, 2), line and pixel, for n points.
+    """
     axes, count = len(search.axes), len(order)
     size, width = len(shared), (search.interior + 1) + search.trend
     value, by = np.zeros((size, count, 2)), np.zeros((size, count, 2, 3))
@@ -450,7 +453,7 @@ def _moments(line: _Line, off: np.ndarray, basis: np.ndarray) -> np.ndarray:
     line : _Line
         Sightings with the measured positions.
     off : (n,) ndarray
-        Measured less expected lines, whose part that is not smooth counts as noise, within the limits of its sigma.
+        Measured minus expected lines, whose part that is not smooth counts as noise, within the limits of its sigma.
     basis : (n, width) ndarray
         Smooth functions of the points.
     """

@@ -65,7 +65,8 @@ deg.
 _MARGIN = 0.05
 """Share of an image's time, before its first line and after its last one, for which attitudes are sampled."""
 _NEAR = 0.1
-"""Longest extrapolation of an orbit beyond its readings, in seconds: the third derivative of its positions makes 2 um.
+"""Longest extrapolation of an orbit beyond its readings, in seconds: the neglected third derivative of its positions
+causes an error of 2 um.
 """
 _LINES_OFF = 3.0
 """Largest allowed disagreement between the duration of the image and its number of lines, in lines."""

@@ -196,7 +196,7 @@ def velocity_misfit(time: Array, place: Array, speed: Array) -> tuple[Array, boo
     Returns
     -------
     tuple of (N - 1,) ndarray and bool
-        Relative differences, and whether the velocities less omega x P fit while they themselves do not.
+        Relative differences, and whether the velocities minus omega x P fit while they themselves do not.
     """
     rate = np.diff(place, axis=0) / np.diff(time)[:, None]
     # Across a long step the chord is shorter than the arc and lies to its side, which is not an error of the velocity.
