@@ -271,7 +271,7 @@ class AsBuiltBench(Site):
 
     @property
     def last(self) -> str | None:
-        """Name of the last move that was made."""
+        """Name of the last actuator move that was made; None if there was none."""
         return self.parameters.moves[-1] if self.parameters.moves else None
 
     def merit_parts(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> np.ndarray:

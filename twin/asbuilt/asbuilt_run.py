@@ -48,7 +48,7 @@ class MeritPrediction:
     Attributes
     ----------
     merit : Merit
-        The merit.
+        Merit whose distribution it is.
     designed : float
         Value of the nominal instrument, SI.
     before : tuple of float
@@ -86,7 +86,7 @@ class AsBuiltRun:
     setup : AsBuiltSetup
         Test with the measurements.
     bench : AsBuiltBench
-        The instrument.
+        Instrument that is evaluated.
     data : tuple of ndarray
         Readings of each measurement, SI.
     estimate : StateEstimate

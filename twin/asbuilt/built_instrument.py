@@ -15,7 +15,7 @@ from scenes.specs.load import CAMERAS, INSTRUMENTS, is_path, library_names
 from twin.asbuilt.asbuilt_run import AsBuiltRun
 
 POSTERIOR = "posterior"
-"""Name of the file with the posterior covariance."""
+"""Name of the disturbances file that holds the posterior covariance of the motions."""
 CORRELATION = f"{POSTERIOR}_correlation"
 """Name of the table with the correlations of the posterior."""
 

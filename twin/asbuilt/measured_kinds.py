@@ -184,7 +184,7 @@ class MeasuredKind(ABC):
         return Path(self.spec.file_at((key,), value, Path(self.site.test.source.file).parent, description))
 
     def wrong(self, text: str, key: str, allowed: str | None = None, found: str | None = None) -> InputError:
-        """Return an error at a key of the measurement."""
+        """Return an InputError placed at a key of the measurement in the file."""
         return InputError(self.spec.issue(Problem(text, found, allowed), (key,)))
 
 
@@ -257,7 +257,7 @@ class FocusReadings(MeasuredKind):
         self.blocks = tuple(f"field {text}" for text in self.labels)
 
     def predict(self, view: View) -> np.ndarray:
-        """Return the best focus of each field."""
+        """Return the best focus of each field in every state, metres downstream of the line CCD."""
         paths = self.beams.light(view.states).paths
         return np.asarray(np.einsum("fn,sfn->sf", self.rows, paths))
 
@@ -303,7 +303,7 @@ class MtfReadings(MeasuredKind):
         self.blocks = tuple(f"field {field_text(field)}" for field in spec.fields for _ in range(2))
 
     def predict(self, view: View) -> np.ndarray:
-        """Return the MTF of each field and direction."""
+        """Return the MTF of each field and direction in every state."""
         return self.tried.parts_of(view.states)
 
     def covariance(self) -> np.ndarray:
@@ -399,7 +399,7 @@ class SpotReadings(MeasuredKind):
     shown = ("px", 1.0)
 
     def prepare(self) -> None:
-        """Set up the monitor's beams."""
+        """Set up the light path of the monitor's beams and trace the nominal spots."""
         experiment = self.site.experiment
         if not experiment.monitored:
             raise InputError(
@@ -502,7 +502,7 @@ class TemperatureReadings(MeasuredKind):
     shown = ("K", 1.0)
 
     def prepare(self) -> None:
-        """Resolve the full names of the bodies."""
+        """Resolve the names of the bodies in the file to their full paths."""
         self.bodies = named_bodies(self)
         self.labels = self.blocks = self.bodies
 

@@ -109,7 +109,7 @@ class Parameters:
 
     @property
     def components(self) -> tuple[Component, ...]:
-        """Components of the prior."""
+        """Components of the prior: motions and temperatures of bodies."""
         return self.stated.components
 
     @property

@@ -37,7 +37,7 @@ class WavefrontMeasurement(Protocol):
         """Return the path of a file given under a key; raise InputError if it does not exist."""
 
     def wrong(self, text: str, key: str, allowed: str | None = None, found: str | None = None) -> InputError:
-        """Return an error at a key of the measurement."""
+        """Return an InputError placed at a key of the measurement in the file."""
 
 
 def stated_orientation(measurement: WavefrontMeasurement) -> Orientation:

@@ -55,7 +55,7 @@ def compare_report(comparison: Comparison) -> Report:
 
 
 def _row(name: str, diff: Differences) -> list[Cell]:
-    """Return the row of a run in the summary."""
+    """Return a run's row in the summary: numbers of differing inputs, results and images."""
     far = max((abs(one.in_sigma) for one in diff.numbers if one.in_sigma is not None), default=None)
     return [name, len(diff.inputs), len(diff.numbers), len(diff.arrays), diff.compared, far]
 
@@ -226,7 +226,7 @@ class Differences:
 
     @property
     def same(self) -> bool:
-        """True if no result differs."""
+        """True if no result differs from the reference by more than the tolerances."""
         return not self.numbers and not self.arrays
 
 
@@ -269,7 +269,7 @@ def differences(reference: Run, other: Run, rtol: float, sigmas: float | None) -
         Relative tolerance: of the larger of two numbers, and for arrays of the peak.
     sigmas : float | None
         Where a number has a sigma in both runs, differences within this multiple of it do not count; the sigmas and the
-        recorded frames, whose noise is another draw, are then ignored. None compares all to ``rtol``.
+        recorded frames, whose random noise differs, are then ignored. None compares all to ``rtol``.
 
     Raises
     ------

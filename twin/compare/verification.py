@@ -85,7 +85,7 @@ RELATIVE_OF_GEOMETRY = 1e-6
 
 @dataclass(frozen=True)
 class Quantity:
-    """Number, text or array with another value in the repeated run.
+    """Number, text or array with a different value in the repeated run.
 
     Attributes
     ----------
@@ -152,7 +152,7 @@ def file_state(name: str, old: Path, new: Path, elsewhere: bool) -> FileState:
     new : Path
         File of the repeated run.
     elsewhere : bool
-        Whether the run was repeated on another processor, which rounds otherwise; a few pixels may then differ.
+        Whether the run was repeated on a different processor, which rounds otherwise; a few pixels may then differ.
     """
     if not (old.is_file() and new.is_file()):
         return FileState(name, GONE if old.is_file() else NEW)
@@ -468,7 +468,7 @@ class Verification:
         return " ".join(map(report.sentence, ("; ".join(first) or whole, *self._repeated())))
 
     def _repeated(self) -> list[str]:
-        """Return the sentences on the repetition."""
+        """Return the sentences of the verdict on whether the repeated run agrees."""
         if self.obstacle:
             return [f"the run cannot be repeated: {self.obstacle}"]
         repetition = self.repetition

@@ -19,7 +19,7 @@ from twin.framework.svg import BLUE, GREY, INK, ORANGE, look, new_figure, plain_
 
 
 def design_report(run: DesignRun) -> Report:
-    """Return the report of an optimised camera."""
+    """Return the report: numbers before and after, layout, wavefront error over the field, and the new file."""
     setup, design = run.setup, run.best
     before, after = design.before, design.after
     worst = float(after.errors.max())

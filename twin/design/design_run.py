@@ -72,7 +72,7 @@ class DesignRun:
 
     @property
     def best(self) -> Design:
-        """Best design: prescription before and after."""
+        """Best design of all starts, with the prescription before and after."""
         return self.searched.best
 
 

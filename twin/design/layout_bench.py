@@ -160,7 +160,7 @@ class LayoutBench:
     Parameters
     ----------
     setup : MonitorDesignSetup
-        The design.
+        Specification of the search for a layout.
     backend : Backend
         Array backend of the ray trace.
     """
@@ -325,7 +325,7 @@ class LayoutBench:
 
 
 class _OutsideLimitsError(Exception):
-    """A layout violates a limit of its design."""
+    """Error that a layout violates a limit of its design, such as on mass."""
 
 
 def _reason(error: Exception) -> str:

@@ -225,7 +225,7 @@ STEP = 0.01
 The traced derivatives of the spots are smooth over the whole range, and rays are aimed to 1e-9 of it.
 """
 ORDER = 6
-"""Default order of the central differences."""
+"""Default order of the central differences (error proportional to the step to this power)."""
 _WEIGHTS = {2: {1: 1.0 / 2.0}, 4: {1: 8.0 / 12.0, 2: -1.0 / 12.0}, 6: {1: 45.0 / 60.0, 2: -9.0 / 60.0, 3: 1.0 / 60.0}}
 """Order -> number of steps -> weight of a central difference (Fornberg, Math. Comp. 51, 699, 1988)."""
 _JUMP = {4: {1: 4.0 / 3.0, 2: -1.0 / 3.0}, 6: {1: 1.5, 2: -0.6, 3: 0.1}}
@@ -245,7 +245,7 @@ class LayoutNumber:
     Attributes
     ----------
     beams : Layout
-        The layout.
+        Layout of the monitor (its beams).
     beam : int
         Index of the beam, from 0.
     name : str
@@ -307,7 +307,7 @@ def numbers_of(bench: LayoutBench, beams: Layout, order: int = ORDER) -> tuple[L
     bench : LayoutBench
         Evaluator of the layouts of the design.
     beams : Layout
-        The layout.
+        Layout of the monitor (its beams).
     order : int
         Order of the differences.
     """
@@ -329,7 +329,7 @@ def known_of(bench: LayoutBench, beams: Layout) -> dict[str, Information]:
     bench : LayoutBench
         Evaluator of the layouts of the design.
     beams : Layout
-        The layout.
+        Layout of the monitor (its beams).
 
     Raises
     ------

@@ -45,7 +45,7 @@ class Candidate:
     Attributes
     ----------
     beams : tuple of int
-        Indices of the beams in the pool, ascending.
+        Indices of the beams among all feasible ones of the search, ascending.
     merit : float
         Predicted merit: the largest ratio of a standard deviation to its goal.
     """
@@ -215,7 +215,7 @@ class Workers:
     Raises
     ------
     RunFolderError
-        On entering: the journal belongs to another search, or cannot be written.
+        On entering: the journal belongs to a different search, or cannot be written.
     """
 
     def __init__(self, bench: LayoutBench, count: int, journal: Journal, advance: Advance) -> None:
@@ -424,7 +424,7 @@ class _OneSearch:
         return [beam for beam in wanted if beam not in self.tried]
 
     def _try(self, part: str, beams: Sequence[Beam]) -> None:
-        """Evaluate beams alone; the feasible ones join the pool."""
+        """Evaluate beams alone; the feasible ones are added to those that are combined to layouts."""
         self.tried += beams
         for facts in self.ask(part, beams):
             if facts.refused:

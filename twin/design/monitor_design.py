@@ -61,7 +61,7 @@ class MonitorDesignRun:
     Attributes
     ----------
     setup : MonitorDesignSetup
-        The design.
+        Specification of the search for a layout.
     bench : LayoutBench
         Evaluator of the layouts.
     results : Found
@@ -97,7 +97,7 @@ def run_monitor_design(
     Parameters
     ----------
     setup : MonitorDesignSetup
-        The design.
+        Specification of the search for a layout.
     backend : Backend
         Array backend of the ray trace.
     seed : int
@@ -116,7 +116,7 @@ def run_monitor_design(
     BenchError
         No beam or no layout is feasible.
     RunFolderError
-        The journal belongs to another search, or cannot be written.
+        The journal belongs to a different search, or cannot be written.
     """
     bench = LayoutBench(setup, backend)
     _check_start(setup, backend, seed, advance)

@@ -78,7 +78,7 @@ _FRONT = (
     "pupil that its prisms block and against their mass. Named layouts are on the front: no other is better in all "
     "three."
 )
-"""Caption of the figure of the front."""
+"""Caption of the figure of accuracy against obstructed pupil share and mass."""
 _CAUSES = "Standard deviations by cause: without measurement, with the start and with the best layout."
 """Caption of the figure of the causes."""
 _PUPILS = "Seen along the light into the first camera; X points toward the central prism. Filled: left; open: right."

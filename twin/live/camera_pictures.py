@@ -121,7 +121,7 @@ class CameraPictures:
         curve.legend(fontsize=7)
 
     def _bench(self, camera: str) -> tuple[TargetCamera, TargetsSpec]:
-        """Return the target bench of a camera, and its settings."""
+        """Return the camera ready to image test targets, and the settings of the targets."""
         if camera not in self._benches:
             experiment = self.experiment
             instrument, resolved = experiment.instrument, _with_targets(experiment.resolved)

@@ -171,7 +171,7 @@ class Client:
         self._handle(message, now)
 
     def _handle(self, message: messages.Message, now: float) -> None:
-        """Store the request of a message."""
+        """Store the request that a message of the page contains, for the scheduler."""
         match message:
             case messages.AskedState():
                 self.state = self._with_hidden(message)
@@ -208,22 +208,25 @@ class Client:
             self.recorded.append((time.monotonic() - self.record_began, state))
 
     def queue_state(self, message: bytes, before: BeforeKey) -> None:
-        """Send a state that contains the reference images of this noise, frames and seed; a later one replaces it."""
+        """Queue a state to be sent to the page; a later one replaces it.
+
+        ``before`` names the noise, frames and seed of the reference images that it contains.
+        """
         self._answer = message, before
         self._to_send.set()
 
     def queue_picture(self, message: str) -> None:
-        """Send a picture; a later one replaces it."""
+        """Queue a picture to be sent to the page; a later one replaces it."""
         self._picture = message
         self._to_send.set()
 
     def queue_text(self, message: str) -> None:
-        """Send a text after the queued ones."""
+        """Queue a text to be sent to the page after the queued ones."""
         self._queued_texts.append(message)
         self._to_send.set()
 
     def queue_json(self, data: dict[str, Any]) -> None:
-        """Send plain data as JSON after the queued texts."""
+        """Queue plain data to be sent to the page as JSON after the queued texts."""
         self.queue_text(json.dumps(data))
 
     async def send(
@@ -293,7 +296,7 @@ class LiveApi:
         return client
 
     def disconnect(self, client: Client) -> None:
-        """Remove a page."""
+        """Remove a page from those that are served."""
         with contextlib.suppress(ValueError):
             self.clients.remove(client)
 

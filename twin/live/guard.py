@@ -46,7 +46,7 @@ HEADERS: Mapping[str, str] = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
-"""HTTP headers of every answer."""
+"""HTTP security headers that every answer contains."""
 
 
 class BadToken(ValueError):
@@ -264,7 +264,7 @@ class Connections:
 
 
 class Connection(H11Protocol):
-    """HTTP connection whose requests have timeouts."""
+    """HTTP connection with timeouts for each request, its answer and the idle time after it."""
 
     all: ClassVar[Connections]
     _deadline: asyncio.TimerHandle | None = None
@@ -287,7 +287,7 @@ class Connection(H11Protocol):
             self._request_received()
 
     def _request_received(self) -> None:
-        """Handle the complete head of a request."""
+        """Handle the complete head of a request: check its token and start the timeout of its answer."""
         if self.all.is_token({key.decode("latin-1"): value.decode("latin-1") for key, value in self.headers}):
             self.all.authenticate(self)
         if not self.cycle.response_complete:
@@ -320,7 +320,7 @@ class Connection(H11Protocol):
         super().handle_websocket_upgrade(event)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget a closed connection."""
+        """Remove a closed connection from the lists and end its timeouts."""
         self._set_deadline(None)
         self.all.forget(self)
         super().connection_lost(exc)
@@ -341,7 +341,7 @@ class Connection(H11Protocol):
 
 
 class PageSocket(WebSocketsSansIOProtocol):
-    """WebSocket of a page."""
+    """WebSocket of a page, which never waits forever for a page that does not receive or answer."""
 
     def send_receive_event_to_app(self) -> None:
         """Pass on a complete message; silently close the connection if its text is not UTF-8."""

@@ -1,8 +1,8 @@
 """Knobs of the live twin: adjustable motions of bodies, factors of a study, and the resulting perturbations.
 
-A knob has the name of its motion in scripts and in a course's tables: ``base/forward/M2 shift z``. Its value is a
-number in the knob's unit; it has exactly the effect of a job's file that contains this number with this unit, to the
-last bit.
+A knob has the name of its motion in scripts and in the tables of a job's series of states (``course``):
+``base/forward/M2 shift z``. Its value is a number in the knob's unit; it has exactly the effect of a job's file that
+contains this number with this unit, to the last bit.
 """
 
 from __future__ import annotations
@@ -216,7 +216,7 @@ def _without_knobs(what: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _set_quantities(what: dict[str, Any], kind: str, numbers: Mapping[str, float], unit: str) -> None:
-    """Set the quantities of one kind in a perturbation."""
+    """Set the quantities of one kind in a body's perturbation from numbers by axis, with their unit."""
 
     def quantity(axis: str) -> str:
         return f"{numbers.get(axis, 0.0)!r} {unit}"
@@ -285,7 +285,7 @@ def base_with_factors(setup: StudySetup, scalars: Mapping[str, Any]) -> Tree:
     Parameters
     ----------
     setup : StudySetup
-        The study.
+        Study with its base job, factors and responses.
     scalars : Mapping[str, Any]
         Factor -> value as a study's file writes it; the others leave the base unchanged.
 

@@ -89,7 +89,7 @@ class LiveBench:
 
     @cached_property
     def clearances(self) -> Clearances:
-        """Pairs of bodies that may collide."""
+        """Calculator of the distances between bodies that may collide."""
         return Clearances.of(self.twin.experiment.instrument)
 
     @cached_property
@@ -194,7 +194,7 @@ class LiveBench:
         return self._quality({})
 
     def _quality(self, state: State) -> dict[str, Any]:
-        """Return the content of quality.json of a state."""
+        """Return the image quality of a perturbed state, as the content of quality.json."""
         job, experiment = self.twin.resolved.job, self.twin.experiment
         obstructed = job.render.obstructed
         return quality_dicts(experiment.instrument, experiment.backend, [state], obstructed)[0]
@@ -221,7 +221,7 @@ class LiveBench:
         return moved
 
     def state(self, asked: AskedState) -> tuple[dict[str, Any], np.ndarray | None]:
-        """Compute a state of the knobs.
+        """Compute spots, readings and true changes for the motions that the knobs set.
 
         Array dimensions: C area CCDs, H rows, W columns.
 
@@ -449,12 +449,12 @@ def _course_data(course: CourseSpec) -> dict[str, Any]:
 
 
 def _label(parameter: Parameter) -> Mapping[str, str]:
-    """Return key, symbol, unit and meaning of a parameter."""
+    """Return key, symbol, unit and meaning of a camera parameter, for the page."""
     return {"key": parameter.key, "symbol": parameter.symbol, "unit": parameter.unit, "meaning": parameter.meaning}
 
 
 HEAD = "# Recorded with python -m twin.live; repeat it: python -m twin.render THIS_FILE\n"
-"""First line of a saved file."""
+"""Comment in the first line of a saved file."""
 
 
 def _head() -> str:
@@ -480,7 +480,7 @@ def job_text(bench: LiveBench, asked: AskedState) -> str:
     Parameters
     ----------
     bench : LiveBench
-        The instrument.
+        Instrument that is evaluated.
     asked : AskedState
         The state.
 
@@ -503,14 +503,14 @@ def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> s
     Parameters
     ----------
     bench : LiveBench
-        The instrument.
+        Instrument that is evaluated.
     kept : Sequence[tuple[float, AskedState]]
         (seconds since the recording began, state) in the order in which they were shown.
 
     Raises
     ------
     ValueError
-        There are too few states, or something changed that a course cannot change.
+        There are too few states, or something changed that a job's series of states cannot change.
     """
     steps = _limited_times(kept)
     if len(steps) < FEWEST:
@@ -534,7 +534,7 @@ def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> s
 
 
 def _limited_times(kept: Sequence[tuple[float, AskedState]]) -> list[tuple[float, AskedState]]:
-    """Return states at ascending times in milliseconds, at most as many as a course may have.
+    """Return states at ascending times in milliseconds, at most as many as a job's series of states may have.
 
     The first and the last state are among them.
     """

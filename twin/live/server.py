@@ -128,7 +128,7 @@ class LiveServer:
             raise self._failed
 
     def stop(self) -> None:
-        """End the server in order."""
+        """End the server after the open requests."""
         if self._uvicorn is not None:
             self._uvicorn.should_exit = True
 
@@ -200,7 +200,7 @@ class LiveServer:
                 self._last = asyncio.get_running_loop().call_later(IDLE_TIMEOUT, self.stop)
 
     async def _read(self, ws: WebSocket, client: Client) -> None:
-        """Receive the messages of a page."""
+        """Receive messages of a page and pass them to the scheduler, until the page disconnects."""
         while True:
             message = await ws.receive()
             if message["type"] == "websocket.disconnect":
@@ -214,7 +214,7 @@ class LiveServer:
 
 
 def _file(name: str) -> Response:
-    """Return a part of the page as an answer."""
+    """Return a file of the page (HTML, CSS, script) as an HTTP answer."""
     return Response(PARTS[name].read_bytes(), media_type=TYPES[name.rpartition(".")[2]])
 
 

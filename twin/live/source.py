@@ -47,7 +47,7 @@ class Source:
     Attributes
     ----------
     resolved : ResolvedJob
-        The job.
+        Resolved job with everything that it refers to.
     name : str
         Name of the file or run folder, with the number of a study's run; empty for an instrument of the library.
     about : str
@@ -125,7 +125,7 @@ def read_source(what: str, run: int | None = None) -> Source:
 
 
 def _of_folder(folder: Path, run: int | None) -> Source:
-    """Return the source of a run folder."""
+    """Return the source that a run folder represents, by the command that wrote it."""
     config, manifest = folder / CONFIG, read_manifest(folder)
     if not config.is_file():
         raise InputError(_no_config(folder, manifest))
@@ -251,7 +251,7 @@ def _with_motions(setup: MonitorSetup) -> ResolvedJob:
     Raises
     ------
     InputError
-        A body has another pivot than under ``perturb``.
+        A body's pivot differs from the one under ``perturb``.
     """
     resolved, test = setup.resolved, setup.test
     if not test.motion:

@@ -150,7 +150,7 @@ def _mark_jumps_and_events(axes: Axes, overview: Overview, trend: Trend) -> None
 
 
 def _dated(axes: Axes) -> None:
-    """Format the time axis."""
+    """Format the time axis of a panel with UTC dates."""
     locator = AutoDateLocator(minticks=3, maxticks=9)
     axes.xaxis.set_major_locator(locator)
     axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))
@@ -188,7 +188,7 @@ RECENT = 30 * DAY
 MOST_EXPLAINED = 4
 """Largest number of quantities in the lead whose scatter explained by temperatures is given."""
 MOST_MOTIONS = 12
-"""Number of motions of bodies listed."""
+"""Number of the most significant motions of bodies that the report lists."""
 MOST_SHOWN = 40
 """Number of rows shown in the report of a table that lists the newest first; its CSV has all rows."""
 _NOT = "\N{EM DASH}"
@@ -201,7 +201,7 @@ def daily_report(history: History, overview: Overview, end: int) -> Report:
     Parameters
     ----------
     history : History
-        The record.
+        Record of the instrument in operation.
     overview : Overview
         Overview of the record at the end of the day.
     end : int
@@ -469,7 +469,7 @@ def _newest(name: str, title: str, caption: str, heads: Sequence[str], rows: lis
 
 
 def _sensor_section(overview: Overview) -> Section:
-    """Return the section on the temperature sensors."""
+    """Return the section on the condition of the temperature sensors."""
     rows: list[list[Cell]] = [
         [
             one.body,
@@ -488,7 +488,7 @@ def _sensor_section(overview: Overview) -> Section:
 
 
 def _alarm_section(overview: Overview) -> Section:
-    """Return the section on the alarms."""
+    """Return the section on the alarms of the record and their acknowledgements."""
     if not overview.alarms:
         return Section("Alarms", ("No alarm has been raised.",), name="alarms")
     waiting = {id(alarm) for alarm in overview.open_alarms()}
@@ -532,7 +532,7 @@ def _excluded_section(history: History, overview: Overview) -> Section:
 
 
 def _warnings(overview: Overview, end: int) -> tuple[str, ...]:
-    """Return the warnings of the report."""
+    """Return the warnings at the top of the report: doubtful estimate, old readings, open alarms, faulty sensors."""
     out = overview.filter_result.warnings
     age = (end - overview.time) / DAY
     if age > 1.0:

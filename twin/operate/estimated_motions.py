@@ -77,7 +77,7 @@ class EstimatedMotions:
 
     @property
     def sigma(self) -> Array:
-        """(M,) standard deviations, in SI units.
+        """Standard deviations of the estimated amounts, (M,), in SI units.
 
         Array dimensions: M motions.
         """
@@ -200,7 +200,7 @@ def merge_components(motions: EstimatedMotions, instrument: Instrument) -> tuple
     motions : EstimatedMotions
         The M motions.
     instrument : Instrument
-        Their instrument.
+        Instrument whose motions they are.
     """
     nodes, bodies = instrument.nodes, {body.path: body for body in instrument.assembly.tree.bodies}
     components: list[Component] = []
@@ -275,7 +275,7 @@ def prior_files(
     stated : Disturbances
         Effect of the same motions on spots and parameters.
     instrument : Instrument
-        Their instrument.
+        Instrument whose motions they are.
     stem : str
         Name of the file.
     reason : str

@@ -40,7 +40,7 @@ METHODS = {
     "filtered": "filtered estimate",
     "smoothed": "smoothed estimate",
 }
-"""Key of an estimate of the cameras -> its name."""
+"""Key of each of the four compared estimates -> its name in the report."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +186,7 @@ class StepwiseIngest:
     Parameters
     ----------
     history
-        The record.
+        Record of the instrument in operation.
     file
         YAML file that describes the tables.
 
@@ -268,7 +268,7 @@ def covered(error: Array, sigma: Array, times: float) -> tuple[int, int]:
     error : ndarray
         Errors; NaN is ignored.
     sigma : ndarray
-        Their standard deviations, of the same shape.
+        Standard deviations of the errors, of the same shape.
     times : float
         Multiple of sigma.
     """
@@ -419,7 +419,7 @@ def _shown(life: JudgedLife) -> tuple[tuple[str, str], ...]:
 
 
 def _verdict_sentences(life: JudgedLife, numbers: dict[str, Any], shown: Sequence[tuple[str, str]]) -> list[str]:
-    """Return the sentences of the verdict and the lead."""
+    """Return the sentences at the top of the report: errors of the estimates, and coverage by their sigmas."""
     out_by_group = []
     for group, key in shown[-2:] if len(shown) > 1 else shown:
         one, estimate = life.quantities[life.number(group, key)], numbers["quantities"][group][key]

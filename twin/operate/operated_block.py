@@ -118,7 +118,7 @@ def posterior(
 KEYS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
 """Keys of a camera's change, in the order of the block adjustment's parameters."""
 UNITS = np.array([ARCSEC, ARCSEC, ARCSEC, 1e-6])
-"""Units of these keys in rad and m."""
+"""Size in rad or m of one unit of each key in ``KEYS``."""
 _NEAR = 0.02
 """Largest difference between a camera of the record and the block's line.
 

@@ -59,7 +59,7 @@ def readings(history: History, begin: int, end: int, most: int) -> list[dict[str
     Parameters
     ----------
     history : History
-        The record.
+        Record of the instrument in operation.
     begin : int
         First time of the span, in microseconds of TAI since 2000.
     end : int
@@ -127,7 +127,7 @@ class Coverage:
     low : float
         Lower end of the Clopper-Pearson interval of the share at the level `CONFIDENCE`.
     high : float
-        Its upper end.
+        Upper end of this interval.
     """
 
     sigmas: int
@@ -172,7 +172,7 @@ class SingleReadings:
     values : (N, Q) ndarray
         Values in each quantity's unit; NaN where a reading lacks the quantity.
     sigmas : (N, Q) ndarray
-        Standard deviations stated by the readings, in the same units.
+        Standard deviations that the readings report, in the same units.
     """
 
     times: np.ndarray
@@ -256,7 +256,7 @@ class Overview:
 
     @classmethod
     def of(cls, history: History, operation: Operation) -> Overview:
-        """Return the overview after all readings of the record."""
+        """Return the overview of a record and its estimate after all readings."""
         known = operation.plan.operation.events
         found = ((int(entry["time_us"]), str(entry["subject"])) for entry in history.entries("event"))
         events = tuple((time, name, tuple(known.get(name, ()))) for time, name in found)
@@ -376,7 +376,7 @@ class Overview:
         ]
 
     def score_sentence(self) -> str:
-        """Return the sentence on the coverage of the predictions."""
+        """Return the sentence on the share of readings within one and two sigmas of their predictions."""
         one, two = self.coverages
         if not one.count:
             return "No reading has been predicted yet"
@@ -481,7 +481,7 @@ def trend(history: History, overview: Overview, begin: int, end: int, count: int
     Parameters
     ----------
     history : History
-        The record.
+        Record of the instrument in operation.
     overview : Overview
         Overview of the record.
     begin : int

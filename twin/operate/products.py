@@ -3,9 +3,9 @@
 They are the camera models that locate its images, the state of the instrument as a job, and its uncertainty as a prior.
 
 Motions whose specified time law is `white` differ in every image and every reading, such as the differences between
-orbits. No reading determines them for an image taken at another moment, and an image takes seconds. Camera models are
-not corrected for them, and their specified sizes make ERR_RAND, the error that images do not share. All other motions
-are corrected as estimated, and their uncertainty makes ERR_BIAS.
+orbits. No reading determines them for an image taken at a different moment, and an image takes seconds. Camera models
+are not corrected for them, and their specified sizes make ERR_RAND, the error that images do not share. All other
+motions are corrected as estimated, and their uncertainty makes ERR_BIAS.
 
 The products have a period of validity. The estimate p(t) of a quantity at a time t, used at a different time t', has
 the error p(t) - P(t'), where P is the true value. p(t') is the mean of P(t') given the same readings, with the standard
@@ -210,7 +210,7 @@ class Products:
     Attributes
     ----------
     history : History
-        The record.
+        Record of the instrument in operation.
     time : int
         Time of the estimate, in microseconds of TAI since 2000.
     scene_time : int | None
@@ -281,7 +281,7 @@ def make_products(
     operation : Operation
         Estimate of the record.
     history : History
-        The record.
+        Record of the instrument in operation.
     time : int
         Microseconds of TAI since 2000.
     scene : ExportSource | None
@@ -292,7 +292,7 @@ def make_products(
     Raises
     ------
     Problem
-        There is no estimate for that time, or the scene is of another instrument.
+        There is no estimate for that time, or the scene is of a different instrument.
     InputError
         The scene cannot be simulated or modelled.
     """
@@ -331,7 +331,7 @@ def make_products(
 
 
 def _components(operation: Operation) -> list[Component]:
-    """Return the specified components in the order of the model, which may have been traced in another order."""
+    """Return the specified components in the order of the model, which may have been traced in a different order."""
     stated = operation.experiment.stated
     assert stated is not None, "a plan states what moves"
     by_key = {(component.cause, component.name): component for component in stated.components}
@@ -340,7 +340,7 @@ def _components(operation: Operation) -> list[Component]:
 
 
 def _require_same_instrument(scene: ExportSource, history: History) -> None:
-    """Raise Problem if a scene is of another instrument than the record."""
+    """Raise Problem if a scene's instrument is not that of the record."""
     plain = scene.setup.plain()
     allowed = f"a scene of {history.name} ({history.sha256[:12]}), which the record is of: camera: {history.name}"
     if not isinstance(plain.get("instrument"), Mapping):
@@ -363,7 +363,7 @@ def _ends(operation: Operation, history: History, result: FilterResult) -> tuple
 
 
 def _at(course: Course, k: int) -> Course:
-    """Return the estimate at one of its times."""
+    """Return the estimate at time number ``k`` alone."""
     names = ("times", "values", "sigmas", "changes", "covariance")
     return replace(course, **{name: getattr(course, name)[k : k + 1] for name in names})
 
@@ -464,7 +464,7 @@ def _warnings(
     omitted: Sequence[OmittedComponent],
     prior: Prior,
 ) -> tuple[str, ...]:
-    """Return the warnings of the products."""
+    """Return warnings about the estimate, its distance in time from the scene, and omitted components."""
     out = list(result.warnings)
     if scene is not None and abs(scene - time) > APART:
         out.append(f"the scene was taken at {utc_text(scene)}, and the estimate is for {utc_text(time)}")

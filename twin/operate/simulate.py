@@ -146,7 +146,7 @@ def drawn_life(
     dates: Sequence[tuple[int, str]] | None = None,
     coefficient_error: float = 0.0,
 ) -> Life:
-    """Draw the course of every motion.
+    """Draw the amounts of every motion over time, with steps and events.
 
     Array dimensions: T times.
 
@@ -227,7 +227,7 @@ TELEMETRY, LIFE = "telemetry.yaml", "life"
 TEMPERATURES, PASSES, EVENTS = "temperatures.csv", "passes.csv", "events.csv"
 RENDER = "render and recover"
 _SENSORS = 15
-"""Random stream of the sensors' errors."""
+"""Number of the random stream of the temperature sensors' errors."""
 _KELVIN = 4
 """Number of decimals of a sensor's temperature in kelvin; real sensors show as many or fewer."""
 

@@ -244,7 +244,7 @@ def ingest_files(history: History, file: Path) -> list[IngestResult]:
     Parameters
     ----------
     history : History
-        The record.
+        Record of the instrument in operation.
     file : Path
         YAML file that describes the tables.
     """

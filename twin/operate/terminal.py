@@ -73,7 +73,7 @@ def utc_option(option: str, text: str) -> int:
     option : str
         Option with its dashes.
     text : str
-        Its value.
+        Value of the option.
 
     Raises
     ------
@@ -131,7 +131,7 @@ class Call:
     location : str
         Folder or address of the record.
     history : History
-        The record.
+        Record of the instrument in operation.
     errors : Console
         Console for errors and progress.
     options : cli.Options
@@ -173,7 +173,7 @@ class Call:
         Parameters
         ----------
         setup : OperationSetup
-            The plan.
+            Plan of operation.
         history : History | None
             The record as of an earlier time, instead of the command's.
 

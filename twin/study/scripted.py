@@ -41,7 +41,7 @@ class Perturbed(Protocol):
 
     @property
     def resolved(self) -> ResolvedJob:
-        """Job that the instrument stands for."""
+        """Job (instrument, perturbation and settings) that the instrument stands for."""
 
     def perturbed(self, perturb: Mapping[str, Mapping[str, Any]]) -> Perturbed:
         """Return the instrument with these bodies perturbed; raise InputError if that is impossible."""
@@ -123,7 +123,7 @@ def study(
     Raises
     ------
     InputError
-        Nothing varies, a range has another form, or a value is not allowed in a job's file.
+        Nothing varies, a range has a different form, or a value is not allowed in a job's file.
     RuntimeError
         The study could not be completed; the message gives the reason.
     """
@@ -169,7 +169,7 @@ def _run(command: list[str], quiet: bool, progress: bool | ProgressCallback) -> 
 
 
 def _silent(done: int, runs: int) -> None:
-    """Ignore the progress."""
+    """Ignore the progress of a study; used without a progress bar."""
 
 
 def _progress_bar() -> ProgressCallback:

@@ -27,7 +27,7 @@ def check_size(setup: StudySetup, confirmed: bool) -> None:
     Parameters
     ----------
     setup : StudySetup
-        The study.
+        Study with its base job, factors and responses.
     confirmed : bool
         True if the limit of runs may be exceeded.
 
@@ -59,7 +59,7 @@ def run_study(
     Parameters
     ----------
     setup : StudySetup
-        The study.
+        Study with its base job, factors and responses.
     session : Session
         Session of the command.
     store : Path

@@ -29,7 +29,7 @@ DRAWS = 2000
 CHECKED = 1000
 """Number of these cameras that are traced exactly in every round."""
 ROUNDS = 6
-"""Largest number of rounds."""
+"""Largest number of rounds in which limits are changed and the model is computed again."""
 BOUND = 2.0
 """Largest factor by which a limit may change in a round."""
 _STEPS = 60
@@ -205,7 +205,7 @@ class _Costs:
 
     @classmethod
     def of(cls, setup: ToleranceSetup) -> _Costs:
-        """Return the costs of a budget."""
+        """Return the cost curves of all limits of a budget, and which limits are fixed."""
         entries = list(setup.test.tolerances.values())
         fixed = [
             tolerance.kept or tolerance.mean is not None or tolerance.measured is not None for tolerance in entries
@@ -295,7 +295,7 @@ class _MarginModel:
         return self._margins(self.bench.values(parts))
 
     def passing(self, level: np.ndarray) -> float:
-        """Return the share of the cameras that pass with limits at exp(level) times those of the bench."""
+        """Return the share of the cameras that meet all requirements, with limits at exp(level) times the present ones."""
         return float(np.mean(self._worst(self.model.parts(np.exp(level))) + self.offset <= 0.0))
 
     def quantile(self, level: np.ndarray) -> tuple[float, np.ndarray]:

@@ -44,7 +44,7 @@ from twin.targets.target_path import TargetPath
 from twin.tolerance.variations import VariedParameter, states_of
 
 ROTATIONS = ("d_alpha", "d_beta", "d_gamma")
-"""Keys of the three rotations of a camera."""
+"""Keys of the three rotations of a camera's line of sight."""
 STEP = 0.1
 """Step of the numerical derivatives with respect to compensators, as a share of their range."""
 
@@ -343,11 +343,11 @@ class Merit:
 PART_COUNTS = {"boresight": 2, "roll": 1, "principal_distance": 1}
 """Number of parts (smooth quantities) of those kinds of merits for which it does not depend on fields."""
 AT_FIELDS = ("wavefront", "mtf", "chief_ray", "obstruction")
-"""Kinds of merits that have fields."""
+"""Kinds of merits that are evaluated at several fields of a camera."""
 
 
 def part_count(spec: MeritSpec, line_points: int, cameras: Sequence[str] = ()) -> int:
-    """Return the number of parts of a merit."""
+    """Return the number of parts of a merit, smooth quantities such as the MTF at one field."""
     match spec.kind:
         case "monitor_angle" | "monitor_focus":
             return len(readings_of(spec, cameras))

@@ -271,7 +271,7 @@ def draw_samples(
     Raises
     ------
     RunFolderError
-        The journal belongs to another run, or cannot be written.
+        The journal belongs to a different run, or cannot be written.
     Incomplete
         The engine of studies could not finish all runs.
     """

@@ -216,7 +216,7 @@ class AdjustedCameras:
 
     @classmethod
     def joined(cls, results: Sequence[AdjustedCameras]) -> AdjustedCameras:
-        """Return several results concatenated in order."""
+        """Return the results of several groups of cameras concatenated in order."""
         paths = [result.paths for result in results if result.paths is not None]
         return cls(
             np.concatenate([result.moves for result in results]),

@@ -79,7 +79,7 @@ class Yield:
 
     @property
     def share(self) -> float:
-        """Share of cameras that pass."""
+        """Share of all cameras that pass."""
         return self.passed / self.of
 
     def judged(self, wanted: float) -> str:
@@ -94,7 +94,7 @@ class MeritResult:
     Attributes
     ----------
     merit : Merit
-        The merit.
+        Merit whose distribution it is.
     nominal : float
         Value of the nominal camera, adjusted, SI.
     mean, deviation : float
@@ -102,7 +102,7 @@ class MeritResult:
     levels : tuple of float
         Values that shares ``LEVELS`` of the cameras do not exceed (for an MTF: exceed), SI.
     linear, quadratic : tuple of float
-        The same quantiles by the first-order and by the second-order model, SI.
+        Quantiles at ``LEVELS`` by the first-order and by the second-order model, SI.
     passing : Yield
         Share of cameras that meet the requirement.
     model_passing : tuple of float
@@ -197,7 +197,7 @@ def run_tolerance(
     InputError
         A name does not exist, the nominal camera has no light at a field, or the memory does not suffice.
     RunFolderError, Incomplete
-        The folder of finished work belongs to another run or cannot be written, or the workers could not finish all
+        The folder of finished work belongs to a different run or cannot be written, or the workers could not finish all
         runs.
     """
     test, force = setup.test, force or Workforce()
@@ -265,7 +265,7 @@ def _states(bench: ToleranceBench, samples: Samples, rows: np.ndarray) -> list[S
 
 
 def worst_cameras(bench: ToleranceBench, samples: Samples) -> np.ndarray:
-    """Return the indices of the worst cameras, the worst first."""
+    """Return the indices of the cameras with the largest excess over a requirement, the worst first."""
     return np.argsort(-bench.worst_margins(samples.values), kind="stable")[:WORST]
 
 
@@ -291,7 +291,7 @@ def _require_light(setup: ToleranceSetup, sensitivity: Sensitivities) -> None:
 
 
 def with_limits(setup: ToleranceSetup, limits: Mapping[str, str | float]) -> ToleranceSetup:
-    """Return the budget with other limits."""
+    """Return the budget with the given limits, by tolerance, instead of its own."""
     entries = {
         name: tolerance.model_copy(update={"limit": limits.get(name, tolerance.limit)})
         for name, tolerance in setup.test.tolerances.items()
@@ -464,14 +464,14 @@ def _short(disturbances: dict[str, Any]) -> Any:
 
 
 def _reference(setup: ToleranceSetup) -> str:
-    """Return the instrument as a job in another folder refers to it: by name or by its absolute path."""
+    """Return the instrument as a job in a different folder refers to it: by name or by its absolute path."""
     named = setup.test.instrument
     path = (Path(setup.test.source.file).parent / named).resolve()
     return str(path) if is_path(named) and path.is_file() else named
 
 
 def _perturb(motion: Any) -> dict[str, Any]:
-    """Return a motion in the form of a job's file."""
+    """Return a motion of a body as the mapping that a job's file has under ``perturb``."""
     out: dict[str, Any] = {}
     for kind in ("rotate", "shift"):
         values = [value if abs(value) > _NOTHING else 0.0 for value in getattr(motion, kind)]

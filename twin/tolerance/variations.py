@@ -29,7 +29,7 @@ from scenes.yaml.errors import InputError, KeyPath, Problem, shown
 from scenes.yaml.spec import Spec
 
 HEAT = ("temperature", "gradient")
-"""Kinds of motions that are thermal."""
+"""Kinds of motions that are thermal: a body's temperature, or a gradient in it."""
 SHAPE = ("scale", "expansion", "radius", "conic", "index", "abbe")
 """Kinds of motions that change a body's shape or material, and are neither rigid nor a figure error."""
 
@@ -132,7 +132,7 @@ def actuator_parameter(
 
 @dataclass(frozen=True, eq=False)
 class _Maker:
-    """Builder of parameters from the entries of a file."""
+    """Builder of varied parameters (motions per unit) from the entries of a budget's file."""
 
     test: Spec
     instrument: Instrument
@@ -314,7 +314,7 @@ def spectrum_over(element: Element, terms: Sequence[int], power: float) -> np.nd
     terms : sequence of int
         Noll indices.
     power : float
-        Exponent of the spectrum, see ``spectrum_shares``.
+        Exponent of the decrease of a term's variance with its radial order n, (n + 1)^-power.
     """
     shares, disk, outer = spectrum_shares(terms, power), element.figure_disk, element.outer_edge
     assert outer is not None
@@ -381,7 +381,7 @@ def states_of(numbers: Sequence[VariedParameter], amounts: np.ndarray) -> list[S
 def _motions(
     count: int, rotate: np.ndarray, shift: np.ndarray, figure: dict[int, np.ndarray], shape: dict[str, np.ndarray]
 ) -> list[Motion]:
-    """Return the motions of one body in each of several states."""
+    """Return the motions of one body in S states from arrays with one entry per state."""
     turns, shifts = rotate.tolist(), shift.tolist()
     figures = {j: values.tolist() for j, values in figure.items()}
     shapes = {name: values.tolist() for name, values in shape.items()}

@@ -90,7 +90,7 @@ def unpacked(content: bytes, *classes: type) -> Any:
 SPANS = (1, 3, 10)
 """Numbers of consecutive readings whose summed chi-square is tested against the predictions."""
 HISTORY_LENGTH = 200
-"""Number of the latest innovations, and of the latest excluded entries, that the state keeps."""
+"""Number of the latest innovations (readings minus predictions), and excluded entries, that the state keeps."""
 OUTLIER_SIGMAS = 6.0
 """Residual of a sensor's reading, in standard deviations, beyond which the reading is not used."""
 SENSOR_WINDOW = 10
@@ -420,7 +420,7 @@ class EstimatorState:
 
     @classmethod
     def from_bytes(cls, content: bytes) -> EstimatorState:
-        """Return the state that was serialised by `packed`."""
+        """Return the estimator's state that was serialised by `packed`."""
         return cast("EstimatorState", unpacked(content, cls, Scores, Sensor, JumpDetection))
 
 
@@ -518,7 +518,7 @@ class EntryFilter:
     def _updated(
         self, state: EstimatorState, entry: Mapping[str, Any], observed: Observed
     ) -> tuple[EstimatorState, Innovation]:
-        """Return the state updated with one observation, and the innovation."""
+        """Return the state updated with one observation, and the innovation (observation minus prediction)."""
         filter_state, innovation = self.series_filter.update(state.filter_state, observed, entry["decided"] is not None)
         used = np.append(state.used, np.int64(entry["id"]))
         # the number of columns is zero if no motion may jump
@@ -554,7 +554,7 @@ class EntryFilter:
         return self._updated(state, entry, observed)[0]
 
     def _monitor(self, state: EstimatorState, entry: Mapping[str, Any]) -> EstimatorState:
-        """Return the state updated with a reading of the monitor."""
+        """Return the estimator's state updated with a reading of the monitor (spot positions)."""
         time = int(entry["time_us"])
         if entry["content"]["numbers"].get("sigma_holds") is False:
             return state.excluding(time, "monitor", "monitor", "its reported sigma does not hold")

@@ -69,7 +69,7 @@ class Operation:
     Parameters
     ----------
     history
-        The record.
+        Record of the instrument in operation.
     plan
         Plan of operation of the record's instrument.
     advance
@@ -139,7 +139,7 @@ class Operation:
 
     @cached_property
     def model(self) -> OperationModel:
-        """Traced model, read from the record if it is kept there."""
+        """Traced effects of all motions on spots and cameras; read from the record if stored there."""
         checkpoint = self.history.checkpoint(self.key, number=_MODEL)
         if checkpoint is not None:
             return cast("OperationModel", unpacked(checkpoint.content, OperationModel))
@@ -263,11 +263,11 @@ class Operation:
         return bool(np.all(np.abs(state.basis - basis) <= 1e-9 * np.abs(basis).max(axis=1, keepdims=True)))
 
     def _save_state(self, state: EstimatorState, number: int, newest: int) -> None:
-        """Save the estimator's state in the record under a number."""
+        """Save the estimator's state in the record as the checkpoint of the given number."""
         self.history.save_checkpoint(self.key, number, state.time, newest, packed(state))
 
     def filter_readings(self) -> FilterResult:
-        """Filter all new readings and return the result."""
+        """Filter all new readings and return the present estimate, with jumps, sensors and requirements."""
         state = self.estimator_state
         now = self.forecast([state.time])
         jumps = tuple(self._detected_jump(jump.time, jump.jump) for jump in state.jumps)
@@ -617,7 +617,7 @@ class Operation:
 
     @cached_property
     def _all_segments(self) -> list[EstimatorState]:
-        """All permanent checkpoints, and the newest state."""
+        """All permanent checkpoints of the estimator, and its newest state."""
         last = self.estimator_state  # filters new readings and saves their checkpoints first
         checkpoints = (
             EstimatorState.from_bytes(checkpoint.content)

@@ -178,8 +178,8 @@ def read_plan(path: Path, history: History) -> OperationSetup:
     Raises
     ------
     InputError
-        The file cannot be read, is not valid, or is of another instrument than the record; or it requires a quantity
-        that the instrument does not have.
+        The file cannot be read, is not valid, or is for a different instrument from the record's; or it requires a
+        quantity that the instrument does not have.
     """
     setup = read_operation(path)
     operation, digest = setup.operation, digest_of_job(setup.model)
@@ -219,7 +219,7 @@ def stored_plan(history: History) -> OperationSetup | None:
     Raises
     ------
     InputError
-        Another version of the program stored the plan in another form.
+        Another version of the program stored the plan in a different form.
     """
     row = history.plan()
     return None if row is None else validate(OperationSetup, YamlFile("the record's plan", row["content"], {}))

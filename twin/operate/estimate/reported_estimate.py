@@ -36,9 +36,7 @@ Three of 200 are rejected by chance once in a thousand times.
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """Estimate of all quantities at T times.
-
-    Array dimensions: K cameras with 4 parameters each.
+    """Estimate of all quantities, with standard deviations, at T times.
 
     Attributes
     ----------
@@ -51,7 +49,8 @@ class Course:
     sigmas : (T, Q) ndarray
         Total standard deviations of the values.
     changes : (T, 4 K) ndarray
-        d_alpha, d_beta, d_gamma (rad) and d_f (m) of one camera after the other.
+        Rotations d_alpha, d_beta, d_gamma (rad) and change of principal distance d_f (m) of one of K cameras after the
+        other.
     covariance : (T, 4 K, 4 K) ndarray
         Covariance of the errors of `changes`.
     """
@@ -132,7 +131,7 @@ class DetectedJump(_Dated):
         return f"between {utc_text(self.after_us)} and {utc_text(self.until_us)}: {', '.join(own)}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as plain data."""
+        """Return the jump's body, times, sizes and effects as plain data, times as UTC."""
         return {
             **super().to_dict(),
             "sizes": [{"name": n, "unit": u, "size": z, "sigma": s} for n, u, z, s in self.sizes],
@@ -220,7 +219,7 @@ class Motions:
     labels : tuple[str, ...]
         Names of the motions.
     units : tuple[str, ...]
-        Their units.
+        Unit of each motion.
     mean : (M,) ndarray
         Estimated amounts in these units.
     covariance : (M, M) ndarray
@@ -313,7 +312,7 @@ class FilterResult:
         return out
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the result as plain data."""
+        """Return the estimate with jumps, sensors, requirements and warnings as plain data for JSON."""
         return {
             "time_utc": utc_text(self.time),
             "readings": self.readings,
@@ -413,7 +412,7 @@ def raise_alarms(history: History, plan: OperationSpec, result: FilterResult) ->
     Parameters
     ----------
     history : History
-        The record.
+        Record of the instrument in operation.
     plan : OperationSpec
         Plan under which the readings were filtered.
     result : FilterResult

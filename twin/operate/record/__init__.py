@@ -1,4 +1,4 @@
-"""Record of an instrument: its contents, its database, the ingest of readings, and its tables for other programs.
+"""Record of an instrument: contents, database, ingest of readings, and tables for other programs.
 
 The location of a record, and its errors, are defined here, so that a command can report them before it imports the
 database library.
@@ -13,7 +13,7 @@ FILE = "record.sqlite"
 
 
 class NotARecord(Exception):
-    """A database that holds no record, or one of another version; the message says what to do."""
+    """A database that holds no record, or one of a different version; the message says what to do."""
 
 
 class RecordFailed(Exception):

@@ -24,7 +24,7 @@ MICRO = 1_000_000
 DECISION = "decision"
 """Kind of an entry by which a person excludes another entry from the estimate, or includes it."""
 _NOT_THE_INSTRUMENT = ("description", "disturbances")
-"""Keys of an instrument that do not belong to its identity."""
+"""Keys of an instrument's file that do not count for its identity (its SHA-256)."""
 
 
 def canonical(data: Any) -> str:
@@ -260,7 +260,7 @@ def digest_of_job(job: ResolvedJob) -> str:
 
 
 def one_line(error: InputError | Issue | Problem) -> str:
-    """Return an error as one line."""
+    """Return the text of an error, with its place in the file, as one line."""
     if isinstance(error, Problem):
         return str(error.at("")).removeprefix("input: ")
     return "; ".join(str(error).splitlines())

@@ -572,7 +572,7 @@ def initialise_record(place: str, job: ResolvedJob, simulated: bool = False) -> 
     Raises
     ------
     NotARecord
-        There is a record of another instrument, or of another version.
+        There is a record of a different instrument, or of a different version.
     RecordFailed
         The record cannot be created.
     """

@@ -74,7 +74,7 @@ INSTRUMENT = _table(
     Column("bodies", Text, nullable=False),
     Column("plain", Text, nullable=False),
 )
-"""The one instrument of the record."""
+"""Table with a single row, the instrument of the record."""
 SOURCE = _table(
     "source",
     Column("file", Text, nullable=False),
@@ -256,13 +256,13 @@ def version(connection: Connection) -> int:
 
 
 def require_version(found: int) -> None:
-    """Raise NotARecord if another version of the program made the record."""
+    """Raise NotARecord if a different version of the program made the record."""
     if found != VERSION:
         raise NotARecord(f"the record has version {found}, this program needs {VERSION}; use the program that made it")
 
 
 WAIT = 60.0
-"""Time that a writer waits for another one, in seconds."""
+"""Time that a writer waits for a second writer to finish, in seconds."""
 _LOCK = 7_236_001
 """Number of the advisory lock by which writers on a PostgreSQL server take turns."""
 

@@ -84,7 +84,7 @@ def run_entries(place: Path, kind: str, moment: int, history: History, assume_in
     moment : int
         Time of the reading, or of the beginning of a series, in microseconds of TAI since 2000.
     history : History
-        The record.
+        Record of the instrument in operation.
     assume_instrument : bool
         Assume that a run which does not name its instrument is of the record's instrument.
     """
@@ -127,7 +127,7 @@ def _require_unchanged(folder: Path, file: Path, digest: str, manifest: Manifest
 
 
 def _require_instrument(folder: Path, history: History, assume_instrument: bool) -> None:
-    """Raise Problem or InputError if a run is of another instrument, or does not name its instrument."""
+    """Raise Problem or InputError if a run is of a different instrument, or does not name its instrument."""
     data = read_yaml(folder / CONFIG).data if is_file(folder / CONFIG) else None
     model = data.get("model", data) if isinstance(data, Mapping) else None
     instrument = model.get("instrument") if isinstance(model, Mapping) else None
@@ -184,7 +184,7 @@ MOST_DEPARTURE = 100.0
 A job's changes of temperature have the same limit.
 """
 QUATERNION_TOLERANCE = 1e-3
-"""Largest departure of a quaternion's length from 1."""
+"""Largest difference between a quaternion's length and 1 with which it is accepted."""
 
 
 def read_telemetry(path: Path, history: History) -> TelemetrySpec:
@@ -200,7 +200,7 @@ def read_telemetry(path: Path, history: History) -> TelemetrySpec:
     Raises
     ------
     InputError
-        The file cannot be read, is not valid, or is of another instrument than the record.
+        The file cannot be read, is not valid, or is for a different instrument from the record's.
     """
     spec = validate(TelemetrySpec, read_yaml(path))
     digest = digest_of_job(resolve_on(spec, spec.instrument))
@@ -374,7 +374,7 @@ def _number(cell: str) -> float:
 
 
 def _require_plausible(subject: str, kelvin: float, unit: str, history: History) -> None:
-    """Raise Problem for a temperature too far from the instrument's, such as of a column in another unit."""
+    """Raise Problem for a temperature too far from the instrument's, such as of a column in a different unit."""
     off = kelvin - history.temperature
     if abs(off) <= MOST_DEPARTURE:
         return
@@ -389,7 +389,7 @@ def _require_plausible(subject: str, kelvin: float, unit: str, history: History)
 
 
 def _event(table: ReadingTableSpec, row: dict[str, str], moment: int, line: int) -> Entry:
-    """Return one event. Raise Problem if its name is unknown."""
+    """Return the event in a row of a table. Raise Problem if its name is unknown."""
     text = row[str(table.name)]
     name = table.events.get(text, text)
     if name not in EVENTS:
@@ -489,7 +489,7 @@ class Sources:
                     yield read_table_file(table, path, history)
 
     def _run(self, place: Path, moment: int | None, history: History) -> Iterator[FileContent]:
-        """Yield the content of a run folder."""
+        """Yield the readings of a run folder, unless it is unchanged since the last poll."""
         folder = place if place.is_dir() else place.parent
         moment = time_of_name(folder.name) if moment is None else moment
         if moment is None and place in self.places:

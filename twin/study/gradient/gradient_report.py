@@ -40,7 +40,7 @@ def _write_report(setup: StudySetup, gradient: Gradient, folder: RunFolder, warn
     Parameters
     ----------
     setup : StudySetup
-        The study.
+        Study with its base job, factors and responses.
     gradient : Gradient
         Jacobian of the study.
     folder : RunFolder
@@ -200,7 +200,7 @@ def _normalised(gradient: Gradient) -> np.ndarray:
 
 
 def _heat_map(gradient: Gradient) -> Figure:
-    """Plot each response's normalised change due to each factor's spread as colours: responses along x, factors down."""
+    """Plot each response's normalised change due to each factor's spread as colours, factors along y."""
     shares = _normalised(gradient).T
     rows, columns = shares.shape
     figure = svg.new_figure(2.1 + 0.21 * max(rows, 4))

@@ -118,7 +118,7 @@ class Chain:
     Attributes
     ----------
     resolved : ResolvedJob
-        The job.
+        Resolved job with everything that it refers to.
     experiment : MonitorExperiment
         Instrument of the job.
     """
@@ -229,7 +229,7 @@ def sight_gradient(
     Parameters
     ----------
     instrument : Instrument
-        The instrument.
+        Instrument that is evaluated.
     backend : Backend
         Array backend of the ray trace.
     motions : sequence of ElementaryMotion
@@ -291,7 +291,7 @@ class GradientFactor:
     Attributes
     ----------
     setup : StudySetup
-        The study.
+        Study with its base job, factors and responses.
     name : str
         Name of the factor.
     unit : str
@@ -501,7 +501,7 @@ class _GradientResponse:
     name : str
         Name of the response.
     spec : ResponseSpec
-        Its keys.
+        Keys of its number, and of the number that is subtracted, in the results.
     """
 
     name: str
@@ -609,7 +609,7 @@ class _Traced:
         self.quality = [i for i in self.rows if i not in self.exact]
 
     def fill(self, table: Gradient) -> None:
-        """Fill in AD and differences with respect to all factors."""
+        """Fill in derivatives by automatic differentiation and by finite differences, for all factors."""
         chain = Chain(self.maker.base, MonitorExperiment(self.maker.base, self.backend))
         try:
             about = _state(chain, self.maker.base)
@@ -632,7 +632,7 @@ class _Traced:
             table.method[self.exact, k] = AD
 
     def _differences(self, chain: Chain, table: Gradient, rows: Sequence[int], steps: Mapping[int, float]) -> None:
-        """Fill in the differences of selected rows with respect to all factors."""
+        """Fill in the finite differences of selected responses with respect to all factors."""
         if not rows:
             return
         moving = list(self.slopes)

@@ -1,1 +1,1 @@
-"""Statistics of a study and its report."""
+"""Statistics of a study's responses, and the study's report."""

@@ -117,7 +117,7 @@ def _model_text(name: str, part: Indices) -> str:
 
 
 def convergence_texts(analysis: StudyAnalysis, names: list[str]) -> list[str]:
-    """Return sentences on whether there are enough runs."""
+    """Return sentences on whether the number of runs determines the statistics accurately enough."""
     goals = (
         f"A statistic counts as known when half its 95% interval is below {GOALS['mean']:g}σ (mean, standard "
         f"deviation) or {GOALS['p95']:g}σ (quantiles)."
@@ -154,7 +154,7 @@ def _round_up(count: int) -> int:
 
 
 LEAST_SHARE = 0.02
-"""Share of the variance below which a factor is not named."""
+"""Share of a response's variance below which a factor is not named in the conclusions."""
 LINEAR = 0.5
 """Share of the variance explained by the linear model, below which the report says that it describes poorly."""
 

@@ -166,19 +166,19 @@ def _orthonormal(columns: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 HIGHEST_DEGREE = 12
-"""Highest total degree of the polynomials."""
+"""Highest total degree of the polynomials of a polynomial chaos model."""
 MOST_TERMS = 250
 """Largest number of terms of a polynomial chaos model."""
 MOST_RUNS = 20_000
-"""Largest number of runs to which a model is fitted."""
+"""Largest number of runs to which a polynomial chaos model is fitted."""
 TINY = sys.float_info.min
 """Smallest positive normal float64, which avoids divisions by zero."""
 RUNS_TO_CHOOSE = 3_000
 """Number of runs, the first ones, with which the degree is selected."""
 RUNS_PER_TERM = 2.5
-"""Smallest number of runs per term."""
+"""Smallest number of runs per term of a polynomial chaos model."""
 RESAMPLES = 1000
-"""Number of bootstrap resamples for the intervals."""
+"""Number of bootstrap resamples for the confidence intervals of the indices."""
 HARMONICS = 10
 """Number of harmonics whose power RBD-FAST (random balance designs) sums."""
 MANY_FAILED = 0.05
@@ -505,7 +505,7 @@ class _Chaos:
         return np.asarray(self.coefficients**2 - np.sum(inverse**2, axis=1)[1:] * self._fit_rest[1])
 
     def _shares(self) -> np.ndarray:
-        """Return first-order and total indices, (2, axes)."""
+        """Return the first-order and the total sensitivity index of each axis (group of factors), (2, axes)."""
         whole = max(float(np.sum(self._squares)), 0.0) + self._fit_rest[1]
         return np.clip(self._parts(self._squares) / whole, 0.0, 1.0)
 

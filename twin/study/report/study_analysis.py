@@ -357,7 +357,7 @@ class StudyAnalysis:
 
     @classmethod
     def of(cls, runs: StudyRuns) -> StudyAnalysis:
-        """Analyse all runs."""
+        """Compute statistics, models, indices, requirements and Pareto fronts of all runs."""
         everything = runs.everything
         indexed = everything if runs.study.report.sobol else ()
         fronts, wrong = [], []

@@ -225,7 +225,7 @@ def _binned(axes: Axes, factor: Factor, response: Response) -> None:
 
 
 def _groups(other: Factor | None, response: Response) -> list[tuple[str, np.ndarray]]:
-    """Return label and runs of each value of the other factor."""
+    """Return the label and the runs of each value of a second factor, or one group without it."""
     if other is None:
         return [("", response.good)]
     number = (lambda level: plain(level, 4)) if other.numeric else (lambda level: short(str(level)))

@@ -429,7 +429,7 @@ def _fronts(analysis: StudyAnalysis) -> Section | None:
 
 
 def _cell(factor: Factor, run: int) -> Cell:
-    """Value of a factor; whole numbers without decimals."""
+    """Return a factor's value in a run as a cell of a table; whole numbers without decimals."""
     value: Cell = factor.values[run].item()
     whole = factor.numeric and bool(np.all(factor.levels == np.rint(factor.levels)))
     return int(value) if whole and isinstance(value, float) else value

@@ -95,12 +95,12 @@ class Response(Series):
 
     @cached_property
     def good(self) -> np.ndarray:
-        """True where there is a finite number, (runs,)."""
+        """True for each run whose value is a finite number, (runs,)."""
         return np.isfinite(self.values)
 
     @cached_property
     def known(self) -> np.ndarray:
-        """Finite numbers."""
+        """Values that are finite numbers, without those of failed runs."""
         return np.asarray(self.values[self.good])
 
     @cached_property
@@ -180,7 +180,7 @@ class StudyRuns:
 
     @property
     def everything(self) -> tuple[Response, ...]:
-        """Responses, then the reported standard deviations."""
+        """All responses, followed by the standard deviations that runs report for them."""
         return (*self.responses, *self.sigmas)
 
     @cached_property
@@ -205,7 +205,7 @@ def _factor_values(values: np.ndarray) -> np.ndarray:
 
 
 CONFIDENCE = 0.95
-"""Two-sided confidence of all intervals."""
+"""Two-sided confidence level of all intervals in the report."""
 LEAST = 20
 """Smallest number of runs from which distributions are tested and sensitivity indices computed."""
 UNLIKELY = 0.01

@@ -158,7 +158,7 @@ def with_place(tree: Tree, model: type[Spec], key: KeyPath, neutral: bool = Fals
     tree : dict
         Plain data of a ``model``; not changed.
     model : type of Spec
-        Model of the tree.
+        Data model (class) of the plain data.
     key : KeyPath
         Keys and list indices from the root.
     neutral : bool
@@ -386,7 +386,7 @@ class BlockResult:
 
     @classmethod
     def joined(cls, parts: Sequence[BlockResult]) -> BlockResult:
-        """Return several results concatenated in order."""
+        """Return the results of several blocks concatenated in the order of their runs."""
         return cls(
             np.concatenate([part.values for part in parts]),
             np.concatenate([part.sigmas for part in parts]),

@@ -29,7 +29,7 @@ from twin.study.runs.plan import Plan
 from twin.study.runs.setup import StudySetup, study_from_text
 
 BLOCKS = "blocks.journal"
-"""Name of the journal in the folder of a study."""
+"""File name of the journal (finished blocks of runs) in the folder of a study."""
 LONGEST_REPEAT = 4.0
 """Time, seconds, beyond which the first block is not evaluated a second time for a better estimate."""
 _ALONE = threading.Lock()
@@ -164,7 +164,7 @@ def journal_of(setup: StudySetup, file: Path | None, noun: str = "study") -> Jou
     Parameters
     ----------
     setup : StudySetup
-        The study.
+        Study with its base job, factors and responses.
     file : Path or None
         File of the journal, None to keep nothing.
     noun : str
@@ -220,7 +220,7 @@ class Engine:
 
     @property
     def missing(self) -> list[int]:
-        """Numbers of the missing blocks, in order."""
+        """Numbers of the blocks whose results are not in the journal yet, in order."""
         return [block for block in range(self.plan.blocks) if self._known(block) is None]
 
     def result(self) -> BlockResult:
@@ -319,7 +319,7 @@ class Engine:
         self.computed += self._runs([*results])
 
     def task(self, block: int) -> Task:
-        """Return the task of a block for a worker."""
+        """Return what a worker needs to compute a block."""
         runs = tuple(self.plan.run(number) for number in self.plan.block(block))
         return Task(self.plan.config, source_digest(), self.backend, runs)
 
@@ -341,7 +341,7 @@ def check_responses(setup: StudySetup, sample: Any) -> None:
     Parameters
     ----------
     setup : StudySetup
-        The study.
+        Study with its base job, factors and responses.
     sample : dict
         Results of one run, by file.
 

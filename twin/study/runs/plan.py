@@ -38,7 +38,7 @@ _LISTS = ("values", "table")
 
 
 def run_count(study: StudySpec) -> int:
-    """Return the number of runs."""
+    """Return the number of runs that a study's design specifies."""
     if study.design.runs is not None:
         return study.design.runs
     count = 1
@@ -235,7 +235,7 @@ def number_at(base: Tree, place: KeyPath, unit: str) -> float:
     Raises
     ------
     Problem
-        The base has no value there, or one of another kind.
+        The base has no value there, or one of a different kind.
     """
     try:
         value = leaf(base, place)
@@ -312,7 +312,7 @@ class Plan:
     Attributes
     ----------
     setup : StudySetup
-        The study.
+        Study with its base job, factors and responses.
     columns : tuple[Column, ...]
         Values of every factor, in the study's order.
     """
@@ -346,11 +346,11 @@ class Plan:
 
     @property
     def blocks(self) -> int:
-        """Number of blocks."""
+        """Number of blocks of runs that are evaluated together."""
         return -(-self.runs // self.setup.job.block)
 
     def block(self, number: int) -> range:
-        """Return the numbers of the runs of a block."""
+        """Return the numbers of the runs that belong to a block."""
         size = self.setup.job.block
         return range(number * size, min((number + 1) * size, self.runs))
 
@@ -483,7 +483,7 @@ def study_bytes(setup: StudySetup, runs: int) -> float:
     Parameters
     ----------
     setup : StudySetup
-        The study.
+        Study with its base job, factors and responses.
     runs : int
         Number of runs.
     """
@@ -500,7 +500,7 @@ def require_study_memory(setup: StudySetup) -> None:
     Parameters
     ----------
     setup : StudySetup
-        The study.
+        Study with its base job, factors and responses.
 
     Raises
     ------

@@ -42,7 +42,7 @@ def run_results(
     Parameters
     ----------
     resolved : ResolvedJob
-        The job.
+        Resolved job with everything that it refers to.
     experiment : MonitorExperiment
         Instrument of the job.
     state : State
@@ -75,7 +75,7 @@ def _run_together(
     Parameters
     ----------
     experiment : MonitorExperiment
-        The instrument.
+        Instrument that is evaluated.
     runs : sequence of MonitorRun
         Runs to be evaluated together.
     before : callable
@@ -273,13 +273,13 @@ def _alone(resolved: ResolvedJob, backend: Backend) -> Outcome:
 
 
 def _forget(cache: OrderedDict[Any, Any]) -> None:
-    """Drop the least recently used items."""
+    """Drop the least recently used items of a cache beyond ``KEPT``."""
     while len(cache) > KEPT:
         cache.popitem(last=False)
 
 
 PERTURB = ("job", "perturb")
-"""Beginning of the keys of perturbations in the base's tree."""
+"""Beginning of the key paths of perturbations in the plain data of the base job."""
 
 
 class JobMaker:

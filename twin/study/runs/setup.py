@@ -1,4 +1,4 @@
-"""Setup of a study: its specification, the resolved tree of its base job and the tables of its factors."""
+"""Setup of a study: specification, resolved data of its base job and tables of its factors."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ class StudySetup:
         Plain data of the resolved base job with an entry at the key of every factor. If the base has no value there and
         absence has the same effect as a value, that value is used; else one of the factor's.
     base : dict
-        The same without values of factors: an entry exists only if the base has one, or one with the same effect as its
-        absence.
+        Plain data of the resolved base job without values of factors: an entry exists only if the base has one, or one
+        with the same effect as its absence.
     """
 
     study: StudySpec
@@ -71,7 +71,10 @@ class StudySetup:
 
     @cached_property
     def content(self) -> str:
-        """Checksum of everything in the study that affects a number; the base's tree contains all library files."""
+        """Checksum of everything in the study that affects a number.
+
+        The base job's data contain all library files.
+        """
         study = {key: value for key, value in self.study.plain().items() if key not in WORDS}
         study["base"] = {"command": self.study.base.command}
         # in order, because random draws and columns are assigned by position
@@ -88,14 +91,14 @@ class StudySetup:
         return hashlib.sha256(json.dumps([self.content, versions(), source_digest()]).encode()).hexdigest()
 
     def error(self, problem: Problem | str, key: KeyPath, allowed: str | None = None) -> InputError:
-        """Return an error at ``key`` of the study."""
+        """Return an InputError placed at ``key`` of the study's file."""
         if isinstance(problem, str):
             return self.study.error(problem, key, allowed=allowed)
         issue = Issue(problem.problem, "", None, (), problem.found, problem.allowed, problem.suggestion)
         return InputError(self._placed(issue, (*key, *problem.within)))
 
     def _placed(self, issue: Issue, key: KeyPath) -> Issue:
-        """Return the issue placed at ``key`` of the study."""
+        """Return an issue of the base job placed at ``key`` of the study's file."""
         source = self.study.source
         return replace(issue, file=source.file, line=source.line(key), key=(*source.prefix, *key))
 
