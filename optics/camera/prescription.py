@@ -285,7 +285,7 @@ class Camera:
 
     @cached_property
     def paraxial(self) -> Paraxial:
-        """Focal lengths, and positions and magnification of the pupils, for rays close to the axis; lengths in metres."""
+        """Focal lengths, and positions and magnification of the pupils, for rays close to the axis; in metres."""
         return paraxial(self._axial, -float(self.launch[2]), abs(self.surfaces[-1].thickness))
 
     @property

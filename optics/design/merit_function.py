@@ -504,9 +504,10 @@ def _crossing(start: np.ndarray, end: np.ndarray, level: float) -> np.ndarray:
 
 
 def _extents(rays: DesignRays) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the extents along z between all E pairs of surfaces (E,), metres, and their derivatives (V, E).
+    """Return the extents along z of all E ordered pairs of surfaces (E,), metres, and their derivatives (V, E).
 
-    The derivatives are with respect to the V variables. The largest extent is the envelope.
+    An extent leads from the farthest point of one surface to that of the other; the largest is the envelope. The
+    derivatives are with respect to the V variables.
     """
     z = rays.points[1:, ..., 2].reshape(len(rays.points) - 1, -1)
     surfaces = np.arange(len(z))

@@ -263,7 +263,10 @@ def descend(
 def _step(
     merit: MeritFunction, start: Prescription, variables: tuple[Variable, ...], iterations: int
 ) -> tuple[Prescription, int, bool]:
-    """Run one constrained least-squares search; return the prescription, the Jacobians used, and whether it converged."""
+    """Run one constrained least-squares search.
+
+    The result is the prescription, the number of Jacobians, and True if the search converged.
+    """
     size = _sizes(start, variables)
 
     def evaluate(x: np.ndarray, differentiate: bool) -> Sample | None:

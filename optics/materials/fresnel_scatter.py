@@ -127,7 +127,7 @@ class ABg:
         return self.b ** (1.0 / self.g) if self.g > 0.0 else 1.0
 
     def _upper(self, reach: float) -> float:
-        """Return the integral of the lobe's upper bound over distances below ``reach``, relative to the specular power."""
+        """Return the integral of the lobe's upper bound over distances below ``reach``, per specular power."""
         bound = self.a / self.b * _largest_ratio(self.g) if self.g > 0.0 else self.a / (1.0 + self.b)
         return bound * _harvey_integral(self._scale, self.g, reach)
 

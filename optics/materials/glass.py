@@ -98,7 +98,7 @@ class _IndexByTemperature:
     name: str
 
     def _at_reference(self, wavelength_m: float) -> float:
-        """Return the index relative to air at 20 C; raise UnphysicalError for a wavelength outside the formula's range."""
+        """Return the index relative to air at 20 C; raise UnphysicalError outside the formula's wavelengths."""
         raise NotImplementedError
 
     @property
@@ -170,7 +170,7 @@ class _IndexByTemperature:
         return self._constants(temperature_k).slope(n, wavelength_m, temperature_k)
 
     def _constants(self, temperature_k: float) -> ThermalDispersion:
-        """Return the constants of dn/dT; raise UnphysicalError where they are unknown or not valid at the temperature."""
+        """Return the constants of dn/dT; raise UnphysicalError where unknown or not valid at the temperature."""
         known = self._dispersion
         if known is None:
             raise UnphysicalError(f"{self.name}: no constants for the change of its index with temperature are known")
@@ -322,7 +322,10 @@ def _powers(c: Sequence[float], w: float, exponents: Sequence[int]) -> float:
 
 
 def _sellmeier(c: Sequence[float], w: float, start: float = 1.0) -> float:
-    """Return the index n at wavelength ``w`` (um) from n^2 = start + sum of B w^2 / (w^2 - C) over pairs B, C in ``c``."""
+    """Return the index n at wavelength ``w`` (um) by Sellmeier's formula.
+
+    n^2 = start + sum of B w^2 / (w^2 - C) over the pairs B, C in ``c``.
+    """
     w2 = w * w
     return sqrt(start + sum(b * w2 / (w2 - d) for b, d in zip(c[0::2], c[1::2], strict=False) if b))
 

@@ -103,7 +103,7 @@ def map_leaves(function: Callable[..., Any], tree: Tree, *others: Any) -> Tree:
 
 
 def _mapped(function: Callable[..., Any], tree: Any, others: tuple[Any, ...]) -> Any:
-    """Return a branch of a tree with the function applied to each leaf and to the corresponding leaves of the others."""
+    """Return a branch with the function applied to each leaf and to the corresponding leaves of the others."""
     if tree is None:
         return None
     if not others:

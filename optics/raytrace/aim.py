@@ -49,7 +49,10 @@ class RayFan:
     moves_position: bool = False
 
     def at(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return launch points and unit directions, (B, N, 3) each, for the parameters (a, b) of each ray, (B, N, 2)."""
+        """Return launch points and unit directions, (B, N, 3) each, for the parameters (a, b) of each ray.
+
+        ``q`` (B, N, 2) are these parameters, for N rays in each of B systems.
+        """
         start = self.position if self.moves_position else self.direction
         # component by component, since each is one block of memory
         moved = np.empty((3, *q.shape[:2]))

@@ -30,7 +30,7 @@ from optics.raytrace.assembly import Assembly, Element, Interaction
 
 @dataclass(frozen=True)
 class Structure:
-    """Properties of one element that determine the code of a kernel, such as the kind of its surface and interaction."""
+    """Properties of one element that determine the code of a kernel, e.g. the kind of its surface."""
 
     interaction: Interaction
     plane: bool

@@ -185,7 +185,10 @@ def paraxial(matrix: RayMatrix, before: float, behind: float) -> Paraxial:
 
 
 def equal_area_radius(points: np.ndarray) -> float:
-    """Return the radius of the circle that has the area of a closed smooth curve through N evenly spaced points (N, 2)."""
+    """Return the radius of the circle that has the area of a closed smooth curve.
+
+    ``points`` (N, 2) are N points evenly spaced along the curve.
+    """
     return float(np.sqrt(enclosed_area(points) / np.pi))
 
 

@@ -340,7 +340,7 @@ def _thickness(width: float) -> float:
 
 
 def _mirror(name: str, position: Sequence[float], direction: np.ndarray) -> Passage:
-    """Return the reflection of the beam at a mirror that has a face of its own, at a position (metres) and direction."""
+    """Return the reflection of the beam at a mirror with a face of its own, at a position (metres) and direction."""
     return Passage(name, name, Interaction.REFLECT, np.array(position), direction)
 
 
@@ -484,7 +484,7 @@ def _axes(normal: np.ndarray, direction: np.ndarray | None) -> np.ndarray:
 def facet_block(
     path: str, material: str, facets: Mapping[str, str], spread: tuple[float, float], height: float
 ) -> Solid:
-    """Return the central block whose facets are mirrors for both cameras, with its side walls and bottom.
+    """Return the central prism: a solid whose facets are mirrors, with side walls and a bottom.
 
     Each mirror facet has a body of its own (``facets``: name -> path). The walls are as far behind the centres of the
     facets as those are from the apex.

@@ -99,7 +99,7 @@ class GradedRay:
         return self._add(self.origin + self.tangent * tau, self.index * even + self.along * odd)
 
     def slope(self, tau: Any) -> Any:
-        """Return the derivative of the position with respect to ``tau``: the refractive index times the unit direction."""
+        """Return the derivative of the position with respect to ``tau``: the index times the unit direction."""
         x2 = self.square * tau * tau
         odd = tau * (1.0 + x2 / 6.0 * (1.0 + x2 / 20.0))
         even = 0.5 * tau * tau * (1.0 + x2 / 12.0 * (1.0 + x2 / 30.0))
@@ -261,7 +261,10 @@ class Traced:
         return rows(self.hits[element], self.count)
 
     def xy(self, element: int | None = None) -> np.ndarray:
-        """Return x, y (B, N, 2) of N rays in B systems on the last element or on a requested one, in its frame, metres."""
+        """Return x, y (B, N, 2) of N rays in B systems, metres, on the last element or on a requested one.
+
+        They are in the element's own frame.
+        """
         vector = self.local.position if element is None else self.hits[element]
         return np.moveaxis(np.stack([c.numpy() for c in (vector.x, vector.y)]).reshape(2, self.count, -1), 0, -1)
 
@@ -709,7 +712,7 @@ def _to_frame(backend: Backend, p: Any, d: Any, frame: FrameNumbers) -> tuple[An
 
 
 def _distance(p: Any, d: Any, surface: SurfaceNumbers, table: Any, differentiable: bool, steps: int) -> tuple[Any, Any]:
-    """Return the distance from p along d to the surface, metres (may be negative), and whether an intersection exists."""
+    """Return the distance from p along d to the surface, metres (may be negative), and whether they intersect."""
     import drjit as dr
 
     if surface.curvature is None:

@@ -128,7 +128,7 @@ class NodalDeformation:
         return float(np.sqrt(np.sum(self.weight * values**2)))
 
     def range(self, values: np.ndarray) -> float:
-        """Return the largest minus the smallest of the values at the K nodes (K,) in the clear aperture, in their unit."""
+        """Return the largest minus the smallest of values at the K nodes (K,), within the clear aperture."""
         inside = values[self.weight > 0.0]
         return float(np.ptp(inside))
 

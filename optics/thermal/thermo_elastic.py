@@ -313,7 +313,10 @@ class Kinematic:
         object.__setattr__(self, "points", points)
 
     def released(self, motion: np.ndarray) -> np.ndarray:
-        """Return the six components that this support holds at 0, from the displacements (3 points, 3), metres, (6,)."""
+        """Return the six components of displacement that this support holds at 0, metres, (6,).
+
+        ``motion`` (3, 3) are the displacements of its three points, metres.
+        """
         along = self.points[1] - self.points[0]
         along = along / np.linalg.norm(along)
         normal = np.cross(along, self.points[2] - self.points[0])

@@ -156,8 +156,7 @@ class PupilField:
         return PupilField(self.u[piece], self.v[piece], self.eikonal[piece], self.amplitude[piece], self.wavelength)
 
     def scaled_by(self, size: np.ndarray) -> PupilField:
-        """Return the field in coordinates x / size, y / size: those of pixels scaled by ``size``, one number per image,
-        (B,).
+        """Return the field in coordinates x / size, y / size: those of pixels scaled by ``size``, (B,), per image.
 
         Phases u x + v y stay, and so does the power: an image is then photons per area of the nominal pixels.
         """

@@ -101,9 +101,7 @@ class StopOutlines:
         return out
 
     def _of_one(self, number: int, further: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the shadows in the pupil of image ``number``, as K polygons of W corners that do not overlap, (K, W,
-        2).
-        """
+        """Return the shadows in the pupil of image ``number``: K polygons of W corners without overlap, (K, W, 2)."""
         image = slice(number, number + 1)
         open_area = _window(1)
         for polygon in self.clear:
@@ -396,7 +394,10 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _window(count: int, radius: float = _WINDOW, number: int = _WINDOW_SIDES) -> np.ndarray:
-    """Return, for ``count`` images, a regular polygon of ``number`` corners about a disk of ``radius``, (B, number, 2)."""
+    """Return a regular polygon of ``number`` corners about a disk of ``radius``, repeated for ``count`` images.
+
+    It has the shape (count, number, 2).
+    """
     angle = 2.0 * np.pi * (np.arange(number) + 0.5) / number
     corners = radius / np.cos(np.pi / number) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return np.broadcast_to(corners, (count, *corners.shape))

@@ -537,11 +537,10 @@ class _Edges:
         return cls(row, cell, position - cell, sign, _rest(position - cell, rest), rest)
 
     def counted(self, start: int, lines: int, cells: int, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the illuminated fraction of each node of some lines, and the indices of the nodes of cells with an
-        edge.
+        """Return the illuminated fraction of each node of some lines, and the indices of nodes of cells with an edge.
 
-        The shapes are (lines, I, cells) and (I, P), for I nodes per cell and P edges. The fraction steps up and down
-        at the edges; in their cells it is the fraction behind the edge.
+        The shapes are (lines, I, cells) and (I, P), for I nodes per cell and P edges. The fraction steps up and down at
+        the edges; in their cells it is the fraction behind the edge.
         """
         rows = slice(*np.searchsorted(self.row, [start, start + lines]))
         cell_index, size, nodes = (self.row[rows] - start) * cells + self.cell[rows], lines * cells, len(weight)
@@ -597,8 +596,9 @@ def _rest(position: np.ndarray, polynomials_of_rest: np.ndarray) -> np.ndarray:
 
 
 def _same_rows(row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return all ordered pairs of the P items with the same value in ``row`` (P,), which ascends, as two arrays of
-    indices.
+    """Return all ordered pairs of items that have the same value in ``row``, as two arrays of indices.
+
+    ``row`` (P,) is ascending, for P items.
     """
     counts = np.bincount(row)
     start = np.cumsum(counts) - counts

@@ -1,14 +1,16 @@
 """Optical transfer function of a smooth pupil: its autocorrelation over the true region of overlap.
 
-With U of ``optics.waves.diffraction`` the irradiance |U|^2 has the transform
+With the field U on the detector (``optics.waves.diffraction``) the irradiance I = |U|^2 has the transform, at a
+frequency f in cycles/m,
 
     I~(f) = integral I(x) exp(-2 pi i f.x) dx = integral g(w) conj(g(w - lambda f)) dw, g(w) = a(w) exp(ik (L(w) + dz
     sqrt(1 - |w|^2))),    w = (u, v),
 
-for a detector moved downstream by dz (Hopkins, Proc. R. Soc. A 231, 91 (1955), without his paraxial phase). The
-integral runs over the overlap of the pupil with itself shifted by lambda f, whose edge is followed exactly, by Gauss'
-rules: no sampled pupil with a jagged edge, exactly zero beyond the cut-off, and an error that falls exponentially with
-the number of nodes. The shadows of bodies in the overlap (``optics.waves.pupil_shadow``) are integrated separately.
+for a detector moved downstream by dz (Hopkins, Proc. R. Soc. A 231, 91 (1955), without his paraxial phase), with a the
+amplitude, L the eikonal and (u, v) the direction cosines. The integral runs over the overlap of the pupil with itself
+shifted by lambda f, whose edge is followed exactly, by Gauss' rules: no sampled pupil with a jagged edge, exactly zero
+beyond the cut-off, and an error that falls exponentially with the number of nodes. The shadows of bodies in the overlap
+(``optics.waves.pupil_shadow``) are integrated separately.
 
 ``VariedTransfer`` gives the MTF of thousands of wavefronts that vary a little about a known one. The nodes of the
 overlap's quadrature and the known pupil's values there are computed once; a varied wavefront then costs a matrix
@@ -51,7 +53,7 @@ _PROBED = _BLOCK_NODES // len(_PROBE) ** 2
 
 
 def transfer(pupil: PupilFunction, frequency: np.ndarray, wavelength: float, defocus: np.ndarray) -> np.ndarray:
-    """Return the optical transfer function at one wavelength.
+    """Return the optical transfer function at one wavelength, for M frequencies and Z positions of the detector.
 
     Parameters
     ----------
@@ -93,13 +95,13 @@ def polychromatic_transfer(
         Pupil of the image, the same at all wavelengths; or one for each of them, all about one point of the image, so
         that lateral colour blurs the image.
     frequency : (M, 2) ndarray
-        Spatial frequencies, cycles/m.
+        M spatial frequencies along the detector's x and y, cycles/m.
     wavelengths : (K,) ndarray
         Wavelengths, metres.
     weights : (K,) ndarray
-        Share of the signal (power x response) at each wavelength; they need not sum to 1.
+        Fraction of the signal (power x response) at each wavelength; they need not sum to 1.
     defocus : (Z,) ndarray
-        Shifts of the detector along its normal, metres, positive downstream.
+        Z shifts of the detector along its normal, metres, positive downstream.
 
     Returns
     -------
@@ -133,7 +135,7 @@ def polychromatic_transfer(
 
 
 def _band(wavelengths: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return checked wavelengths and normalised weights."""
+    """Return the wavelengths (metres) after checks, and the weights divided by their sum."""
     wavelengths, weights = np.asarray(wavelengths, float), np.asarray(weights, float)
     if wavelengths.ndim != 1 or wavelengths.shape != weights.shape:
         raise ValueError(f"one weight for each wavelength expected, got {weights.shape} for {wavelengths.shape}")
@@ -159,10 +161,11 @@ LEAST_ACROSS = 13
 def _correlate(
     pupil: PupilFunction, shift: np.ndarray, wavelength: np.ndarray, defocus: np.ndarray, part: Part = "all"
 ) -> np.ndarray:
-    """Return the transfer function at normalised shifts (S,), wavelengths (S,) and defocus (Z,): (S, Z).
+    """Return the transfer function at S normalised shifts for Z positions of the detector, (S, Z).
 
-    ``part`` may be "clear" for that of the clear pupil, or "shadow" for the shadow's contribution; both are normalised
-    to the whole.
+    ``shift`` and ``wavelength`` (metres) have the shape (S,), ``defocus`` (metres) has (Z,). ``part`` may be "clear"
+    for the transfer function of the clear pupil, or "shadow" for the shadow's contribution; both are normalised to the
+    whole.
     """
     if part not in get_args(Part):
         raise ValueError(f"a transfer function has no part {part!r}; there are {', '.join(get_args(Part))}")
@@ -200,7 +203,10 @@ def _correlate(
 
 
 def _products(pupil: PupilFunction, points: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the product of amplitudes at c + s/2 and c - s/2, and the differences of eikonals and normal cosines."""
+    """Return products of the amplitudes of both shifted pupils, and differences of their eikonals and normal cosines.
+
+    They are taken half a shift ahead of and half a shift behind the complex points of the overlap.
+    """
     ahead, behind = points + 0.5 * shift[:, None], points - 0.5 * shift[:, None]
     (path, light), (path_behind, light_behind) = pupil.values(ahead), pupil.values(behind)
     return light * light_behind, path - path_behind, pupil.cosines(ahead)[2] - pupil.cosines(behind)[2]
@@ -209,7 +215,7 @@ def _products(pupil: PupilFunction, points: np.ndarray, shift: np.ndarray) -> tu
 def _spans(
     pupil: PupilFunction, shift: np.ndarray, right: np.ndarray, left: np.ndarray, wave: np.ndarray, defocus: np.ndarray
 ) -> np.ndarray:
-    """Return the range of the phase across and along the chords for the worst defocus, (2, S).
+    """Return the range of the phase across and along the chords of S overlaps for the worst defocus, (2, S).
 
     The unit is radians per radian of the angle in which Gauss nodes are evenly spaced: half the range of a linear
     phase.
@@ -229,7 +235,7 @@ def _spans(
 def _blocks(
     used: np.ndarray, across: np.ndarray, along: np.ndarray, layers: int
 ) -> Iterator[tuple[np.ndarray, int, int]]:
-    """Yield shifts of similar phase ranges, with their numbers of nodes, in blocks of bounded size."""
+    """Yield the indices of shifts with similar ranges of phase, and their numbers of nodes, in bounded blocks."""
     order = np.argsort(along)[::-1]
     start = 0
     while start < len(order):
@@ -252,10 +258,10 @@ FINER = (4, 8, 16, 32, 64)
 """Numbers of additional nodes that are tried."""
 
 CONVERGED = 2e-4
-"""Change of a transfer function by additional nodes below which there are enough."""
+"""Largest change of a transfer function due to additional nodes with which there are enough nodes."""
 
 WORST_TRANSFER = 1e-3
-"""Largest allowed change of a transfer function by additional nodes; beyond it an error is raised."""
+"""Largest allowed change of a transfer function due to additional nodes; beyond it an error is raised."""
 
 _TEST_FREQUENCIES = np.array([[x, 0.0] for x in (0.12, 0.3, 0.55, 0.8)] + [[0.0, y] for y in (0.2, 0.4, 0.6, 0.9)])
 """Frequencies at which numbers of nodes are compared, in units of the cut-off along both axes."""
@@ -312,7 +318,7 @@ def with_enough_nodes(pupil: PupilFunction, wavelength: float) -> PupilFunction:
 
 
 TABLE_TAIL = 1e-6
-"""Largest coefficient in the last quarter of a table's series, for a function that is 1 at zero frequency."""
+"""Largest coefficient in the last quarter of a table's series, for a transfer function that is 1 at zero frequency."""
 
 _DENSE = (1536, 512)
 """Number of cells of a table's spline from zero to the cut-off, and around the circle."""
@@ -361,16 +367,16 @@ class TransferTable:
     def build(
         cls, pupil: PupilFunction, wavelengths: np.ndarray, weights: np.ndarray, defocus: float = 0.0
     ) -> TransferTable:
-        """Build the table of one image; arguments as for ``polychromatic_transfer``, with one defocus.
+        """Build the table of the polychromatic transfer function of one image at one focus.
 
         Parameters
         ----------
         pupil : PupilFunction
             Pupil of the image.
         wavelengths : (K,) ndarray
-            Wavelengths, metres.
+            K wavelengths, metres.
         weights : (K,) ndarray
-            Share of the signal at each wavelength.
+            Fraction of the signal at each wavelength.
         defocus : float
             Shift of the detector along its normal, metres, positive downstream.
 
@@ -430,7 +436,7 @@ class TransferTable:
         return out.reshape(fx.shape)
 
     def _values(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
-        """Return the transfer function at frequencies (N,)."""
+        """Return the complex transfer function at N frequencies (N,), cycles/m."""
         (a, b), (c, d) = self.to_shift
         x, y = a * fx + b * fy, c * fx + d * fy
         size = np.hypot(x, y)
@@ -460,12 +466,10 @@ def _centroid(pupil: PupilFunction, wavelength: float, defocus: float) -> np.nda
 def _polar_terms(
     pupil: PupilFunction, wavelengths: np.ndarray, defocus: float, centroid: np.ndarray, rings: int, arms: int
 ) -> np.ndarray:
-    """Return Chebyshev and Fourier coefficients of the transfer function about its centroid.
+    """Return Chebyshev and Fourier coefficients of the transfer function at K wavelengths about its centroid.
 
-    The result is complex, (K, rings, 2 arms).
-
-    Chebyshev polynomials are of the arc cosine of shift / cut-off, Fourier terms of the direction, in the order of
-    ``np.fft.fft``.
+    The result is complex, (K, rings, 2 arms). Chebyshev polynomials are of the arc cosine of shift / cut-off, Fourier
+    terms of the direction, in the order of ``np.fft.fft``.
     """
     node = np.cos(np.pi * (np.arange(rings) + 0.5) / rings)
     direction = np.pi * np.arange(arms) / arms
@@ -481,7 +485,10 @@ def _polar_terms(
 def _about(
     pupil: PupilFunction, shift: np.ndarray, wavelengths: np.ndarray, defocus: float, centroid: np.ndarray, part: Part
 ) -> np.ndarray:
-    """Return ``part`` of the transfer function about ``centroid`` at normalised shifts of any shape, (K, *shape)."""
+    """Return the transfer function at K wavelengths and normalised shifts of any shape, (K, *shape).
+
+    The phase of the image's centroid is removed; ``part`` selects the clear pupil or the shadow.
+    """
     repeated = np.repeat(wavelengths, shift.size)
     values = _correlate(pupil, np.tile(shift.ravel(), len(wavelengths)), repeated, np.array([defocus]), part)
     phase_path = (pupil.axes.T @ centroid) @ np.stack([shift.real, shift.imag]).reshape(2, -1)
@@ -498,7 +505,7 @@ def _shadow_table(
     radius: np.ndarray,
     directions: int,
 ) -> np.ndarray:
-    """Return the shadow's contribution to a table, on its grid of ``radius`` and directions, complex."""
+    """Return the shadow's contribution to a table of the transfer function, complex, at given radii and directions."""
     rings, arms = _SHADOW_GRID
     direction = np.pi * np.arange(arms) / arms
     ratio = np.arange(rings) / rings
@@ -527,15 +534,15 @@ box: with one wave of error at the edge of the pupil the MTF is accurate to 1e-6
 
 @dataclass(frozen=True, eq=False)
 class _WavelengthTerms:
-    """One wavelength of a varied transfer function.
+    """Quantities at one wavelength from which a varied transfer function is computed.
 
     Attributes
     ----------
     phasors : (Q,) ndarray
-        Complex phasors of the known pupil at the nodes of the overlap, times their weights; their sum is its transfer
-        function times the wavelength's share.
+        Complex phasors of the known pupil at the Q nodes of the overlap, times their weights; their sum is its transfer
+        function times the fraction of the light at this wavelength.
     phase_matrix : (Q, N) ndarray
-        Matrix from optical paths at the traced nodes of the stop to phase changes at the nodes of the overlap, by
+        Matrix from optical paths at the N traced nodes of the stop to phase changes at the nodes of the overlap, by
         polynomials over the pupil, radians per metre.
     paths : slice
         Paths of this wavelength among those of all traced wavelengths.
@@ -550,8 +557,8 @@ class _WavelengthTerms:
 class VariedTransfer:
     """Optical transfer function of one image at one frequency, at one wavelength or several, for varying wavefronts.
 
-    The optical paths are those of the traced wavelengths, one after the other, (..., K N), metres; mirrors image all
-    wavelengths alike, so that one is traced for all.
+    The optical paths are those of N rays at K traced wavelengths, one wavelength after the other, (..., K N), metres;
+    mirrors image all wavelengths alike, so that one is traced for all.
 
     Attributes
     ----------
@@ -571,7 +578,7 @@ class VariedTransfer:
         cosines: np.ndarray,
         degree: int,
     ) -> VariedTransfer | None:
-        """Compute the parts that do not vary.
+        """Compute the parts of the transfer function that do not vary.
 
         Parameters
         ----------
@@ -580,11 +587,11 @@ class VariedTransfer:
         frequency : (2,) ndarray
             Spatial frequency along the detector's axes, cycles/m.
         wavelengths : (C,) ndarray
-            Wavelengths, metres.
+            C wavelengths, metres.
         shares : (C,) ndarray
-            Shares of the wavelengths in the light, which sum to 1.
+            Fractions of the light at these wavelengths, which sum to 1.
         cosines : (C, N, 2) or (1, N, 2) ndarray
-            Direction cosines along these axes of the rays whose wavefront varies.
+            Direction cosines along these axes of the N rays whose wavefront varies.
         degree : int
             Degree of the polynomials of its variation.
 
@@ -608,7 +615,10 @@ class VariedTransfer:
         return float(abs(sum(np.sum(terms.phasors) for terms in self.colours)))
 
     def modulation(self, paths: np.ndarray) -> np.ndarray:
-        """Return the MTF for optical paths longer than those of the known pupil by ``paths`` (..., K N), metres."""
+        """Return the MTF (0 to 1) when the optical paths of the rays exceed those of the known pupil by ``paths``.
+
+        ``paths`` (..., K N) are for N rays at each of K traced wavelengths, metres.
+        """
         whole: np.ndarray | int = 0
         for terms in self.colours:
             phase = paths[..., terms.paths] @ terms.phase_matrix.T
@@ -616,12 +626,12 @@ class VariedTransfer:
         return np.asarray(np.abs(whole))
 
     def curvature(self, slopes: np.ndarray) -> np.ndarray:
-        """Return the second derivatives of the MTF by pairs of parameters, (L, L), at the known pupil.
+        """Return the second derivatives of the MTF with respect to pairs of L parameters, (L, L), at the known pupil.
 
         Parameters
         ----------
         slopes : (L, K N) ndarray
-            Derivatives of the rays' optical paths by the parameters, metres per unit.
+            Derivatives of the optical paths of N rays at K wavelengths with respect to the parameters, metres per unit.
         """
         whole, first, second = 0j, 0j, 0j
         for terms in self.colours:
@@ -638,7 +648,21 @@ class VariedTransfer:
 def _wavelength_terms(
     pupil: PupilFunction, frequency: np.ndarray, wavelength: float, cosines: np.ndarray, degree: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return phasors and phase matrix of one wavelength; arguments as for ``VariedTransfer.of``, cosines (N, 2)."""
+    """Return phasors and phase matrix of one wavelength (see ``_WavelengthTerms``); None beyond its cut-off.
+
+    Parameters
+    ----------
+    pupil : PupilFunction
+        Known pupil.
+    frequency : (2,) ndarray
+        Spatial frequency along the detector's axes, cycles/m.
+    wavelength : float
+        Wavelength, metres.
+    cosines : (N, 2) ndarray
+        Direction cosines of the N rays whose wavefront varies.
+    degree : int
+        Degree of the polynomials of its variation.
+    """
     shift = np.atleast_1d(pupil.normalised(*(wavelength * np.asarray(frequency))))
     right, left, inside = pupil.edge.corners(shift)
     if not inside[0]:

@@ -1,8 +1,9 @@
 """Shadows of bodies in exit pupils: quadrature over their parts of the overlap of a pupil with itself.
 
-A shadow is a set of convex polygons in the normalised pupil plane. With P the clear pupil and S the shadow, the overlap
-of the vignetted pupil P - S with itself, shifted by -s/2 and +s/2, is that of P less S - s/2 and S + s/2; their common
-part counts once. All of these are intersections of convex regions, and the integrand is smooth in each of them.
+A shadow is a set of convex polygons in the normalised pupil plane, whose points are complex numbers p = x + iy with the
+pupil's edge near the unit circle. With P the clear pupil and S the shadow, the overlap of the vignetted pupil P - S
+with itself, shifted by -s/2 and +s/2, is that of P less S - s/2 and S + s/2; their common part counts once. All of
+these are intersections of convex regions, and the integrand is smooth in each of them.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ FEW_SIDES = 64
 """Number of sides of that polygon for many pupils at once: 16 times the errors."""
 
 MAX_PIECE = 0.5
-"""Largest size of a piece, in radii of the pupil.
+"""Largest size along x and y of a polygon of a shadow, in radii of the pupil; larger ones are divided.
 
-A wavefront is extrapolated from a piece to its box, whose corners may lie outside the pupil.
+A wavefront is extrapolated from a polygon to its box, whose corners may lie outside the pupil.
 """
 
 _ITERATIONS = 3
@@ -55,19 +56,19 @@ _AREA_TOLERANCE = 1e-5
 """Tolerance of the area of a part of a polygon, for a pupil of radius 1: arcs are integrated by Gauss' rule."""
 
 SMALLEST = 1e-9
-"""Area of a piece, for a pupil of radius 1, below which it counts as empty."""
+"""Area of a polygon, for a pupil of radius 1, below which it counts as empty."""
 
 
 @dataclass(frozen=True, eq=False)
 class PupilShadow:
-    """Shadows in B pupils.
+    """Shadows in B pupils, in normalised pupil coordinates.
 
     Attributes
     ----------
     pieces : (B, K, V, 2) ndarray
-        Convex polygons in the pupil that do not overlap, counterclockwise; some are empty.
+        K convex polygons of V corners in each pupil that do not overlap, counterclockwise; some are empty.
     radius : (B, H) ndarray
-        Radii of the pupils' edges as complex Fourier terms over the angle about p = 0.
+        Radii of the pupils' edges as H complex Fourier terms over the angle about the origin.
     """
 
     pieces: np.ndarray
@@ -75,14 +76,14 @@ class PupilShadow:
 
     @classmethod
     def within(cls, polygons: np.ndarray, harmonics: np.ndarray, rim_sides: int = RIM_SIDES) -> PupilShadow:
-        """Return the parts of polygons that lie in pupils with given edges.
+        """Return the parts of polygons that lie in B pupils with given edges.
 
         Parameters
         ----------
         polygons : (B, K, V, 2) ndarray
-            Polygons in the pupil planes, which do not overlap.
+            K polygons of V corners in the pupil planes, which do not overlap.
         harmonics : (2H + 1, B) ndarray
-            Complex harmonics of the pupils' edges.
+            Complex harmonics, of orders -H to H, of the pupils' edges.
         rim_sides : int
             Number of sides of the polygon that represents an edge.
         """
@@ -91,7 +92,7 @@ class PupilShadow:
 
     @property
     def area(self) -> np.ndarray:
-        """Area of each pupil's shadow, (B,), in p."""
+        """Area of the shadow of each of B pupils, (B,), in units of the square of the pupil's radius."""
         return np.asarray(np.sum(area(self.pieces), axis=-1))
 
     @cached_property
@@ -109,7 +110,10 @@ class PupilShadow:
         return PupilShadow(self.pieces[which], self.radius[which])
 
     def whole(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return a quadrature over the pieces: points (B, K, count^2), complex, and area weights."""
+        """Return a quadrature over the shadows' polygons: complex nodes (B, K, count^2) and area weights.
+
+        There are K polygons in each of B pupils, and ``count`` nodes along each side of a polygon's box.
+        """
         number = self.pieces.shape[:2]
         points, weights = quadrature(self.pieces.reshape(-1, *self.pieces.shape[2:]), count)
         return points.reshape(*number, -1), weights.reshape(*number, -1)
@@ -120,14 +124,14 @@ class PupilShadow:
         Parameters
         ----------
         shift : (B, S) ndarray
-            Complex shifts s.
+            S complex shifts s of each of B pupils.
         count : int
             Number of nodes along each side of a region's bounding box.
 
         Returns
         -------
         points : (B, S, Q) ndarray
-            Complex points c.
+            Q complex nodes, in coordinates midway between those of the two shifted pupils.
         weights : (B, S, Q) ndarray
             Area weights, negative where one shadow blocks light and positive where two shadows overlap: to be added to
             ``PupilEdge.overlap``.
@@ -141,7 +145,15 @@ class PupilShadow:
         return points.reshape(*shift.shape, -1), weights.reshape(*shift.shape, -1)
 
     def parts(self, shift: np.ndarray, count: int) -> ShadowParts:
-        """Return the quadrature of ``overlap``, region by region."""
+        """Return a quadrature over the shadows' parts of the overlap of each pupil with itself, region by region.
+
+        Parameters
+        ----------
+        shift : (B, S) ndarray
+            S complex shifts of each of B pupils.
+        count : int
+            Number of nodes along each side of a region's bounding box.
+        """
         moves = np.stack([shift.real, shift.imag], axis=-1)
         full = area(self.pieces) > SMALLEST
         points, weights = self.whole(count)
@@ -187,13 +199,17 @@ class PupilShadow:
 
     @cached_property
     def _corners(self) -> np.ndarray:
-        """Number of corners of each piece without those that repeat its last, (B, K)."""
+        """Number of corners of each of K polygons in B pupils without those that repeat its last, (B, K)."""
         apart = np.any(self.pieces[:, :, 1:] != self.pieces[:, :, :-1], axis=-1)
         last = self.pieces.shape[2] - 1 - np.argmax(apart[..., ::-1], axis=-1)
         return np.asarray(np.where(np.any(apart, axis=-1), last + 1, 1))
 
     def _pairs(self, moves: np.ndarray, full: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return pupils, steps and pairs of pieces of which the second, moved by (B, S, 2), may intersect the first."""
+        """Return the pairs of polygons of which the second, moved by a shift, may intersect the first.
+
+        ``moves`` (B, S, 2) are S shifts of B pupils, and ``full`` is the mask of polygons that are not empty. The
+        result is the indices of pupil, shift, and both polygons.
+        """
         low, high = self.pieces.min(axis=2), self.pieces.max(axis=2)
         moved_low, moved_high = (end[:, None, None] + moves[:, :, None, None] for end in (low, high))
         apart = (high[:, None, :, None] <= moved_low) | (moved_high <= low[:, None, :, None])
@@ -206,7 +222,10 @@ _CORNER_LIMITS = (12, 20, 32, 52)
 
 
 def _similar(*corners: np.ndarray) -> Iterator[tuple[np.ndarray | slice, tuple[int | None, ...]]]:
-    """Yield groups of F sets of polygons with similar numbers of corners, and upper bounds of these; None for all."""
+    """Yield groups of polygons with similar numbers of corners, and upper bounds of these numbers for each set.
+
+    The bounds are None where all polygons form one group.
+    """
     if max((int(np.max(count, initial=0)) for count in corners), default=0) <= _CORNER_LIMITS[0]:
         yield slice(None), (None,) * len(corners)
         return
@@ -224,7 +243,8 @@ def _similar(*corners: np.ndarray) -> Iterator[tuple[np.ndarray | slice, tuple[i
 class ShadowParts:
     """Quadrature over F regions that shadows cut out of overlaps of B pupils with themselves, for S shifts each.
 
-    A region is given by its position in a shadow: for light that passes q there and q - sign s in the other pupil.
+    A region is given by its position in a shadow: for light that passes a point q of the pupil there, and q - sign *
+    shift in the other pupil.
 
     Attributes
     ----------
@@ -233,11 +253,11 @@ class ShadowParts:
     sign : (F,) ndarray
         Sign of the shift of the pupil that the shadow belongs to.
     piece : (W,) ndarray of int
-        Index of the piece for the first W regions, which are whole pieces.
+        Index of the polygon for the first W regions, which are whole polygons.
     whole : (B, K, Q) ndarray
-        Complex nodes of all pieces.
+        Q complex nodes in each of all K polygons.
     points : (F, Q) ndarray
-        Complex nodes q.
+        Complex nodes q of each region.
     weights : (F, Q) ndarray
         Area weights, with the signs of ``PupilShadow.overlap``.
     """
@@ -252,22 +272,22 @@ class ShadowParts:
 
 
 def separate(polygons: list[np.ndarray], fewest: bool = False) -> tuple[np.ndarray, list[int]]:
-    """Return the union of polygons as pieces that do not overlap.
+    """Return the union of polygons as convex polygons that do not overlap.
 
     Parameters
     ----------
     polygons : list of (B, V, 2) ndarray
-        Convex polygons, counterclockwise.
+        Convex polygons of V corners in B pupils, counterclockwise.
     fewest : bool
         True to take the largest polygons first and cut each other one along the sides that cut off most, which leaves
-        few pieces of polygons with many sides.
+        few results of polygons with many sides.
 
     Returns
     -------
     pieces : (B, K, W, 2) ndarray
-        Pieces.
+        K convex polygons of W corners.
     owners : list of int
-        Polygon of each piece; a common part belongs to the first polygon.
+        Index of the given polygon that each is a part of; a common part belongs to the first polygon.
     """
     done: list[np.ndarray] = []
     owners: list[int] = []
@@ -286,16 +306,18 @@ def separate(polygons: list[np.ndarray], fewest: bool = False) -> tuple[np.ndarr
 
 
 def without(part: np.ndarray, before: np.ndarray, fewest: bool = False) -> list[np.ndarray]:
-    """Return the pieces of ``part`` outside ``before``; itself if they do not intersect in any of the pupils.
+    """Return what lies of ``part`` outside ``before``, as convex polygons.
+
+    The result is ``part`` itself if the two do not intersect in any of the pupils.
 
     Parameters
     ----------
     part : (B, V, 2) ndarray
-        Convex polygons.
+        One convex polygon of V corners in each of B pupils.
     before : (B, W, 2) ndarray
-        Convex polygons, counterclockwise; some may be empty.
+        One convex polygon of W corners in each pupil, counterclockwise; some may be empty.
     fewest : bool
-        True to leave few pieces, as for ``separate``.
+        True to leave few polygons, by cutting along the sides that cut off most.
     """
     empty = area(before) < SMALLEST
     if np.all(empty | (area(intersect(part, *sides(before))) < SMALLEST)):
@@ -316,14 +338,16 @@ def without(part: np.ndarray, before: np.ndarray, fewest: bool = False) -> list[
 
 
 def tiled(pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Divide shadows (B, K, V, 2) into pieces no larger than MAX_PIECE along x and y.
+    """Divide the polygons of shadows into parts no larger than MAX_PIECE along x and y.
+
+    ``pieces`` (B, K, V, 2) are K polygons of V corners in each of B pupils.
 
     Returns
     -------
     pieces : (B, L, W, 2) ndarray
-        Pieces.
+        L polygons of W corners.
     owners : (L,) ndarray of int
-        Index in K of the polygon of each piece.
+        Index, among the K given polygons, of the one that each is a part of.
     """
     owners = np.arange(pieces.shape[1])
     for axis in (0, 1):
@@ -347,7 +371,11 @@ def tiled(pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def edge_radius(harmonics: np.ndarray) -> np.ndarray:
-    """Return the Fourier terms c (B, K) of the radius Re sum c_k exp(ik angle) of edges with given harmonics."""
+    """Return the K Fourier terms (B, K) of the radius of B edges, as a function of the angle about the origin.
+
+    The radius is the real part of the sum of c_k exp(i k angle) with these terms c_k; ``harmonics`` are those of the
+    edges.
+    """
     last = len(harmonics) // 2
     order = np.abs(np.arange(-last, last + 1))
     used = int(np.max(order[np.max(np.abs(harmonics), axis=1) > _ANGLE_TOLERANCE]))
@@ -368,7 +396,10 @@ def edge_radius(harmonics: np.ndarray) -> np.ndarray:
 
 
 def _radius(terms: np.ndarray, phasor: np.ndarray) -> np.ndarray:
-    """Return the radius (N, ...) of edges with ``terms`` (N, K) in directions exp(i angle), (N, ...)."""
+    """Return the radius of N edges in given directions, (N, ...), from its Fourier terms.
+
+    ``terms`` (N, K) are K terms of each edge, and ``phasor`` (N, ...) is exp(i angle) of the directions.
+    """
     over = (slice(None),) + (None,) * (phasor.ndim - 1)
     total = np.zeros_like(phasor)
     for k in range(terms.shape[1] - 1, 0, -1):
@@ -384,9 +415,9 @@ def cut(polygons: np.ndarray, radius: np.ndarray, rim_sides: int) -> np.ndarray:
     Parameters
     ----------
     polygons : (B, K, V, 2) ndarray
-        Polygons in p.
+        K polygons of V corners in each of B pupils, in normalised pupil coordinates.
     radius : (B, H) ndarray
-        Radii of the edges as complex Fourier terms over the angle.
+        Radii of the edges as H complex Fourier terms over the angle.
     rim_sides : int
         Number of sides of the polygon that represents an edge.
     """
@@ -408,12 +439,12 @@ def cut(polygons: np.ndarray, radius: np.ndarray, rim_sides: int) -> np.ndarray:
 
 
 def _least(radius: np.ndarray) -> np.ndarray:
-    """Return a lower bound of each edge's radius, (N,)."""
+    """Return a lower bound of the radius of each of N edges, (N,), from its Fourier terms."""
     return np.asarray(np.abs(radius[:, 0]) - np.sum(np.abs(radius[:, 1:]), axis=-1))
 
 
 def _most(radius: np.ndarray) -> np.ndarray:
-    """Return an upper bound of each edge's radius, (N,)."""
+    """Return an upper bound of the radius of each of N edges, (N,), from its Fourier terms."""
     return np.asarray(np.sum(np.abs(radius), axis=-1))
 
 
@@ -422,14 +453,14 @@ def quadrature_within(polygons: np.ndarray, radius: np.ndarray, count: int) -> t
 
     Every part of a polygon's boundary that lies outside the edge is moved inward along the radius onto it. That changes
     no winding number of a point inside the edge, so that the new boundary goes once around the intersection and around
-    nothing else. Each side becomes an arc, a straight piece and an arc; most of them have no length.
+    nothing else. Each side becomes an arc, a straight line and an arc; most of them have no length.
 
     Parameters
     ----------
     polygons : (F, V, 2) ndarray
-        Polygons in p.
+        F polygons of V corners, in normalised pupil coordinates.
     radius : (F, H) ndarray
-        Radius of the edge of each as complex Fourier terms over the angle.
+        Radius of the edge of each as H complex Fourier terms over the angle.
     count : int
         Number of nodes along each of the two directions.
     """
@@ -494,9 +525,10 @@ def quadrature_within(polygons: np.ndarray, radius: np.ndarray, count: int) -> t
 
 
 def _selected(pairs: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pairs of points (2, N, V) selected by a mask (N, V) as (2, N, W), and the mask (N, W) of valid ones.
+    """Return the selected pairs of points of N boundaries, packed as (2, N, W), and the mask (N, W) of valid ones.
 
-    In the padding both points of a pair coincide.
+    ``pairs`` (2, N, V) are V pairs per boundary, and ``mask`` (N, V) selects among them. In the padding both points of
+    a pair coincide.
     """
     counts = np.sum(mask, axis=1)
     width = max(int(np.max(counts, initial=0)), 1)
@@ -507,13 +539,16 @@ def _selected(pairs: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _direction(point: np.ndarray) -> np.ndarray:
-    """Return the unit complex number in the direction of a point, 1 at the origin."""
+    """Return the complex number of modulus 1 in the direction of a complex point; 1 at the origin."""
     size = np.abs(point)
     return np.asarray(np.where(size > 0.0, point, 1.0) / np.where(size > 0.0, size, 1.0))
 
 
 def _radius_and_slope(terms: np.ndarray, phasor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the radius and its derivative by the angle, as ``_radius``."""
+    """Return the radius of edges in given directions, and its derivative with respect to the angle, per radian.
+
+    ``terms`` and ``phasor`` are the radius's Fourier terms and exp(i angle) of the directions.
+    """
     over = (slice(None),) + (None,) * (phasor.ndim - 1)
     total, slope = np.zeros_like(phasor), np.zeros_like(phasor)
     for k in range(terms.shape[1] - 1, 0, -1):
@@ -523,7 +558,10 @@ def _radius_and_slope(terms: np.ndarray, phasor: np.ndarray) -> tuple[np.ndarray
 
 
 def in_rows(owner: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return how to pack items (F,) of given owners in rows: their order, the column of each, and the rows' length."""
+    """Return how to arrange F items in an array with one row per owner: their order, columns, and the rows' length.
+
+    ``owner`` (F,) is the row of each item.
+    """
     order = np.argsort(owner, kind="stable")
     counts = np.bincount(owner, minlength=rows)
     column = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)

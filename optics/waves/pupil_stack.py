@@ -83,7 +83,7 @@ MIN_ILLUMINATED = (DEGREE + 1) * (DEGREE + 2) // 2
 """Smallest number of illuminated nodes for a fit: the number of polynomials of the lowest degree."""
 
 EVEN_WEIGHT = 1e-2
-"""Relative weight of dark nodes, like ``DARK_WEIGHT``, for direction cosines and amplitudes.
+"""Weight of nodes in the dark relative to illuminated ones, in fits of direction cosines and amplitudes.
 
 These vary so little that no higher polynomials are needed.
 """
@@ -96,19 +96,19 @@ _BLOCK_SHADOWS = 2**16
 
 @dataclass(frozen=True, eq=False)
 class PupilStack:
-    """B exit pupils, in normalised coordinates p as complex numbers x + iy.
+    """B exit pupils, in normalised coordinates p (complex numbers x + iy, the edge near the unit circle).
 
     Attributes
     ----------
     centre : (B, 2) ndarray
         Direction cosines (u, v) of p = 0.
     axes : (B, 2, 2) ndarray
-        Derivatives d(u, v)/dp.
+        Derivatives of (u, v) with respect to (x, y).
     harmonics : (2H + 1, B) ndarray
-        Complex harmonics of the edges in p.
+        Complex harmonics, of orders -H to H, of the edges in p.
     eikonal_terms, amplitude_terms : (B, D + 1, D + 1) ndarray
-        Coefficients of T_i(x) T_j(y) of the eikonal, metres, and of the amplitude density (unit power: its square
-        integrates to 1 over du dv).
+        Coefficients of the products T_i(x) T_j(y) of Chebyshev polynomials to degree D: of the eikonal, metres, and of
+        the amplitude density (unit power: its square integrates to 1 over du dv).
     span : (B,) ndarray
         Peak-to-valley of the eikonal over each pupil after removal of a plane, metres.
     residual : (B,) ndarray
@@ -142,14 +142,14 @@ class PupilStack:
         rim_sides: int = FEW_SIDES,
         bright: np.ndarray | None = None,
     ) -> PupilStack:
-        """Fit pupils traced at nodes of the stop, all of which carry light.
+        """Fit B pupils traced at N nodes of the stop, all of which carry light.
 
         Parameters
         ----------
         u, v : (B, N) ndarray
             Direction cosines along the detector's two axes.
         eikonal : (B, N) ndarray
-            Eikonal, metres.
+            Eikonal (optical path of each ray's plane wave to the image point), metres.
         amplitude : (B, N) ndarray
             Amplitudes of the nodes as in ``optics.waves.diffraction.PupilField``, positive.
         nodes : PupilNodes
@@ -157,7 +157,7 @@ class PupilStack:
         degree : int
             Degree of the polynomials.
         shadows : (B, K, V, 2) ndarray, optional
-            Polygons on the stop's unit disk that do not overlap; None for free beams.
+            K polygons of V corners on the stop's unit disk that do not overlap; None for free beams.
         rim_sides : int
             Number of sides of the polygon that represents the edge where a shadow extends over it.
         bright : (B, N) ndarray of bool, optional
@@ -224,22 +224,24 @@ class PupilStack:
         shadows: np.ndarray | None,
         bright: np.ndarray,
     ) -> PupilStack:
-        """Fit vignetted pupils by polynomials of the first degree that is accurate enough, or of the best degree.
+        """Fit B vignetted pupils by polynomials of the first degree that is accurate enough, or of the best degree.
 
         Parameters
         ----------
         u, v : (B, N) ndarray
-            Direction cosines, as for ``fit``.
-        eikonal, amplitude : (B, N) ndarray
-            Eikonal and amplitude, as for ``fit``.
+            Direction cosines along the detector's two axes, at N nodes of the stop.
+        eikonal : (B, N) ndarray
+            Eikonal, metres.
+        amplitude : (B, N) ndarray
+            Amplitudes of the nodes as in ``optics.waves.diffraction.PupilField``.
         nodes : PupilNodes
-            Quadrature over the stop, as for ``fit``.
+            Quadrature over the stop's unit disk.
         wavelength : float
             Wavelength, metres.
         shadows : (B, K, V, 2) ndarray, optional
-            Shadows, as for ``fit``.
+            K polygons of V corners on the stop's unit disk that do not overlap; None for none.
         bright : (B, N) ndarray of bool
-            Mask of the nodes outside the shadows, as for ``fit``.
+            Mask of the nodes outside the shadows; the values of the others are ignored.
         """
         best: PupilStack | None = None
         for degree in VIGNETTED_DEGREES + (() if shadows is not None and shadows.shape[1] else MORE_DEGREES):
@@ -255,9 +257,10 @@ class PupilStack:
 
     @property
     def bend(self) -> np.ndarray:
-        """Departure of each edge from an ellipse, (B,).
+        """Departure of each of B edges from an ellipse, (B,), in units of the pupil's radius.
 
-        ``transfer`` allows at most ``optics.waves.pupil_terms.WORST_BEND``.
+        It is the sum of the moduli of the edge's harmonics, each times the square of its order. ``transfer`` allows at
+        most ``optics.waves.pupil_terms.WORST_BEND``.
         """
         last = len(self.harmonics) // 2
         return np.asarray(np.arange(-last, last + 1) ** 2 @ np.abs(self.harmonics) - 1.0)
@@ -293,16 +296,16 @@ class PupilStack:
         )
 
     def transfer(self, frequency: np.ndarray, wavelengths: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Return polychromatic transfer functions in the plane of the traced detector.
+        """Return polychromatic transfer functions in the plane of the traced detector, for M frequencies of B images.
 
         Parameters
         ----------
         frequency : (M, 2) ndarray
             Spatial frequencies along the detector's two axes, cycles/m.
         wavelengths : (K,) ndarray
-            Wavelengths, metres.
+            K wavelengths, metres.
         weights : (K,) ndarray
-            Share of the signal at each wavelength; they need not sum to 1.
+            Fraction of the signal at each wavelength; they need not sum to 1.
 
         Returns
         -------
@@ -320,13 +323,19 @@ class PupilStack:
         return np.asarray(total / self.power[:, None])
 
     def _shifts(self, frequency: np.ndarray, wavelengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return normalised shifts, complex (B, K * M), and the wave number of each, (K * M,)."""
+        """Return the normalised shifts that M frequencies mean at K wavelengths, and the wave number of each, rad/m.
+
+        Shifts are complex, (B, K * M) for B pupils; wave numbers have the shape (K * M,).
+        """
         steps = (wavelengths[:, None, None] * frequency).reshape(-1, 2)
         moved = np.linalg.solve(self.axes, np.broadcast_to(steps.T, (len(self.axes), 2, len(steps))))
         return moved[:, 0] + 1j * moved[:, 1], np.repeat(2.0 * np.pi / wavelengths, len(frequency))
 
     def _clear(self, frequency: np.ndarray, wavelengths: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """Return the integral over the overlaps of the clear pupils, mean over the band, (B, M)."""
+        """Return the transfer functions of B pupils without shadows at M frequencies, as means over the band, (B, M).
+
+        They are integrals over the overlaps, not yet divided by the power.
+        """
         shift, wave = self._shifts(frequency, wavelengths)
         steps = shift.shape[1]
         edges = PupilEdge(np.repeat(self.harmonics, steps, axis=1))
@@ -345,7 +354,10 @@ class PupilStack:
     def _shadowed(
         self, shadow: PupilShadow, frequency: np.ndarray, wavelengths: np.ndarray, share: np.ndarray
     ) -> np.ndarray:
-        """Return the shadows' contribution to ``_clear``."""
+        """Return the shadows' contribution to the integrals over the overlaps, to be added to that of clear pupils.
+
+        It has the shape (B, M) for M frequencies of B pupils.
+        """
         shift, wave = self._shifts(frequency, wavelengths)
         values = np.zeros(shift.shape, complex)
         for rows, _, along in self._pieces(float(np.max(wave)), 1, _BLOCK_SHADOWS):
@@ -369,7 +381,7 @@ class PupilStack:
         return np.asarray(np.einsum("k,bkm->bm", share, values.reshape(len(values), len(share), len(frequency))))
 
     def _pieces(self, wave: float, shifts: int, points: int) -> Iterator[tuple[np.ndarray, int, int]]:
-        """Yield pupils that need the same numbers of nodes, in blocks of bounded size."""
+        """Yield groups of pupils that need the same numbers of nodes, in blocks of bounded size."""
         along = np.array([nodes_for(float(span), LEAST_ALONG) for span in wave * self.span])
         for count in np.unique(along):
             rows = int(count) + LEAST_ACROSS - LEAST_ALONG
@@ -379,7 +391,11 @@ class PupilStack:
                 yield some[start : start + room], rows, int(count)
 
     def _sums(self, points: np.ndarray, weight: np.ndarray, shift: np.ndarray, wave: np.ndarray) -> np.ndarray:
-        """Return integrals over overlaps with points c and weights (B, S, Q), of shifts (B, S) at wave numbers (S,)."""
+        """Return integrals over the overlaps of B pupils with themselves at S shifts, (B, S).
+
+        ``points`` and ``weight`` (B, S, Q) are Q complex nodes and area weights, ``shift`` (B, S) the complex shifts
+        and ``wave`` (S,) the wave numbers, rad/m.
+        """
         half = 0.5 * shift[..., None]
         (path, light), (path_behind, light_behind) = (self._values(c) for c in (points + half, points - half))
         phase = wave[:, None] * (path - path_behind)
@@ -388,7 +404,10 @@ class PupilStack:
         return np.asarray(real + 1j * imaginary)
 
     def _values(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return eikonal and amplitude at p (B, S, Q), of its shape."""
+        """Return eikonal (metres) and amplitude density at complex points of B pupils, each of the points' shape.
+
+        ``p`` (B, S, Q) are Q points for each of S shifts.
+        """
         eikonal, amplitude = (
             part.reshape(p.shape)
             for part in polynomials((self.eikonal_terms, self.amplitude_terms), p.reshape(len(p), -1))
@@ -396,7 +415,10 @@ class PupilStack:
         return eikonal, amplitude
 
     def _values_at(self, owner: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return eikonal and amplitude at positions p (F, Q) of pupils (F,)."""
+        """Return eikonal (metres) and amplitude density at Q points of each of F regions, (F, Q).
+
+        ``owner`` (F,) is the pupil of each region, and ``p`` (F, Q) are complex points.
+        """
         order, column, width = in_rows(owner, len(self.axes))
         points = np.zeros((len(self.axes), width, p.shape[1]), complex)
         points[owner[order], column] = p[order]
@@ -409,12 +431,12 @@ class PupilStack:
 
     @property
     def light(self) -> np.ndarray:
-        """Fraction of the clear pupils' light that passes the shadows, (B,)."""
+        """Fraction of the clear pupil's light that passes the shadows, for each of B pupils, (B,)."""
         return np.asarray(self.power / self._clear_power)
 
     @cached_property
     def power(self) -> np.ndarray:
-        """Integral of the squared amplitude over each pupil in p, (B,)."""
+        """Integral of the squared amplitude over each of B pupils less its shadows, in normalised coordinates, (B,)."""
         if self.shadow is None:
             return self._clear_power
         points, weight = (a.reshape(len(self.axes), -1) for a in self.shadow.whole(LEAST_SHADOW + 2))
@@ -422,19 +444,19 @@ class PupilStack:
 
     @cached_property
     def _clear_power(self) -> np.ndarray:
-        """Integral of the squared amplitude over each clear pupil in p, (B,)."""
+        """Integral of the squared amplitude over each of B pupils without shadows, in normalised coordinates, (B,)."""
         return clear_power(self.harmonics, self.amplitude_terms)
 
 
 def clear_power(harmonics: np.ndarray, amplitude_terms: np.ndarray) -> np.ndarray:
-    """Return the integral of the squared amplitude over pupils in p without shadows, (B,).
+    """Return the integral of the squared amplitude over B pupils without shadows, in normalised coordinates, (B,).
 
     Parameters
     ----------
     harmonics : (2H + 1, B) ndarray
-        Complex harmonics of their edges.
+        Complex harmonics, of orders -H to H, of their edges.
     amplitude_terms : (B, D + 1, D + 1) ndarray
-        Amplitude coefficients, as in ``PupilStack``.
+        Amplitude coefficients of degree D, as in ``PupilStack``.
     """
     edges, nothing = PupilEdge(harmonics), np.zeros(len(amplitude_terms), complex)
     right, left, _ = edges.corners(nothing)
@@ -444,7 +466,11 @@ def clear_power(harmonics: np.ndarray, amplitude_terms: np.ndarray) -> np.ndarra
 
 
 def _edges(terms: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return centres (B, 2), axes (B, 2, 2) and harmonics (2H + 1, B) of the unit circle's images by maps (B, 2, K)."""
+    """Return centres (B, 2), axes (B, 2, 2) and harmonics (2H + 1, B) of the edges of B pupils.
+
+    The edges are the images of the unit circle under polynomial maps with K coefficients per coordinate, ``terms`` (B,
+    2, K). Harmonics have the orders -H to H.
+    """
     samples = 4 * degree
     angle = 2.0 * np.pi * np.arange(samples) / samples
     rim = terms @ products(np.cos(angle), np.sin(angle), degree).T
@@ -465,18 +491,18 @@ SHADOW_NODES = 8
 
 @dataclass(frozen=True, eq=False)
 class PupilFunction:
-    """Exit pupil of one image, in normalised coordinates p as complex numbers x + iy.
+    """Exit pupil of one image, in normalised coordinates p (complex numbers x + iy, the edge near the unit circle).
 
     Attributes
     ----------
     centre : (2,) ndarray
         Direction cosines (u, v) of p = 0.
     axes : (2, 2) ndarray
-        Derivatives d(u, v)/dp.
+        Derivatives of (u, v) with respect to (x, y).
     edge : PupilEdge
         Edge of the pupil in p.
     eikonal_terms : (D + 1, D + 1) ndarray
-        Coefficients of T_i(x) T_j(y) of the eikonal, metres.
+        Coefficients of the products T_i(x) T_j(y) of Chebyshev polynomials to degree D of the eikonal, metres.
     amplitude_terms : (D + 1, D + 1) ndarray
         Coefficients of the amplitude density (unit power: its square integrates to 1 over du dv).
     eikonal_residual : float
@@ -503,18 +529,21 @@ class PupilFunction:
     transfer_error: float = np.nan
 
     def normalised(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the normalised shift, complex, of shifts (x, y) of the direction cosines, of any equal shapes."""
+        """Return shifts (x, y) of the direction cosines as complex shifts in normalised pupil coordinates."""
         (a, b), (c, d) = np.linalg.inv(self.axes)
         return np.asarray((a * x + b * y) + 1j * (c * x + d * y))
 
     def cosines(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return direction cosines (u, v, w) at p, of p's shape; w > 0 along the detector's normal, downstream."""
+        """Return the direction cosines (u, v, w) at complex pupil points p, each of p's shape.
+
+        w is along the detector's normal, positive downstream.
+        """
         u = self.centre[0] + self.axes[0, 0] * p.real + self.axes[0, 1] * p.imag
         v = self.centre[1] + self.axes[1, 0] * p.real + self.axes[1, 1] * p.imag
         return u, v, np.sqrt(np.maximum(1.0 - u * u - v * v, 0.0))
 
     def values(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return eikonal (metres) and amplitude density at p, of p's shape."""
+        """Return eikonal (metres) and amplitude density at complex pupil points p, each of p's shape."""
         eikonal, amplitude = (
             part.reshape(p.shape)
             for part in polynomials((self.eikonal_terms[None], self.amplitude_terms[None]), p.reshape(1, -1))
@@ -522,14 +551,20 @@ class PupilFunction:
         return eikonal, amplitude
 
     def cutoff(self, direction: np.ndarray, wavelength: float) -> np.ndarray:
-        """Return cut-off frequencies, cycles/m, (M,), along directions (M, 2) in detector x, y (need not be unit)."""
+        """Return the cut-off frequencies along M directions, (M,), cycles/m.
+
+        ``direction`` (M, 2) are vectors in detector x, y, of any length.
+        """
         unit = np.asarray(direction) / np.linalg.norm(direction, axis=-1, keepdims=True)
         shift = self.normalised(unit[..., 0], unit[..., 1])
         return np.asarray(self.edge.reach(np.angle(shift))[0] / (np.abs(shift) * wavelength))
 
     @cached_property
     def power(self) -> float:
-        """Integral of the squared amplitude over du dv: 1 apart from fit errors and the light blocked by the shadow."""
+        """Integral of the squared amplitude over direction cosines.
+
+        It is 1 apart from fit errors and the light that the shadow blocks.
+        """
         if self.shadow is None:
             return self.clear_power
         # as in the transfer function at frequency zero
@@ -543,7 +578,7 @@ class PupilFunction:
 
     @cached_property
     def clear_power(self) -> float:
-        """Integral of the squared amplitude over du dv, without the shadow."""
+        """Integral of the squared amplitude over the direction cosines of the pupil without its shadow."""
         (power,) = clear_power(self.edge.harmonics[:, None], self.amplitude_terms[None])
         return float(power * abs(np.linalg.det(self.axes)))
 
@@ -562,14 +597,14 @@ def fit_pupils(
     field : PupilField
         Field traced at ``nodes`` of the stop.
     nodes : PupilNodes
-        Quadrature over the stop's unit disk, without a hole.
+        Quadrature of N nodes over the stop's unit disk, without a hole.
     degree : int
         Degree of the polynomials for the map from the stop, the eikonal and the amplitude; with ``bright`` the first of
         ``VIGNETTED_DEGREES`` that is accurate enough is used instead.
     shadows : (B, K, V, 2) ndarray, optional
-        Polygons on the stop's unit disk that do not overlap; None for a free beam.
+        K polygons of V corners on the stop's unit disk that do not overlap; None for a free beam.
     bright : (B, N) ndarray of bool, optional
-        Mask of the nodes outside the shadows of edges, as for ``PupilStack.fit``.
+        Mask of the nodes outside the shadows of edges; the values of the others are ignored.
 
     Returns
     -------
@@ -615,7 +650,7 @@ def fit_pupils(
 def circular_pupil(f_number: float, eikonal_terms: np.ndarray | None = None) -> PupilFunction:
     """Return a circular pupil of uniform amplitude for a telecentric image.
 
-    Its edge is at sqrt(u^2 + v^2) = 1 / (2 f_number).
+    Its edge is where the direction cosines (u, v) fulfil sqrt(u^2 + v^2) = 1 / (2 f_number).
 
     Parameters
     ----------

@@ -1,11 +1,13 @@
 """Polynomials over a pupil (products of Chebyshev polynomials), and the edge of a pupil and its self-overlap.
 
-Coefficients of the products T_i(x) T_j(y) with i + j <= degree are in the order of ``orders``.
+Coefficients of the products T_i(x) T_j(y) of Chebyshev polynomials with i + j <= degree are in the order of ``orders``.
 
 Points of the normalised pupil plane are complex numbers p = x + iy. The edge is the image of the stop's rim under a
 smooth map; normalised so that its first harmonic is the unit circle it is
 
-    B(a) = exp(ia) + sum_n c_n exp(ina),    a = angle on the stop's rim.
+    B(a) = exp(ia) + sum_n c_n exp(ina),    a = angle on the stop's rim,
+
+with small complex harmonics c_n.
 """
 
 from __future__ import annotations
@@ -22,14 +24,17 @@ from optics.numerics.quadrature import PupilNodes
 
 
 def orders(degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the orders (i, j) with i + j <= degree, (K,) each."""
+    """Return the orders (i, j) of the K Chebyshev products T_i(x) T_j(y) with i + j <= degree, (K,) each."""
     i, j = np.indices((degree + 1, degree + 1))
     keep = i + j <= degree
     return i[keep], j[keep]
 
 
 def _series(x: np.ndarray, degree: int) -> np.ndarray:
-    """Return T_0 .. T_degree of x (B, P), shape (B, degree + 1, P)."""
+    """Return the Chebyshev polynomials T_0 .. T_degree at P points in each of B pupils, (B, degree + 1, P).
+
+    ``x`` (B, P) are coordinates from -1 to 1.
+    """
     out = np.empty((len(x), degree + 1, x.shape[1]))
     out[:, 0], twice = 1.0, 2.0 * x
     if degree:
@@ -41,14 +46,14 @@ def _series(x: np.ndarray, degree: int) -> np.ndarray:
 
 
 def polynomials(tables: Iterable[np.ndarray], p: np.ndarray) -> list[np.ndarray]:
-    """Return sums of T_i(x) T_j(y) for several tables of coefficients at the same points.
+    """Return sums of the products T_i(x) T_j(y) for several tables of coefficients at the same points.
 
     Parameters
     ----------
     tables : iterable of (B, D + 1, D + 1) ndarray
-        Coefficients.
+        Coefficients of degree D for B pupils.
     p : (B, P) ndarray
-        Complex points x + iy.
+        P complex points x + iy of each pupil.
 
     Returns
     -------
@@ -61,7 +66,9 @@ def polynomials(tables: Iterable[np.ndarray], p: np.ndarray) -> list[np.ndarray]
 
 
 def products(x: np.ndarray, y: np.ndarray, degree: int) -> np.ndarray:
-    """Return the products T_i(x) T_j(y) with i + j <= degree at points of any shape, (..., K).
+    """Return the K products T_i(x) T_j(y) with i + j <= degree at points of any shape, (..., K).
+
+    T_i is the Chebyshev polynomial of order i.
 
     Parameters
     ----------
@@ -82,7 +89,7 @@ def products(x: np.ndarray, y: np.ndarray, degree: int) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def to_terms(nodes: PupilNodes, degree: int) -> np.ndarray:
-    """Return the matrix from values at nodes of the stop to least-squares coefficients of ``products``, (K, N).
+    """Return the matrix (K, N) from values at N nodes of the stop to K least-squares coefficients of ``products``.
 
     Raises
     ------
@@ -116,13 +123,13 @@ def smooth_terms(
     Parameters
     ----------
     design : (N, K) or (B, N, K) ndarray
-        ``products`` at the nodes.
+        K ``products`` at N nodes, common to all B pupils or of each.
     weight : (N,) ndarray
         Weights of the nodes.
     bright : (B, N) ndarray of bool
         Mask of the illuminated nodes.
     values : (B, N, C) ndarray
-        Values to fit; ignored where there is no light.
+        C quantities to fit; ignored where there is no light.
     dark_weight : float
         Weight of dark nodes; the larger it is, the less the higher polynomials contribute there.
 
@@ -146,7 +153,7 @@ def smooth_terms(
 
 
 def slopes(nodes: PupilNodes, degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of ``products`` along x and along y at the nodes, (N, K) each."""
+    """Return the derivatives of K ``products`` along x and along y at N nodes, (N, K) each."""
     i, j = orders(degree)
     derive = chebyshev.chebder(np.eye(degree + 1), axis=0)
     tx, ty = (chebyshev.chebvander(c, degree) for c in (nodes.x, nodes.y))
@@ -155,7 +162,11 @@ def slopes(nodes: PupilNodes, degree: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 WORST_BEND = 0.3
-"""Largest sum of n^2 |c_n|: up to it the edge is convex and the iterations for its chords converge."""
+"""Largest allowed departure of an edge from an ellipse: the sum of n^2 |c_n| over its complex harmonics c_n, n their
+order.
+
+Up to it the edge is convex and the iterations for its chords converge.
+"""
 
 _ITERATIONS = 60
 _CLOSE = 1e-13
@@ -169,7 +180,7 @@ class PupilEdge:
     Attributes
     ----------
     harmonics : (2H + 1,) or (2H + 1, S) ndarray
-        Complex harmonics c_-H .. c_H, with c_1 = 1 and c_0 = c_-1 = 0.
+        Complex harmonics of the orders -H to H; that of order 1 is 1, those of the orders 0 and -1 are 0.
 
     Raises
     ------
@@ -188,9 +199,9 @@ class PupilEdge:
             )
 
     def boundary(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return edge points B and dB/da at angles a of the stop's rim, complex, of the angles' shape.
+        """Return complex edge points at angles (radians) of the stop's rim, and their derivatives by the angle.
 
-        For S edges the shape is (S, ...).
+        They have the angles' shape; for S edges (S, ...).
         """
         last = len(self.harmonics) // 2
         phasor = np.exp(1j * angle)
@@ -206,11 +217,10 @@ class PupilEdge:
         return point, slope
 
     def reach(self, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the longest chord along directions, and its half angle (see ``_chord``).
+        """Return the length of the longest chord along each direction, and its half angle on the stop's rim, radians.
 
-        Directions are in radians, in normalised coordinates.
-
-        A longer shift leaves no overlap of the pupil with itself: this is the cut-off.
+        Directions are in radians, in normalised coordinates. A longer shift leaves no overlap of the pupil with itself:
+        this is the cut-off.
         """
         half = np.full(np.shape(direction), 0.5 * np.pi)
         mean = np.asarray(direction) + 0.5 * np.pi
@@ -228,25 +238,26 @@ class PupilEdge:
     def _chord(self, direction: np.ndarray, mean: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the chord along ``direction`` between the edge's angles mean - half and mean + half.
 
-        B(m - d) - B(m + d) = 2 sin d exp(i direction) H, H = -i exp(-i direction) sum c_n exp(inm) sin(nd) / sin d. A
-        given d in [0, pi] (from the tangent chord on one side to that on the other) has one m with real H; it is well
-        conditioned also where the chord shrinks to a point.
+        With B(a) the edge point at angle a, c_n the harmonics, m the mean and d the half angle, B(m - d) - B(m + d) = 2
+        sin d exp(i direction) H, H = -i exp(-i direction) sum c_n exp(inm) sin(nd) / sin d. A given d in [0, pi] (from
+        the tangent chord on one side to that on the other) has one m with real H; it is well conditioned also where the
+        chord shrinks to a point.
 
         Parameters
         ----------
         direction : (S,) ndarray
-            Directions, radians.
+            Directions of S chords, radians.
         mean : (S,) ndarray
-            Initial mean angles.
+            Initial mean angles, radians.
         half : (S,) ndarray
-            Half angles d.
+            Half angles d, radians.
 
         Returns
         -------
         mean : (S,) ndarray
-            Mean angles m.
+            Mean angles m, radians.
         length : (S,) ndarray
-            Lengths, negative for negative ``half``.
+            Lengths, in radii of the pupil, negative for negative ``half``.
         """
         last = len(self.harmonics) // 2
         factor = -1j * np.exp(-1j * np.asarray(direction))
@@ -269,17 +280,17 @@ class PupilEdge:
         return mean, 2.0 * np.sin(half) * (value.real - step * slope.real)
 
     def corners(self, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the intersections of the edges of two copies of the pupil, shifted by s.
+        """Return where the edges of two copies of the pupil, shifted against each other by s, intersect.
 
         Parameters
         ----------
         shift : (S,) ndarray
-            Normalised complex shifts s.
+            S normalised complex shifts s.
 
         Returns
         -------
         a, b : (2, S) ndarray
-            Angles with B(a) - B(b) = s at both intersections.
+            Angles on the stop's rim of both intersections, on the two copies: the edge points at a and b differ by s.
         inside : (S,) ndarray of bool
             True where the copies overlap.
         """
@@ -315,22 +326,22 @@ class PupilEdge:
         Parameters
         ----------
         shift : (S,) ndarray
-            Normalised shifts s.
+            S normalised complex shifts s.
         right : (2, S) ndarray
             Angles a of ``corners``.
         left : (2, S) ndarray
             Angles b of ``corners``.
         across : (ndarray, ndarray)
-            Points and weights in t over [-1, 1], (I,) each.
+            I points and weights in t over [-1, 1], (I,) each.
         along : (ndarray, ndarray)
-            Points and weights on the lines over [-1, 1], (J,) each.
+            J points and weights on the lines over [-1, 1], (J,) each.
 
         Returns
         -------
         points : (S, I * J) ndarray
             Complex points c, such that c - s/2 and c + s/2 are in the pupil.
         weight : (S, I * J) ndarray
-            Area weights in p.
+            Area weights, in normalised coordinates.
         """
         t = across[0]
         arcs = []

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 
 def _checked(psf: ArrayLike, step: float) -> np.ndarray:
-    """Return the samples of an image. Raise ValueError unless sum and step are positive."""
+    """Return the samples of an image as an array; raise ValueError unless their sum and the step are positive."""
     samples = np.asarray(psf, float)
     if samples.ndim != 2 or not np.all(np.isfinite(samples)) or not np.sum(samples) > 0.0:
         raise ValueError(f"psf must be finite, of shape (rows, columns) and of positive sum, got {samples.shape}")
