@@ -329,5 +329,5 @@ MATCH: Record[Match] = Record(
 
 
 def exported(run: Match) -> dict[str, str]:
-    """Return the files of a folder of measurements, path -> text, with a test file that reads them."""
+    """Return the files of a folder with the measurements of the pass, path -> text."""
     return campaign_files([run.measurements], run.setup.camera.plain())
