@@ -54,9 +54,9 @@ class UndeterminedError(MeasurementError, ValueError):
 Array = NDArray[np.float64]
 """Array of float64."""
 Indices = NDArray[np.intp]
-"""Array of indices."""
+"""Array of integer indices, as NumPy uses them."""
 Mask = NDArray[np.bool_]
-"""Boolean array."""
+"""Array of truth values that selects elements of another array."""
 PER_SI: Mapping[str, float] = {
     "mm": MM_PER_M,
     "um": UM_PER_M,
@@ -151,7 +151,7 @@ def _default_fields(value: Any) -> list[tuple[str, str]]:
 
 
 def _label(path: str, unit: str) -> str:
-    """Return a field's name with blanks for underscores, without its SI suffix if another unit is printed."""
+    """Return a field's name for readers: blanks instead of underscores, without a unit suffix that does not apply."""
     name = path.rpartition(".")[2]
     return (_SI_ENDING.sub("", name) if unit else name).replace("_", " ")
 

@@ -18,11 +18,11 @@ from scipy.special import chdtrc, chdtri, gammaln, i0e, i1e, xlogy
 from analysis.arrays import Array
 
 _NORMAL_SIZE = 1.4826
-"""Standard deviation of a normal distribution divided by the median of the absolute deviations."""
+"""Ratio of a normal distribution's standard deviation to the median of the absolute deviations."""
 
 
 def chance_beyond(chi_square: Any, degrees: Any) -> Any:
-    """Return the probability that chi-square exceeds a value (upper tail).
+    """Return the probability that chi-square exceeds a value by chance (upper tail of its distribution).
 
     Parameters
     ----------
@@ -62,19 +62,20 @@ def density(chi_square: Any, degrees: Any) -> Any:
 
 
 def p_value(chi_square: float, degrees: int) -> float:
-    """Return the p-value of a chi-square, the probability of a larger one; 1 without degrees of freedom."""
+    """Return the probability of a larger chi-square (p-value) by chance; 1 without degrees of freedom."""
     return float(chdtrc(degrees, chi_square)) if degrees > 0 else 1.0
 
 
 def gain(columns: np.ndarray, root: np.ndarray | None = None, cutoff: float = 1e-15) -> np.ndarray:
-    """Return the least-squares inverse: the matrix G of the estimates G y of observations y, with covariance G C G'.
+    """Return the least-squares inverse of a design matrix: the matrix from observations to estimated unknowns.
 
-    The columns are scaled to unit length, as their units may differ by many orders of magnitude.
+    With the inverse G, the estimates are G y for observations y, and their covariance is G C G' for the covariance C of
+    the observations. The columns are scaled to unit length, as their units may differ by many orders of magnitude.
 
     Parameters
     ----------
     columns : (..., N, P) ndarray
-        Derivatives of the observations with respect to the unknowns.
+        Derivatives of the N observations with respect to the P unknowns.
     root : (..., N, N) ndarray or None
         Cholesky factor of the observations' covariance; None for equal weights.
     cutoff : float
@@ -83,7 +84,7 @@ def gain(columns: np.ndarray, root: np.ndarray | None = None, cutoff: float = 1e
     Returns
     -------
     (..., P, N) ndarray
-        The inverse.
+        Matrix from N observations to P unknowns.
     """
     white: np.ndarray = columns
     if root is not None:
@@ -103,7 +104,7 @@ def proportion_interval(successes: int, trials: int, confidence: float) -> tuple
     trials : int
         Number of trials.
     confidence : float
-        Least probability with which the interval contains the proportion.
+        Smallest probability with which the interval contains the proportion.
 
     Returns
     -------
@@ -143,12 +144,12 @@ def proportion_interval(successes: int, trials: int, confidence: float) -> tuple
 
 
 def robust_sigma(residuals: ArrayLike) -> float:
-    """Return the standard deviation of normal residuals from their median absolute value; up to half may be outliers.
+    """Return the standard deviation of normal residuals from their median absolute value, robust to outliers.
 
     Parameters
     ----------
     residuals : array_like
-        Residuals about their median, of any shape.
+        Residuals about their median, of any shape; up to half of them may be outliers.
 
     Returns
     -------
@@ -185,9 +186,10 @@ def robust_variance(squares: ArrayLike) -> float:
 
 
 def rice_bias(modulus: ArrayLike, sigma: ArrayLike) -> Array:
-    """Return the bias of a modulus by noise: the mean of |m + noise| minus |m|, >= 0.
+    """Return the mean amount by which noise increases the modulus of a complex amplitude m, >= 0.
 
-    The noise along m moves the mean only to higher order. For a large modulus the bias is about sigma^2 / (2 m).
+    It is the mean of |m + noise| minus |m|. The noise along m moves the mean only to higher order. For a large modulus
+    the bias is about sigma^2 / (2 m).
 
     Parameters
     ----------
@@ -213,11 +215,13 @@ def rice_bias(modulus: ArrayLike, sigma: ArrayLike) -> Array:
 def measured_bias(modulus: ArrayLike, sigma_across: ArrayLike) -> Array:
     """Return an estimate of `rice_bias` from the measured |m + noise| alone.
 
-    The mean of the estimate is nearly the bias at the true |m|. |m + noise|^2 is (m + along)^2 + across^2. The root of
-    this minus the mean of across^2 has the mean |m| but for terms of sigma^4 / m^3, so that r - sqrt(r^2 -
-    sigma_across^2) estimates the bias. `rice_bias` at `signal_modulus` does not: that estimate scatters, and the mean
-    of a convex function exceeds the function of the mean, by 0.2 sigma to 0.3 sigma between 0.7 sigma and 2 sigma.
-    Where r is below sigma there is no real root, and the bias is that without a signal.
+    The estimate is that of the bias `rice_bias` of the modulus of a complex amplitude m; "along" and "across" are the
+    components of the noise along m and perpendicular to it, and r is the measured modulus. The mean of the estimate is
+    nearly the bias at the true |m|. |m + noise|^2 is (m + along)^2 + across^2. The root of this minus the mean of
+    across^2 has the mean |m| but for terms of sigma^4 / m^3, so that r - sqrt(r^2 - sigma_across^2) estimates the bias.
+    `rice_bias` at `signal_modulus` does not: that estimate scatters, and the mean of a convex function exceeds the
+    function of the mean, by 0.2 sigma to 0.3 sigma between 0.7 sigma and 2 sigma. Where r is below sigma there is no
+    real root, and the bias is that without a signal.
 
     The mean of any function of r is an analytic function of m^2, which |m| at 0 is not: no estimator is unbiased
     everywhere. The mean of this one is right to 0.03 sigma for |m| of 3 sigma and more, to 0.09 sigma for 0.6 sigma and
@@ -239,7 +243,7 @@ def measured_bias(modulus: ArrayLike, sigma_across: ArrayLike) -> Array:
 
 
 def rice_sigma(modulus: ArrayLike, sigma_along: ArrayLike, sigma_across: ArrayLike) -> Array:
-    """Return the standard deviation of |m + noise|.
+    """Return the standard deviation of the measured modulus |m + noise| of a complex amplitude m.
 
     Exact for equal noise along and across m, and in the limit of a large m, where only the noise along it counts.
 
@@ -262,7 +266,7 @@ def rice_sigma(modulus: ArrayLike, sigma_along: ArrayLike, sigma_across: ArrayLi
 
 
 def signal_modulus(modulus: ArrayLike, sigma_along: ArrayLike, sigma_across: ArrayLike) -> Array:
-    """Return an estimate of the true modulus |m| from a measured |m + noise|.
+    """Return an estimate of the true modulus |m| of a complex amplitude m from the measured modulus |m + noise|.
 
     The estimate is the root of the square of the measurement minus the mean square of the noise, or 0 if that is
     negative.

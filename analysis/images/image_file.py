@@ -81,7 +81,9 @@ class ImageHeader:
 
 
 def full_scale(dtype: np.dtype[Any], bits: int | None = None) -> float:
-    """Return the largest value of a type, of which perhaps not all bits are used; infinity for signed and real numbers.
+    """Return the largest value of a number type, of which perhaps not all bits are used.
+
+    It is infinity for signed and real numbers.
 
     Parameters
     ----------
@@ -105,7 +107,7 @@ def different_pages(path: Path, kinds: dict[str, list[int]], choose: str) -> Ima
     kinds : dict of str to list of int
         Page numbers by the description of their kind.
     choose : str
-        Option with which the user can select a page; empty for none.
+        Option with which the user can select a page; empty if there is none.
     """
     listed = ", ".join(f"{kind} (first: {numbers[0]})" for kind, numbers in list(kinds.items())[:4])
     remedy = f"select one with {choose} NUMBER" if choose else "save those that belong together as a separate file"
@@ -236,7 +238,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _images(units: Any) -> list[Any]:
-    """Return the units that are images; if some are named as the measurement, only these."""
+    """Return the units of a FITS file that are images; if some are named as the measurement, only these."""
     from astropy.io import fits
 
     kinds = (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)
@@ -246,7 +248,7 @@ def _images(units: Any) -> list[Any]:
 
 
 def _physical(unit: Any) -> np.dtype[Any]:
-    """Return the type of a unit's scaled values."""
+    """Return the number type of a FITS unit's values after scaling (BZERO, BSCALE)."""
     header = unit.header
     bits, zero, scale = int(header["BITPIX"]), float(header.get("BZERO", 0)), float(header.get("BSCALE", 1))
     if bits < 0:
@@ -328,7 +330,7 @@ def fits_time(path: Path) -> datetime | None:
 
 
 def fits_cards(path: Path, number: int) -> dict[str, Any]:
-    """Return keys and values of the header of the unit that contains a plane.
+    """Return keyword -> value of the FITS header of the unit that contains a plane.
 
     Parameters
     ----------
@@ -483,7 +485,9 @@ def tiff_origin(path: Path) -> tuple[datetime | None, str]:
 
 
 def tiff_pages(path: Path, pages: Iterable[int], check: Callable[[], None]) -> Iterator[NDArray[Any]]:
-    """Yield the pages, (rows, columns) or with channels last; of an uncompressed page only the accessed part is read.
+    """Yield the pages of a TIFF, each (rows, columns) or with the channels last.
+
+    Of an uncompressed page only the part that is accessed is read.
 
     Parameters
     ----------
@@ -531,7 +535,7 @@ class Region:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Slices of an array (rows, columns)."""
+        """Slices of rows and of columns that cut the region out of an array (rows, columns)."""
         return slice(self.row, self.row + self.height), slice(self.column, self.column + self.width)
 
 
@@ -596,6 +600,8 @@ class ImageFile:
     def read(self, regions: dict[str, Region], gamma: str | None = None) -> dict[str, Array]:
         """Read regions of all pages as grey values linear in light, (P, H, W) by name.
 
+        Dimensions: P pages, H rows, W columns.
+
         Parameters
         ----------
         regions : dict of str to Region
@@ -630,6 +636,8 @@ class ImageFile:
     def frames(self, region: Region | None = None) -> NDArray[Any]:
         """Return all pages as they are stored, (frames, H, W) in the file's type and the machine's byte order.
 
+        Dimensions: H rows, W columns.
+
         Parameters
         ----------
         region : Region or None
@@ -644,6 +652,8 @@ class ImageFile:
 
     def pages(self, region: Region | None = None) -> Iterator[NDArray[Any]]:
         """Yield the pages of `frames`, (H, W) each, one at a time.
+
+        Dimensions: H rows, W columns.
 
         Parameters
         ----------
@@ -687,7 +697,7 @@ class ImageFile:
             )
 
     def _decoded(self) -> Iterator[NDArray[Any]]:
-        """Yield the pages, (rows, columns) or with channels last.
+        """Yield the decoded pages, each (rows, columns) or with the channels last.
 
         Raises
         ------
@@ -810,7 +820,10 @@ def tone_curve(gamma: str | None, full_scale: float) -> Callable[[Array], Array]
 
 
 def _luminance(colour: Array, linear: Callable[[Array], Array], full_scale: float) -> Array:
-    """Return the luminance (H, W) of grey (H, W) or of (H, W, RGB and perhaps alpha)."""
+    """Return the luminance (H, W) of grey (H, W) or of (H, W, RGB and perhaps alpha).
+
+    Dimensions: H rows, W columns.
+    """
     if colour.ndim == 2:
         return linear(colour)
     if colour.shape[-1] < 3:

@@ -1,11 +1,12 @@
 """State of an instrument by Bayesian least squares on an exact model, its observability, and the next alignment move.
 
-A state is an amount for each of M motions with a joint normal prior, x = m + G u with u ~ N(0, I). Measurements are
-groups of numbers y = h(x) + B b + e: h is the traced instrument, e ~ N(0, R), and b are biases of the measuring
-instrument, free or with a prior. Each group is whitened and its free biases are projected out. The estimate is the mode
-of the posterior distribution, found by Gauss-Newton steps on the exact h; its covariance is that of the linearisation
-there (Tarantola, Inverse Problem Theory, 2005, sec. 3.4). With a linear h and one group of monitor spots it is the best
-linear unbiased prediction of ``analysis.monitor.disturbances``.
+A state is an amount for each of M motions with a joint normal prior, x = m + G u with the prior mean m, a root G of the
+prior covariance and independent u ~ N(0, I). Measurements are groups of numbers y = h(x) + B b + e: h is the traced
+instrument, e ~ N(0, R), and b are biases of the measuring instrument, free or with a prior. B are the derivatives of
+the numbers with respect to the biases. Each group is whitened and its free biases are projected out. The estimate is
+the mode of the posterior distribution, found by Gauss-Newton steps on the exact h; its covariance is that of the
+linearisation there (Tarantola, Inverse Problem Theory, 2005, sec. 3.4). With a linear h and one group of monitor spots
+it is the best linear unbiased prediction of ``analysis.monitor.disturbances``.
 
 Observability: few combinations of many small motions affect a wavefront (Schechter & Levinson, PASP 123, 812, 2011);
 the others form the benign subspace of an instrument. In independent units of the prior, measurements with whitened
@@ -33,11 +34,18 @@ from analysis.statistics import chance_beyond, limit_of
 from optics.numerics.array_math import covariance_root
 
 Predict = Callable[[Array], Array]
-"""Function from states (S, M), SI, to the error-free measurements (S, D), group after group; NaN where the light is
+"""Function that predicts the error-free measurements (S, D) of states (S, M), in SI units.
+
+S is the number of states, D of measured numbers (group after group), M of motions. The result is NaN where the light is
 lost.
+
+Dimensions: S states, M motions, D measured numbers.
 """
 Slope = Callable[[Array], Array]
-"""Function from one state (M,) to the derivatives (D, M) of the measurements."""
+"""Function from one state (M,) to the derivatives (D, M) of the measurements.
+
+Dimensions: M motions, D measured numbers.
+"""
 
 FALSE_ALARM = 1e-3
 """Probability that measurements with the specified errors are called a contradiction."""
@@ -55,14 +63,16 @@ _NO_RANK = 1e-9
 class StatePrior:
     """Prior distribution of a state, before any measurement.
 
+    Dimensions: U independent units of the prior.
+
     Attributes
     ----------
     labels : tuple of str
         Names of the M motions.
     mean : (M,) ndarray
-        Mean, SI.
+        Mean amount of each motion, SI units.
     root : (M, U) ndarray
-        Root G of the covariance G G', SI.
+        Matrix root G of the covariance G G', SI units.
     """
 
     labels: tuple[str, ...]
@@ -87,18 +97,26 @@ class StatePrior:
 
     @cached_property
     def sigma(self) -> Array:
-        """Standard deviations, (M,) SI."""
+        """Prior standard deviations of the motions, (M,), SI units.
+
+        Dimensions: M motions.
+        """
         return np.asarray(np.sqrt(np.sum(self.root**2, axis=1)))
 
     @property
     def covariance(self) -> Array:
-        """Covariance, (M, M) SI."""
+        """Prior covariance of the motions, (M, M), SI units.
+
+        Dimensions: M motions.
+        """
         return np.asarray(self.root @ self.root.T)
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredGroup:
-    """Numbers of one measurement with their errors.
+    """Measured numbers of one measurement with the covariance of their errors and possible biases.
+
+    Dimensions: B biases.
 
     Attributes
     ----------
@@ -138,13 +156,18 @@ class MeasuredGroup:
             raise ValueError(f"measurement {self.name}: {count} numbers need as many labels and blocks")
 
     def with_values(self, values: Array) -> MeasuredGroup:
-        """Return the same measurement with other values (D,)."""
+        """Return the same measurement with other values (D,).
+
+        Dimensions: D measured numbers.
+        """
         return MeasuredGroup(
             self.name, self.kind, self.labels, values, self.covariance, self.biases, self.bias_sigmas, self.blocks
         )
 
     def whitener(self, without: Sequence[str] = ()) -> Array:
-        """Return W (R, D), which makes errors independent with unit variance and eliminates free biases.
+        """Return the matrix (R, D) that makes the errors independent with unit variance and eliminates free biases.
+
+        Dimensions: R whitened measured numbers, D measured numbers.
 
         Parameters
         ----------
@@ -203,7 +226,7 @@ class ConsistencyTest:
 
     @classmethod
     def of(cls, name: str, chi_square: float, degrees: int) -> ConsistencyTest:
-        """Return the test of a chi-square; without degrees of freedom p is 1."""
+        """Return the test of a chi-square, with its p-value; without degrees of freedom the p-value is 1."""
         p_value = float(chance_beyond(chi_square, degrees)) if degrees else 1.0
         return cls(name, float(chi_square), degrees, p_value)
 
@@ -217,6 +240,8 @@ class ConsistencyTest:
 class StateEstimate:
     """Posterior state after the measurements, with its tests.
 
+    Dimensions: U independent units of the prior, R whitened measured numbers.
+
     Attributes
     ----------
     prior : StatePrior
@@ -224,9 +249,9 @@ class StateEstimate:
     groups : tuple of MeasuredGroup
         Measurements.
     unit : (U,) ndarray
-        Estimate u in the prior's independent units.
+        Estimated state in the independent units u of the prior, whose prior variance is 1.
     root : (U, U) ndarray
-        Root of the posterior covariance of u, root root'.
+        Matrix root of the posterior covariance of u, which is root root'.
     slope : (R, U) ndarray
         Whitened derivatives of all measurements with respect to u at the estimate.
     residual : (R,) ndarray
@@ -238,7 +263,8 @@ class StateEstimate:
     blocks : dict of str to tuple of ConsistencyTest
         Tests of each block, by the name of its measurement.
     excluded : tuple of (str, str, ConsistencyTest)
-        Blocks that were excluded since they contradict all else: measurement, block, test at that time.
+        Blocks that were excluded because they contradict all other measurements: measurement, block, and the test that
+        failed.
     steps : int
         Number of Gauss-Newton steps.
     settled : float
@@ -265,22 +291,34 @@ class StateEstimate:
 
     @cached_property
     def mean(self) -> Array:
-        """Estimated state, (M,) SI."""
+        """Estimated amounts of the motions, (M,), SI units.
+
+        Dimensions: M motions.
+        """
         return np.asarray(self.prior.mean + self.prior.root @ self.unit)
 
     @cached_property
     def spread(self) -> Array:
-        """Root of the posterior covariance, (M, U) SI: the covariance is spread spread'."""
+        """Matrix root of the posterior covariance of the motions, (M, U), SI units: the covariance is spread spread'.
+
+        Dimensions: M motions, U independent units of the prior.
+        """
         return np.asarray(self.prior.root @ self.root)
 
     @property
     def covariance(self) -> Array:
-        """Posterior covariance, (M, M) SI."""
+        """Posterior covariance of the motions, (M, M), SI units.
+
+        Dimensions: M motions.
+        """
         return np.asarray(self.spread @ self.spread.T)
 
     @property
     def sigma(self) -> Array:
-        """Posterior standard deviations, (M,) SI."""
+        """Posterior standard deviations of the motions, (M,), SI units.
+
+        Dimensions: M motions.
+        """
         return np.asarray(np.sqrt(np.sum(self.spread**2, axis=1)))
 
     @property
@@ -289,7 +327,11 @@ class StateEstimate:
         return 1.0 if self.whole.passes() else self.whole.chi_square / self.whole.degrees
 
     def draw(self, rng: np.random.Generator, count: int) -> Array:
-        """Draw random states of the posterior, (count, M) SI, scaled by the variance factor.
+        """Draw random states from the posterior distribution, (count, M), SI units.
+
+        The posterior covariance is multiplied by the variance factor.
+
+        Dimensions: M motions.
 
         Parameters
         ----------
@@ -310,6 +352,8 @@ def estimate_state(
     A block of numbers that contradicts everything else, at the false-alarm probability shared among all blocks, is
     excluded and the estimate is repeated (data snooping: Baarda, A testing procedure for use in geodetic networks,
     1968).
+
+    Dimensions: M motions.
 
     Parameters
     ----------
@@ -366,12 +410,15 @@ def _gauss_newton(
     unit: Array,
     out: dict[str, list[str]],
 ) -> StateEstimate:
-    """Iterate Gauss-Newton steps from a start, without the excluded blocks."""
+    """Return the estimate by Gauss-Newton steps from a start, without the excluded blocks."""
     whiteners = [group.whitener(out.get(group.name, ())) for group in groups]
     values = np.concatenate([group.values for group in groups])
 
     def whitened(rows: Array) -> Array:
-        """Return whitened rows (R, ...) of numbers (D, ...)."""
+        """Return measured numbers (D, ...) of all groups transformed to independent numbers of unit variance, (R, ...).
+
+        Dimensions: R whitened measured numbers, D measured numbers.
+        """
         ends = np.cumsum([0, *(len(group.values) for group in groups)])
         return np.concatenate([w @ rows[a:b] for w, a, b in zip(whiteners, ends[:-1], ends[1:], strict=True)])
 
@@ -450,9 +497,12 @@ def _tested(
 
 
 def _consistency(name: str, residual: Array, spread: Array, rows: Array) -> ConsistencyTest:
-    """Return the test of a mean shift of some numbers, rows (R, K): the reduction of the total chi-square.
+    """Return the test whether some whitened numbers agree with all others.
 
-    It equals the chi-square of these numbers about their prediction from all others.
+    Its chi-square is the reduction of the total chi-square by a mean shift of these numbers, rows (R, K). It equals the
+    chi-square of these numbers about their prediction from all others.
+
+    Dimensions: R whitened measured numbers, K numbers tested.
     """
     scale = np.linalg.norm(rows, axis=0)
     rows = rows[:, scale > 0.0] / scale[scale > 0.0]
@@ -468,13 +518,15 @@ def _consistency(name: str, residual: Array, spread: Array, rows: Array) -> Cons
 DETERMINED = 0.5
 """Ratio of posterior to prior standard deviation below which a combination counts as determined."""
 _NAMED = 0.25
-"""Least weight of a motion in a combination, relative to the largest, for it to be named."""
+"""Smallest weight of a motion in a combination, relative to the largest, for it to be named."""
 _MOST_NAMED = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Combination:
-    """Linear combination of motions that the measurements determine to some degree.
+    """Linear combination of motions that the measurements determine better or worse than others.
+
+    Dimensions: M motions.
 
     Attributes
     ----------
@@ -501,6 +553,8 @@ class Combination:
 
     def of(self, amounts: Array, prior_sigma: Array, mean: Array) -> Array:
         """Return the value of the combination in states (..., M), SI.
+
+        Dimensions: M motions.
 
         Parameters
         ----------
@@ -551,9 +605,9 @@ def _name(labels: tuple[str, ...], weights: Array) -> str:
 
 
 _MOST_NODES = 600
-"""Greatest number of nodes of the search; if it is reached, the result may not be the optimum."""
+"""Largest number of nodes of the branch-and-bound search; if it is reached, the result may not be the optimum."""
 _CLOSE = 1e-3
-"""Relative improvement of the merit below which another move is not sought."""
+"""Improvement of the merit, relative to it, below which no better move is sought."""
 _TINY = 1e-6
 
 
@@ -585,6 +639,8 @@ class Actuators:
     def made(self, wanted: Array, errors: Array) -> Array:
         """Return the executed moves (..., C) with random errors; an actuator that is not moved has no error.
 
+        Dimensions: C actuators.
+
         Parameters
         ----------
         wanted : (..., C) ndarray
@@ -599,7 +655,9 @@ class Actuators:
 
 @dataclass(frozen=True, eq=False)
 class NextMove:
-    """Move of the actuators.
+    """Best next move of the actuators, with the merit that it is expected to leave.
+
+    Dimensions: C actuators.
 
     Attributes
     ----------
@@ -618,14 +676,16 @@ class NextMove:
 
 
 def best_move(residual: Array, slope: Array, actuators: Actuators) -> NextMove:
-    """Return the move that minimises the expected merit.
+    """Return the move of the actuators that minimises the expected merit, a sum of squares.
+
+    Dimensions: R numbers of the merit, C actuators.
 
     Parameters
     ----------
     residual : (R,) ndarray
-        Expected numbers before the move, r0 + D E x.
+        Expected values before the move of the numbers whose squares are summed.
     slope : (R, C) ndarray
-        Derivatives A with respect to each actuator, per SI unit.
+        Derivatives of these numbers with respect to the move of each actuator, per SI unit.
     actuators : Actuators
         Limits, steps and errors of the actuators.
     """
@@ -653,6 +713,8 @@ def merit_reduction(
 
     The uncertainty of the state matters only where actuators could correct it: tr(H D P D' H) with H the projection on
     their range.
+
+    Dimensions: U independent units of the prior, R numbers of the merit, C actuators, N numbers.
 
     Parameters
     ----------
@@ -697,9 +759,9 @@ def _bounded(slope: Array, residual: Array, low: Array, high: Array) -> Array:
 
 
 def _whole_steps(slope: Array, residual: Array, low: Array, high: Array, steps: Array) -> tuple[Array, bool]:
-    """Minimise |residual + slope amounts| within limits, by whole steps where required.
+    """Return the moves that minimise |residual + slope amounts| within limits, in whole steps where required.
 
-    Returns the amounts, and True if the search was completed. Branch and bound: continuous amounts are a lower bound of
+    The second result is True if the search was completed. Branch and bound: continuous amounts are a lower bound of
     what whole steps can reach, and the actuator whose rounding costs most is branched upon first.
     """
     length = np.linalg.norm(slope, axis=0)
@@ -736,7 +798,10 @@ def _whole_steps(slope: Array, residual: Array, low: Array, high: Array, steps: 
 
 
 def _rounded(slope: Array, residual: Array, amounts: Array, low: Array, high: Array, steps: Array) -> Array:
-    """Round one actuator after the other to whole steps, the strongest first, and re-optimise the others."""
+    """Return the moves with one actuator after the other rounded to whole steps and the others optimised again.
+
+    The actuator with the strongest effect is rounded first.
+    """
     lows, highs, out = low.copy(), high.copy(), amounts
     for k in np.argsort(-np.linalg.norm(slope, axis=0) * steps):
         if steps[k] > 0.0:

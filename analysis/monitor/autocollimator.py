@@ -11,9 +11,9 @@ so that
 
 and a rotation of the table by a small angle reads
 
-    about X1: d_beta   mirror 1  d_beta  about X1    mirror 2  d_beta         about X2 about Y1: d_alpha  mirror 1
-    d_alpha about Y1    mirror 2  d_alpha cos b  about Y2 about Z1: d_gamma  mirror 1  nothing             mirror 2
-    d_gamma sin b  about Y2.
+- by d_beta about X1: d_beta about X1 at mirror 1, d_beta about X2 at mirror 2;
+- by d_alpha about Y1: d_alpha about Y1 at mirror 1, d_alpha cos b about Y2 at mirror 2;
+- by d_gamma about Z1: nothing at mirror 1, d_gamma sin b about Y2 at mirror 2.
 
 The paper prints the same factors with "beta" for b, but calls the last one a rotation of mirror 2 "about its own Z".
 That rotation is d_gamma cos b and cannot be measured; the one that is d_gamma sin b, and that the autocollimator reads,
@@ -36,20 +36,25 @@ AXES = ("X", "Y", "Z")
 
 
 def mirror_rotation(shift_m: ArrayLike, focal_length_m: float) -> Array:
-    """Return the rotation of a mirror, rad, from the shift of its spot, m (paper 001, eq. (1))."""
+    """Return the rotation of a mirror, rad, from the shift of its autocollimator spot, m (paper 001, eq. (1))."""
     return np.asarray(0.5 * np.arctan(np.asarray(shift_m, np.float64) / focal_length_m))
 
 
 def reading_of_normal(normal: ArrayLike) -> Array:
-    """Return readings (..., 2), rad, for mirror normals (..., 3) in the instrument's frame; (0, 0, -1) reads zero."""
+    """Return the autocollimator's readings for unit normals of the mirror.
+
+    Readings (..., 2) are the angles about X and about Y, rad; normals (..., 3) are in the instrument's frame, and the
+    normal (0, 0, -1) reads zero.
+    """
     n = np.asarray(normal, np.float64)
     return np.stack([np.arctan2(n[..., 1], -n[..., 2]), np.arctan2(-n[..., 0], -n[..., 2])], axis=-1)
 
 
 def column_component(axis: str) -> int:
-    """Return the component of the readings in Table 2 for a rotation about this axis: 0 about X, 1 about Y.
+    """Return which component of the readings Table 2 lists for a rotation about an axis: 0 about X, 1 about Y.
 
-    For Z it is 1: mirror 2 rotates about its own Y.
+    Table 2 of paper 001 compares the readings of two autocollimators that view mirrors on one turntable. For the axis Z
+    it is 1: mirror 2 rotates about its own Y.
     """
     if axis not in AXES:
         raise ValueError(f"readings: axis must be X, Y or Z, found {axis!r}")
@@ -57,7 +62,7 @@ def column_component(axis: str) -> int:
 
 
 def relation_factor(axis: str, unit: int, between: float) -> float:
-    """Return the reading of autocollimator 1 or 2 for one unit of rotation of the table, to first order.
+    """Return the factor from a small rotation of the turntable to the reading of autocollimator 1 or 2.
 
     Parameters
     ----------
@@ -66,7 +71,7 @@ def relation_factor(axis: str, unit: int, between: float) -> float:
     unit : int
         Autocollimator, 1 or 2.
     between : float
-        Angle b between the two, rad.
+        Angle between the viewing directions of the two autocollimators, rad.
     """
     if axis not in AXES or unit not in (1, 2):
         raise ValueError(f"relations: axis must be X, Y or Z and unit 1 or 2, found {axis!r} and {unit!r}")
@@ -76,14 +81,15 @@ def relation_factor(axis: str, unit: int, between: float) -> float:
 
 
 def exact_reading(axis: str, angle: ArrayLike, unit: int, between: float) -> Array:
-    """Return readings (..., 2), rad, for rotations of the table by any angle, (...).
+    """Return the exact readings of one autocollimator, (..., 2) rad, for rotations of the turntable by any angle.
 
     The two mirrors are perpendicular to their autocollimators at first.
 
-    With u the axis in the autocollimator's frame, n = n0 cos a + (u x n0) sin a + u (u . n0)(1 - cos a), n0 = -Z. The
-    difference from the relations is, about Y2, a relative -sin^2(b) a^2 / 6 for a rotation about Y1 (-cos^2(b) a^2 / 6
-    about Z1), 0.0003" at 720"; about X2, a second-order term of size sin(b) cos(b) a^2 / 2, 0.54" at 720" and 30 or 60
-    deg.
+    With u the axis and a the angle of the rotation in the autocollimator's frame, n0 the mirror's first normal and b
+    the angle between the autocollimators, the normal becomes n = n0 cos a + (u x n0) sin a + u (u . n0)(1 - cos a), n0
+    = -Z. The difference from the first-order relations (`relation_factor`) is, about Y2, a relative -sin^2(b) a^2 / 6
+    for a rotation about Y1 (-cos^2(b) a^2 / 6 about Z1), 0.0003" at 720"; about X2, a second-order term of size sin(b)
+    cos(b) a^2 / 2, 0.54" at 720" and 30 or 60 deg.
 
     Parameters
     ----------
@@ -94,7 +100,7 @@ def exact_reading(axis: str, angle: ArrayLike, unit: int, between: float) -> Arr
     unit : int
         Autocollimator, 1 or 2.
     between : float
-        Angle b between the two, rad.
+        Angle b between the two autocollimators, rad.
     """
     a = np.asarray(angle, np.float64)
     b = between if unit == 2 else 0.0
@@ -113,10 +119,10 @@ def exact_reading(axis: str, angle: ArrayLike, unit: int, between: float) -> Arr
 
 
 def mean_difference(first: ArrayLike, second: ArrayLike) -> float:
-    """Return the mean of |first - second| over the rows of a table.
+    """Return the mean absolute difference of two columns of readings, as in the last line of Table 2 of paper 001.
 
-    It is the last line of Table 2: about X and Y the difference of mirror 1 and the scaled mirror 2; about Z, however,
-    that of the scaled mirror 2 and the *turntable's* angle.
+    About X and Y that line compares the reading of mirror 1 with the scaled reading of mirror 2; about Z, however, the
+    scaled reading of mirror 2 with the *turntable's* angle.
     """
     return float(np.mean(np.abs(np.asarray(first, np.float64) - np.asarray(second, np.float64))))
 
@@ -126,7 +132,8 @@ class ReadingMap:
     """Calibration of an autocollimator: polynomial from the position of its spot to the reading.
 
     The lens images f tan(2 theta) only to first order: it distorts by some 1e-4. As manufacturers do, the map is
-    determined once by rotating a mirror by known angles, and is used from then on.
+    determined once by rotating a mirror by known angles, and is used from then on. (f is the focal length, theta the
+    rotation of the mirror.)
 
     Attributes
     ----------
@@ -135,9 +142,9 @@ class ReadingMap:
     scale : float
         Half range of the spots, px.
     degree : int
-        Degree of the polynomial in row and column together.
+        Largest sum of the exponents of row and column.
     coefficients : (terms, 2) ndarray
-        Coefficients, rad.
+        Coefficients of the rotations about X and about Y, rad, for each product of powers of row and column.
     residual : float
         Rms residual of the calibration, rad.
     """
@@ -150,7 +157,7 @@ class ReadingMap:
 
     @classmethod
     def fit(cls, position: ArrayLike, reading: ArrayLike, degree: int = 5) -> ReadingMap:
-        """Fit the map by least squares over P known rotations.
+        """Fit the polynomial map from spot positions to readings by least squares over P known rotations.
 
         Parameters
         ----------
@@ -179,23 +186,27 @@ class ReadingMap:
         return cls(centre, scale, degree, np.asarray(solution, dtype=np.float64), rms)
 
     def __call__(self, position: ArrayLike) -> Array:
-        """Return readings (..., 2), rad, for spots (..., 2) in px."""
+        """Return the rotations of the mirror about X and Y, (..., 2) rad, for spot positions (row, column) in px."""
         reduced = (np.asarray(position, np.float64) - self.centre) / self.scale
         return np.asarray(_monomials(reduced, self.degree) @ self.coefficients)
 
     def slope(self, position: ArrayLike) -> Array:
-        """Return the derivatives of the reading by (row, column), (..., 2, 2) rad/px."""
+        """Return the derivatives of both angles with respect to the spot's row and column, (..., 2, 2) rad/px."""
         spot = np.asarray(position, np.float64)
         step = 0.5 * np.eye(2)
         return np.stack([self(spot + step[k]) - self(spot - step[k]) for k in range(2)], axis=-1)
 
     def covariance(self, position: ArrayLike, spot_covariance: ArrayLike) -> Array:
-        """Return the covariance of readings, (..., 2, 2) rad^2, from that of the spots, (..., 2, 2) px^2."""
+        """Return the covariance of the two angles read, (..., 2, 2) rad^2, from that of the spot's position in px^2.
+
+        ``position`` is the spot's row and column, (..., 2) px, and ``spot_covariance`` the covariance of both, (..., 2,
+        2) px^2.
+        """
         slope = self.slope(position)
         return np.asarray(slope @ np.asarray(spot_covariance, np.float64) @ np.swapaxes(slope, -1, -2))
 
 
 def _monomials(spot: Array, degree: int) -> Array:
-    """Return all products row^i column^j with i + j <= degree, (..., terms)."""
+    """Return all products row^i column^j with i + j up to a degree, for spot positions (..., 2): (..., terms)."""
     row, column = spot[..., 0], spot[..., 1]
     return np.stack([row**i * column**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1)

@@ -31,26 +31,29 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.arrays import Array
 
 DECAYING = 1.0 - 1e-12
-"""Largest eigenvalue of stable loops; the margin to 1 covers rounding for loops that are marginally stable."""
+"""Largest absolute eigenvalue of loops that count as stable: errors decay from reading to reading.
+
+The margin to 1 covers rounding for loops that are marginally stable.
+"""
 _LEAST, _MOST = 1e-6, 1e6
 """Gain margins that are as bad and as good as any."""
 _CLOSE = 1e-12
-"""Relative accuracy of a gain margin."""
+"""Relative accuracy to which a gain margin is computed."""
 _SETTLING, _WATCHED = 400, 400
 """Readings before a limit cycle is looked at, and for which it is."""
 _OFFSETS = 41
-"""Number of values of the uncorrected quantity between two steps for which limit cycles are searched."""
+"""Number of constant values of the uncorrected quantity, spread over one step, for which limit cycles are searched."""
 
 
 def open_loop(gain: float, delay: int, frequency: ArrayLike) -> NDArray[np.complex128]:
-    """Return the transfer function L of the open loop.
+    """Return the complex transfer function of the open loop, an integrator with a delay, at given frequencies.
 
     Parameters
     ----------
     gain : float
-        Gain g.
+        Gain: the fraction of the residual that one reading corrects.
     delay : int
-        Delay d, readings.
+        Delay of the mechanism, in readings.
     frequency : array_like
         Frequency, of any shape, cycles per reading, above 0 up to 0.5.
     """
@@ -59,17 +62,17 @@ def open_loop(gain: float, delay: int, frequency: ArrayLike) -> NDArray[np.compl
 
 
 def rejection(gain: float, delay: int, frequency: ArrayLike) -> Array:
-    """Return the size of the rejection: residual over oscillation of a quantity, |1 + m a / p|, when images are taken.
+    """Return the ratio of a quantity's residual under control to its uncorrected oscillation, at given frequencies.
 
-    Images are taken after the command of the same reading: with delay 0 and gain 1 the residual is zero at any
-    frequency.
+    A ratio below 1 means that the loop reduces the oscillation. Images are taken after the command of the same reading:
+    with delay 0 and gain 1 the residual is zero at any frequency.
 
     Parameters
     ----------
     gain : float
-        Gain g.
+        Gain: the fraction of the residual that one reading corrects.
     delay : int
-        Delay d, readings.
+        Delay of the mechanism, in readings.
     frequency : array_like
         Frequency, of any shape, cycles per reading, above 0 up to 0.5.
     """
@@ -79,7 +82,7 @@ def rejection(gain: float, delay: int, frequency: ArrayLike) -> Array:
 
 @dataclass(frozen=True)
 class Margins:
-    """Stability margins of a loop.
+    """Stability margins of a control loop: how far its gain and phase are from instability.
 
     Attributes
     ----------
@@ -88,9 +91,11 @@ class Margins:
     gain : float
         Gain margin: the limit over the loop's own gain; infinite for gain 0.
     phase_deg : float
-        Phase margin where the open loop's size is 1; NaN where it is larger or smaller at all frequencies.
+        Phase margin, degrees: distance of the open loop's phase from -180 degrees where its modulus is 1; NaN where it
+        is larger or smaller at all frequencies.
     crossover : float
-        Frequency at which the open loop's size is 1, cycles per reading; NaN if there is none.
+        Frequency at which the modulus of the open loop's transfer function is 1, cycles per reading; NaN if there is
+        none.
     """
 
     limit: float
@@ -100,19 +105,19 @@ class Margins:
 
     @property
     def stable(self) -> bool:
-        """True if errors decay."""
+        """True if errors decay: the gain is below the limit of stability."""
         return self.gain > 1.0
 
 
 def margins(gain: float, delay: int) -> Margins:
-    """Return the margins of a single loop.
+    """Return the stability margins of a single loop, an integrator with a delay.
 
     Parameters
     ----------
     gain : float
-        Gain g, 0 or more.
+        Gain, 0 or more: the fraction of the residual that one reading corrects.
     delay : int
-        Delay d, readings.
+        Delay of the mechanism, in readings.
     """
     limit = 2.0 * math.sin(math.pi / (4 * delay + 2))
     if not 0.0 < gain <= 2.0:
@@ -125,16 +130,16 @@ def margins(gain: float, delay: int) -> Margins:
 def spectral_radius(
     coupling: ArrayLike, gains: Sequence[float], delays: Sequence[int], quantities: Sequence[int] | None = None
 ) -> float:
-    """Return the largest size of the eigenvalues of n coupled loops: below 1 all errors decay.
+    """Return the largest absolute eigenvalue of the common recursion of n coupled loops: below 1 all errors decay.
 
-    A loop of gain 0, which does nothing, does not count. Loops on one quantity add up the same numbers, so that motions
-    of their mechanisms that cancel are not a state of their own.
+    A loop of gain 0, which does nothing, does not count. Loops that act on one quantity integrate the same readings;
+    motions of their mechanisms that cancel in the quantity are therefore no separate state of the recursion.
 
     Parameters
     ----------
     coupling : (n, n) array_like
-        Effect of the mechanism of a column on the quantity of a row, over the effect of the row's own mechanism; 1 on
-        the diagonal.
+        Element (i, j): effect of the mechanism of loop j on the quantity of loop i, divided by the effect of loop i's
+        own mechanism; 1 on the diagonal.
     gains : (n,) sequence of float
         Gains of the loops.
     delays : (n,) sequence of int
@@ -165,18 +170,21 @@ def spectral_radius(
 def common_margin(
     coupling: ArrayLike, gains: Sequence[float], delays: Sequence[int], quantities: Sequence[int] | None = None
 ) -> float:
-    """Return the factor of all gains together at which the loops reach the limit of stability.
+    """Return the common factor of all gains at which coupled loops reach the limit of stability.
+
+    Dimensions: n loops.
 
     Parameters
     ----------
     coupling : (n, n) array_like
-        Coupling of the loops, as in `spectral_radius`.
+        Element (i, j): effect of the mechanism of loop j on the quantity of loop i, divided by the effect of loop i's
+        own mechanism.
     gains : (n,) sequence of float
         Gains of the loops.
     delays : (n,) sequence of int
         Delays of the loops, readings.
     quantities : (n,) sequence of int or None
-        Quantities that the loops act on, as in `spectral_radius`.
+        Index of the quantity that each loop acts on; by default each has its own.
     """
     g = np.asarray(gains, np.float64)
     if not np.any(g):
@@ -200,7 +208,9 @@ def common_margin(
 
 @dataclass(frozen=True)
 class LimitCycle:
-    """Limit cycle of a mechanism with whole steps at a constant quantity, for the worst position between two steps.
+    """Endless cycle of a mechanism that moves by whole steps while the controlled quantity would be constant.
+
+    It is the worst case over all positions of the desired value between two steps.
 
     Attributes
     ----------
@@ -209,7 +219,8 @@ class LimitCycle:
     left : float
         Largest residual of the quantity during the cycle, in units of the effect of one step.
     period : float
-        Number of readings of the longest cycle; 0 for none, NaN where it does not repeat within the simulated time.
+        Number of readings of the longest cycle; 0 if there is none, NaN where it does not repeat within the simulated
+        time.
     """
 
     steps: int
@@ -218,14 +229,14 @@ class LimitCycle:
 
 
 def limit_cycle(gain: float, delay: int, dead_band: float = 0.0) -> LimitCycle:
-    """Return the limit cycle of a mechanism with whole steps, by simulation of the recursion.
+    """Return the limit cycle of a mechanism that moves by whole steps, by simulation of the control loop.
 
     Parameters
     ----------
     gain : float
-        Gain g.
+        Gain: the fraction of the residual that one reading corrects.
     delay : int
-        Delay d, readings.
+        Delay of the mechanism, in readings.
     dead_band : float
         Residual, in units of the effect of one step, below which no correction is made.
     """
@@ -245,7 +256,7 @@ def limit_cycle(gain: float, delay: int, dead_band: float = 0.0) -> LimitCycle:
 
 
 def _period(places: Array) -> float:
-    """Return the number of readings after which positions repeat; NaN if they do not."""
+    """Return the number of readings after which the positions of a mechanism repeat; NaN if they do not."""
     for length in range(1, len(places) // 2):
         if np.array_equal(places[length:], places[:-length]):
             return float(length)

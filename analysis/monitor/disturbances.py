@@ -1,8 +1,8 @@
 """Prior of the disturbances for the analysis: effects of each motion on spots and cameras, and correlations.
 
-Spots and parameters are linear in the M motions, s = A x and p = B x with x ~ N(0, C); a column of A and B is for one
-standard deviation, so that C is a correlation matrix. The prior of p is B C B', that of s is A C A' + R, with the noise
-R.
+Spot shifts s and changes p of the camera parameters are linear in the amounts x of the M motions, s = A x and p = B x
+with x ~ N(0, C); a column of A and B is for one standard deviation, so that C is a correlation matrix. The prior of p
+is B C B', that of s is A C A' + R, with the covariance R of the noise of the spot positions.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from analysis.statistics import chance_beyond, density, limit_of
 from optics.numerics.array_math import covariance_root
 
 FALSE_ALARM = 1e-3
-"""Probability that shifts in accordance with the prior are called a contradiction."""
+"""Probability that spot shifts that follow the prior are nevertheless called a contradiction to it."""
 _INFLATIONS = np.logspace(0.0, 8.0, 161)
-"""Factors by which the variance of a body is increased when a contradiction is explained."""
+"""Factors by which the prior variance of a body's motions is increased to find which explains a contradiction best."""
 
 
 @dataclass(frozen=True)
 class TimeLaw:
-    """Covariance of a disturbance at two times, in units of the square of its prior standard deviation.
+    """Covariance in time of a disturbance, in units of the square of its prior standard deviation.
 
-    The law is g(t) g(t') rho(t - t') C(t, t'): an amplitude that is known but for its size, a correlation over the
-    interval, and the probability that a step has occurred by both times. Each factor is positive semidefinite, and so
-    is their product.
+    The covariance of the values at the times t and t' is g(t) g(t') rho(t - t') C(t, t'): g is the known growth of a
+    trend or relaxation, rho the correlation over the interval, and C the probability that a step has occurred by both
+    times. Each factor is positive semidefinite, and so is their product.
 
     Attributes
     ----------
@@ -40,9 +40,9 @@ class TimeLaw:
     drift_s : float or None
         Correlation time, s; None for a constant.
     period_s : float or None
-        Period of an oscillation, s; None for none.
+        Period of an oscillation, s; None if there is none.
     trend_s : float or None
-        Time of a linear growth to one standard deviation, g = (t - since) / trend_s, s; None for none.
+        Time of a linear growth to one standard deviation, g = (t - since) / trend_s, s; None if there is none.
     relaxation_s : float or None
         Time constant of a relaxation to a new value, g = 1 - exp(-(t - since) / relaxation_s) and 0 before, s; None for
         none.
@@ -81,14 +81,17 @@ class TimeLaw:
     every_s: float | None = None
 
     def __post_init__(self) -> None:
-        """Check the times. Raises ValueError."""
+        """Check that the times and their combination are possible; raise ValueError otherwise."""
         for name in ("drift_s", "period_s", "trend_s", "relaxation_s", "every_s"):
             value = getattr(self, name)
             if value is not None and not value > 0.0:
                 raise ValueError(f"time law: {name} must be positive, found {value}")
 
     def covariance(self, one: ArrayLike, two: ArrayLike) -> Array:
-        """Return the covariance between times, s, of shapes that broadcast; the result has their common shape."""
+        """Return the covariance between the disturbance's values at two times, in units of the prior variance.
+
+        The arguments are times in seconds, of shapes that broadcast; the result has their common shape.
+        """
         first, second = np.asarray(one, np.float64), np.asarray(two, np.float64)
         away = np.abs(first - second)
         if self.jump:
@@ -115,9 +118,9 @@ class TimeLaw:
         return np.asarray(np.interp(when, at, chance))
 
     def two_time_moments(self, then: float, now: float) -> tuple[float, float, float]:
-        """Return the variance at one time, the covariance with a later one, and the variance there.
+        """Return the variance at an earlier time, the covariance with a later time, and the variance at the later time.
 
-        A jump may have occurred between the times.
+        The three numbers are in units of the prior variance. A jump may have occurred between the times.
 
         Parameters
         ----------
@@ -133,7 +136,10 @@ class TimeLaw:
         return before, across, after
 
     def amplitude(self, time: Array) -> Array:
-        """Return the amplitude g(t) of trend and relaxation; 1 without them."""
+        """Return the amplitude of trend and relaxation at times in seconds, relative to one prior standard deviation.
+
+        It is 1 without trend and relaxation.
+        """
         out, since = np.ones_like(time), time - self.since_s
         if self.trend_s is not None:
             out = out * since / self.trend_s
@@ -145,14 +151,14 @@ class TimeLaw:
 @shows("name", "labels", "spots [px]")
 @dataclass(frozen=True, eq=False)
 class Disturbances:
-    """Prior of the motions of K cameras with D spot coordinates together.
+    """Prior of the motions of the bodies that carry K cameras, with their effect on D spot coordinates together.
 
     Attributes
     ----------
     name : str
         Name of the prior.
     labels : tuple of str
-        Names of the M motions: ``base/forward/M2 shift z``.
+        Names of the M motions, such as ``base/forward/M2 shift z``: path of the body and kind of motion.
     bodies : tuple of str
         Body of each motion.
     causes : tuple of str
@@ -160,7 +166,7 @@ class Disturbances:
     sigmas : (M,) ndarray
         Standard deviations in the units of `units`.
     units : tuple of str
-        Unit of each standard deviation, for readers.
+        Unit of each standard deviation, as shown in tables and reports.
     spots : (D, M) ndarray
         Spot shifts for one standard deviation, px, spots in the order of the calibration, each row then column.
     parameters : (4 K, M) ndarray
@@ -227,6 +233,8 @@ class Disturbances:
     ) -> Disturbances:
         """Return disturbances from plain arrays, each motion of a body of its own.
 
+        Dimensions: D spot coordinates (row and column of every spot), P parameters.
+
         Parameters
         ----------
         spots : (D, M) array_like
@@ -256,23 +264,34 @@ class Disturbances:
 
     @cached_property
     def root(self) -> Array:
-        """Root of the correlation matrix, (M, M): root root' = correlation."""
+        """Matrix root of the correlation matrix, (M, M): root times its transpose is the correlation.
+
+        Dimensions: M motions.
+        """
         return covariance_root(self.correlation)
 
     @cached_property
     def spot_covariance(self) -> Array:
-        """Covariance of the shifts without noise, (D, D) px^2."""
+        """Prior covariance of the spot shifts without noise of the images, (D, D) px^2.
+
+        Dimensions: D spot coordinates (row and column of every spot).
+        """
         root = self.spots @ self.root
         return np.asarray(root @ root.T)
 
     @cached_property
     def parameter_covariance(self) -> Array:
-        """Covariance of the parameters before any measurement, (4 K, 4 K) rad^2, rad m, m^2."""
+        """Covariance of the parameters before any measurement, (4 K, 4 K) rad^2, rad m, m^2.
+
+        Dimensions: K cameras.
+        """
         root = self.parameters @ self.root
         return np.asarray(root @ root.T)
 
     def scaled(self, factors: Sequence[float] | Array) -> Disturbances:
         """Return the prior with its standard deviations multiplied by factors (M,).
+
+        Dimensions: M motions.
 
         Parameters
         ----------
@@ -283,7 +302,7 @@ class Disturbances:
         return replace(self, sigmas=self.sigmas * f, spots=self.spots * f, parameters=self.parameters * f)
 
     def between(self, then: float, now: float) -> Disturbances:
-        """Return the prior of the changes from one time to another, instead of those from the nominal instrument.
+        """Return the prior of the changes between two times, instead of the changes since the nominal instrument.
 
         Parameters
         ----------
@@ -333,9 +352,12 @@ class Disturbances:
         )
 
     def best_gain(self, noise: Array) -> Array:
-        """Return the gain of the best linear unbiased prediction, (..., 4 K, D) parameters per px.
+        """Return the gain of the best linear unbiased prediction of the parameters, (..., 4 K, D) rad and m per px.
 
-        It is B C A' (A C A' + R)^-1.
+        It is B C A' (A C A' + R)^-1, with the effects A (`spots`) and B (`parameters`) of the motions, their
+        correlation C and the noise R.
+
+        Dimensions: K cameras, D spot coordinates (row and column of every spot).
 
         Parameters
         ----------
@@ -345,9 +367,12 @@ class Disturbances:
         return self._best(self.parameters, noise)
 
     def best_amounts(self, noise: Array) -> Array:
-        """Return the gain of the best prediction for the motions, (..., M, D) standard deviations per px.
+        """Return the gain of the best linear prediction of the motions, (..., M, D) prior standard deviations per px.
 
-        It is C A' (A C A' + R)^-1.
+        It is C A' (A C A' + R)^-1, with the effect A (`spots`) of the motions on the spots, their correlation C and the
+        noise R.
+
+        Dimensions: M motions, D spot coordinates (row and column of every spot).
 
         Parameters
         ----------
@@ -365,7 +390,9 @@ class Disturbances:
         return np.asarray(across @ np.linalg.pinv(spread, rcond=1e-13, hermitian=True))
 
     def misfit(self, gain: Array) -> Array:
-        """Return the covariance of an estimator's error by the motions themselves, (..., 4 K, 4 K).
+        """Return the covariance of an estimator's error that the motions cause without any noise, (..., 4 K, 4 K).
+
+        Dimensions: K cameras, D spot coordinates (row and column of every spot).
 
         Parameters
         ----------
@@ -387,7 +414,7 @@ class Suspect:
     times : float
         Factor of its prior standard deviations that explains the shifts best.
     gain : float
-        Increase of the log likelihood by that.
+        Increase of the log likelihood of the shifts if the prior is widened by that factor.
     """
 
     body: str
@@ -403,7 +430,8 @@ class Consistency:
     Attributes
     ----------
     chi_square : float
-        Chi-square, s' (A C A' + R)^-1 s.
+        Chi-square of the shifts s, s' (A C A' + R)^-1 s, with their covariance A C A' under the prior and R due to
+        noise.
     degrees : int
         Degrees of freedom, the number of spot coordinates.
     limit : float
@@ -413,7 +441,7 @@ class Consistency:
     false_alarm : float
         Probability for which ``limit`` holds.
     sigma_noise : float
-        Standard deviation of ``chi_square`` by the noise of the images, to first order.
+        Standard deviation of ``chi_square`` due to the noise of the images, to first order.
     """
 
     chi_square: float
@@ -435,12 +463,12 @@ class Consistency:
 
     @property
     def chance_sigma_noise(self) -> float:
-        """Standard deviation of ``chance`` by the noise of the images, to first order."""
+        """Standard deviation of ``chance`` due to the noise of the images, to first order."""
         return float(density(self.chi_square, self.degrees)) * self.sigma_noise
 
     @staticmethod
     def power(times: float, degrees: int) -> float:
-        """Return the probability of detecting disturbances larger than the prior by a common factor.
+        """Return the probability of detecting that the disturbances exceed the prior by a common factor.
 
         The noise is assumed to be small.
 
@@ -455,7 +483,9 @@ class Consistency:
 
 
 def chi_squares(shifts: Array, noise: Array, stated: Disturbances) -> Array:
-    """Return the predictive chi-square of each of T measurements, (T,), without a search for suspects.
+    """Return the chi-square of each of T measurements against the prior, (T,), without a search for causes.
+
+    Dimensions: D spot coordinates (row and column of every spot).
 
     Parameters
     ----------
@@ -477,6 +507,8 @@ def consistency(
     false_alarm: float = FALSE_ALARM,
 ) -> Consistency:
     """Test one measurement against the prior by its predictive chi-square.
+
+    Dimensions: D spot coordinates (row and column of every spot), k motions of the body.
 
     Parameters
     ----------

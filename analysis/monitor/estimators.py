@@ -3,7 +3,10 @@
 Each is linear to first order: parameters = gain x shifts. With the gain, the noise of the shifts and the prior of the
 disturbances (``analysis.monitor.disturbances``) the covariance of the error follows in the same way for all:
 
-    noise: gain R gain',   misfit: (gain A - B) C (gain A - B)',   total: their sum.
+    noise: gain R gain', misfit: (gain A - B) C (gain A - B)', total: their sum,
+
+with the effects A of the motions on the spots and B on the parameters, their correlation C and the noise R of the
+shifts.
 
 Order of spots: one camera after the other, left before right, of each row and column. Order of parameters: d_alpha,
 d_beta, d_gamma (rad), d_f (m) of one camera after the other.
@@ -31,7 +34,7 @@ PARAMETERS_PER_CAMERA = 4
 
 @dataclass(frozen=True, eq=False)
 class Shifts:
-    """Input of an estimator: S states of K cameras with C spots together.
+    """Input of an estimator: positions of the C spots of K cameras before and after a change, in S states.
 
     Attributes
     ----------
@@ -42,7 +45,7 @@ class Shifts:
     cameras : mapping of str to CameraCalibration
         Calibration of each camera.
     disturbances : Disturbances or None
-        Prior of the disturbances; None for none.
+        Prior of the disturbances; None if there is none.
     """
 
     before: Array
@@ -53,18 +56,21 @@ class Shifts:
 
     @property
     def vector(self) -> Array:
-        """Shifts after - before, (S, 2 C) px."""
+        """Shifts (position after minus before) of all spots, row and column of one after the other, (S, 2 C) px.
+
+        Dimensions: S states, C spots.
+        """
         return (self.after - self.before).reshape(len(self.after), -1)
 
     @property
     def spots(self) -> dict[str, slice]:
-        """Range of each camera's spots among all."""
+        """Camera -> slice of its spots among the spots of all cameras."""
         ends = np.cumsum([0, *(len(camera.channels) for camera in self.cameras.values())]).tolist()
         return {name: slice(a, b) for name, a, b in zip(self.cameras, ends[:-1], ends[1:], strict=True)}
 
     @property
     def coordinates(self) -> dict[str, slice]:
-        """Range of each camera's spot coordinates among all."""
+        """Camera -> slice of its spot coordinates (row and column of each spot) among those of all cameras."""
         return {name: slice(2 * spots.start, 2 * spots.stop) for name, spots in self.spots.items()}
 
 
@@ -74,9 +80,9 @@ class Estimator(ABC):
     Attributes
     ----------
     title : str
-        Name for readers: its name in files with blanks.
+        Name shown in tables and reports: the name in files with blanks instead of underscores.
     note : str
-        Description for readers.
+        Description shown in reports.
     stated : bool
         True if it needs a prior of the disturbances; without one it is not in the results.
     """
@@ -86,20 +92,22 @@ class Estimator(ABC):
     stated: bool = False
 
     def applies(self, cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> bool:
-        """Return True if it can be used with these cameras and this prior.
+        """Return True if the estimator can be used with these cameras and this prior.
 
         Parameters
         ----------
         cameras : mapping of str to CameraCalibration
             Calibration of each camera.
         disturbances : Disturbances or None
-            Prior of the disturbances; None for none.
+            Prior of the disturbances; None if there is none.
         """
         return disturbances is not None or not self.stated
 
     @abstractmethod
     def gain(self, shifts: Shifts) -> Array:
-        """Return the gain, parameters per pixel of shift, (S, 4 K, 2 C).
+        """Return the matrix from shifts (px) to parameters (rad and m), for every state: (S, 4 K, 2 C).
+
+        Dimensions: S states, K cameras, C spots.
 
         Parameters
         ----------
@@ -108,7 +116,9 @@ class Estimator(ABC):
         """
 
     def read(self, shifts: Shifts) -> Array:
-        """Return the parameters, (S, 4 K): gain x shifts, unless an estimator improves on that.
+        """Return the estimated parameters, (S, 4 K) rad and m: gain times shifts, or something better.
+
+        Dimensions: S states, K cameras.
 
         Parameters
         ----------
@@ -123,7 +133,9 @@ class PerCameraEstimator(Estimator):
 
     @abstractmethod
     def camera_gain(self, camera: CameraCalibration, covariance: Array) -> Array:
-        """Return the gain for one camera, (4, 2 n) or (S, 4, 2 n) parameters per pixel.
+        """Return the matrix from one camera's shifts (px) to its four parameters (rad, m), (4, 2 n) or (S, 4, 2 n).
+
+        Dimensions: n spots of the camera, S states.
 
         Parameters
         ----------
@@ -134,7 +146,10 @@ class PerCameraEstimator(Estimator):
         """
 
     def gain(self, shifts: Shifts) -> Array:
-        """Return the block-diagonal gain, camera by camera."""
+        """Return the gain of all cameras, (S, 4 K, 2 C) rad and m per px, whose diagonal blocks are single cameras.
+
+        Dimensions: S states, K cameras, C spots.
+        """
         count = PARAMETERS_PER_CAMERA * len(shifts.cameras)
         out = np.zeros((len(shifts.covariance), count, shifts.covariance.shape[-1]))
         for k, (name, columns) in enumerate(shifts.coordinates.items()):
@@ -148,16 +163,16 @@ Exact = Callable[[ArrayLike, ArrayLike, ArrayLike, MonitorGeometry], CameraParam
 
 @dataclass(frozen=True)
 class Formula(PerCameraEstimator):
-    """Set of formulas of `analysis.monitor.monitor_formulas`.
+    """Estimator that applies a set of printed or derived formulas of `analysis.monitor.monitor_formulas`.
 
     Attributes
     ----------
     name : str
         Name in that module and in files.
     note : str
-        Description for readers.
+        Description shown in reports.
     exact : callable or None
-        Exact formulas, where they are not linear.
+        Function with the exact formulas, where these are not linear; None otherwise.
     """
 
     name: str
@@ -166,11 +181,11 @@ class Formula(PerCameraEstimator):
 
     @property
     def title(self) -> str:  # type: ignore[override]
-        """Name with blanks."""
+        """Name of the set of formulas with blanks instead of underscores."""
         return self.name.replace("_", " ")
 
     def applies(self, cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> bool:
-        """Return True for cameras with a left and a right spot.
+        """Return True if every camera has a left and a right spot, which the formulas need.
 
         Parameters
         ----------
@@ -182,7 +197,10 @@ class Formula(PerCameraEstimator):
         return all(camera.pair is not None for camera in cameras.values())
 
     def camera_gain(self, camera: CameraCalibration, covariance: Array) -> Array:
-        """Return the formulas' coefficients; further spots have zero weight."""
+        """Return the formulas' coefficients for one camera with n spots, (4, 2 n) rad and m per px.
+
+        Spots beyond the left and the right one have coefficients of zero.
+        """
         out = np.zeros((PARAMETERS_PER_CAMERA, 2 * len(camera.channels)))
         out[:, [2 * k + axis for k in _pair(camera) for axis in (0, 1)]] = monitor_formulas.coefficients(
             self.name, camera.geometry
@@ -190,7 +208,7 @@ class Formula(PerCameraEstimator):
         return out
 
     def read(self, shifts: Shifts) -> Array:
-        """Return the changes by the exact formulas where there are such."""
+        """Return the parameters of K cameras in S states, (S, 4 K) rad and m, by exact formulas where there are such."""
         if self.exact is None:
             return super().read(shifts)
         parts = []
@@ -212,13 +230,16 @@ def _pair(camera: CameraCalibration) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class LeastSquares(PerCameraEstimator):
-    """Gauss-Markov estimate of the motions that paper 001 considers, by `analysis.monitor.model_fit`."""
+    """Weighted least-squares (Gauss-Markov) estimate of the four motions of each camera that paper 001 considers.
+
+    The computation is in `analysis.monitor.model_fit`.
+    """
 
     title: str = "model"
     note: str = "weighted least squares on all spot coordinates with the Jacobian of the traced instrument"
 
     def camera_gain(self, camera: CameraCalibration, covariance: Array) -> Array:
-        """Return the gain of the weighted fit."""
+        """Return the matrix from one camera's shifts (px) to its parameters (rad and m) by the weighted fit."""
         return model_fit.gain(covariance, camera.spot_jacobian, camera.parameter_jacobian, camera.motions)
 
 
@@ -226,12 +247,14 @@ class LeastSquares(PerCameraEstimator):
 class Posterior(Estimator):
     """Minimum-variance linear estimate (best linear unbiased prediction).
 
-    Of all linear functions of all spots it has the least mean square error under the prior and the noise:
+    Of all linear functions of all spots it has the smallest mean square error under the prior and the noise:
 
-        p = B C A' (A C A' + R)^-1 s
+        p = B C A' (A C A' + R)^-1 s,
 
-    For normal disturbances it is the mean of the posterior distribution, and its total covariance that distribution's
-    (Robinson, Statistical Science 6, 15-32, 1991; Kay, Fundamentals of Statistical Signal Processing, 1993, ch. 12).
+    with the shifts s, the effects A of the motions on the spots and B on the parameters, their correlation C and the
+    noise R. For normal disturbances it is the mean of the posterior distribution, and its total covariance that
+    distribution's (Robinson, Statistical Science 6, 15-32, 1991; Kay, Fundamentals of Statistical Signal Processing,
+    1993, ch. 12).
     """
 
     title: str = "posterior"
@@ -239,7 +262,10 @@ class Posterior(Estimator):
     stated: bool = True
 
     def gain(self, shifts: Shifts) -> Array:
-        """Return the gain of the best prediction; raise ValueError without a prior."""
+        """Return the gain of the best linear prediction, (S, 4 K, 2 C) rad and m per px.
+
+        Dimensions: S states, K cameras, C spots. ValueError is raised without a prior.
+        """
         stated = shifts.disturbances
         if stated is None:
             raise ValueError("posterior: needs stated disturbances")
@@ -260,17 +286,18 @@ _ESTIMATORS: dict[str, Estimator] = {
     "posterior": Posterior(),
 }
 ESTIMATORS = ExtensionTable("estimators", _ESTIMATORS, Estimator)
-"""Estimators by their name in the results, in the order of tables. A new one is added here: it is then in
-recovered.json, crosstalk.json, the tables and the figures.
+"""Estimators by their name in the results, in the order of tables.
+
+A new one is added here: it is then in recovered.json, crosstalk.json, the tables and the figures.
 """
 
 
 PREFERRED = ("posterior", "model")
-"""Estimators for verdicts: the first one in the results is used."""
+"""Names of the estimators whose results decide verdicts: the first one that is in the results is used."""
 
 
 def preferred_estimator(names: Iterable[str]) -> str:
-    """Return the name of the estimator for verdicts, quoted sigmas and studies: the best one in the results.
+    """Return the name of the estimator in the results that verdicts, quoted sigmas and studies use.
 
     Parameters
     ----------
@@ -290,13 +317,13 @@ def preferred_estimator(names: Iterable[str]) -> str:
 
 
 def applicable(cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> dict[str, Estimator]:
-    """Return the estimators that can be used with these cameras and this prior.
+    """Return name -> estimator for the estimators that can be used with these cameras and this prior.
 
     Parameters
     ----------
     cameras : mapping of str to CameraCalibration
         Calibration of each camera.
     disturbances : Disturbances or None
-        Prior of the disturbances; None for none.
+        Prior of the disturbances; None if there is none.
     """
     return {name: estimator for name, estimator in ESTIMATORS.items() if estimator.applies(cameras, disturbances)}

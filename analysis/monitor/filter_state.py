@@ -48,7 +48,9 @@ from analysis.monitor.jump_detection import Amounts, Candidate, Jump
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """Reading of all spots, or of d sensors or combinations of parameters.
+    """One reading at one time: of all spots, of d temperature sensors, or of d combinations of camera parameters.
+
+    Dimensions: D spot coordinates (row and column of every spot), P parameters.
 
     Attributes
     ----------
@@ -61,7 +63,7 @@ class Observed:
     sensors : tuple of int
         Indices of the d sensors of `HeatInputs` that were read.
     parameters : (d, P) ndarray or None
-        Combinations of the parameters that were read.
+        Coefficients of the d combinations of the P parameters that were read; None for other readings.
     """
 
     time: float
@@ -72,13 +74,13 @@ class Observed:
 
     @property
     def spots(self) -> bool:
-        """True for a reading of the spots."""
+        """True if this is a reading of the spots."""
         return not self.sensors and self.parameters is None
 
 
 @dataclass(frozen=True)
 class BadReading:
-    """Evidence that a reading is bad.
+    """Evidence that a reading is wrong by itself (bad) and not a real change.
 
     Attributes
     ----------
@@ -97,18 +99,20 @@ class BadReading:
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """Difference of a reading from its prediction, with the decisions that followed from it.
+    """Difference of a reading from its prediction by all earlier ones, with the decisions that followed from it.
+
+    Dimensions: d values of the reading.
 
     Attributes
     ----------
     observed : Observed
         Reading.
     white : (d,) ndarray
-        Difference in independent standard deviations.
+        Difference from the prediction, transformed to independent numbers of unit variance.
     log_score : float
         Logarithm of the predicted density at the reading.
     jump : Jump or None
-        Jump detected at this reading; None for none.
+        Jump detected at this reading; None if there is none.
     bad : BadReading or None
         Evidence that the reading is bad, where it was set aside; None where it was accepted.
     earlier : Innovation or None
@@ -127,13 +131,15 @@ class Innovation:
 
     @property
     def chi_square(self) -> float:
-        """Chi-square, with as many degrees of freedom as values were read."""
+        """Sum of squares of the whitened difference, with as many degrees of freedom as values were read."""
         return float(self.white @ self.white)
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Kalman filter with the effect of a step just before each of the last L readings.
+    """Kalman filter together with the effect that a step just before each of the last L readings would have had.
+
+    Dimensions: n states of the filter, q values that readings can contain (outputs).
 
     Attributes
     ----------
@@ -156,13 +162,15 @@ class Track:
     information: Array
 
     def alone(self) -> Track:
-        """Return the filter without the step hypotheses."""
+        """Return the filter without the hypotheses of steps before the last readings."""
         return replace(self, response=self.response[:0], score=self.score[:0], information=self.information[:0])
 
 
 @dataclass(frozen=True, eq=False)
 class Whitened:
-    """Reading divided by the root of its covariance.
+    """Reading transformed by the root of its predicted covariance, to independent values of unit variance.
+
+    Dimensions: d values of the reading, n states of the filter, q values that readings can contain (outputs).
 
     Attributes
     ----------
@@ -171,7 +179,7 @@ class Whitened:
     white : (d,) ndarray
         Whitened innovation, root^-1 (value - prediction).
     rows : (d, n) ndarray
-        Whitened observation matrix, root^-1 H.
+        Whitened observation matrix, root^-1 H, where H is the derivative of the reading with respect to the states.
     gain : (d, n) ndarray
         Product root^-1 H P with the covariance P of the states.
     picked : (d, q) ndarray
@@ -206,7 +214,9 @@ class PendingReading:
 
 @dataclass(frozen=True, eq=False)
 class FilterState:
-    """State of the filter after the readings so far.
+    """State of the Kalman filter and of its jump detection after the readings so far.
+
+    Dimensions: L gaps between readings, in each of which a step may have occurred, m motions that jump at a known rate.
 
     Attributes
     ----------
@@ -240,40 +250,49 @@ class FilterState:
 
     @property
     def mean(self) -> Array:
-        """Mean of the states, (n,)."""
+        """Mean of the states, (n,).
+
+        Dimensions: n states of the filter.
+        """
         return self.state.mean
 
     @property
     def covariance(self) -> Array:
-        """Covariance of the states, (n, n)."""
+        """Covariance of the states, (n, n).
+
+        Dimensions: n states of the filter.
+        """
         return self.state.covariance
 
     @property
     def jump_track(self) -> Track:
-        """Filter that detects jumps."""
+        """Filter in which jumps are detected: `search` if there is one, otherwise `state`."""
         return self.state if self.search is None else self.search
 
 
 _SCALES = (0.125, 0.25, 0.5, 1.0, 2.0)
-"""Sizes of jumps relative to the prior."""
+"""Assumed sizes of undetected jumps, relative to their prior root mean square size."""
 _AGAIN = 2.0
-"""Factor of the variance that an undetected jump adds for a smoother, since the readings that indicated the jump and
-its size are used once more.
+"""Factor of the variance that an undetected jump adds for a smoother.
+
+It is above 1 since the readings that indicated the jump and its size are used once more.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class JumpingBody:
-    """Body that jumps at a known rate.
+    """Body whose motions jump at a known rate.
+
+    Dimensions: q values that readings can contain (outputs).
 
     Attributes
     ----------
     motions : tuple of int
         Indices of its r motions that jump.
     spots : (q, r) ndarray
-        Effect of independent amounts of unit variance that make up the motions.
+        Effect on the q outputs of independent amounts of unit variance that make up the jumping motions.
     root : (r, r) ndarray
-        Motions by these amounts.
+        Matrix from these amounts to the motions, in prior standard deviations.
     every_s : float
         Mean time between two jumps, s.
     """
@@ -294,7 +313,7 @@ def jumping_bodies(
     stated : Disturbances
         Prior of the disturbances.
     may : sequence of Candidate
-        Candidates for jumps.
+        Motions, alone or of one body together, that may jump.
     otherwise : float or None
         Mean time between two jumps, s, of motions without a known rate; None to return only bodies with a rate.
     """
@@ -310,12 +329,14 @@ def jumping_bodies(
 
 @dataclass(frozen=True, eq=False)
 class Hint:
-    """Hypotheses of a jump of unknown size of one body before each of L readings.
+    """Hypotheses that one body has made a jump of unknown size, one for each of the gaps before the last L readings.
+
+    Dimensions: r motions of the body that may jump.
 
     Attributes
     ----------
     log_weight : (L,) ndarray
-        Logarithm of the weight w.
+        Logarithm of the weight of each hypothesis, its likelihood ratio times its prior probability.
     mean : (L, r) ndarray
         Mean of the amounts if the jump occurred there.
     covariance : (L, r, r) ndarray
@@ -328,7 +349,10 @@ class Hint:
 
     @classmethod
     def of(cls, looked: tuple[Array, Array], own: tuple[Array, Array], outputs: Array, expected: Array) -> Hint:
-        """Compute the hypotheses from scores and information.
+        """Compute the hypotheses from the scores and information of steps.
+
+        Dimensions: L gaps between readings, in each of which a step may have occurred, q values that readings can
+        contain (outputs), r motions of the body that may jump.
 
         Parameters
         ----------
@@ -337,7 +361,7 @@ class Hint:
         own : tuple of ndarray
             Score and information by which the amounts are computed.
         outputs : (q, r) ndarray
-            Effect of unit amounts.
+            Effect on the outputs of independent amounts of unit variance.
         expected : (L,) ndarray
             Mean number of jumps in the gap before each reading; 0 where there is no gap.
         """
@@ -358,9 +382,11 @@ class Hint:
 
 
 def _chances(hints: Sequence[Hint], window: int | None = None) -> list[Array]:
-    """Return the probability of a jump of each body before each reading, (L,), at most one jump within a window.
+    """Return for each body the probability of a jump before each reading, (L,), one jump at most in a window.
 
     The window extends over the given number of readings on either side, or over all.
+
+    Dimensions: L gaps between readings, in each of which a step may have occurred.
     """
     log_weights = np.logaddexp.reduce([hint.log_weight for hint in hints], axis=0)
     if window is None:
@@ -374,6 +400,9 @@ def _chances(hints: Sequence[Hint], window: int | None = None) -> list[Array]:
 
 def mixture(mean: Array, covariance: Array, hints: Sequence[Hint], moved: Sequence[Array]) -> tuple[Array, Array]:
     """Return mean (n,) and covariance (n, n) of the states with undetected jumps weighted by their probabilities.
+
+    Dimensions: n states of the filter, L gaps between readings, in each of which a step may have occurred, r motions of
+    the body that may jump.
 
     Parameters
     ----------
@@ -399,9 +428,11 @@ def mixture(mean: Array, covariance: Array, hints: Sequence[Hint], moved: Sequen
 def undetected_variance(
     score: Sequence[Array], information: Sequence[Array], gap: Array, bodies: Sequence[JumpingBody], window: int
 ) -> list[Array]:
-    """Return the variance that a smoother adds for undetected jumps, (N, r) for each body.
+    """Return the variance that a smoother adds for undetected jumps, an array (N, r) for each body.
 
     It is relative to the mean square of the motions at their prior rate.
+
+    Dimensions: r motions of the body that may jump.
 
     Parameters
     ----------
@@ -466,7 +497,7 @@ def may_be_bad(bad: BadReading | None, log_odds: float, recent: Sequence[bool]) 
 
 
 def chance_good(log_odds: float) -> float:
-    """Return the probability with which a reading that is set aside counts as good in the meantime.
+    """Return the probability with which a reading that was set aside still counts as good until it is decided.
 
     Parameters
     ----------
@@ -477,7 +508,9 @@ def chance_good(log_odds: float) -> float:
 
 
 def bad_reading(white: Array, root: Array, noise: Array) -> BadReading | None:
-    """Return the evidence for errors in a reading; None where it cannot be set aside.
+    """Return the evidence for errors in a reading; None where nothing speaks for them.
+
+    Dimensions: D spot coordinates (row and column of every spot).
 
     Parameters
     ----------
@@ -506,7 +539,10 @@ def bad_reading(white: Array, root: Array, noise: Array) -> BadReading | None:
 
 
 def _with_errors(precision: Array, pulled: Array, variance: Array) -> Array:
-    """Return the log likelihood ratio with errors at the 1, 2, ... coordinates that explain most, (D,)."""
+    """Return the log likelihood ratios for errors at the 1, 2, ... D coordinates that explain most, (D,).
+
+    Dimensions: D spot coordinates (row and column of every spot).
+    """
     free, total, out = np.ones(len(pulled), bool), 0.0, np.empty(len(pulled))
     for number in range(len(pulled)):
         inner = 1.0 + variance * np.diag(precision)
@@ -521,12 +557,14 @@ def _with_errors(precision: Array, pulled: Array, variance: Array) -> Array:
 
 
 def jump_evidence(track: Track, gap: Array, bodies: Sequence[JumpingBody], life: float, noise: Array) -> float:
-    """Return the log likelihood ratio of all readings with at most one jump at any of L places, to that without a jump.
+    """Return the log likelihood ratio of the last readings with at most one jump to that without any jump.
+
+    Dimensions: D spot coordinates (row and column of every spot).
 
     Parameters
     ----------
     track : Track
-        Filter with the step hypotheses at the L places.
+        Filter with a step hypothesis for each of L gaps between readings.
     gap : (L,) ndarray
         Length of the interval in which each occurs, s.
     bodies : sequence of JumpingBody

@@ -1,7 +1,7 @@
 """Detection of jumps: steps of a body at an unknown time in a series of measurements.
 
 Whitened shifts u = L^-1 s of a series without jumps are independent numbers of unit variance, with L the Cholesky
-factor of their covariance by all other motions and by noise. A step of amounts z of some motions between the
+factor of their covariance due to all other motions and to noise. A step of amounts z of some motions between the
 measurements k - 1 and k adds G_k A z to them, G_k = L^-1 (e_k x 1), e_k being 1 from measurement k on. The generalised
 likelihood ratio of that step against none, its amounts being free, is
 
@@ -41,27 +41,30 @@ from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.statistics import limit_of
 
 MOST = 100
-"""Greatest number of jumps that are searched for in one series."""
+"""Largest number of jumps that are searched for in one series of measurements."""
 UNOBSERVABLE = 1e-9
-"""Eigenvalue of J, relative to the largest, below which a combination of motions counts as unobservable: float64 has no
-significant digits of it.
+"""Eigenvalue of a step's information matrix, relative to the largest, that counts as unobservable.
+
+Below it, float64 has no significant digits of the combination of motions.
 """
 _UNLIKELY = 1e-4
-"""Likelihood relative to that of the most likely time below which a time is excluded."""
+"""Likelihood of a time of a jump, relative to the most likely time, below which that time is excluded."""
 _AHEAD = 100.0
-"""Length after the end of a series, in units of its length, over which a forecast includes further jumps."""
+"""Length of time after the end of a series, in units of its length, over which a forecast includes further jumps."""
 _AGAIN, _TWO_VALUED = 1.0, 1.5
 """For a smoother: weight of the repeated uncertainty of a detected jump in the spots, and of the jump's own square."""
 _INFLATIONS = np.logspace(0.0, 8.0, 161)
-"""Factors by which the variance of a jump is increased to find the most likely one."""
+"""Factors by which the prior variance of a jump is increased in the search for the most likely one."""
 _SIZES = np.linspace(0.0, 8.0, 401)
 _MEAN_SQUARE = 2.0 * (_SIZES[1] - _SIZES[0]) * _SIZES**2 * np.exp(-0.5 * _SIZES**2) / np.sqrt(2.0 * np.pi)
-"""Contributions to the mean square of a normal number by its size in standard deviations."""
+"""Contribution of each size in _SIZES (in standard deviations) to the mean square of a normal number."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Motions that may jump together.
+    """Motions of one body, one or all, that are tested for having jumped together.
+
+    Dimensions: D spot coordinates (row and column of every spot), r motions of the body that may jump.
 
     Attributes
     ----------
@@ -70,9 +73,9 @@ class Candidate:
     motions : tuple of int
         Indices of the motions among the disturbances.
     spots : (D, r) ndarray
-        Spot shifts, px, by independent amounts of unit variance that make up the motions.
+        Spot shifts, px, due to independent amounts of unit variance that make up the motions.
     root : (r, r) ndarray
-        Motions by these amounts.
+        Matrix from these amounts to the motions, in prior standard deviations.
     """
 
     body: str
@@ -83,14 +86,16 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Score and information of steps at K times, from which `most_likely_jump` tests the motions of any body.
+    """Score and information of a step at each of K times, from which the motions of any body are tested.
+
+    Dimensions: D spot coordinates (row and column of every spot).
 
     Attributes
     ----------
     after, until : (K,) ndarray
         Interval in which the step occurs, s.
     score : (K, D) ndarray
-        Score G' u.
+        Score G' u, with the whitened shifts u and the whitened effect G of a unit step of each spot coordinate.
     information : (K, D, D) ndarray
         Information G' G.
     """
@@ -103,7 +108,7 @@ class Steps:
 
 @dataclass(frozen=True)
 class Jump:
-    """Detected jump.
+    """Detected jump: a step of one body's motions at an unknown time, with everything that was found out about it.
 
     Attributes
     ----------
@@ -162,11 +167,11 @@ class Jump:
 
     @cached_property
     def law(self) -> TimeLaw:
-        """Law in time of the jump once it is detected."""
+        """Time law of the jump once it is detected: a step with a known distribution of its time."""
         return TimeLaw(event=self.chances)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the jump as JSON files contain it."""
+        """Return the jump as plain data for the JSON files of results."""
         amounts = zip(self.labels, self.units, self.sizes, self.sigmas, strict=True)
         return {
             "body": self.body,
@@ -181,7 +186,9 @@ class Jump:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """Motions that step once by unknown amounts: at an event, or a detected jump.
+    """One step of some motions by unknown amounts, either at a given event or as a detected jump.
+
+    Dimensions: D spot coordinates (row and column of every spot), P parameters.
 
     Attributes
     ----------
@@ -225,7 +232,13 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Amounts:
-    """Amounts of a jump for each of L places: mean (L, r), covariance (L, r, r), log weights (L,)."""
+    """Amounts of a jump under each of L hypotheses of its place among the readings.
+
+    The fields are the means of the amounts (L, r), their covariances (L, r, r) and the log weights of the hypotheses
+    (L,).
+
+    Dimensions: r motions of the body that may jump.
+    """
 
     mean: Array
     covariance: Array
@@ -233,16 +246,19 @@ class Amounts:
 
     @classmethod
     def of(cls, score: Array, information: Array, outputs: Array, times: float) -> Amounts:
-        """Compute the amounts from the score and information of steps.
+        """Compute the amounts of a jump from the score and information of a step at each place.
+
+        Dimensions: L gaps between readings, in each of which a step may have occurred, q values that readings can
+        contain (outputs), r motions of the body that may jump.
 
         Parameters
         ----------
         score : (L, q) ndarray
-            Score, as in `Steps`.
+            Score of a step at each place: weighted sum of the whitened readings after it.
         information : (L, q, q) ndarray
-            Information, as in `Steps`.
+            Information (inverse covariance) on the step's effect on the outputs.
         outputs : (q, r) ndarray
-            Effect of the motions.
+            Effect on the outputs of one prior standard deviation of each motion.
         times : float
             Ratio of their standard deviations to those of ``outputs``.
         """
@@ -256,7 +272,7 @@ class Amounts:
 
 
 def candidates(stated: Disturbances) -> tuple[Candidate, ...]:
-    """Return the candidates for jumps: each motion whose law is `jump`, and those of a body together.
+    """Return what is tested for jumps: each motion that may jump alone, and all such motions of a body together.
 
     Parameters
     ----------
@@ -277,7 +293,9 @@ def candidates(stated: Disturbances) -> tuple[Candidate, ...]:
 
 
 def steps(root: Array, white: Array, when: Array, inside: slice, reference: float | None) -> Steps:
-    """Return score and information of steps between any two consecutive measurements.
+    """Return score and information of a step between any two consecutive measurements of a series.
+
+    Dimensions: n measurements, D spot coordinates (row and column of every spot).
 
     Parameters
     ----------
@@ -312,7 +330,7 @@ def most_likely_jump(found: Sequence[Steps], may: Sequence[Candidate], stated: D
     Parameters
     ----------
     found : sequence of Steps
-        Steps at all times that are tested, piece by piece.
+        Steps at all times that are tested, one object for each section of the series.
     may : sequence of Candidate
         Candidates for jumps.
     stated : Disturbances
@@ -355,7 +373,7 @@ def most_likely_jump(found: Sequence[Steps], may: Sequence[Candidate], stated: D
 
 
 def _log_chance(square: Array, degrees: NDArray[np.int_]) -> Array:
-    """Return the logarithm of the probability of a larger chi-square, also where it underflows in float64."""
+    """Return the natural logarithm of the probability of a larger chi-square, also where it underflows in float64."""
     half, shape = 0.5 * square, 0.5 * np.maximum(degrees, 1)
     chance = gammaincc(shape, half)
     far = (shape - 1.0) * np.log(np.maximum(half, 1.0)) - half - gammaln(shape)
@@ -363,14 +381,20 @@ def _log_chance(square: Array, degrees: NDArray[np.int_]) -> Array:
 
 
 def _chances(after: Array, until: Array, log_ratio: Array) -> tuple[tuple[float, float], ...]:
-    """Return the distribution of the time of a step, all times having equal prior probability."""
+    """Return the distribution of the time of a step from its log likelihood ratio in each interval.
+
+    It consists of pairs (time in seconds, probability that the step has occurred by then); all times have equal prior
+    probability.
+    """
     weight = np.exp(log_ratio - log_ratio.max())
     weight = np.where(weight < _UNLIKELY, 0.0, weight * (until - after))
     return knots(after, until, weight / weight.sum())
 
 
 def knots(after: Array, until: Array, weight: Array) -> tuple[tuple[float, float], ...]:
-    """Return pairs (time, probability that a step has occurred by then), linear between.
+    """Return pairs (time, probability that a step has occurred by then), with linear interpolation between them.
+
+    Dimensions: L gaps between readings, in each of which a step may have occurred.
 
     Parameters
     ----------
@@ -394,12 +418,14 @@ def jump_scale(information: Array, score: Array) -> float:
 
     It is at least the size of the jump itself, and at least 1.
 
+    Dimensions: r motions of the body that may jump.
+
     Parameters
     ----------
     information : (r, r) ndarray
-        Information on its amounts.
+        Information (inverse covariance) of the readings on the jump's r amounts.
     score : (r,) ndarray
-        Score of its amounts.
+        Score of these amounts: information times their estimate.
     """
     values, vectors = np.linalg.eigh(information)
     values, along = np.maximum(values, 0.0), vectors.T @ score
@@ -411,7 +437,7 @@ def jump_scale(information: Array, score: Array) -> float:
 
 
 def with_jumps(stated: Disturbances, found: Sequence[Jump]) -> Disturbances:
-    """Return the prior with detected jumps appended as events, in this order.
+    """Return the prior with a copy of the motions of each detected jump appended as an event, in this order.
 
     Parameters
     ----------
@@ -426,7 +452,9 @@ def with_jumps(stated: Disturbances, found: Sequence[Jump]) -> Disturbances:
 
 
 def subthreshold_share(limit: float, seen: Array) -> Array:
-    """Return the share of the mean square of normal jumps that is due to those below the detection limit, (n,).
+    """Return the fraction of the mean square of normally distributed jumps that is due to undetected ones, (n,).
+
+    Dimensions: n jumps.
 
     Parameters
     ----------
@@ -482,6 +510,8 @@ def with_sizes(
     jump: Jump, stated: Disturbances, root: Array, white: Array, when: Array, reference: float | None
 ) -> Jump:
     """Return the jump with its sizes, estimated from all measurements with all other jumps known.
+
+    Dimensions: n measurements, D spot coordinates (row and column of every spot).
 
     Parameters
     ----------
@@ -544,6 +574,9 @@ class Bodies:
     ) -> Bodies:
         """Return all hypotheses that are not much less likely than the most likely one.
 
+        Dimensions: L gaps between readings, in each of which a step may have occurred, q values that readings can
+        contain (outputs).
+
         Parameters
         ----------
         may : sequence of Candidate
@@ -574,7 +607,10 @@ class Bodies:
 
     @property
     def spots(self) -> list[Array]:
-        """Effect of unit amounts of each body on the outputs, (q, r)."""
+        """Effect of unit amounts of each body on the q outputs, one array (q, r) for each body.
+
+        Dimensions: q values that readings can contain (outputs), r motions of the body that may jump.
+        """
         return [candidate.spots for candidate in self.own]
 
     @property
@@ -587,7 +623,10 @@ class Bodies:
     def known(
         self, mean: Array, covariance: Array, response: Array, levels: Sequence[Array], amounts: Sequence[Amounts]
     ) -> tuple[Array, Array]:
-        """Return mean (n,) and covariance (n, n) of a filter as if it had known of the jump.
+        """Return mean (n,) and covariance (n, n) that a filter would have if it had known of the jump from its start.
+
+        Dimensions: n states of the filter, L gaps between readings, in each of which a step may have occurred, q values
+        that readings can contain (outputs), r motions of the body that may jump.
 
         Parameters
         ----------
@@ -615,7 +654,9 @@ class Bodies:
 
 
 def mixture_moments(amounts: Sequence[Amounts], effects: Sequence[Array], weight: Array) -> tuple[Array, Array]:
-    """Return mean and covariance of the effect of jumps, averaged over bodies and places by their probabilities.
+    """Return mean and covariance of the effect of a jump, averaged over bodies and places by their probabilities.
+
+    Dimensions: o values affected by the jump, r motions of the body that may jump.
 
     Parameters
     ----------

@@ -93,12 +93,12 @@ from analysis.statistics import limit_of
 from optics.numerics.array_math import covariance_root
 
 _NEARLY = 1e-11
-"""Regularisation of the information, relative to the sum of its eigenvalues."""
+"""Number added to the diagonal of an information matrix before inversion, relative to the sum of its eigenvalues."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Evaluation:
-    """Evaluation of a reading of spots.
+    """Result of processing a reading of the spots, before it is decided whether the reading is bad.
 
     Attributes
     ----------
@@ -126,14 +126,16 @@ class _Evaluation:
 class SeriesFilter:
     """Kalman filter of the disturbances, with detection of jumps and of bad readings.
 
+    Dimensions: D spot coordinates (row and column of every spot).
+
     Attributes
     ----------
     stated : Disturbances
         Prior of the motions with their laws in time.
     reference_noise : (D, D) ndarray or None
-        Noise of the spots that shifts are counted from, px^2; None for none.
+        Noise of the spots that shifts are counted from, px^2; None if there is none.
     heat : HeatInputs or None
-        Temperatures that sensors read; None for none.
+        Temperatures that sensors read; None if there is none.
     life_s : float
         Time over which ``stated.jump_false_alarm`` counts, all tests together, s: each test gets its share by the ratio
         of the time between its two readings to the life, whatever the cadence of the readings.
@@ -148,7 +150,7 @@ class SeriesFilter:
     unfound : bool
         True to include jumps too small to be detected, where their rate is known.
     before_s : float
-        Time before the first reading of spots in which bodies may have jumped, s; 0 for none.
+        Time before the first reading of spots in which bodies may have jumped, s; 0 if there is none.
     leaving_out : bool
         True if a reading may be excluded as bad.
     candidates : tuple of Candidate
@@ -173,12 +175,15 @@ class SeriesFilter:
 
     @cached_property
     def space(self) -> StateSpace:
-        """State space of the disturbances."""
+        """State space (states, their transitions and their effects) of the disturbances."""
         return StateSpace(self.stated, self.reference_noise, self.heat, self.stepping)
 
     @cached_property
     def _step_levels(self) -> list[Array]:
-        """Covariance of the states by each step, (n, n)."""
+        """Covariance that each known step adds to the states, one array (n, n) for each step.
+
+        Dimensions: n states of the filter.
+        """
         out = []
         for step in self.steps:
             if step.moment is not None:
@@ -195,7 +200,10 @@ class SeriesFilter:
 
     @cached_property
     def _step_ends(self) -> Array:
-        """Interval in which each step occurs, (S, 2) s."""
+        """First and last possible time of each of the S known steps, (S, 2) s.
+
+        Dimensions: S steps.
+        """
         return np.array([(step.chances[0][0], step.chances[-1][0]) for step in self.steps]).reshape(-1, 2)
 
     def _with_steps(self, covariance: Array, then: float, now: float) -> Array:
@@ -212,25 +220,31 @@ class SeriesFilter:
 
     @cached_property
     def _stacked(self) -> Disturbances:
-        """Prior with all q outputs that readings may contain in place of the spots."""
+        """Prior whose spots are replaced by all outputs that readings may contain: spots, sensors and parameters."""
         if not self.parameters_read:
             return self.stated
         return replace(self.stated, spots=np.concatenate([self.stated.spots, self.stated.parameters]))
 
     @cached_property
     def walking(self) -> NDArray[np.int_]:
-        """Indices of the motions that jump at a known rate, (m,)."""
+        """Indices of the motions that jump at a known rate, (m,).
+
+        Dimensions: m motions that jump at a known rate.
+        """
         indices = [k for k, law in enumerate(self.stated.laws) if law.every_s is not None and self.unfound]
         return np.array(indices, int)
 
     @cached_property
     def _walk(self) -> Array:
-        """Effect of these motions on the level states, times the root of their rate, (r, m)."""
+        """Effect on the level states of the motions that jump at a known rate, times the root of their rate, (r, m).
+
+        Dimensions: r motions of the body that may jump, m motions that jump at a known rate.
+        """
         rates = np.array([1.0 / float(self.stated.laws[k].every_s or 1.0) for k in self.walking])
         return self.space.level_of(self.walking.tolist())[self.space.level] * np.sqrt(rates)
 
     def looks(self, between: ArrayLike) -> Array:
-        """Return the number of tests for a jump in the whole life, as a factor of the probability of one test.
+        """Return the number of tests for a jump in the whole life: the probability of a false alarm is divided by it.
 
         Parameters
         ----------
@@ -261,7 +275,7 @@ class SeriesFilter:
         return FilterState(time, math.nan, empty, empty, track, track if len(left) and self.candidates else None, left)
 
     def at(self, current: FilterState, time: float) -> FilterState:
-        """Return the predicted state at a later time without further readings.
+        """Return the state predicted for a later time if there are no further readings.
 
         Parameters
         ----------
@@ -295,6 +309,8 @@ class SeriesFilter:
     def with_random_walk(self, current: FilterState, left: Array, over: float) -> FilterState:
         """Return the state with the random walk of undetected jumps over a time added.
 
+        Dimensions: m motions that jump at a known rate.
+
         Parameters
         ----------
         current : FilterState
@@ -302,13 +318,13 @@ class SeriesFilter:
         left : (m,) ndarray
             Share of the mean square of jumps that is not detected.
         over : float
-            Time, s.
+            Length of the time, s.
         """
         covariance = self._with_random_walk(current.covariance, left, over)
         return replace(current, state=replace(current.state, covariance=covariance))
 
     def inflated(self, current: FilterState, observed: Observed, times: float) -> FilterState:
-        """Return the state for a sensor with a larger uncertainty than specified.
+        """Return the state with the predicted uncertainty of one sensor's reading increased.
 
         The covariance of the states is increased in the direction of its reading, and unchanged in all others.
 
@@ -335,7 +351,7 @@ class SeriesFilter:
         return replace(current, state=loose(current.state), search=search, pending=put)
 
     def update(self, current: FilterState, observed: Observed, sure: bool = False) -> tuple[FilterState, Innovation]:
-        """Update the state by one reading; return it with the innovation.
+        """Update the state by one reading; return it with the reading's difference from its prediction.
 
         Parameters
         ----------
@@ -344,7 +360,7 @@ class SeriesFilter:
         observed : Observed
             Reading, not before the time of ``current``.
         sure : bool
-            True if the reading has been declared good.
+            True if the reading has been declared good, so that it is not tested.
 
         Raises
         ------
@@ -416,7 +432,10 @@ class SeriesFilter:
         return _Evaluation(before, after, innovation, log_ratio - good, likely, bad)
 
     def _with_detection(self, current: FilterState, telling: bool = False) -> tuple[FilterState, Jump | None]:
-        """Return the state with the share of undetectable jumps after a reading, and with the jump that is detected."""
+        """Return the state after a test for jumps, and the jump that is detected, or None.
+
+        The state contains the fraction of the mean square of jumps that is too small to be detected.
+        """
         if not (self.candidates and len(current.until)):
             return current, None
         now = replace(current, undetected=self._undetectable_share(current))
@@ -424,7 +443,7 @@ class SeriesFilter:
         return (now, None) if jump is None else self._with_jump(now, jump)
 
     def _with_step(self, current: FilterState, after: float, until: float) -> FilterState:
-        """Return the state with a step hypothesis just before a reading added; the oldest one is discarded."""
+        """Return the state with a hypothesis of a step before a reading added; the oldest hypothesis is discarded."""
         start = max(0, len(current.until) + 1 - self.window)
 
         def more(track: Track) -> Track:
@@ -445,9 +464,12 @@ class SeriesFilter:
         )
 
     def read(self, mean: Array, covariance: Array, observed: Observed) -> tuple[Array, Array, Array, Array]:
-        """Return the prediction of a reading: mean, observation matrix, covariance of the rest, effect of unit outputs.
+        """Return the predicted reading and what is needed to compare it with the actual one.
 
-        The shapes are (d,), (d, n), (d, d) with noise included, and (d, q).
+        The result holds the prediction (d,), its derivatives with respect to the states (d, n), the covariance of noise
+        and second-order terms (d, d), and the effect of unit outputs on the reading (d, q).
+
+        Dimensions: d values of the reading, n states of the filter, q values that readings can contain (outputs).
 
         Parameters
         ----------
@@ -471,7 +493,7 @@ class SeriesFilter:
         return combinations @ values[width:], combinations @ rows[width:], noise, picked
 
     def whitened(self, track: Track, observed: Observed) -> Whitened:
-        """Return a reading divided by the root of its covariance.
+        """Return a reading transformed to independent values of unit variance by the root of its predicted covariance.
 
         Parameters
         ----------
@@ -498,7 +520,7 @@ class SeriesFilter:
         return Whitened(root, both[:, 0], both[:, 1 : n + 1], both[:, n + 1 : 2 * n + 1], both[:, 2 * n + 1 :])
 
     def ingested(self, track: Track, observed: Observed, w: Whitened | None = None) -> tuple[Track, Innovation]:
-        """Return a filter after one reading, and the innovation.
+        """Return a filter after one reading, and the difference of the reading from its prediction.
 
         Parameters
         ----------
@@ -507,7 +529,7 @@ class SeriesFilter:
         observed : Observed
             Reading.
         w : Whitened or None
-            Result of `whitened`, if known.
+            Whitened reading from `whitened`, if it has been computed already.
         """
         w = self.whitened(track, observed) if w is None else w
         covariance = track.covariance - w.gain.T @ w.gain  # symmetric to the bit, as the product is
@@ -523,7 +545,10 @@ class SeriesFilter:
         return ingested, Innovation(observed, w.white, log_score)
 
     def _undetectable_share(self, current: FilterState) -> Array:
-        """Return the share of the mean square of jumps that cannot be detected, (m,), by the oldest step hypothesis."""
+        """Return the undetectable fraction of the mean square of jumps, (m,), from the oldest step hypothesis.
+
+        Dimensions: m motions that jump at a known rate.
+        """
         information, between = current.jump_track.information[0], current.until[0] - current.after[0]
         column = self._stacked.spots[:, self.walking]
         seen = np.sqrt(np.maximum(np.einsum("qm,qr,rm->m", column, information, column), 0.0))
@@ -589,7 +614,7 @@ class SeriesFilter:
 
     @cached_property
     def _jumping(self) -> tuple[JumpingBody, ...]:
-        """All bodies that may jump; those without a known rate jump once in the life."""
+        """All bodies that may jump; one without a known rate is assumed to jump once in the life of the filter."""
         return jumping_bodies(self.stated, self.candidates, self.life_s)
 
     @cached_property
@@ -598,7 +623,7 @@ class SeriesFilter:
         return jumping_bodies(self.stated, self.candidates) if self.unfound else ()
 
     def mixture(self, current: FilterState) -> FilterState:
-        """Return the state with undetected jumps weighted by their probabilities.
+        """Return the state that includes undetected jumps, each weighted by its probability.
 
         Later readings continue from the state that is passed in.
 
@@ -631,7 +656,9 @@ class SeriesFilter:
         )
 
     def parameters(self, current: FilterState, time: float) -> tuple[Array, Array]:
-        """Return the parameters (P,) and their covariance (P, P) at a time.
+        """Return the changes of the camera parameters (P,), rad and m, and their covariance (P, P) at a time.
+
+        Dimensions: P parameters.
 
         Parameters
         ----------
@@ -644,7 +671,9 @@ class SeriesFilter:
         return self.parameters_of(state.mean, state.covariance, time)
 
     def parameters_of(self, mean: Array, covariance: Array, time: float) -> tuple[Array, Array]:
-        """Return the parameters (P,) and their covariance (P, P) of given states.
+        """Return the changes of the camera parameters (P,), rad and m, and their covariance (P, P) for given states.
+
+        Dimensions: P parameters, n states of the filter.
 
         Parameters
         ----------
@@ -663,7 +692,9 @@ class SeriesFilter:
     def motions_of(
         self, mean: Array, covariance: Array, time: float, since: float, acting: bool = False
     ) -> tuple[Array, Array]:
-        """Return the motions (M,) and their covariance (M, M) in prior standard deviations.
+        """Return the estimated motions (M,) and their covariance (M, M), in prior standard deviations.
+
+        Dimensions: M motions, n states of the filter.
 
         Parameters
         ----------
@@ -691,21 +722,23 @@ class SeriesFilter:
 
 
 def _symmetric(square: Array) -> Array:
-    """Return a covariance, symmetric to the last bit."""
+    """Return a covariance made symmetric to the last bit."""
     return np.asarray(0.5 * (square + square.T))
 
 
 T = TypeVar("T")
 _PIECE = 400
-"""Number of readings whose covariances are held at once."""
+"""Number of readings whose covariances are held in memory at once by the smoother."""
 
 
 def with_indicated_jumps(
     how: SeriesFilter, knowing: SeriesFilter, start: FilterState, observed: Sequence[Observed], left: Sequence[Array]
 ) -> tuple[FilterState, list[Array]]:
-    """Return the start state and the shares of undetected jumps, with the jumps that all readings indicate.
+    """Return the smoother's start state and shares of undetected jumps, with the jumps that all readings indicate.
 
     The shares, N arrays (m,), are those of the mean square of jumps before each reading.
+
+    Dimensions: m motions that jump at a known rate.
 
     Parameters
     ----------
@@ -714,11 +747,11 @@ def with_indicated_jumps(
     knowing : SeriesFilter
         Filter that does not search for jumps but knows the detected ones.
     start : FilterState
-        State before the first reading, as for `smoothed`.
+        State before the first reading.
     observed : sequence of Observed
         N readings in the order of time.
     left : sequence of (m,) ndarrays
-        Shares of undetectable jumps, as for `smoothed`.
+        Fraction of the mean square of jumps that could not be detected, before each of the N readings.
     """
     if not how.jumping_bodies or not observed:
         return start, list(left)
@@ -763,7 +796,11 @@ def smoothed(
     each: Callable[[Array, Array, float], T],
     note: Callable[[int, Array, Array], None] = lambda number, score, information: None,
 ) -> list[T]:
-    """Return results at given times from all readings: a forward pass, then a backward pass piece by piece.
+    """Return results at given times from all readings, by a forward and then a backward pass over the readings.
+
+    The backward pass works on sections of the series, to limit memory.
+
+    Dimensions: T times, m motions that jump at a known rate, n states of the filter.
 
     Parameters
     ----------
@@ -833,6 +870,8 @@ def smooth_jointly(
     The states at these times are carried along with the filter as constant copies, up to the last of them; the readings
     after that enter by the smoother.
 
+    Dimensions: T times, P parameters, m motions that jump at a known rate.
+
     Parameters
     ----------
     how : SeriesFilter
@@ -844,7 +883,7 @@ def smooth_jointly(
     wanted : (T,) array_like
         Times, s, in order, none before ``start``.
     left : sequence of (m,) ndarrays
-        Shares of undetectable jumps, as for `smoothed`.
+        Fraction of the mean square of jumps that could not be detected, before each of the N readings.
     """
     times, space = np.asarray(wanted, np.float64), how.space
     size, ahead = space.size, 0
@@ -894,7 +933,7 @@ def smooth_jointly(
 def _filtered(
     how: SeriesFilter, current: FilterState, observed: Sequence[Observed], left: Sequence[Array]
 ) -> Iterator[tuple[FilterState, Whitened]]:
-    """Yield the state before each reading of one piece, and the whitened reading."""
+    """Yield the state before each reading of one section of a series, and the whitened reading."""
     for reading, share in zip(observed, left, strict=True):
         before = replace(current, undetected=share)
         there = how.at(before, reading.time)
@@ -906,7 +945,7 @@ def _filtered(
 READINGS, SHARES = (1, 3, 10), (0.5, 0.95)
 """Numbers of readings after a jump within which it is detected, and shares of detected jumps."""
 _SIZES = np.geomspace(0.03, 100.0, 71)
-"""Simulated sizes relative to the prior, 12 percent apart."""
+"""Simulated sizes of a jump relative to its prior standard deviations, 12 percent apart."""
 _DRAWS, _BEFORE = 400, 20
 """Simulated jumps of each size, which give 95 percent to 1.1; readings after which the information is steady."""
 
@@ -929,7 +968,7 @@ class DetectionPower:
 
     @property
     def plain(self) -> dict[str, float | None]:
-        """Sizes by share and number of readings; None for none."""
+        """Smallest detectable sizes by share of detected jumps and number of readings, as plain data; None if larger."""
         keys = [f"{round(100 * share)}_percent_within_{n}" for n in READINGS for share in SHARES]
         return {
             key: size if size == size else None for key, size in zip(keys, self.sizes.ravel().tolist(), strict=True)
@@ -937,7 +976,9 @@ class DetectionPower:
 
 
 def detection_power(how: SeriesFilter, interval: float, noise: Array) -> tuple[DetectionPower, ...]:
-    """Return the smallest jump of each body that is detected in 50 % and in 95 % of cases within 1, 3 and 10 readings.
+    """Return the smallest jump of each body that is detected in 50 % and 95 % of cases within 1, 3 and 10 readings.
+
+    Dimensions: D spot coordinates (row and column of every spot).
 
     Parameters
     ----------
@@ -966,7 +1007,10 @@ def detection_power(how: SeriesFilter, interval: float, noise: Array) -> tuple[D
 
 
 def _step_informations(how: SeriesFilter, interval: float, noise: Array) -> Array:
-    """Return the information on a step by 1 to N readings after it, (N, q, q)."""
+    """Return the information (inverse covariance) on a step from 1 to N readings after it, (N, q, q).
+
+    Dimensions: q values that readings can contain (outputs).
+    """
     current, nothing = how.start(0.0), np.zeros(len(noise))
     out: list[Array] = []
     for k in range(_BEFORE + READINGS[-1]):
@@ -977,7 +1021,12 @@ def _step_informations(how: SeriesFilter, interval: float, noise: Array) -> Arra
 
 
 def _test(spots: Array, information: Array, chance: float) -> tuple[Array, float]:
-    """Return the matrix (r, q) that makes a score independent numbers, and the limit of the sum of their squares."""
+    """Return the test for one candidate: the matrix that whitens its score, (r, q), and the limit of the test.
+
+    The matrix turns a score into independent numbers of unit variance, whose sum of squares is compared with the limit.
+
+    Dimensions: r motions of the body that may jump, q values that readings can contain (outputs).
+    """
     values, vectors = np.linalg.eigh(spots.T @ information @ spots)
     seen = values > UNOBSERVABLE * values.max()
     return (vectors[:, seen] / np.sqrt(values[seen])).T @ spots.T, float(limit_of(chance, int(np.sum(seen))))
@@ -986,7 +1035,10 @@ def _test(spots: Array, information: Array, chance: float) -> tuple[Array, float
 def _detection_rates(
     spots: Array, informations: Array, tests: Sequence[Sequence[tuple[Array, float]]], rng: np.random.Generator
 ) -> Array:
-    """Return the share of jumps of each size that is detected with 1 to N readings, (N, S)."""
+    """Return the fraction of simulated jumps of each of S sizes that is detected within 1 to N readings, (N, S).
+
+    Dimensions: S sizes.
+    """
     amounts = rng.standard_normal((_DRAWS, spots.shape[1]))
     amounts *= np.sqrt(spots.shape[1]) / np.linalg.norm(amounts, axis=1, keepdims=True)
     step, noise, before = amounts @ spots.T, np.zeros((_DRAWS, len(spots))), np.zeros_like(informations[0])
@@ -1002,7 +1054,7 @@ def _detection_rates(
 
 
 def _smallest_size(found: Array, share: float) -> float:
-    """Return the size from which on a share of jumps is detected; NaN for none."""
+    """Return the size from which on a given fraction of jumps is detected; NaN if no size reaches it."""
     less = np.flatnonzero(found < share)
     first = less[-1] + 1 if len(less) else 0
     if first == len(_SIZES):

@@ -1,8 +1,9 @@
 """Error budget of a monitor: contributions of every motion and of every number of the prior to the variances.
 
-With spots s = A x + noise, parameters p = B x, x ~ N(0, C) and a quantity q = r p, an estimate g s has the error (g A -
-r B) x + g noise. With e = g A - r B the contribution of motion i to the variance e C e' is e_i (C e)_i: the
-contributions add up to the variance, and those of correlated motions can be negative.
+With spot shifts s = A x + noise, camera parameters p = B x, amounts x ~ N(0, C) of the motions and a quantity q = r p
+(a linear combination of the parameters with coefficients r), an estimate g s has the error (g A - r B) x + g noise.
+With e = g A - r B the contribution of motion i to the variance e C e' is e_i (C e)_i: the contributions add up to the
+variance, and those of correlated motions can be negative.
 
 A number of the prior is one standard deviation that a cause gives to motions of several bodies: ``figure Z7: 2 nm`` of
 all mirrors. Motions i and j contribute e_i C_ij e_j to the variance V of an estimate's error, which is proportional to
@@ -11,8 +12,8 @@ the square of the numbers, so that sigma depends on a number s by
     d ln sigma / d ln s = sum of e_i (C e)_i / V over the number's motions,
 
 its elasticity: a number of elasticity 0.4 that is 10 % larger makes sigma 4 % larger. For the best estimator this holds
-whether its prior is changed as well or not, since its gain is where the variance is least (the envelope theorem); sigma
-for a number twice as large is computed for both cases.
+whether its prior is changed as well or not, since its gain is where the variance is smallest (the envelope theorem);
+sigma for a number twice as large is computed for both cases.
 
 A prior that is a guess has heavier tails than a normal one. With each number multiplied by 1 / sqrt(w), w from a gamma
 distribution of shape nu / 2 and mean 1, motions have Student's distribution with nu degrees of freedom (Lange, Little
@@ -39,15 +40,17 @@ from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, CameraCalibra
 class Quantity:
     """Quantity read by the monitor, to first order a linear combination of the parameters of all cameras.
 
+    Dimensions: K cameras.
+
     Attributes
     ----------
     group : str
         Name of a camera, ``intersection_angle`` or ``ground``.
     parameter : Parameter
-        Reading of that group.
+        What of that group is read, with its unit.
     row : (4 K,) ndarray
-        Coefficients, in the reading's unit per rad and m of d_alpha, d_beta, d_gamma, d_f of one camera after the
-        other.
+        Coefficients of the linear combination, in the quantity's unit per rad of d_alpha, d_beta and d_gamma and per m
+        of d_f, of one camera after the other.
     """
 
     group: str
@@ -56,17 +59,17 @@ class Quantity:
 
     @property
     def key(self) -> str:
-        """Key in results, which ends in the unit."""
+        """Name of the quantity in files of results, which ends in its unit."""
         return self.parameter.key
 
     @property
     def name(self) -> str:
-        """Group and key, as operation plans name it: ``forward d_f_um``."""
+        """Name in operation plans, group and key: ``forward d_f_um``."""
         return f"{self.group} {self.parameter.key}"
 
 
 def quantities(cameras: Mapping[str, CameraCalibration], ground: GroundGeometry | None = None) -> tuple[Quantity, ...]:
-    """Return all quantities that are read of an instrument.
+    """Return all quantities that the monitor of an instrument reads.
 
     They are every parameter; for a pair the intersection angle; where the altitude is known, the errors on the ground
     at the middle of the line.
@@ -129,7 +132,7 @@ def unchanged_quantities(
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Contributions of the M motions to the variances of Q quantities.
+    """Contributions of each motion of the prior and of the noise to the variances of Q quantities.
 
     Attributes
     ----------
@@ -147,19 +150,27 @@ class Split:
 
     @property
     def sigma_before(self) -> Array:
-        """Standard deviations without a measurement, (Q,)."""
+        """Prior standard deviations of the quantities, without a measurement, (Q,), in their units.
+
+        Dimensions: Q quantities.
+        """
         return np.sqrt(self.before.sum(axis=1))
 
     @property
     def sigma(self) -> Array:
-        """Standard deviations of the estimate's error, (Q,)."""
+        """Standard deviations of the estimate's error due to motions and noise, (Q,), in the units of the quantities.
+
+        Dimensions: Q quantities.
+        """
         return np.sqrt(self.after.sum(axis=1) + self.noise)
 
     @staticmethod
     def by(shares: Array, names: Sequence[str]) -> dict[str, Array]:
-        """Return the contributions summed over the motions of each name, (Q,).
+        """Return name -> sum of the contributions of the motions with that name, (Q,).
 
         The names are in the order of their first occurrence.
+
+        Dimensions: Q quantities, M motions.
 
         Parameters
         ----------
@@ -175,16 +186,18 @@ class Split:
 def split(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> Split:
     """Compute the contributions of the motions to the variances of quantities, before and after a measurement.
 
+    Dimensions: Q quantities, K cameras, D spot coordinates (row and column of every spot).
+
     Parameters
     ----------
     rows : (Q, 4 K) ndarray
-        Coefficients of the quantities.
+        Coefficients of each quantity on the parameters of all cameras (rad and m).
     stated : Disturbances
         Prior of the disturbances.
     noise : (D, D) ndarray
         Covariance of the shifts, px^2.
     gain : (4 K, D) ndarray
-        Gain of an estimator.
+        Gain of an estimator, rad and m per px.
     """
     prior, reading = rows @ stated.parameters, rows @ gain
     error = reading @ stated.spots - prior
@@ -193,12 +206,14 @@ def split(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> Split
 
 
 def posterior_sigma(rows: Array, stated: Disturbances, noise: Array) -> Array:
-    """Return the posterior standard deviations of the best linear unbiased prediction, (Q,).
+    """Return the standard deviations of quantities after the best linear unbiased prediction, (Q,), in their units.
+
+    Dimensions: Q quantities, K cameras, D spot coordinates (row and column of every spot).
 
     Parameters
     ----------
     rows : (Q, 4 K) ndarray
-        Coefficients of the quantities.
+        Coefficients of each quantity on the parameters of all cameras (rad and m).
     stated : Disturbances
         Prior of the disturbances, with any number of spots.
     noise : (D, D) ndarray
@@ -211,14 +226,16 @@ def posterior_sigma(rows: Array, stated: Disturbances, noise: Array) -> Array:
 class LeastObservable:
     """Most likely motions by which a quantity is wrong by one sigma although all spots have been measured.
 
+    Dimensions: M motions, D spot coordinates (row and column of every spot).
+
     Attributes
     ----------
     amounts : (M,) ndarray
         Motions in standard deviations.
     change : float
-        Change of the quantity, its posterior standard deviation.
+        Change of the quantity by these motions, equal to its posterior standard deviation.
     spots : (D,) ndarray
-        Spot shifts by these motions, px.
+        Spot shifts due to these motions, px.
     noise : (D,) ndarray
         Standard deviations of the measured shifts, px.
     """
@@ -230,15 +247,18 @@ class LeastObservable:
 
 
 def least_seen(row: Array, stated: Disturbances, noise: Array) -> LeastObservable:
-    """Return the combination of motions that the spots observe least and that still changes a quantity.
+    """Return the combination of motions that the spots reveal least and that still changes a quantity.
 
-    With Q the posterior covariance of the motions and b = row B it is Q b / sqrt(b' Q b): of all combinations that
-    change the quantity by its posterior sigma the one of the largest posterior probability.
+    With the posterior covariance Q of the motions and the effect b = row B of each motion on the quantity, the
+    combination is Q b / sqrt(b' Q b): of all combinations that change the quantity by its posterior sigma the one of
+    the largest posterior probability.
+
+    Dimensions: K cameras, D spot coordinates (row and column of every spot).
 
     Parameters
     ----------
     row : (4 K,) ndarray
-        Coefficients of the quantity.
+        Coefficients of the quantity on the parameters of all cameras (rad and m).
     stated : Disturbances
         Prior of the disturbances.
     noise : (D, D) ndarray
@@ -255,12 +275,14 @@ def least_seen(row: Array, stated: Disturbances, noise: Array) -> LeastObservabl
 
 
 def sigma_if_known(rows: Array, stated: Disturbances, noise: Array, groups: Sequence[Sequence[str]]) -> Array:
-    """Return the posterior standard deviations if some motions were known exactly, (G, Q).
+    """Return the posterior standard deviations of quantities if some motions were known exactly, (G, Q).
+
+    Dimensions: Q quantities, K cameras, D spot coordinates (row and column of every spot).
 
     Parameters
     ----------
     rows : (Q, 4 K) ndarray
-        Coefficients of the quantities.
+        Coefficients of each quantity on the parameters of all cameras (rad and m).
     stated : Disturbances
         Prior of the disturbances.
     noise : (D, D) ndarray
@@ -284,7 +306,9 @@ def sigma_if_known(rows: Array, stated: Disturbances, noise: Array, groups: Sequ
 
 
 def with_further_spots(stated: Disturbances, spots: Array, own: Sequence[bool]) -> Disturbances:
-    """Return the prior with further spots that are measured at the same time.
+    """Return the prior for a monitor with further spots that are measured at the same time as the existing ones.
+
+    Dimensions: D spot coordinates (row and column of every spot), M motions.
 
     Parameters
     ----------
@@ -329,10 +353,12 @@ def with_further_spots(stated: Disturbances, spots: Array, own: Sequence[bool]) 
 def field_covariance(
     direction_rad: float, cameras: Mapping[str, CameraCalibration], half_field: Sequence[float]
 ) -> Array:
-    """Return the covariance of the parameters from ground control points, (4 K, 4 K).
+    """Return the covariance of the camera parameters (rad, m) as measured with ground control points, (4 K, 4 K).
 
     The points determine the direction of the line's middle, and of each half of the line relative to the other, to some
     angle: d_gamma and d_f are that angle at the line's end.
+
+    Dimensions: K cameras.
 
     Parameters
     ----------
@@ -351,15 +377,17 @@ def field_covariance(
 
 
 def calibrated_sigma(rows: Array, stated: Disturbances, noise: Array, field: Array, gap_s: float) -> Array:
-    """Return the standard deviations some time after a calibration on a test field, (Q,).
+    """Return the standard deviations of quantities some time after a calibration on a test field, (Q,).
 
     The test field on the ground gave the parameters, and the monitor measured then as well as now: unchanged motions
     are known, later changes are not.
 
+    Dimensions: Q quantities, K cameras, D spot coordinates (row and column of every spot).
+
     Parameters
     ----------
     rows : (Q, 4 K) ndarray
-        Coefficients of the quantities.
+        Coefficients of each quantity on the parameters of all cameras (rad and m).
     stated : Disturbances
         Prior of the disturbances with its laws in time; correlated motions have the same law.
     noise : (D, D) ndarray
@@ -367,7 +395,7 @@ def calibrated_sigma(rows: Array, stated: Disturbances, noise: Array, field: Arr
     field : (4 K, 4 K) ndarray
         Covariance of the parameters from the test field.
     gap_s : float
-        Time since then, s.
+        Time since the calibration, s.
     """
     before, across, after = np.array([law.two_time_moments(0.0, gap_s) for law in stated.laws]).reshape(-1, 3).T
     now, then, old_now = stated.correlation * after, stated.correlation * across, stated.correlation * before
@@ -390,15 +418,15 @@ def calibrated_sigma(rows: Array, stated: Disturbances, noise: Array, field: Arr
 
 
 UNOBSERVED = 0.1
-"""Shift relative to its noise below which a motion counts as having no effect on a spot."""
+"""Ratio of a motion's spot shift to the shift's noise below which the motion has no effect on a spot."""
 SHARE = 0.01
-"""Share of the variance of a quantity from which an unobserved body is reported."""
+"""Smallest fraction of the variance of a quantity from which on a body that the spots do not reveal is reported."""
 DEGREES = 4.0
-"""Degrees of freedom of Student's distribution, for numbers of the prior that are not measured."""
+"""Degrees of freedom of Student's distribution that is assumed for numbers of the prior that are guesses."""
 _DRAWS = 8_000
 _STEPS = 100
 _ROUNDING = 1e-12
-"""Relative step of a half width at which Newton's method ends; each step doubles the digits."""
+"""Step of a half width, relative to it, at which Newton's method ends; each step doubles the digits."""
 _LEVELS = (0.6826894921370859, 0.9544997361036416, 0.9973002039367398)
 """Probabilities within 1, 2 and 3 standard deviations of a normal error."""
 
@@ -418,9 +446,9 @@ class Elasticity:
     elasticity : (Q,) ndarray
         Relative change of sigma per relative change of the number.
     doubled : (Q,) ndarray
-        Sigma of the error if the number is twice as large and the prior is not changed.
+        Sigma of the error if the real number is twice as large but the estimator still assumes the original prior.
     told : (Q,) ndarray
-        Sigma of the error if the number is twice as large in the prior as well.
+        Sigma of the error if the number is twice as large in reality and in the estimator's prior.
     """
 
     number: str
@@ -434,7 +462,7 @@ class Elasticity:
 
 @dataclass(frozen=True, eq=False)
 class HeavyTail:
-    """Errors of Q quantities under a prior with heavy tails, read by the same estimator.
+    """Errors of Q quantities if the motions have heavier tails than the normal prior that the estimator assumes.
 
     Attributes
     ----------
@@ -455,7 +483,7 @@ class HeavyTail:
 
 
 def prior_numbers(stated: Disturbances) -> dict[str, list[int]]:
-    """Return the motions of each number of the prior. Axes with the same standard deviation of a cause are one number.
+    """Return for each number of the prior the indices of the motions whose standard deviation it is.
 
     Parameters
     ----------
@@ -475,18 +503,20 @@ def prior_numbers(stated: Disturbances) -> dict[str, list[int]]:
 
 
 def elasticities(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> tuple[Elasticity, ...]:
-    """Return the elasticities of all numbers of the prior, the largest for the first quantity first.
+    """Return the relative sensitivity of sigma to each number of the prior, largest for the first quantity first.
+
+    Dimensions: Q quantities, K cameras, D spot coordinates (row and column of every spot).
 
     Parameters
     ----------
     rows : (Q, 4 K) ndarray
-        Coefficients of the quantities.
+        Coefficients of each quantity on the parameters of all cameras (rad and m).
     stated : Disturbances
         Prior of the disturbances.
     noise : (D, D) ndarray
         Covariance of the shifts, px^2.
     gain : (4 K, D) ndarray
-        Gain of the estimator.
+        Gain of the estimator, rad and m per px.
     """
     reading = rows @ gain
     error = reading @ stated.spots - rows @ stated.parameters
@@ -514,20 +544,22 @@ def elasticities(rows: Array, stated: Disturbances, noise: Array, gain: Array) -
 
 
 def unobserved_bodies(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> dict[str, Array]:
-    """Return the shares of the variances by motions that hardly move the spots, (Q,), of each body.
+    """Return body -> fraction of each quantity's variance due to its motions that hardly move the spots, (Q,).
 
     Only bodies for which a share exceeds `SHARE` are returned.
+
+    Dimensions: Q quantities, K cameras, D spot coordinates (row and column of every spot).
 
     Parameters
     ----------
     rows : (Q, 4 K) ndarray
-        Coefficients of the quantities.
+        Coefficients of each quantity on the parameters of all cameras (rad and m).
     stated : Disturbances
         Prior of the disturbances.
     noise : (D, D) ndarray
         Covariance of the shifts, px^2.
     gain : (4 K, D) ndarray
-        Gain of the estimator.
+        Gain of the estimator, rad and m per px.
     """
     still = np.all(np.abs(stated.spots) < UNOBSERVED * np.sqrt(np.diag(noise))[:, None], axis=0)
     contributions = split(rows, stated, noise, gain)
@@ -541,18 +573,20 @@ def unobserved_bodies(rows: Array, stated: Disturbances, noise: Array, gain: Arr
 def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, degrees: float = DEGREES) -> HeavyTail:
     """Compute the errors of an estimator if each number of the prior has Student's distribution.
 
-    Each number has one random scale for all its motions, in place of its standard deviation.
+    Each number has one random scale for all its motions, instead of its standard deviation.
+
+    Dimensions: Q quantities, K cameras, D spot coordinates (row and column of every spot).
 
     Parameters
     ----------
     rows : (Q, 4 K) ndarray
-        Coefficients of the quantities.
+        Coefficients of each quantity on the parameters of all cameras (rad and m).
     stated : Disturbances
         Prior of the disturbances; its standard deviations are the scales.
     noise : (D, D) ndarray
         Covariance of the shifts, px^2.
     gain : (4 K, D) ndarray
-        Gain of the estimator.
+        Gain of the estimator, rad and m per px.
     degrees : float
         Degrees of freedom, above 2.
     """
@@ -583,7 +617,10 @@ def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, de
 
 
 def _of(error: Array, indices: Sequence[int]) -> Array:
-    """Return the error (Q, M) with all but some motions set to zero."""
+    """Return the error per unit of each motion (Q, M), set to zero for all motions but some.
+
+    Dimensions: Q quantities, M motions.
+    """
     out = np.zeros_like(error)
     out[:, indices] = error[:, indices]
     return out
@@ -594,6 +631,8 @@ def _half_widths(sigma: Array, level: float) -> Array:
 
     The probability grows with the half width ever more slowly. Newton's method from 0 therefore approaches from below
     at every step.
+
+    Dimensions: N random draws, Q quantities.
     """
     inverse = np.divide(1.0, sigma, out=np.zeros_like(sigma), where=sigma > 0.0)
     sure = np.mean(sigma <= 0.0, axis=0)  # errors of zero variance

@@ -1,8 +1,8 @@
 """Estimator `model`: weighted least squares on all spot coordinates with the Jacobian of the traced instrument.
 
 The instrument is linear over the small motions of a monitor: spot shifts s = A m (px) and changes of the camera's
-parameters p = B m, for P motions m. `gain` maps s to the Gauss-Markov estimate of m and on to p. It can separate only
-the family of motions that it assumes; `observability` reports quantitatively how it misreads all others.
+parameters p = B m, with the amounts m of P motions. `gain` maps s to the Gauss-Markov estimate of m and on to p. It can
+separate only the family of motions that it assumes; `observability` reports quantitatively how it misreads all others.
 
 Order of spot coordinates: row and column of one spot after the other, [left row, left column, right row, right column]
 of a plain pair, px, after - before. Order of parameters: d_alpha, d_beta, d_gamma (rad), d_f (m).
@@ -50,6 +50,8 @@ _ROUNDING = 1e-6
 class RankError(MeasurementError, ValueError):
     """Error raised when the spots cannot separate the motions.
 
+    Dimensions: K combinations, P motions that are fitted.
+
     Attributes
     ----------
     null_vectors : (K, P) ndarray
@@ -67,7 +69,9 @@ def gain(
     parameter_jacobian: ArrayLike,
     motion_names: Sequence[str] | None = None,
 ) -> Array:
-    """Return the gain of the weighted least-squares fit, parameters per pixel of shift, (..., 4, D).
+    """Return the gain of the weighted least-squares fit, (..., 4, D) rad and m per pixel of shift.
+
+    Dimensions: D spot coordinates (row and column of every spot).
 
     Parameters
     ----------
@@ -105,7 +109,9 @@ def gain(
 
 @dataclass(frozen=True, eq=False)
 class MotionReport:
-    """Response of spots and model to one unit (scale) of one motion.
+    """Response of the spots and of the `model` estimator to one unit of one motion.
+
+    Dimensions: D spot coordinates (row and column of every spot), F motions that the model fits.
 
     Attributes
     ----------
@@ -164,6 +170,8 @@ def observability(
     family: Sequence[int],
 ) -> ObservabilityReport:
     """Report which motions the spots can separate.
+
+    Dimensions: D spot coordinates (row and column of every spot).
 
     Parameters
     ----------
@@ -283,12 +291,12 @@ def _sum(terms: Sequence[tuple[float, str]]) -> str:
 
 
 def _table(values: Array) -> Array:
-    """Return values (4,) in rad and m in the units of ``_SHOWN``."""
+    """Return four parameters in rad and m, (4,), converted to the units in which they are shown (arcsec, um)."""
     return values * np.array([factor for _, factor, _ in _SHOWN])
 
 
 def _show(values: Array, smallest: float = 0.0) -> str:
-    """Return the components above ``smallest`` (arcsec, um) and above rounding as text; empty if there are none."""
+    """Return as text those of four parameters that exceed ``smallest`` (arcsec, um) and rounding, empty if none."""
     return ", ".join(
         f"{name} {value:+.3g}{unit}"
         for value, (name, _, unit) in zip(_table(values), _SHOWN, strict=True)
@@ -334,26 +342,28 @@ def _jacobians(spots: ArrayLike, parameters: ArrayLike, limited: bool = True) ->
 
 
 _NOTHING = 1e-12
-"""Eigenvalue of the effect of a law's motions on the spots, relative to the largest, that is due to rounding alone."""
+"""Eigenvalue of the spots' covariance due to one law's motions, relative to the largest, that is only rounding."""
 
 
 @shows("sigma", "bodies")
 @dataclass(frozen=True, eq=False)
 class UnobservableMode:
-    """Motions that change quantities but move no spot.
+    """Motions that change quantities (camera parameters or combinations of them) but move no spot.
+
+    Dimensions: Q quantities, M motions.
 
     Attributes
     ----------
     quantities : (Q,) ndarray
         Effect of one standard deviation of the mode, in the quantities' units.
     sigma : float
-        Root of the sum of its squares in units of the quantities' scales.
+        Root of the sum of the squares of `quantities`, each divided by its scale.
     motions : (M,) ndarray
         Most likely motions that cause it, in prior standard deviations.
     bodies : mapping of str to float
         Share of each body in the mode's variance, the largest first; negative where motions are correlated.
     spots : float
-        Largest spot shift by the motions, px: rounding.
+        Largest spot shift due to the motions, px; only rounding makes it differ from 0.
     """
 
     quantities: Array
@@ -364,7 +374,10 @@ class UnobservableMode:
 
 
 def _unobservable(stated: Disturbances) -> Array:
-    """Return the covariance of the motions if each law's share of the spots were known, (M, M)."""
+    """Return the covariance of the motions that remains if the spot shifts due to each time law were known, (M, M).
+
+    Dimensions: M motions.
+    """
     out = np.zeros_like(stated.correlation)
     for law in dict.fromkeys(stated.laws):
         indices = np.flatnonzero([other == law for other in stated.laws])
@@ -381,6 +394,8 @@ def _unobservable(stated: Disturbances) -> Array:
 def error_floor(stated: Disturbances, rows: Array) -> Array:
     """Return the lower bound of the error covariance of quantities for every estimate from the spots, (Q, Q).
 
+    Dimensions: Q quantities, P parameters.
+
     Parameters
     ----------
     stated : Disturbances
@@ -393,11 +408,13 @@ def error_floor(stated: Disturbances, rows: Array) -> Array:
 
 
 _LEAST_MODE = 1e-3
-"""Sigma relative to that of the first mode below which a mode is excluded."""
+"""Ratio of a mode's sigma to that of the first mode below which the mode is not reported."""
 
 
 def unobservable_modes(stated: Disturbances, rows: Array, scale: Array) -> tuple[UnobservableMode, ...]:
-    """Return the modes of the error floor, the largest first.
+    """Return the changes of quantities that no measurement of the spots reveals, the largest first.
+
+    Dimensions: Q quantities, P parameters.
 
     Parameters
     ----------

@@ -50,9 +50,9 @@ from analysis.arrays import ARCSEC, UM_PER_M, Array, StateArrays, UndeterminedEr
 
 FORMULAS = ("paper_single", "paper_joint", "derived")
 PARAMETERS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
-"""Keys of the parameters in results, which end in their unit."""
+"""Names of the four parameters of a camera in files of results; each ends in the parameter's unit."""
 PER_SI = np.array([1 / ARCSEC, 1 / ARCSEC, 1 / ARCSEC, UM_PER_M])
-"""Number of these units in one SI unit (rad, m)."""
+"""Number of the units arcsec, arcsec, arcsec, um in one SI unit (rad, m), for the four parameters."""
 
 
 @shows("principal_distance_m [m]", "separation_m [mm]", "pitch_m [um]", "field_alpha_rad [deg]", "field_beta_rad [deg]")
@@ -121,7 +121,7 @@ class MonitorGeometry:
 @shows("d_alpha_rad [arcsec]", "d_beta_rad [arcsec]", "d_gamma_rad [arcsec]", "d_f_m [um]")
 @dataclass(frozen=True, eq=False)
 class CameraParameters(StateArrays):
-    """Changes of one camera, scalars or arrays of one shape (...).
+    """Changes of one camera: numbers for one state, or arrays of one common shape for many states.
 
     Attributes
     ----------
@@ -130,9 +130,10 @@ class CameraParameters(StateArrays):
     d_f_m : ndarray
         Change of the principal distance, m.
     covariance : (..., 4, 4) ndarray
-        Covariance of d_alpha, d_beta, d_gamma (rad), d_f (m) by the noise of the images.
+        Covariance of d_alpha, d_beta, d_gamma (rad), d_f (m) due to the noise of the images.
     total : (..., 4, 4) ndarray or None
-        Covariance by the noise and by the estimator's error under the disturbances of the prior; None without a prior.
+        Covariance due to the noise and to the estimator's error under the disturbances of the prior; None without a
+        prior.
     """
 
     d_alpha_rad: Array
@@ -144,16 +145,16 @@ class CameraParameters(StateArrays):
 
     @classmethod
     def from_vector(cls, values: ArrayLike, covariance: ArrayLike, total: ArrayLike | None = None) -> CameraParameters:
-        """Return the changes from plain arrays.
+        """Return the changes of one camera from plain arrays.
 
         Parameters
         ----------
         values : (..., 4) array_like
             Changes d_alpha, d_beta, d_gamma (rad), d_f (m).
         covariance : (..., 4, 4) array_like
-            Covariance by the noise.
+            Covariance due to the noise.
         total : (..., 4, 4) array_like or None
-            Covariance by noise and misfit; None without a prior.
+            Covariance due to noise and misfit; None without a prior.
         """
         vector, spread = np.asarray(values, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
         if vector.shape[-1:] != (4,) or spread.shape[-2:] != (4, 4):
@@ -169,23 +170,27 @@ class CameraParameters(StateArrays):
 
     @property
     def error_covariance(self) -> Array:
-        """Covariance of the total error, (..., 4, 4); without a prior, that of the noise."""
+        """Covariance of the total error in rad and m, (..., 4, 4); without a prior, that due to noise alone."""
         return self.covariance if self.total is None else self.total
 
     @property
     def sigma(self) -> Array:
-        """Standard deviations of the error, (..., 4), in the order and units of `vector`; see `error_covariance`."""
+        """Standard deviations of the total error of d_alpha, d_beta, d_gamma (rad) and d_f (m), (..., 4).
+
+        Without a prior they are those due to noise alone.
+        """
         return np.sqrt(np.diagonal(self.error_covariance, axis1=-2, axis2=-1))
 
     @property
     def sigma_noise(self) -> Array:
-        """Standard deviations by the noise of the images alone, (..., 4)."""
+        """Standard deviations due to the noise of the images alone, (..., 4): three angles in rad, d_f in m."""
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the changes with <key>_sigma and <key>_sigma_noise as floats, or nested lists for arrays.
+        """Return the changes with their total and noise standard deviations as plain data for files of results.
 
-        The keys are d_alpha_arcsec, d_beta_arcsec, d_gamma_arcsec and d_f_um.
+        The keys are d_alpha_arcsec, d_beta_arcsec, d_gamma_arcsec and d_f_um, and these with _sigma and _sigma_noise;
+        values are floats, or nested lists for arrays.
         """
         values, sigma, noise = self.vector, self.sigma, self.sigma_noise
         out: dict[str, Any] = {}
@@ -197,11 +202,13 @@ class CameraParameters(StateArrays):
 
 
 def coefficients(name: str, geometry: MonitorGeometry) -> Array:
-    """Return the coefficients of an estimator in FORMULAS, (4, 4) parameters per pixel of shift.
+    """Return the coefficients of a set of formulas, (4, 4) rad and m per pixel of shift.
 
     Rows are [d_alpha, d_beta, d_gamma, d_f] (rad, m), columns [left row, left column, right row, right column], after -
     before. For `paper_single` it is the argument of the arctangents. Multiplied with the Jacobian (4, M) of spot shifts
     per motion it gives a crosstalk table.
+
+    Dimensions: M motions.
     """
     if name not in FORMULAS:
         raise ValueError(f"monitoring: no estimator {name!r}; there are {', '.join(FORMULAS)}")
@@ -249,9 +256,10 @@ def paper_single(
 def paper_joint(
     before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry
 ) -> CameraParameters:
-    """Return the changes by Table 1 of paper 001, last column, as printed.
+    """Return the changes by the last column of Table 1 of paper 001, as printed.
 
-    For the sign of Y_L see the module.
+    The table does not define the sign of Y_L; each row takes the sign that agrees with the single-change formula beside
+    it.
 
     Parameters
     ----------
@@ -269,7 +277,7 @@ def paper_joint(
 
 
 def derived(before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry) -> CameraParameters:
-    """Return the changes by the corrected formulas (see the module).
+    """Return the changes by the corrected formulas, the first-order response of a plane-mirror return.
 
     Parameters
     ----------
@@ -327,7 +335,7 @@ class IntersectionAngleChange(StateArrays):
     sigma_rad : (...) ndarray
         Standard deviation of its error, rad.
     sigma_noise_rad : (...) ndarray or None
-        Standard deviation by the noise of the images, rad; None where that is the whole error.
+        Standard deviation due to the noise of the images, rad; None where that is the whole error.
     """
 
     change_rad: Array
@@ -336,7 +344,7 @@ class IntersectionAngleChange(StateArrays):
 
     @property
     def noise_rad(self) -> Array:
-        """Standard deviation by the noise of the images alone, (...) rad."""
+        """Standard deviation due to the noise of the images alone, (...) rad."""
         return self.sigma_rad if self.sigma_noise_rad is None else self.sigma_noise_rad
 
 
@@ -348,7 +356,7 @@ def exact(
     across: Array | None = None,
     across_total: Array | None = None,
 ) -> IntersectionAngleChange:
-    """Return the change of the angle between the two rotated lines of sight in space, without approximation.
+    """Return the change of the angle between the two rotated lines of sight in space, without linearisation.
 
     Parameters
     ----------
@@ -361,9 +369,9 @@ def exact(
     backward_look_rad : float
         Look angle of the other camera, rad.
     across : (..., 4, 4) ndarray or None
-        Covariance of the forward with the backward parameters by noise; None for none.
+        Covariance of the forward with the backward parameters due to noise; None if there is none.
     across_total : (..., 4, 4) ndarray or None
-        Covariance of the forward with the backward parameters of the total error; None for none.
+        Covariance of the forward with the backward parameters of the total error; None if there is none.
 
     Raises
     ------
@@ -406,7 +414,7 @@ def exact(
 
 
 def _between(u: tuple[Array, Array, Array], v: tuple[Array, Array, Array]) -> Array:
-    """Return the angle between unit vectors given by their components."""
+    """Return the angle, rad, between two unit vectors given by their components."""
     (ux, uy, uz), (vx, vy, vz) = u, v
     sine = np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2)
     return np.asarray(np.arctan2(sine, ux * vx + uy * vy + uz * vz))
@@ -425,9 +433,12 @@ def _line_of_sight(d_alpha: Array, d_beta: Array, look: float) -> tuple[Array, A
 
 
 EARTH_RADIUS_M = 6_371_000.0
-"""Mean radius (IUGG). The Earth's flattening and rotation change the results here by less than 1 %."""
+"""Mean radius of the Earth (IUGG), m.
+
+The Earth's flattening and rotation change the results here by less than 1 %.
+"""
 _PLACES = 9
-"""Number of positions along the line over which rms values are taken."""
+"""Number of positions along the line CCD over which rms values of ground errors are taken."""
 
 
 @shows()
@@ -443,7 +454,7 @@ class GroundError(StateArrays):
     sigma_m : (S, 3) ndarray
         Standard deviation of the error after correction by the estimate.
     sigma_noise_m : (S, 3) ndarray
-        Part of `sigma_m` by the noise of the images.
+        Part of `sigma_m` due to the noise of the images.
     plan_rms_m, height_rms_m : (S,) ndarray
         Standard deviations after correction, rms over the line: of both plan axes together, and of the height.
     """
@@ -457,7 +468,7 @@ class GroundError(StateArrays):
 
 @dataclass(frozen=True)
 class GroundGeometry:
-    """Pair of line cameras over the ground.
+    """Geometry of a pair of line cameras that looks at the ground from an orbit.
 
     Attributes
     ----------
@@ -482,7 +493,7 @@ class GroundGeometry:
     half_field: tuple[float, float]
 
     def __post_init__(self) -> None:
-        """Raise UndeterminedError if the geometry does not give an intersection."""
+        """Raise UndeterminedError if the rays of the two cameras do not intersect on the ground."""
         if any(abs(math.sin(a)) * (EARTH_RADIUS_M + self.altitude_m) >= EARTH_RADIUS_M for a in self.looks_rad):
             raise UndeterminedError("ground error: a camera looks past the Earth")
         if abs(self.looks_rad[0] - self.looks_rad[1]) < 1e-3:
@@ -497,7 +508,7 @@ class GroundGeometry:
 
     @cached_property
     def ranges_m(self) -> tuple[float, float]:
-        """Slant ranges in the plane of the orbit, m."""
+        """Distances from the cameras to the ground along their rays, in the plane of the orbit, m."""
         first, second = (
             EARTH_RADIUS_M * math.sin(i - a) / math.sin(a) if abs(a) > 1e-9 else self.altitude_m
             for i, a in zip(self.incidences_rad, self.looks_rad, strict=True)
@@ -506,16 +517,20 @@ class GroundGeometry:
 
     @cached_property
     def matrices(self) -> Array:
-        """Shifts on the ground along, across and up, m, for changes of the two cameras, (places, 3, 8).
+        """Matrices from changes of the two cameras to shifts on the ground, at places along the line, (places, 3, 8).
 
-        The changes are d_alpha, d_beta, d_gamma (rad), d_f / f of the first camera, then of the second. The middle of
-        the line is the middle place.
+        Rows of a matrix are the shifts along the track, across it and up, in m; columns are the changes. The changes
+        are d_alpha, d_beta, d_gamma (rad), d_f / f of the first camera, then of the second. The middle of the line is
+        the middle place.
         """
         reach = min(r * t for r, t in zip(self.ranges_m, self.half_field, strict=True))
         return np.stack([self._at(c) for c in np.linspace(-reach, reach, _PLACES)])
 
     def _at(self, across: float) -> Array:
-        """Return the matrix (3, 8) at one distance across the track, m."""
+        """Return the matrix (3, 8) from changes of both cameras to shifts on the ground at one place.
+
+        ``across`` is the distance of the place from the middle of the line, across the track, in m.
+        """
         normal, right = np.zeros((3, 3)), []
         for incidence, far in zip(self.incidences_rad, self.ranges_m, strict=True):
             t = across / far
@@ -534,7 +549,7 @@ class GroundGeometry:
         return matrix
 
     def rows(self, principal_distances_m: tuple[float, float]) -> Array:
-        """Return the matrices, (places, 3, 8), for d_f in metres.
+        """Return the matrices from changes of the two cameras, with d_f in metres, to ground shifts, (places, 3, 8).
 
         Parameters
         ----------
@@ -547,7 +562,7 @@ class GroundGeometry:
         return out
 
     def found(self, true: Array, assumed: Array) -> Array:
-        """Return the exact error along, across and up, (..., 3), of points that are located along assumed rays.
+        """Return the exact error along, across and up, (..., 3) m, of points that are located along assumed rays.
 
         Parameters
         ----------
@@ -577,14 +592,16 @@ class GroundGeometry:
     def error(
         self, values: Array, noise: Array, total: Array, principal_distances_m: tuple[float, float]
     ) -> GroundError:
-        """Return the errors on the ground by estimated changes, and the standard deviations after correction.
+        """Return the errors on the ground due to estimated changes, and the standard deviations after their correction.
+
+        Dimensions: S states.
 
         Parameters
         ----------
         values : (S, 8) ndarray
             Estimated changes, rad and m.
         noise : (S, 8, 8) ndarray
-            Covariance of the changes by noise.
+            Covariance of the changes due to noise.
         total : (S, 8, 8) ndarray
             Covariance of their total error.
         principal_distances_m : tuple of float

@@ -132,7 +132,7 @@ class MonitorCalibration:
 
     @property
     def spots(self) -> int:
-        """Number of spots C."""
+        """Number of spots of all cameras."""
         return sum(len(camera.channels) for camera in self.cameras.values())
 
 
@@ -145,12 +145,14 @@ _PER_SI: Mapping[str, float] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Parameter:
-    """Change of a camera, a pair or a ground point that the monitor reads and that is traced as truth.
+    """Declaration of one quantity that the monitor reads of a camera, a pair or a ground point.
+
+    Its true change is traced in simulations for comparison.
 
     Attributes
     ----------
     key : str
-        Name in files, which ends in the unit.
+        Name in files of results, which ends in the unit.
     symbol : str
         Name in tables, figures and sentences.
     meaning : str
@@ -185,7 +187,7 @@ class Parameter:
 
     @property
     def per_si(self) -> float:
-        """Number of its units in one SI unit."""
+        """Number of this parameter's units in one SI unit."""
         return _PER_SI[self.file_unit]
 
 
@@ -207,10 +209,12 @@ ESTIMATED = (
         (0.0, 0.0, 0.0, 1.0),
     ),
 )  # fmt: skip
-"""Parameters that the estimators determine, in the order of a camera's vector of changes."""
+"""Parameters that the estimators determine, in the order of a camera's vector: d_alpha, d_beta, d_gamma, d_f."""
 CAMERA_PARAMETERS = ExtensionTable("camera_parameters", {one.key: one for one in ESTIMATED}, Parameter)
-"""Readings of every camera by their key. The first four are the parameters that estimators determine; a further one is
-a linear combination of them, and its name here is its key.
+"""Quantities that the monitor reads of every camera, by their key in files.
+
+The first four are the parameters that estimators determine; a further one is a linear combination of them, and its name
+here is its key.
 """
 ANGLE = Parameter("change_arcsec", "Δθ", "change of the angle between the cameras' lines of sight, opening positive", 4)
 """Change of the angle between two cameras' lines of sight."""
@@ -219,11 +223,13 @@ GROUND = (
     Parameter("across_m", "across", "error on the ground across the track, to the right", 3),
     Parameter("height_m", "height", "error in height, up", 3),
 )
-"""Errors of a pair's ground points that are located as if the cameras had not changed."""
+"""Quantities of a pair on the ground: errors of points that are located as if the cameras had not changed."""
 
 
 def rows_of(camera: CameraCalibration) -> Array:
-    """Return the coefficients of a camera's readings, (P, 4), in their units per rad and m of the four parameters.
+    """Return the coefficients of a camera's readings on its four parameters, (P, 4), in their units per rad and m.
+
+    Dimensions: P readings of the camera.
 
     Parameters
     ----------

@@ -6,16 +6,16 @@ Noise that differs from the data sheet is in every pixel of every frame, a chang
 and a wrongly calibrated shape in the spots before as in those after.
 
 **Linearity.** Whether the motions of a reading are small enough for a linear estimator is tested with a retraced state.
-An estimator reads parameters by a set of motions x, s = A x and p = B x for the spots and the parameters; x = G s
-estimates them. Traced again, the instrument in the state x has the spots s(x) and the parameters p(x). One Gauss-Newton
-step about x,
+An estimator assumes a set of motions of amounts x, which shift the spots by s = A x and change the parameters by p = B
+x; x = G s estimates them. Traced again, the instrument in the state x has the spots s(x) and the parameters p(x). One
+Gauss-Newton step about x,
 
     p(x) + B (x' - x),   x' = G (s - s(x) + A x),
 
-differs from the linear reading B G s by its non-linearity. Where that is more than `NONLINEAR_SIGMAS` standard
-deviations of any quantity the steps are iterated to convergence, and the reading is p of the result (Nocedal and
-Wright, Numerical Optimization, 2006, sec. 10.3). The derivatives remain those of the nominal instrument: their relative
-change is of the size of the motions in radians.
+differs from the linear reading B G s by its non-linearity. Here x' is the estimate of the motions after the step. Where
+the difference is more than `NONLINEAR_SIGMAS` standard deviations of any quantity the steps are iterated to
+convergence, and the reading is p of the result (Nocedal and Wright, Numerical Optimization, 2006, sec. 10.3). The
+derivatives remain those of the nominal instrument: their relative change is of the size of the motions in radians.
 """
 
 from __future__ import annotations
@@ -45,9 +45,12 @@ from analysis.spots.likelihood import FALSE_ALARM, FitStates, fit_states, requir
 from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_covariance, noise_parts
 
 ALIKE = 2.0
-"""Ratio of a core's chi-square to that of the frames' noise up to which the noise explains both."""
+"""Ratio of the chi-square of a spot's core to that of the frames' noise up to which the noise explains both."""
 LOUD = 1.3
-"""Squared ratio of the frames' noise to the specified one above which it is too large: 6 sigma of an image's median."""
+"""Squared ratio of the frames' noise to the specified one above which it is too large.
+
+A median over an image exceeds it by chance only with a deviation of 6 sigma.
+"""
 NOISE, BEFORE, AFTER = "noise", "before", "shape"
 """Causes: noise of the frames, the shape of the spots before, their shape after alone."""
 
@@ -59,13 +62,13 @@ class SpotWarning:
     Attributes
     ----------
     cause : str
-        Cause: `noise`, `before` or `shape`.
+        Cause: ``noise`` of the frames, wrong shape of the spots ``before``, or changed ``shape`` after alone.
     spots : tuple of int
         Indices of the spots that do not fit.
     widening : float
         Largest factor by which the sigma of a spot was increased.
     text : str
-        Text without a full stop.
+        Reason as a sentence without a full stop.
     """
 
     cause: str
@@ -107,18 +110,24 @@ class SpotEvidence:
         Parameters
         ----------
         parts : sequence of SpotEvidence
-            At least one.
+            Evidence of each series; at least one.
         """
         return cls(parts[0].before, FitStates.joined([part.after for part in parts]))
 
     @property
     def holds(self) -> NDArray[np.bool_]:
-        """True for states whose spots before and after are as assumed, (S,)."""
+        """True for states whose spots before and after are as assumed, (S,).
+
+        Dimensions: S states.
+        """
         return np.asarray(np.all(self.before.fits, axis=1) & np.all(self.after.fits, axis=1))
 
     @property
     def widening(self) -> Array:
-        """Factor of the sigma of each spot's position, the larger of before and after, (S, C)."""
+        """Factor of the sigma of each spot's position, the larger of before and after, (S, C).
+
+        Dimensions: S states, C spots.
+        """
         return np.asarray(np.maximum(self.before.widening, self.after.widening))
 
     @property
@@ -127,7 +136,7 @@ class SpotEvidence:
         return int(np.argmax(np.max(self.widening, axis=1)))
 
     def course_doubt(self, moments: Sequence[str], names: Sequence[str]) -> str | None:
-        """Return the reason why sigma is not valid at the worst of the states; None where it always is.
+        """Return the reason why sigma is not valid at the worst of many times; None where it is valid at all.
 
         Parameters
         ----------
@@ -194,7 +203,7 @@ class SpotEvidence:
 
 
 def _noisy(one: FitStates, k: int) -> bool:
-    """Return True if the noise of the frames explains the fit of spot k: all pixels have it, its core not much more."""
+    """Return True if the noise of the frames explains the misfit of spot k, which is then about equal everywhere."""
     noise, whole, core = (float(v[0, k]) for v in (one.noise, one.whole, one.core))
     return noise > LOUD and whole < LOUD * noise and core < ALIKE * noise
 
@@ -206,13 +215,15 @@ def _number(value: float) -> str:
 NONLINEAR_SIGMAS = 3.0
 """Error of a linear reading, in sigmas of a quantity, above which the reading is iterated."""
 _REST = 1e-2
-"""Largest change of a quantity by the last step, in sigmas."""
+"""Largest change of a quantity by the last iteration step, in sigmas, for the iteration to count as converged."""
 _MOST_STEPS = 20
 
 
 @dataclass(frozen=True, eq=False)
 class Retraced:
-    """Exact effects of S states.
+    """Exact effects of S states on spots and cameras, from a ray trace.
+
+    Dimensions: D spot coordinates (row and column of every spot), K cameras.
 
     Attributes
     ----------
@@ -229,6 +240,8 @@ class Retraced:
 @dataclass(frozen=True, eq=False)
 class MotionModel:
     """Motions assumed by an estimator.
+
+    Dimensions: D spot coordinates (row and column of every spot), P motions, K cameras.
 
     Attributes
     ----------
@@ -256,7 +269,9 @@ class MotionModel:
 
 @dataclass(frozen=True, eq=False)
 class Curvature(StateArrays):
-    """Test of the linear readings of an estimator in S states by retraced states.
+    """Test whether the linear readings of an estimator are accurate, by a ray trace of the S estimated states.
+
+    Dimensions: Q quantities.
 
     Attributes
     ----------
@@ -274,7 +289,10 @@ class Curvature(StateArrays):
 
     @property
     def holds(self) -> NDArray[np.bool_]:
-        """True where the readings are valid, linear or not, (S,)."""
+        """True where the readings are valid, because they are linear or because the iteration converged, (S,).
+
+        Dimensions: S states.
+        """
         return self.rests
 
     def worst(self, state: int = 0) -> tuple[int, float]:
@@ -288,7 +306,9 @@ class Curvature(StateArrays):
 
 @dataclass(frozen=True, eq=False)
 class LinearReading:
-    """Linear readings of an estimator in S states.
+    """Results of an estimator in S states by its linear gain, with the motions it assumes.
+
+    Dimensions: K cameras.
 
     Attributes
     ----------
@@ -308,7 +328,9 @@ class LinearReading:
 def read_again(
     readings: Mapping[str, LinearReading], shift: Array, noise: Array, rows: Array
 ) -> dict[str, tuple[Array, Curvature]]:
-    """Return the readings (S, 4 K) of each estimator, iterated where they are not linear, and the tests.
+    """Return each estimator's readings (S, 4 K), iterated where they are not linear, and the tests of linearity.
+
+    Dimensions: S states, K cameras, D spot coordinates (row and column of every spot), Q quantities.
 
     Parameters
     ----------
@@ -327,7 +349,10 @@ def read_again(
 
 
 def _traced_together(wanted: Mapping[str, tuple[MotionModel, Array]]) -> dict[str, Retraced]:
-    """Return the exact effects of the amounts (S, P) of each model; models with the same trace are traced together."""
+    """Return the exact effects of the amounts (S, P) of each model; models with the same trace are traced together.
+
+    Dimensions: S states, P motions.
+    """
     groups: dict[int, list[str]] = {}
     for title, (model, _) in wanted.items():
         groups.setdefault(id(model.trace), []).append(title)
@@ -345,7 +370,9 @@ def _traced_together(wanted: Mapping[str, tuple[MotionModel, Array]]) -> dict[st
 
 @dataclass(frozen=True, eq=False)
 class _Steps:
-    """Gauss-Newton steps about the states of S readings of an estimator.
+    """Gauss-Newton iteration of an estimator's readings in S states.
+
+    Dimensions: D spot coordinates (row and column of every spot), P motions, Q quantities, K cameras.
 
     Attributes
     ----------
@@ -354,7 +381,7 @@ class _Steps:
     shift : (S, D) ndarray
         Shifts, px.
     gain : (S, P, D) ndarray
-        Gain G.
+        Gain G of the motions, their units per px.
     x : (S, P) ndarray
         Motions of the readings.
     sigma : (S, Q) ndarray
@@ -390,7 +417,10 @@ class _Steps:
         return np.asarray(np.einsum("spd,sd->sp", self.gain[states], rest))
 
     def judged(self, values: Array, traced: Retraced) -> tuple[Array, Curvature]:
-        """Return the readings (S, 4 K), iterated where they are not linear, and the test, from the traced states."""
+        """Return the readings (S, 4 K), iterated where they are not linear, and the test of linearity.
+
+        Dimensions: S states, K cameras.
+        """
         model, x, everything = self.model, self.x, slice(None)
         exact = Retraced(x @ model.spots.T, x @ model.parameters.T)
         exact.spots[self.far], exact.parameters[self.far] = traced.spots, traced.parameters
@@ -492,7 +522,10 @@ class Recovery(StateArrays):
 
     @property
     def shift(self) -> Array:
-        """Shifts after - before in the order of the spots, row and column, (S, 2 C) px."""
+        """Shifts after - before in the order of the spots, row and column, (S, 2 C) px.
+
+        Dimensions: S states, C spots.
+        """
         return (self.after - self.before).reshape(len(self.after), -1)
 
     def consistency(
@@ -507,7 +540,8 @@ class Recovery(StateArrays):
         state : int
             Index of the state.
         others : mapping of str to ndarray, or None
-            Further bodies, as in `analysis.monitor.disturbances.consistency`.
+            Further bodies that the prior does not contain, with the spot shifts of their motions, px; they are tested
+            as causes of a contradiction.
         """
         return consistency(self.shift[state], self.shift_covariance[state], disturbances, others)
 
@@ -516,6 +550,8 @@ def measure_spots(
     mean: Array, frames: int, calibration: MonitorCalibration, centroid: str = "ml", threads: int = 1
 ) -> SpotPositions:
     """Measure every spot of mean frames (B, H, W), B a multiple of the number of spots, in the calibration's order.
+
+    Dimensions: B images, H rows, W columns.
 
     Parameters
     ----------
@@ -547,6 +583,8 @@ def judged_spots(
 ) -> tuple[SpotPositions, FitStates]:
     """Measure spots with sigmas scaled by the goodness of their fits; return them with the fits' tests, (B / C, C).
 
+    Dimensions: B images, H rows, W columns.
+
     Parameters
     ----------
     mean : (B, H, W) ndarray
@@ -577,6 +615,8 @@ def recover_monitor(
     frames: int | None = None,
 ) -> Recovery:
     """Recover the changes of all cameras from frames of the monitor's spots before and after, with their covariance.
+
+    Dimensions: H rows, W columns.
 
     Parameters
     ----------
@@ -672,6 +712,8 @@ def recovery_of(
 ) -> Recovery:
     """Return the changes of all cameras from spots that have been measured already.
 
+    Dimensions: S states.
+
     Parameters
     ----------
     first : SpotPositions
@@ -683,13 +725,13 @@ def recovery_of(
     calibration : MonitorCalibration
         Calibration of the nominal instrument with C spots.
     disturbances : Disturbances or None
-        Prior of the disturbances, as in `recover_monitor`.
+        Prior of the disturbances; without it there is no estimator `posterior`.
     keep_parts : bool
         True to keep the noise of every spot, which is large.
     evidence : SpotEvidence or None
         Goodness of the fits; the positions are those of `judged_spots`.
     motions : mapping of str to MotionModel, or None
-        Motions that are traced again, as in `recover_monitor`.
+        For each estimator, the motions that are traced again to test whether its reading is linear.
     """
     spots = calibration.spots
     states = second.row.size // spots
@@ -723,6 +765,8 @@ def estimates(
 ) -> Estimates:
     """Apply all estimators to spot positions.
 
+    Dimensions: S states, C spots.
+
     Parameters
     ----------
     start : (S, C, 2) ndarray
@@ -734,11 +778,11 @@ def estimates(
     cameras : mapping of str to CameraCalibration
         Calibration of each camera.
     disturbances : Disturbances or None
-        Prior of the disturbances; None for none.
+        Prior of the disturbances; None if there is none.
     ground : GroundGeometry or None
         Ground geometry of a pair whose altitude is known.
     motions : mapping of str to MotionModel, or None
-        Motions that are traced again, as in `recover_monitor`.
+        For each estimator, the motions that are traced again to test whether its reading is linear.
     """
     shifts = Shifts(start, end, covariance, cameras, disturbances)
     found: dict[str, tuple[Array, Array, Array | None]] = {}
@@ -765,11 +809,13 @@ def estimates_of(
 ) -> Estimates:
     """Return the results that follow from changes of all cameras: of each camera, of their angle, on the ground.
 
+    Dimensions: S states, K cameras.
+
     Parameters
     ----------
     found : mapping of str to tuple of ndarrays
-        For each estimator, changes (S, 4 K) and their covariances (S, 4 K, 4 K) by noise and of the total error; None
-        for the last without a prior.
+        For each estimator, changes (S, 4 K) and their covariances (S, 4 K, 4 K) due to noise and of the total error;
+        None for the last without a prior.
     cameras : mapping of str to CameraCalibration
         Calibration of each camera.
     ground : GroundGeometry or None
@@ -798,12 +844,14 @@ def estimates_of(
 
 
 def joint(covariance: Array) -> Array:
-    """(S, 2 C, 2 C) from the covariances (S, C, 2, 2) of C spots, which are independent of each other.
+    """Return the joint covariance (S, 2 C, 2 C) of C independent spots from their covariances (S, C, 2, 2).
+
+    Dimensions: S states.
 
     Parameters
     ----------
-    covariance : Array
-        Px^2.
+    covariance : (S, C, 2, 2) ndarray
+        Covariance of row and column of each spot, px^2.
     """
     states, spots = covariance.shape[:2]
     out = np.zeros((states, spots, 2, spots, 2))
@@ -821,6 +869,6 @@ def _sigma(positions: SpotPositions) -> Array:
 
 
 def _pair(cameras: Mapping[str, CameraCalibration]) -> tuple[str, str]:
-    """Return the forward camera, the reference of the angle between two, and the other."""
+    """Return the names of two cameras: the forward one, from which their angle is counted, then the other."""
     forward, backward = sorted(cameras, key=lambda name: -cameras[name].look_rad)
     return forward, backward

@@ -50,19 +50,22 @@ from analysis.statistics import limit_of
 
 Numbers = NDArray[np.int_]
 LARGEST = 2400
-"""Largest number of shifts in one factorisation, 46 MB: 300 times of two cameras. A longer series is processed in
-pieces of a third of that, each from its own measurements and as many before and after it, so that its sigmas are
-those of the measurements used.
+"""Largest number of shifts in one factorisation, 46 MB: 300 times of two cameras.
+
+A longer series is processed in sections of a third of that, each from its own measurements and as many before and after
+it, so that its sigmas are those of the measurements used.
 """
 _AT_ONCE = 64
-"""Number of times whose covariances with all shifts are held at once."""
+"""Number of times whose covariances with all shifts are held in memory at once."""
 
 
 class ShiftNoise(Protocol):
-    """Noise of a series of shifts."""
+    """Interface of the noise of a series of spot shifts: the covariance of any of its measurements together."""
 
     def covariance(self, images: Numbers) -> Array:
         """Return the covariance of the shifts of some measurements, (n D, n D) px^2, one measurement after the other.
+
+        Dimensions: n measurements, D spot coordinates (row and column of every spot).
 
         Parameters
         ----------
@@ -81,7 +84,7 @@ class SeriesChanges:
     values : (T, 4 K) ndarray
         Changes d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other.
     noise : (T, 4 K, 4 K) ndarray
-        Covariance of their errors by the noise of the shifts.
+        Covariance of their errors due to the noise of the shifts.
     total : (T, 4 K, 4 K) ndarray
         Covariance of the total error.
     """
@@ -94,6 +97,8 @@ class SeriesChanges:
 @dataclass(frozen=True, eq=False)
 class SmoothedSeries:
     """Changes of all cameras over a series.
+
+    Dimensions: M measurements.
 
     Attributes
     ----------
@@ -122,6 +127,8 @@ class SmoothedSeries:
 class WhiteNoise:
     """Noise that is independent from measurement to measurement.
 
+    Dimensions: D spot coordinates (row and column of every spot).
+
     Attributes
     ----------
     each : (D, D) ndarray
@@ -131,14 +138,17 @@ class WhiteNoise:
     each: Array
 
     def covariance(self, images: Numbers) -> Array:
-        """Return the (n D, n D) covariance of n measurements, px^2."""
+        """Return the (n D, n D) covariance of n measurements, px^2.
+
+        Dimensions: D spot coordinates (row and column of every spot).
+        """
         return np.asarray(np.kron(np.eye(len(images)), self.each), np.float64)
 
 
 def _series(
     disturbances: Disturbances, measured: ArrayLike, shifts: ArrayLike, noise: ShiftNoise | Array
 ) -> tuple[Array, Numbers, Array, ShiftNoise]:
-    """Return the ascending times of a series, their order, its values and its noise, checked."""
+    """Check a series and return its ascending times, their order, its values and its noise."""
     when, values = np.asarray(measured, np.float64), np.asarray(shifts, np.float64)
     size = len(disturbances.spots)
     if when.ndim != 1 or values.shape != (len(when), size) or not len(when):
@@ -154,12 +164,12 @@ def _series(
 
 
 def window_of(values: int) -> int:
-    """Measurements that are worked on at once.
+    """Return the number of measurements that are processed at once, so that memory is limited.
 
     Parameters
     ----------
     values : int
-        Shifts in each, D.
+        Number of values (spot coordinates) in each measurement.
     """
     return max(3, LARGEST // values)
 
@@ -172,7 +182,9 @@ def smooth_series(
     times: ArrayLike,
     reference: float | None = None,
 ) -> SmoothedSeries:
-    """Estimate the changes over a series of measurements, filtered and smoothed, at any times, with their covariance.
+    """Estimate the changes over a series of measurements, filtered and smoothed, at any times, with covariance.
+
+    Dimensions: M measurements, D spot coordinates (row and column of every spot), T times, P parameters.
 
     Parameters
     ----------
@@ -265,6 +277,8 @@ def detect_jumps(
 ) -> tuple[Jump, ...]:
     """Detect steps at unknown times in a series of measurements by generalised likelihood ratios.
 
+    Dimensions: M measurements, D spot coordinates (row and column of every spot).
+
     Parameters
     ----------
     disturbances : Disturbances
@@ -322,6 +336,8 @@ def detect_jumps(
 class _Search:
     """Search for jumps in a series.
 
+    Dimensions: M measurements, D spot coordinates (row and column of every spot).
+
     Parameters
     ----------
     stated : Disturbances
@@ -335,7 +351,7 @@ class _Search:
     order : (M,) ndarray of int
         Indices of the shifts in the order of time.
     reference : float or None
-        Time from which changes are counted, as in `smooth_series`.
+        Time from which changes are counted, s; None for the calibration.
     """
 
     def __init__(
@@ -388,7 +404,7 @@ class _Search:
         raise AssertionError(f"a jump at {jump.until} s is at no measurement")
 
     def _factors(self, model: Disturbances) -> Iterator[tuple[_Factor, slice]]:
-        """Yield the factorised measurements of each window, and the range of them that is the window's own piece."""
+        """Yield for each window the factorised measurements, and the range of measurements it decides about."""
         process = _Process(model, self.reference)
         for piece, window in _pieces(len(self.when), window_of(self.shifts.shape[1])):
             indices = self.order[window]
@@ -397,7 +413,7 @@ class _Search:
 
 
 def _pieces(count: int, window: int) -> Iterator[tuple[slice, slice]]:
-    """Yield the pieces of a series, and the range of measurements that each is computed from."""
+    """Yield the consecutive sections of a series, and for each the wider range of measurements it is computed from."""
     if count <= window:
         yield slice(0, count), slice(0, count)
         return
@@ -408,7 +424,7 @@ def _pieces(count: int, window: int) -> Iterator[tuple[slice, slice]]:
 
 
 class _Process:
-    """Covariances over time of shifts and parameters."""
+    """Covariances over time of spot shifts and camera parameters under the prior's time laws."""
 
     def __init__(self, stated: Disturbances, reference: float | None) -> None:
         self.reference = reference
@@ -424,7 +440,10 @@ class _Process:
             self.parts.append((law, spots @ correlation @ spots.T, across @ spots.T, across @ parameters.T))
 
     def _covariance(self, law: TimeLaw, one: Array, two: Array) -> Array:
-        """Return the covariance of a law between two sets of times, (n, m)."""
+        """Return the covariance of a law between two sets of times, (n, m).
+
+        Dimensions: n times of the first set, m times of the second set.
+        """
         out = law.covariance(one[:, None], two)
         if self.reference is None:
             return out
@@ -432,15 +451,24 @@ class _Process:
         return np.asarray(out - since[:, None] - until + law.covariance(self.reference, self.reference))
 
     def shifts(self, times: Array) -> Array:
-        """Return the covariance of the shifts, (n D, n D) px^2."""
+        """Return the covariance of the shifts, (n D, n D) px^2.
+
+        Dimensions: n measurements, D spot coordinates (row and column of every spot).
+        """
         return _together([(self._covariance(law, times, times), spots) for law, spots, _, _ in self.parts])
 
     def across(self, times: Array, wanted: Array) -> Array:
-        """Return the covariance of shifts with parameters, (n D, m 4 K)."""
+        """Return the covariance of shifts with parameters, (n D, m 4 K).
+
+        Dimensions: n measurements, D spot coordinates (row and column of every spot), m wanted times, K cameras.
+        """
         return _together([(self._covariance(law, times, wanted), cross.T) for law, _, cross, _ in self.parts])
 
     def parameters(self, wanted: Array) -> Array:
-        """Return the covariance of the parameters at each time, (m, 4 K, 4 K)."""
+        """Return the covariance of the parameters at each time, (m, 4 K, 4 K).
+
+        Dimensions: m wanted times, K cameras.
+        """
         width = len(self.parts[0][3])
         out = np.zeros((len(wanted), width, width))
         for law, _, _, covariance in self.parts:
@@ -453,12 +481,12 @@ class _Process:
 
 
 def _together(parts: list[tuple[Array, Array]]) -> Array:
-    """Return the sum of Kronecker products."""
+    """Return the sum of Kronecker products: of each time law's covariance over time with that over coordinates."""
     return np.asarray(sum(np.kron(time, block) for time, block in parts))
 
 
 class _Factor:
-    """Measurements of one window, whitened in the order of time."""
+    """Measurements of one window, transformed in the order of time to independent numbers of unit variance."""
 
     def __init__(self, process: _Process, when: Array, shifts: Array, noise: Array) -> None:
         self.process, self.when, self.each = process, when, shifts.shape[1]
@@ -472,12 +500,17 @@ class _Factor:
 
     @cached_property
     def noise(self) -> Array:
-        """Covariance of the whitened shifts by their noise, (n D, n D)."""
+        """Covariance of the whitened shifts due to the noise of the shifts alone, (n D, n D).
+
+        Dimensions: n measurements, D spot coordinates (row and column of every spot).
+        """
         left = solve_triangular(self.root, self._noise, lower=True)
         return np.asarray(solve_triangular(self.root, left.T, lower=True))
 
     def estimate(self, times: Array, at: Numbers, filtered: SeriesChanges, smoothed: SeriesChanges) -> None:
         """Fill in the changes at some of the times.
+
+        Dimensions: T times.
 
         Parameters
         ----------
@@ -504,7 +537,7 @@ class _Factor:
 
 
 def _positive(prior: Array, gained: Array) -> Array:
-    """Return prior - gained, without the negative variances that rounding leaves."""
+    """Return the prior covariance minus what was gained, without the negative variances that rounding leaves."""
     size = np.sqrt(np.diag(prior))
     scale = np.where(size > 0.0, size, 1.0)
     left = (prior - gained) / scale[:, None] / scale

@@ -5,10 +5,11 @@ many states, so that the covariances
 
     g(t) g(t') exp(-|t - t'| / D) cos(2 pi (t - t') / T) C(min(t, t'))
 
-are those of states with a decay, a rotation, an amplitude g and a variance C(t) that steps add to (Sarkka, Solin,
-Applied Stochastic Differential Equations, 2019, ch. 12). Motions of one law with the same effect on spots and
-parameters need no separate states: for M motions the states are the singular vectors of their effect on the D + P
-outputs, at most D + P of them. Steps, those of events and those of jumps, change one common level.
+(g growth of a trend, D correlation time, T period of an oscillation, C variance of steps) are those of states with a
+decay, a rotation, an amplitude g and a variance C(t) that steps add to (Sarkka, Solin, Applied Stochastic Differential
+Equations, 2019, ch. 12). Motions of one law with the same effect on spots and parameters need no separate states: for M
+motions the states are the singular vectors of their effect on the D + P outputs, at most D + P of them. Steps, those of
+events and those of jumps, change one common level.
 
 Temperatures of bodies that have a sensor keep separate states, since sensors read them, and so does the factor by which
 the real effect of heat on light exceeds the computed one: the product of the two is taken to second order.
@@ -30,14 +31,16 @@ from analysis.arrays import Array
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 
 _INTERVALS = 200
-"""Number of intervals between readings whose transitions are kept."""
+"""Number of intervals between readings whose state transitions are kept in memory."""
 _NOTHING = 1e-12
-"""Singular value of scaled outputs, relative to the largest, below which only rounding is left."""
+"""Singular value of the scaled effects on the outputs, relative to the largest, below which only rounding is left."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeatInputs:
     """Temperatures read by sensors, as inputs with errors.
+
+    Dimensions: m motions.
 
     Attributes
     ----------
@@ -69,7 +72,9 @@ _Kind = Literal["level", "law", "heat", "factor", "reference"]
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """States of one law.
+    """States that represent all motions of one time law.
+
+    Dimensions: D spot coordinates (row and column of every spot), P parameters.
 
     Attributes
     ----------
@@ -80,7 +85,7 @@ class _Block:
     at : slice
         Range of the states; for a law with a period the first half is the cosine part, the second the sine part.
     outputs : (D + P, r) ndarray
-        Effect of the first r states, for amplitude 1.
+        Effect of the first r states on spot coordinates (px) and parameters, where the law's amplitude is 1.
     covariance : (r, r) ndarray
         Covariance of the states where the law's own variance is 1.
     motions : tuple of int
@@ -104,14 +109,16 @@ class _Block:
 
 @dataclass(frozen=True, eq=False)
 class _Transition:
-    """Transition of the states over an interval.
+    """Change of the states over an interval between two times.
+
+    Dimensions: n states of the filter.
 
     Attributes
     ----------
     kept : (n,) ndarray
-        Factor of the decay of each state.
+        Factor by which each state decays.
     kept_both : (n, n) ndarray
-        Factor of the decay of products of two states.
+        Factor by which the product of two states decays.
     turned : tuple of (slice, ndarray)
         For each law with a period its states, and the matrix of their rotation.
     gained : (n, n) ndarray
@@ -133,9 +140,9 @@ class StateSpace:
     stated : Disturbances
         Prior with D spot coordinates and P parameters.
     reference_noise : (D, D) ndarray or None
-        Noise of the reference's spots, the same error in every shift, px^2; None for none.
+        Noise of the reference's spots, the same error in every shift, px^2; None if there is none.
     heat : HeatInputs or None
-        Temperatures that sensors read; None for none.
+        Temperatures that sensors read; None if there is none.
     stepping : tuple of int
         Indices of motions of any law that may step, beside those with a law of steps.
 
@@ -229,6 +236,8 @@ class StateSpace:
     def outputs_of(self, motions: Sequence[int] | range) -> Array:
         """Return the effect of motions of one standard deviation, (D + P, m): spots in px, then parameters.
 
+        Dimensions: D spot coordinates (row and column of every spot), P parameters.
+
         Parameters
         ----------
         motions : sequence of int
@@ -239,11 +248,13 @@ class StateSpace:
 
     @property
     def level(self) -> slice:
-        """Range of the states that steps change; steps leave all others unchanged."""
+        """Range of the states that steps change; all other states are unchanged by steps."""
         return self._blocks[0].at if self._blocks else slice(0, 0)
 
     def level_of(self, motions: Sequence[int]) -> Array:
-        """Return the change of the states by steps of one standard deviation of motions, (n, m).
+        """Return the change of the states by a step of one standard deviation of each of some motions, (n, m).
+
+        Dimensions: n states of the filter.
 
         Parameters
         ----------
@@ -257,7 +268,10 @@ class StateSpace:
 
     @cached_property
     def level_inverse(self) -> Array:
-        """Least-squares inverse from outputs to the level states, (n, D + P)."""
+        """Least-squares inverse of the effect of the level states on the outputs, (n, D + P).
+
+        Dimensions: n states of the filter, D spot coordinates (row and column of every spot), P parameters.
+        """
         block = self._blocks[0]
         scale = np.abs(block.outputs).max(axis=1, initial=0.0)
         scale = np.where(scale > 0.0, scale, 1.0)
@@ -266,13 +280,18 @@ class StateSpace:
         return out
 
     def _coordinates(self, block: _Block, motions: Sequence[int]) -> Array:
-        """Return the states of a block with the effect of motions, (r, m)."""
+        """Return the states of a block that have the same effect on the outputs as some motions, (r, m).
+
+        Dimensions: r states of the block, m motions.
+        """
         scale = np.abs(block.outputs).max(axis=1, initial=0.0)
         scale = np.where(scale > 0.0, scale, 1.0)[:, None]
         return np.asarray(np.linalg.lstsq(block.outputs / scale, self.outputs_of(motions) / scale, rcond=None)[0])
 
     def start(self, time: float) -> tuple[Array, Array]:
         """Return mean (n,) and covariance (n, n) of the states before any reading.
+
+        Dimensions: n states of the filter.
 
         Parameters
         ----------
@@ -294,6 +313,8 @@ class StateSpace:
 
     def moved(self, states: Array, then: float, now: float, back: bool = False) -> Array:
         """Return states, or quantities that propagate as they do, at another time, (..., n, k).
+
+        Dimensions: n states of the filter, k columns.
 
         Parameters
         ----------
@@ -319,6 +340,8 @@ class StateSpace:
 
         The result is symmetric to the last bit if the input is.
 
+        Dimensions: n states of the filter.
+
         Parameters
         ----------
         square : (n, n) ndarray
@@ -328,7 +351,7 @@ class StateSpace:
         now : float
             Later time, s.
         back : bool
-            True to use the transposed transition, as in `moved`.
+            True to use the transposed transition, which a smoother needs from ``now`` to ``then``.
         """
         if now == then:
             return square
@@ -359,7 +382,7 @@ class StateSpace:
 
     @cached_property
     def _turning(self) -> list[tuple[slice, float, Array, Array]]:
-        """For each law with a period its states, the period, and the rotations by zero and by a quarter."""
+        """Return for each law with a period its states, the period, and the rotations by zero and a quarter period."""
         blocks = [block for block in self._blocks if block.law.period_s is not None]
         quarters = [np.kron([[0.0, -1.0], [1.0, 0.0]], np.eye(block.rank)) for block in blocks]
         periods = [float(block.law.period_s or 0.0) for block in blocks]
@@ -370,11 +393,13 @@ class StateSpace:
 
     @cached_property
     def _transitions(self) -> dict[float, _Transition]:
-        """Transitions of the last intervals: readings mostly come at the same few intervals."""
+        """Interval in seconds -> state transition, for the last intervals, since few different intervals occur."""
         return {}
 
     def spread(self, covariance: Array, then: float, now: float) -> Array:
         """Return the covariance of the states at a later time, with the process noise since then, (n, n).
+
+        Dimensions: n states of the filter.
 
         Parameters
         ----------
@@ -405,9 +430,12 @@ class StateSpace:
         return tuple(block for block in self._blocks if block.law.event or any(law.event for law, _ in block.steps))
 
     def outputs(self, mean: Array, covariance: Array, time: float) -> tuple[Array, Array, Array]:
-        """Return the outputs of states: values, derivatives and covariance of the second-order rest.
+        """Return the outputs (spot shifts and camera parameters) that states cause at a time.
 
-        The shapes are (D + P,), (D + P, n) and (D + P, D + P).
+        The result holds their values (D + P,), their derivatives with respect to the states (D + P, n), and the
+        covariance of the second-order terms (D + P, D + P).
+
+        Dimensions: D spot coordinates (row and column of every spot), P parameters, n states of the filter.
 
         Parameters
         ----------
@@ -421,9 +449,12 @@ class StateSpace:
         return self.acting(self._rows(time), mean, covariance)
 
     def acting(self, rows: Array, mean: Array, covariance: Array) -> tuple[Array, Array, Array]:
-        """Return linear combinations of the states with the factors of the effect of heat on light.
+        """Return linear combinations of the states, with temperatures times the estimated factors of their effect.
 
-        The results are values (R,), derivatives (R, n) and the covariance of the second-order rest, as in `outputs`.
+        The results are values (R,), derivatives with respect to the states (R, n), and the covariance of the
+        second-order terms.
+
+        Dimensions: R combinations, n states of the filter.
 
         Parameters
         ----------
@@ -450,6 +481,8 @@ class StateSpace:
     def _second(self, rows: Array, others: Array, across: Array) -> Array:
         """Return the covariance of the products of factors and temperatures beyond first order, (R, R').
 
+        Dimensions: R combinations, n states of the filter.
+
         Parameters
         ----------
         rows : (R, n) ndarray
@@ -467,6 +500,8 @@ class StateSpace:
 
     def outputs_jointly(self, means: Array, covariance: Array, times: Array) -> tuple[Array, Array]:
         """Return the outputs at T times, (T, D + P), and their joint covariance, (T, D + P, T, D + P).
+
+        Dimensions: D spot coordinates (row and column of every spot), P parameters, n states of the filter.
 
         Parameters
         ----------
@@ -506,7 +541,10 @@ class StateSpace:
 
     @cached_property
     def basis(self) -> Array:
-        """Effect of the states where all amplitudes are 1, (D + P, n)."""
+        """Effect of the states where all amplitudes are 1, (D + P, n).
+
+        Dimensions: D spot coordinates (row and column of every spot), P parameters, n states of the filter.
+        """
         rows = np.zeros((self.width + self.stated.parameters.shape[0], self.size))
         for block in self._blocks:
             rows[:, block.at.start : block.at.start + block.rank] = block.outputs
@@ -525,13 +563,15 @@ class StateSpace:
 
     @cached_property
     def _heated(self) -> list[tuple[int, NDArray[np.int_]]]:
-        """State of each factor, and the states that it acts on."""
+        """Pairs of the index of each factor's state and the indices of the states that it acts on."""
         assert self.heat is not None
         states = np.array([self._heat_states[k] for k in self.heat.motions.tolist()], int)
         return [(self.factors.start + f, states[self.heat.factors == f]) for f in range(len(self.heat.names))]
 
     def heat_outputs(self, mean: Array, time: float) -> Array:
         """Return the part of the outputs due to the heat of bodies with sensors, (D + P,).
+
+        Dimensions: D spot coordinates (row and column of every spot), P parameters, n states of the filter.
 
         Parameters
         ----------
@@ -548,6 +588,8 @@ class StateSpace:
     def sensor_rows(self, sensors: Sequence[int], time: float) -> Array:
         """Return the derivatives of sensor temperatures with respect to the states, (s, n) K.
 
+        Dimensions: s sensors, n states of the filter.
+
         Parameters
         ----------
         sensors : sequence of int
@@ -562,9 +604,11 @@ class StateSpace:
         return out
 
     def motion_gain(self, time: float, steps: Sequence[tuple[Sequence[int], float]] = ()) -> tuple[Array, Array]:
-        """Return the motions as functions of the states: coefficients (M, n) and covariance of the rest (M, M).
+        """Return the matrix (M, n) from states to motions, and the covariance (M, M) that the states leave.
 
-        Motions are in standard deviations.
+        Motions are in prior standard deviations.
+
+        Dimensions: M motions, n states of the filter.
 
         Parameters
         ----------
@@ -607,7 +651,7 @@ class StateSpace:
 
 
 def _is_level(law: TimeLaw) -> bool:
-    """Return True for a law that changes by steps alone."""
+    """Return True for a time law that changes by steps alone."""
     plain = (law.drift_s, law.period_s, law.trend_s, law.relaxation_s) == (None,) * 4
     return plain and not law.white
 
@@ -625,7 +669,7 @@ def _halves(at: slice) -> tuple[slice, slice]:
 
 
 def _kept(law: TimeLaw, over: float) -> float:
-    """Return the factor of a state's decay over a time, s."""
+    """Return the factor by which a state of a time law decays over a time in seconds."""
     if law.white:
         return 0.0 if over > 0.0 else 1.0
     return 1.0 if law.drift_s is None else math.exp(-over / law.drift_s)
@@ -643,7 +687,7 @@ def _step_variance(law: TimeLaw, time: float) -> float:
 
 
 def _gain(law: TimeLaw, time: float) -> float:
-    """Return the amplitude of a trend or a relaxation."""
+    """Return the amplitude of a trend or a relaxation at a time in seconds, in prior standard deviations."""
     if law.trend_s is None and law.relaxation_s is None:
         return 1.0
     return float(law.amplitude(np.array(time)))

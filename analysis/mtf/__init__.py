@@ -1,1 +1,4 @@
-"""MTF from images of slanted edges and bars; also the command `python -m analysis.mtf`."""
+"""Modulation transfer function (MTF) of a camera from images of slanted edges and of bars.
+
+It is also the command ``python -m analysis.mtf``.
+"""

@@ -132,9 +132,11 @@ def bar_mtf(
     offset: float = 0.0,
     rounding: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> BarMtf:
-    """Measure the MTF at the frequency of a group of bars that fills a region, also at Nyquist if the bars are tilted.
+    """Measure the MTF at the frequency of bars that fill a region, also at Nyquist if the bars are tilted.
 
-    For several frames see `measure_bar_pages`.
+    The region may be one frame or the mean of several; `measure_bar_pages` compares several frames with each other.
+
+    Dimensions: H rows, W columns.
 
     Parameters
     ----------
@@ -144,7 +146,8 @@ def bar_mtf(
         Pixels, of any shape, with the level of the spaces: the same region in frames of an even field, or even patches
         far from edges.
     bright : array_like
-        Pixels with the level of the bars, likewise.
+        Pixels, of any shape, with the level of the bars: the same region in frames of an even field, or even patches
+        far from edges.
     frequency : array_like, optional
         Approximate frequency, good to one cycle over the region: (2,) cycles per pixel (down the column, along the
         row), or one number, its length. By default the strongest below Nyquist.
@@ -312,9 +315,10 @@ def _level(
 
 
 def _start(grey: Array, frequency: ArrayLike | None) -> Array:
-    """Return the strongest cell of the windowed spectrum near the given frequency, (2,) cycles/pixel.
+    """Return the frequency of the strongest peak of the windowed spectrum near a given one, (2,) cycles/pixel.
 
-    The cell is unwrapped to that frequency.
+    Frequencies are (down the column, along the row). Of the frequencies that give the same pixels, the one nearest to
+    the given one is returned.
     """
     shape = np.array(grey.shape)
     window = np.outer(*(np.hanning(n + 2)[1:-1] for n in grey.shape))
@@ -349,7 +353,10 @@ def _start(grey: Array, frequency: ArrayLike | None) -> Array:
 
 
 def _other_alias(fitted: Array, frequency: ArrayLike | None) -> Array | None:
-    """Return the alias near Nyquist whose length is nearer to the given one; None if there is none."""
+    """Return the other frequency that gives the same pixels near Nyquist, if its length is nearer to the given one.
+
+    The result is (2,) in cycles/pixel; None if there is no such frequency.
+    """
     if frequency is None or np.ndim(frequency) != 0:
         return None
     length = abs(float(np.asarray(frequency)))
@@ -382,7 +389,10 @@ def _check_phases(frequency: Array, shape: tuple[int, ...]) -> None:
 
 
 def _separable(frequency: Array, shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the harmonics whose aliases are separated from zero, from the fundamental and from each other."""
+    """Return which of the harmonics 3, 5 and 7 can be separated from zero, from the fundamental and from each other.
+
+    Sampling by the pixels maps a harmonic to another frequency (its alias), which must differ from theirs.
+    """
     separable: list[int] = []
     for h in _HARMONICS:
         others = [1, *separable]
@@ -393,7 +403,12 @@ def _separable(frequency: Array, shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _waves(position: Array, frequency: Array, numbers: tuple[int, ...]) -> Array:
-    """Return rows of 1, then cosine and sine of the fundamental and of each harmonic, (3 + 2 K, N)."""
+    """Return the terms of the model at every pixel: 1, then cosine and sine of each wave, (3 + 2 K, N).
+
+    The waves are the fundamental and its harmonics.
+
+    Dimensions: K harmonics, N pixels.
+    """
     phase = 2.0 * np.pi * (frequency @ position)
     turned = np.outer((1, *numbers), phase)
     pairs = np.stack([np.cos(turned), np.sin(turned)], axis=1).reshape(-1, phase.size)
@@ -401,7 +416,10 @@ def _waves(position: Array, frequency: Array, numbers: tuple[int, ...]) -> Array
 
 
 def _design(position: Array, frequency: Array, numbers: tuple[int, ...], parameters: Array) -> Array:
-    """Return the waves, then the derivatives with respect to the two components of the frequency, (P, N)."""
+    """Return the model's terms, then its derivatives with respect to both components of the frequency, (P, N).
+
+    Dimensions: P parameters, N pixels.
+    """
     waves = _waves(position, frequency, numbers)
     slope = np.zeros(waves.shape[1])
     for k, h in enumerate((1, *numbers)):
@@ -411,7 +429,7 @@ def _design(position: Array, frequency: Array, numbers: tuple[int, ...], paramet
 
 
 def _gram(first: Array, second: Array) -> Array:
-    """Return products summed over pixels.
+    """Return the products of two sets of functions, summed over pixels.
 
     A matrix product is not used, since its threads wait for each other on a busy machine.
     """
@@ -419,13 +437,16 @@ def _gram(first: Array, second: Array) -> Array:
 
 
 def _solved(design: Array, value: Array, weight: Array) -> Array:
-    """Return the least-squares parameters."""
+    """Return the parameters of a weighted linear least-squares fit."""
     weighted = design * weight
     return np.asarray(np.linalg.solve(_gram(weighted, design), weighted @ value))
 
 
 def _fit(position: Array, value: Array, weight: Array, start: Array, numbers: tuple[int, ...]) -> tuple[Array, Array]:
-    """Fit frequency (2,) and amplitudes (3 + 2 K,) by Gauss-Newton steps."""
+    """Fit frequency (2,) and amplitudes (3 + 2 K,) by Gauss-Newton steps.
+
+    Dimensions: K harmonics.
+    """
     frequency = start
     limit: Array = np.asarray(0.5 / np.ptp(position, axis=1))
     for _ in range(_STEPS):
@@ -457,8 +478,7 @@ def _check_filled(
 FALSE_ALARM = 1e-4
 """Probability that pages are refused although the bars do not move in them."""
 _ROUGH = 0.3
-"""Ratio of noise to the step of grey values below which the rounding error does not average out: a tenth of it stays.
-"""
+"""Ratio of noise to the step of grey values below which a tenth of the rounding error does not average out."""
 
 
 def measure_bar_pages(
@@ -473,16 +493,19 @@ def measure_bar_pages(
 ) -> BarMtf:
     """Measure the MTF from the bars that fill a region in all pages.
 
+    Dimensions: P pages, H rows, W columns, Q pages of the level.
+
     Parameters
     ----------
     region : (P, H, W) ndarray
         Grey values, linear in light; identical copies of a page do not count.
     dark : (Q, ...) ndarray
-        Pages with the level of the spaces, as in `measure_bars`.
+        Pages with the level of the spaces: the same region in frames of an even field, or even patches far from edges.
     bright : (Q, ...) ndarray
         Pages with the level of the bars.
     frequency : array_like or None
-        Approximate frequency, as in `measure_bars`.
+        Approximate frequency, cycles per pixel: (down the column, along the row), or its length; None for the
+        strongest.
     saturation : float or None
         Grey value of saturation; one page that reaches it is enough for a refusal.
     offset : float
@@ -527,7 +550,10 @@ def measure_bar_pages(
 
 
 def _waves_of_page(shape: tuple[int, ...], bars: BarMtf) -> Array:
-    """Return 1, and the fundamental of unit amplitude with its derivative by the phase, (3, N)."""
+    """Return 1, the fundamental of unit amplitude, and its derivative with respect to the phase, (3, N).
+
+    Dimensions: N pixels.
+    """
     position = np.stack(np.meshgrid(*(np.arange(n) - (n - 1) / 2.0 for n in shape), indexing="ij")).reshape(2, -1)
     phase = 2.0 * np.pi * (bars.frequency @ position) + bars.phase
     return np.stack([np.ones(phase.size), np.cos(phase), -np.sin(phase)])
@@ -542,7 +568,7 @@ def _scatter(mean: Array, bars: BarMtf) -> float:
 
 
 def _check_drift(pages: Array, mean: Array, bars: BarMtf, step: float) -> None:
-    """Raise BarError if the pages differ significantly in phase."""
+    """Raise BarError if the phase of the bars differs significantly between pages, so that the bars move."""
     waves = _waves_of_page(mean.shape, bars)
     inverse = np.linalg.inv(waves @ waves.T)
     rest = (pages - mean).reshape(len(pages), -1)

@@ -53,12 +53,14 @@ _FIRST, _SECOND = (index[:, None] for index in np.triu_indices(4))
 
 @dataclass(frozen=True, eq=False)
 class EdgeDesign:
-    """Rows of the least-squares design of pixels at distances x from the edge, with P unknowns.
+    """Least-squares design matrix of an edge-spread function: one row for each of N pixels, one column per unknown.
+
+    Dimensions: N pixels, M pixels in the core, K terms of uneven light.
 
     Attributes
     ----------
     x : (N,) ndarray
-        Distance along the normal, px.
+        Distance of each pixel from the edge along its normal, px.
     core : float
         Half width of the spline's range, px.
     oversampling : int
@@ -66,7 +68,7 @@ class EdgeDesign:
     inside : (M,) ndarray of int
         Indices of the pixels in the core.
     cell, u : (M,) ndarray
-        Knot interval of each of these and position in it, 0 to 1.
+        Knot interval of each pixel in the core, and position in the interval, 0 to 1.
     basis : (4, M) ndarray
         Values of the four splines of that interval.
     levels : (K + 3, N) ndarray
@@ -85,6 +87,8 @@ class EdgeDesign:
     @staticmethod
     def of(x: Array, core: float, oversampling: int, light: Array | None = None) -> EdgeDesign:
         """Return the design for pixels at the distances x.
+
+        Dimensions: N pixels, K terms of uneven light.
 
         Parameters
         ----------
@@ -118,7 +122,7 @@ class EdgeDesign:
 
     @property
     def spline_count(self) -> int:
-        """Number of splines that lie entirely in the core.
+        """Number of cubic splines that lie entirely in the core.
 
         The curve and two derivatives therefore continue smoothly into the tails. Spline k of interval c has number c +
         k - 3; numbers outside of these have the coefficient zero.
@@ -126,13 +130,19 @@ class EdgeDesign:
         return round(2.0 * self.core * self.oversampling) - 3
 
     def project(self, grey: Array) -> Array:
-        """Return the transposed design times the grey values (N,), (P,)."""
+        """Return the product of the transposed design matrix with grey values (N,), an array (P,).
+
+        Dimensions: N pixels, P coefficients of the edge-spread function.
+        """
         index = (self.cell + _FOUR).ravel()
         spline = np.bincount(index, (self.basis * grey[self.inside]).ravel(), minlength=self.spline_count + 6)
         return np.concatenate([spline[3:-3], self.levels @ grey])
 
     def normal_matrix(self, weight: Array | None = None) -> Array:
-        """Return the sum over pixels of weight (N,) * (design row)^T (design row), (P, P)."""
+        """Return the normal matrix of the least-squares problem, (P, P), with weights (N,) of the pixels.
+
+        Dimensions: N pixels, P coefficients of the edge-spread function.
+        """
         count = self.spline_count
         size = count + 6
         basis = self.basis if weight is None else self.basis * weight[self.inside]
@@ -151,7 +161,9 @@ class EdgeDesign:
 
 @dataclass(frozen=True, eq=False)
 class EdgeSpread:
-    """Fitted edge-spread function; x in pixels along the normal, grey values rise with x.
+    """Fitted edge-spread function: grey value over the distance x along the edge's normal, px, rising with x.
+
+    Dimensions: P coefficients of the edge-spread function.
 
     Attributes
     ----------
@@ -162,7 +174,7 @@ class EdgeSpread:
     coefficients : (P,) ndarray
         Spline, uneven light, then dark level, contrast, tail (grey values; the tail's in grey values * px).
     factor : tuple
-        Cholesky factor of the normal matrix.
+        Cholesky factor of the normal matrix of the fit.
     """
 
     core: float
@@ -172,7 +184,7 @@ class EdgeSpread:
 
     @property
     def spline_count(self) -> int:
-        """Number of splines, whose coefficients come first."""
+        """Number of splines of the core, whose coefficients come first."""
         return round(2.0 * self.core * self.oversampling) - 3
 
     @property
@@ -186,17 +198,26 @@ class EdgeSpread:
         return float(self.coefficients[-2])
 
     def design(self, x: Array) -> EdgeDesign:
-        """Return the design for other distances x, (N,)."""
+        """Return the design matrix with the same knots for other distances from the edge, (N,) px.
+
+        Dimensions: N pixels.
+        """
         return EdgeDesign.of(x, self.core, self.oversampling)
 
     def value(self, design: EdgeDesign) -> Array:
-        """Return the grey values (N,) at the distances of a design with the same knots."""
+        """Return the grey values of the edge-spread function, (N,), at the distances of a design with the same knots.
+
+        Dimensions: N pixels.
+        """
         value = self.coefficients[-len(design.levels) :] @ design.levels
         value[design.inside] += (design.basis * self._local(design)).sum(axis=0)
         return np.asarray(value)
 
     def core_slope(self, design: EdgeDesign) -> Array:
-        """Return the line-spread function inside the core at the distances of a design, (M,) grey values per pixel."""
+        """Return the derivative of grey value with respect to distance for pixels in the core, (M,) grey values per px.
+
+        Dimensions: M pixels in the core.
+        """
         u = design.u
         v = 1.0 - u
         basis = np.stack([-v * v / 2, u * (1.5 * u - 2), v * (2 - 1.5 * v), u * u / 2])
@@ -204,16 +225,21 @@ class EdgeSpread:
         return np.asarray(slope + self._level_slope(design.x[design.inside]))
 
     def slope(self, design: EdgeDesign) -> Array:
-        """Return the line-spread function at all distances of a design, (N,) grey values per pixel."""
+        """Return the derivative of grey value with respect to distance for all pixels, (N,) grey values per px.
+
+        Dimensions: N pixels.
+        """
         slope = self._level_slope(design.x)
         slope[design.inside] = self.core_slope(design)
         return slope
 
     def transform(self, frequency: Array) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Return the optical transfer function (F,) and its derivatives by the coefficients (P, F).
+        """Return the optical transfer function, (F,), and its derivatives with respect to the coefficients, (P, F).
 
-        The transfer function at a frequency, cycles/px, is the integral of the line-spread function times exp(-2 pi i f
-        x), over the contrast.
+        ``frequency`` is along the normal, cycles/px, f in the following. The transfer function is the integral of the
+        line-spread function times exp(-2 pi i f x), divided by the contrast.
+
+        Dimensions: F frequencies, P coefficients of the edge-spread function.
         """
         omega = 2.0 * np.pi * frequency
         step = 1.0 / self.oversampling
@@ -229,21 +255,29 @@ class EdgeSpread:
         return transfer, rows
 
     def covariance(self, design: EdgeDesign, variance: Array) -> Array:
-        """Return the covariance (P, P) of the coefficients for independent pixel noise of variance (N,)."""
+        """Return the covariance of the coefficients, (P, P), for independent noise of the pixels with variances (N,).
+
+        Dimensions: P coefficients of the edge-spread function, N pixels.
+        """
         half = self._solved(design.normal_matrix(variance))
         return self._solved(half.T)
 
     def _solved(self, right: Array) -> Array:
-        """Return the inverse normal matrix times (P, P), computed eight columns at a time.
+        """Return the inverse normal matrix times a matrix ``right``, computed eight columns at a time.
 
         All at once, the linear algebra library would split the work over threads, which on a busy machine wait for each
         other a hundred times longer than the solution takes.
+
+        Dimensions: P coefficients of the edge-spread function.
         """
         columns = range(0, right.shape[1], 8)
         return np.hstack([cho_solve(self.factor, right[:, k : k + 8], check_finite=False) for k in columns])
 
     def _local(self, design: EdgeDesign) -> Array:
-        """Return the coefficients of the splines at each pixel of the core, (4, M)."""
+        """Return the coefficients of the splines at each pixel of the core, (4, M).
+
+        Dimensions: M pixels in the core.
+        """
         padded = np.zeros(self.spline_count + 6)
         padded[3:-3] = self.coefficients[: self.spline_count]
         return np.asarray(padded[design.cell + _FOUR])
@@ -260,6 +294,8 @@ def fit_edge_spread(design: EdgeDesign, grey: Array) -> EdgeSpread:
 
     All pixels have the same weight: weights that follow the shot noise would gain little, and if taken from the data
     they would bias the levels.
+
+    Dimensions: N pixels.
     """
     count = design.spline_count
     matrix = design.normal_matrix()
@@ -298,6 +334,8 @@ _FOLLOWING_STEPS, _LAST_STEPS = 4, 2
 class EdgeRows:
     """Rows across an edge that rises with the column, of one page or of several, and the edge's path through them.
 
+    Dimensions: R rows of pixels, B coefficients of the bend.
+
     Attributes
     ----------
     offset, slope : (R,) ndarray
@@ -307,7 +345,8 @@ class EdgeRows:
     columns : int
         Number of columns W.
     bend : (B,) ndarray
-        Coefficients of the Legendre polynomials of order 2 and up that all pages have in common, px.
+        Coefficients of the Legendre polynomials of order 2 and up that describe a curved edge, the same for all pages,
+        px.
     """
 
     offset: Array
@@ -320,6 +359,8 @@ class EdgeRows:
     def of(lines: Array, shape: tuple[int, ...], bend: Array) -> EdgeRows:
         """Return the rows of pages, one page after the other.
 
+        Dimensions: P pages, B coefficients of the bend.
+
         Parameters
         ----------
         lines : (P, 2) ndarray
@@ -327,7 +368,7 @@ class EdgeRows:
         shape : tuple of int
             Rows and columns of a page.
         bend : (B,) ndarray
-            Coefficients of the path, as the attribute.
+            Coefficients of the Legendre polynomials of order 2 and up that describe a curved edge, px.
         """
         along = np.arange(shape[0]) - (shape[0] - 1) / 2.0
         offset, slope = np.repeat(lines, shape[0], axis=0).T
@@ -335,17 +376,20 @@ class EdgeRows:
 
     @property
     def half(self) -> float:
-        """Distance of the first row from the middle one, px: the unit of length of the polynomials."""
+        """Distance of the first row from the middle one, px, which is the unit of length of the polynomials."""
         return -float(self.along.min())
 
     @property
     def path(self) -> Array:
-        """Column of the edge in each row, (R,)."""
+        """Column of the edge in each row, (R,).
+
+        Dimensions: R rows of pixels.
+        """
         return np.asarray(self.offset + self.slope * self.along + self._legendre(0))
 
     @property
     def plateau(self) -> float:
-        """Least distance of the edge from the nearer side of the region, along the row, px."""
+        """Smallest distance along a row from the edge to the nearer side of the region, px."""
         path = self.path
         return float(min(path.min(), self.columns - 1 - path.max()))
 
@@ -357,8 +401,8 @@ class EdgeRows:
     def distance(self) -> Array:
         """Return the distance of every pixel from the edge along its normal, (R * W,) px.
 
-        A pixel h to the right of a path with the curvature p'' and the angle t is h cos t - p'' h^2 sin^2 t cos^3 t / 2
-        away from it, to first order in p''.
+        A pixel that is h px to the right of a path with the second derivative p'' and the angle t to the column
+        direction is h cos t - p'' h^2 sin^2 t cos^3 t / 2 away from it, to first order in p''.
         """
         angle = np.arctan(self.slope + self._legendre(1))[:, None]
         beside = np.arange(self.columns) - self.path[:, None]
@@ -378,7 +422,10 @@ class EdgeRows:
         return np.asarray(legendre.legvander(self.along / self.half, order).T)
 
     def _legendre(self, derivative: int) -> Array:
-        """Return the bend or its derivative along the edge in every row, (R,)."""
+        """Return the deviation of the path from a straight line, or its derivative along the edge, in every row, (R,).
+
+        Dimensions: R rows of pixels.
+        """
         series = legendre.legder([0.0, 0.0, *self.bend], derivative)
         return np.asarray(legendre.legval(self.along / self.half, series), np.float64) / self.half**derivative
 
@@ -401,7 +448,7 @@ class FittedEdge:
         Change of the bright level over the region's length along the edge and over its width, and that of the dark
         level, grey values; empty where the light is even.
     jitter : float
-        Mean variance of the position of a page's line by noise, px^2.
+        Variance due to noise of the position of a page's line, mean over the pages, px^2.
     """
 
     rows: EdgeRows
@@ -419,6 +466,8 @@ class FittedEdge:
 
 def fit_edge(rising: Array, offset: float, slope: float, even: bool = False) -> FittedEdge:
     """Fit the path, the edge-spread function and the light of a region.
+
+    Dimensions: H rows, W columns.
 
     Parameters
     ----------
@@ -445,6 +494,8 @@ def fit_edge(rising: Array, offset: float, slope: float, even: bool = False) -> 
 
 def fit_rows(rows: EdgeRows, grey: Array, core: float, even: bool, line_steps: int = 0) -> FittedEdge:
     """Fit the edge to rows of one page or of several, with a curved path where that is significant.
+
+    Dimensions: N pixels.
 
     Parameters
     ----------
@@ -484,14 +535,17 @@ def fit_rows(rows: EdgeRows, grey: Array, core: float, even: bool, line_steps: i
 
 
 def _moved(fitted: FittedEdge, grey: Array, order: int) -> FittedEdge:
-    """Return the fit after a Gauss-Newton step of the path."""
+    """Return the fit after one Gauss-Newton step of the coefficients of the edge's path."""
     return replace(fitted, rows=fitted.rows.moved(_path_step(fitted, grey, order)[0]))
 
 
 def _fitted(
     rows: EdgeRows, before: FittedEdge | None, grey: Array, core: float, oversampling: int, even: bool
 ) -> FittedEdge:
-    """Return edge-spread function and light for a path; the columns of light use the spread of the fit before."""
+    """Return the edge-spread function and the uneven light, fitted for a given path of the edge.
+
+    The terms of uneven light need an edge-spread function; that of the fit ``before`` is used.
+    """
     x = rows.distance()
     if even or before is None:
         design = EdgeDesign.of(x, core, oversampling)
@@ -510,10 +564,12 @@ def _fitted(
 
 
 def path_parts(fitted: FittedEdge, order: int) -> tuple[Array, NDArray[np.intp]]:
-    """Return the derivatives of grey values by the path's coefficients, and the indices of their pixels.
+    """Return derivatives of grey values with respect to the path's coefficients, and the indices of their pixels.
 
     The arrays have the shapes (order + 1, M) and (M,). Only pixels in the inner quarter of the core are used: farther
     out the fitted slope is mostly noise and would bias the path.
+
+    Dimensions: M pixels in the core.
     """
     design, rows = fitted.design, fitted.rows
     close = np.abs(design.x[design.inside]) <= fitted.spread.core / CORE_WIDTHS
@@ -523,7 +579,7 @@ def path_parts(fitted: FittedEdge, order: int) -> tuple[Array, NDArray[np.intp]]
 
 
 def _path_step(fitted: FittedEdge, grey: Array, order: int) -> tuple[Array, Array]:
-    """Return the least-squares change of the path's coefficients, (order + 1,), and their sigmas by the residuals."""
+    """Return the least-squares change of the path's coefficients, (order + 1,) px, and its standard deviations."""
     parts, near = path_parts(fitted, order)
     inverse = np.linalg.inv(parts @ parts.T)
     rest = (grey - fitted.light - fitted.spread.value(fitted.design))[near]
@@ -542,7 +598,9 @@ def _chosen_order(fitted: FittedEdge, grey: Array) -> int:
 
 
 def check_phases(distance: Array, rows: int, slope: float) -> None:
-    """Raise EdgeError if the sampling phases leave a wide gap.
+    """Raise EdgeError if the pixels' distances from the edge, modulo a pixel, leave a wide gap.
+
+    Dimensions: N pixels.
 
     Parameters
     ----------
@@ -566,6 +624,8 @@ def check_phases(distance: Array, rows: int, slope: float) -> None:
 
 def core_width(distance: Array, grey: Array, plateau: float) -> float:
     """Return the half width of the spline from the 10-90% width of the edge, px.
+
+    Dimensions: N pixels.
 
     Parameters
     ----------

@@ -70,7 +70,9 @@ class EdgeLine:
 
 
 def checked_region(region: ArrayLike, saturation: float | None) -> Array:
-    """Return the region as float64 (H, W) after the checks that need no edge.
+    """Return the region as float64 (H, W) after all checks that do not need the edge to be found.
+
+    Dimensions: H rows, W columns.
 
     Parameters
     ----------
@@ -105,6 +107,8 @@ def grey_fault(grey: Array, saturation: float | None) -> str:
 
     Faults are values that are not finite, too large or too small to compute with, all equal, saturated, or accumulated
     at their extremes.
+
+    Dimensions: H rows, W columns.
     """
     advice = "lower the exposure or the light"
     bad = int(np.count_nonzero(~np.isfinite(grey)))
@@ -138,9 +142,12 @@ def grey_fault(grey: Array, saturation: float | None) -> str:
 
 
 def pixel_noise(residual: Array) -> float:
-    """Return a robust rms noise of one pixel from the checkerboard differences (a - b - c + d) / 2 of 2 x 2 pixels.
+    """Return a robust estimate of the rms noise of one pixel from residuals (H, W).
 
-    Straight edges of small tilt and slow shading cancel in that difference. The residual has the shape (H, W).
+    It uses the checkerboard differences (a - b - c + d) / 2 of the pixels a, b, c, d in each 2 x 2 square. Straight
+    edges of small tilt and slow shading cancel in that difference. The residual has the shape (H, W).
+
+    Dimensions: H rows, W columns.
     """
     checker = residual[1:, 1:] - residual[1:, :-1] - residual[:-1, 1:] + residual[:-1, :-1]
     return 0.5 * robust_sigma(checker)
@@ -150,6 +157,8 @@ def locate_edge(grey: Array) -> EdgeLine:
     """Return a first line through the one edge in grey values (H, W) as from `checked_region`.
 
     The line is good to some hundredths of a pixel; `analysis.mtf.slanted_edge` refines it on all pixels together.
+
+    Dimensions: H rows, W columns.
 
     Raises
     ------
@@ -194,7 +203,10 @@ def _check_shape(shape: tuple[int, ...], axis: Axis) -> None:
 
 
 def _direction(grey: Array) -> tuple[Axis, int]:
-    """Return axis and sign of the steeper slope of the least-squares plane."""
+    """Return the axis across the edge and whether grey values rise along it (+1) or fall (-1).
+
+    The axis is that of the steeper slope of a plane fitted to the grey values.
+    """
     rows, columns = grey.shape
     row, column = np.arange(rows) - (rows - 1) / 2.0, np.arange(columns) - (columns - 1) / 2.0
     centred = grey - grey.mean()
@@ -219,7 +231,7 @@ def _direction(grey: Array) -> tuple[Axis, int]:
 
 
 def _blocks(grey: Array) -> Array:
-    """Return the means of complete blocks of 4 x 4 px."""
+    """Return the mean grey values of all complete blocks of 4 x 4 px."""
     rows, columns = grey.shape[0] // 4, grey.shape[1] // 4
     whole = grey[: rows * 4, : columns * 4].reshape(rows, 4, columns, 4)
     return np.asarray(whole.mean(axis=(1, 3)))
@@ -243,7 +255,7 @@ def _coarse_line(rising: Array) -> tuple[float, float]:
 
 
 def _refined(rising: Array, offset: float, slope: float) -> tuple[float, float]:
-    """Return the line through the centroids of each row's derivative in a window about the previous line."""
+    """Return offset (px) and slope of the line through the centroids of the rows' derivatives near another line."""
     rows, columns = rising.shape
     row = np.arange(rows) - (rows - 1) / 2.0
     rise = rising[:, 1:] - rising[:, :-1]
@@ -281,7 +293,10 @@ def _check_contrast(rising: Array, line: Array) -> None:
 
 
 def _huber_line(x: Array, y: Array) -> tuple[float, float]:
-    """Fit offset and slope; residuals beyond 1.5 robust sigmas have less weight (Huber)."""
+    """Return offset and slope of a straight line that is fitted robustly to points.
+
+    Residuals beyond 1.5 robust sigmas have less weight (Huber).
+    """
     weight = np.ones_like(x)
     for _ in range(3):
         mean_x, mean_y = np.average(x, weights=weight), np.average(y, weights=weight)

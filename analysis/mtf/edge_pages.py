@@ -1,10 +1,11 @@
 """Slanted edge in several frames: its position in each of them, and the MTF of the frames aligned where it moves.
 
-The mean of frames between which the edge moves by d rms has an MTF that is lower by (2 pi f d)^2 / 2 of itself, which
-the mean does not show. Every page is therefore compared with the mean: its position, angle and two levels are fitted to
-its difference from the mean, with the derivatives of the mean's edge-spread function. Differences of pages contain only
-noise that is new in each, so that chi-square of positions and angles has a known distribution. Pages that do not move
-are measured in their mean. Pages that do are fitted together, each pixel at its own distance from the edge in its page.
+The mean of frames between which the edge moves by d rms has an MTF that is lower by the fraction (2 pi f d)^2 / 2 at
+the frequency f, which the mean does not show. Every page is therefore compared with the mean: its position, angle and
+two levels are fitted to its difference from the mean, with the derivatives of the mean's edge-spread function.
+Differences of pages contain only noise that is new in each, so that chi-square of positions and angles has a known
+distribution. Pages that do not move are measured in their mean. Pages that do are fitted together, each pixel at its
+own distance from the edge in its page.
 
 Rounding to whole grey values is noise only while other noise spreads over the steps (`rounding_residual`).
 """
@@ -33,7 +34,7 @@ _STEPS = 30
 _SETTLED = 2
 """Iterations after which the positions of pages are accurate enough to test for rotation as well."""
 _DONE = 0.1
-"""Step, in sigmas, below which the iteration ends."""
+"""Change of the lines by an iteration step, in their sigmas, below which the iteration ends."""
 _LARGEST_STEP = 2.0
 _LINE, _LEVELS = slice(0, 2), slice(2, 4)
 
@@ -82,20 +83,22 @@ def measure_pages(
     step: float = 0.0,
     even: bool = False,
 ) -> EdgeMtf:
-    """Measure the MTF of the one edge that all pages show.
+    """Measure the MTF of the one edge that all pages (frames of one scene) show.
+
+    Dimensions: P pages, H rows, W columns.
 
     Parameters
     ----------
     pages : (P, H, W) array_like
         Grey values, linear in light; identical copies of a page do not count.
     noise : NoiseModel or None
-        Noise model of the detector, as in `slanted_edge.slanted_edge_mtf`.
+        Noise model of the detector; None to estimate the noise from the residuals.
     saturation : float or None
         Grey value of saturation; one page that reaches it is enough for a refusal.
     step : float
         Step between the grey values of a page, to which they are rounded; 0 for real numbers.
     even : bool
-        True if the light is known to be even, as in `slanted_edge.slanted_edge_mtf`.
+        True if the light is known to be even; otherwise the levels on both sides are fitted as planes.
 
     Raises
     ------
@@ -151,9 +154,11 @@ class _Run:
         shift: _Shift,
         aligned: bool,
     ) -> EdgeMtf:
-        """Return the result of pages (1, H, W), their mean, or (P, H, W), aligned.
+        """Return the MTF of the mean page, given as (1, H, W), or of P aligned pages (P, H, W).
 
         ``frames`` is the number of frames averaged into all pages together.
+
+        Dimensions: H rows, W columns, P pages.
         """
         count = len(stack.line)
         rounded = [rounding_residual(rms, self.step) for rms in shift.page_noise]
@@ -182,7 +187,9 @@ class _Run:
 
 @dataclass(frozen=True, eq=False)
 class _Shift:
-    """Differences between pages.
+    """Differences of the edge's line and of the grey levels between pages, with a test of their significance.
+
+    Dimensions: P pages.
 
     Attributes
     ----------
@@ -191,7 +198,7 @@ class _Shift:
     levels : (P, 2) ndarray
         Change of each page's dark level and contrast.
     covariance : (P, 2, 2) ndarray
-        Covariance of the line by noise that is new in each page.
+        Covariance of the line due to noise that is new in each page.
     chi_square : float
         Chi-square of all lines being the same.
     page_noise : tuple of float
@@ -206,12 +213,12 @@ class _Shift:
 
     @property
     def p_value(self) -> float:
-        """Probability of a larger chi-square; 1 for a single page."""
+        """Probability of a larger chi-square if the edge does not move; 1 for a single page."""
         return float(chance_beyond(self.chi_square, 2 * (len(self.line) - 1))) if len(self.line) > 1 else 1.0
 
     @property
     def turned(self) -> bool:
-        """True if the pages rotate against each other as well."""
+        """True if the edge rotates from page to page in addition to being shifted."""
         slope = self.line[:, 1] - self.line[:, 1].mean()
         chi_square = float(np.sum(slope**2 / self.covariance[:, 1, 1]))
         return bool(chance_beyond(chi_square, len(slope) - 1) < FALSE_ALARM)
@@ -223,6 +230,8 @@ class _Stack:
 
     Each page has a line, offset and slope (P, 2), and levels (P, 2); all share one bend (B,), as in
     `edge_fit.EdgeRows`. ``light`` (H, W) is the uneven light that was subtracted.
+
+    Dimensions: P pages, H rows, W columns, B coefficients of the bend.
     """
 
     pages: Array
@@ -246,22 +255,33 @@ class _Stack:
 
     @property
     def along(self) -> Array:
-        """Distances of the rows from the middle one, (H,) px."""
+        """Distances of the rows from the middle one, (H,) px.
+
+        Dimensions: H rows.
+        """
         rows = self.pages.shape[1]
         return np.arange(rows) - (rows - 1) / 2.0
 
     def distance(self) -> Array:
-        """Return the distance of all pixels from the edge in their page, along its normal, (P, H, W) px."""
+        """Return the distance of all pixels from the edge in their page, along its normal, (P, H, W) px.
+
+        Dimensions: P pages, H rows, W columns.
+        """
         return edge_fit.EdgeRows.of(self.line, self.pages.shape[1:], self.bend).distance().reshape(self.pages.shape)
 
     @property
     def levelled(self) -> Array:
-        """Pages scaled to the levels of the edge-spread function, (P, H, W)."""
+        """Pages scaled to the levels of the edge-spread function, (P, H, W).
+
+        Dimensions: P pages, H rows, W columns.
+        """
         dark, contrast = self.levels[:, :1, None], self.levels[:, 1:, None]
         return np.asarray(self.spread.dark + (self.pages - dark) * (self.spread.contrast / contrast))
 
     def differences(self, step: float, mean: Array | None = None) -> _Shift:
         """Fit the change of each page's line and levels by least squares.
+
+        Dimensions: H rows, W columns.
 
         Parameters
         ----------
@@ -324,7 +344,10 @@ def different_pages(pages: NDArray[np.generic]) -> list[int]:
 
 
 def mean_page(pages: NDArray[np.generic], saturation: float | None) -> Array:
-    """Return the mean (H, W) of pages (P, H, W); a pixel that is saturated in one page gets that level at least."""
+    """Return the mean (H, W) of pages (P, H, W); a pixel that is saturated in one page gets that level at least.
+
+    Dimensions: H rows, W columns, P pages.
+    """
     # sums of huge real numbers may overflow; values that are not finite are refused by the measurement
     with np.errstate(over="ignore", invalid="ignore"):
         mean = np.asarray(pages.mean(axis=0), np.float64)
@@ -334,7 +357,7 @@ def mean_page(pages: NDArray[np.generic], saturation: float | None) -> Array:
 
 
 def _first_line(pages: Array) -> EdgeLine:
-    """Return the line in the first page that shows one; raise the EdgeError of the first page if none does."""
+    """Return the edge's line in the first page that shows one; raise that page's EdgeError if none does."""
     failure: EdgeError | None = None
     for page in pages:
         try:
@@ -346,7 +369,10 @@ def _first_line(pages: Array) -> EdgeLine:
 
 
 def _page_lines(pages: Array, line: EdgeLine) -> Array | None:
-    """Return the line of each page alone, (P, 2); None if a page does not show it."""
+    """Return offset (px) and slope of the edge in each page alone, (P, 2); None if a page does not show the edge.
+
+    Dimensions: P pages.
+    """
     out = []
     for page in pages:
         try:
@@ -360,7 +386,10 @@ def _page_lines(pages: Array, line: EdgeLine) -> Array | None:
 
 
 def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> EdgeMtf:
-    """Measure the edge of pages (P, H, W) in which it moves, by fitting all of them together."""
+    """Measure an edge that moves between the pages (P, H, W), by fitting all pages together.
+
+    Dimensions: P pages, H rows, W columns.
+    """
     if pages.size > MOST_PIXELS:
         raise EdgeError(
             f"the edge moves between the pages, and {len(pages)} of {pages[0].size} pixels are too many to be aligned;"
@@ -422,7 +451,12 @@ def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> E
 
 
 def _levelled(upright: Array, lines: Array, levels: Array, bend: Array) -> tuple[edge_fit.EdgeRows, Array, float]:
-    """Return the rows of all pages, their grey values with the mean levels (N,), and the half width of the spline."""
+    """Return all rows of all pages, their grey values scaled to the mean levels, and the half width of the spline.
+
+    The grey values have the shape (N,), the half width is in px.
+
+    Dimensions: N pixels.
+    """
     dark, contrast = levels.mean(axis=0)
     if np.any(levels[:, 1] < 0.1 * contrast) or contrast <= 0.0:
         page = int(np.argmin(levels[:, 1]))

@@ -59,7 +59,7 @@ def run_mtf(
     csv_file: Path | None,
     as_json: bool,
 ) -> None:
-    """Measure, write and print; the options are those of ``python -m analysis.mtf``.
+    """Run the command ``python -m analysis.mtf``: measure the MTF, write its files and print the result.
 
     Raises
     ------

@@ -57,8 +57,10 @@ def slanted_edge_mtf(
 ) -> EdgeMtf:
     """Measure the modulation transfer function from a slanted edge, with the standard deviation at every frequency.
 
-    Frequencies are counted along the normal of the edge, not along the rows as in ISO 12233. For several frames of the
-    edge see `edge_pages.measure_pages`.
+    Frequencies are counted along the normal of the edge, not along the rows as in ISO 12233. The region may be one
+    frame or the mean of several; `edge_pages.measure_pages` aligns frames between which the edge moves.
+
+    Dimensions: H rows, W columns, F frequencies.
 
     Parameters
     ----------
@@ -132,7 +134,10 @@ def slanted_edge_mtf(
 
 
 def _checked_frequency(frequency: ArrayLike) -> Array:
-    """Return the frequencies (F,) of `slanted_edge_mtf`; raise ValueError if they are unsuitable."""
+    """Return frequencies, (F,) cycles/pixel, if they suit `slanted_edge_mtf`; raise ValueError otherwise.
+
+    Dimensions: F frequencies.
+    """
     wanted = np.array(frequency, dtype=np.float64)
     if wanted.ndim != 1 or wanted.size < 2 or not np.all(np.diff(wanted) > 0) or wanted[0] < 0:
         raise ValueError("frequency must be at least two increasing values >= 0, in cycles/pixel")
@@ -142,7 +147,10 @@ def _checked_frequency(frequency: ArrayLike) -> Array:
 
 
 def rising(grey: Array, line: EdgeLine) -> Array:
-    """Return regions (..., H, W) transposed or mirrored so that the edge is near-vertical and rises to the right."""
+    """Return regions (..., H, W) transposed or mirrored so that the edge is near-vertical and rises to the right.
+
+    Dimensions: H rows, W columns.
+    """
     upright = grey if line.axis == "x" else np.swapaxes(grey, -1, -2)
     return upright if line.sign > 0 else upright[..., ::-1]
 
@@ -163,6 +171,8 @@ def edge_result(
 ) -> EdgeMtf:
     """Return the MTF of a fitted edge, with its sigmas.
 
+    Dimensions: P pages, H rows, W columns, F frequencies.
+
     Parameters
     ----------
     pages : (P, H, W) ndarray
@@ -172,13 +182,13 @@ def edge_result(
     fitted : FittedEdge
         Line and edge-spread function of all pages together.
     noise : NoiseModel or None
-        Noise model, as in `slanted_edge_mtf`.
+        Noise model of the detector; None to estimate the noise from the residuals.
     frames : int
         Number of frames averaged into each page.
     frequency : (F,) ndarray
         Frequencies, cycles/pixel.
     rounding : tuple of float
-        Rounding errors, as in `slanted_edge_mtf`.
+        Rms of the rounding error that remains in the dark and in the bright level, grey values.
 
     Raises
     ------
@@ -272,7 +282,7 @@ def _check_one_edge(residual: Array, contrast: float, line: EdgeLine) -> None:
 
 @dataclass(frozen=True)
 class Structure:
-    """Differences between the means of blocks of pixels and the fit.
+    """Structure in the residuals of the fit: differences between the means of blocks of pixels and the fit.
 
     Attributes
     ----------
@@ -291,6 +301,8 @@ def _structure(fitted: FittedEdge, residual: Array, variance: Array) -> Structur
 
     It is tested in the means of blocks of 8 x 8 px, of strips of 4 px along the edge, and of strips across it on either
     side.
+
+    Dimensions: N pixels.
     """
     along = np.repeat(fitted.rows.along + fitted.rows.half, fitted.rows.columns).astype(np.intp)
     across = np.tile(np.arange(fitted.rows.columns), len(fitted.rows.along))
@@ -307,10 +319,13 @@ def _structure(fitted: FittedEdge, residual: Array, variance: Array) -> Structur
 
 
 def _path_errors(fitted: FittedEdge, residual: Array, variance: Array) -> tuple[float, float, float, Array]:
-    """Return errors of the path: sigma of its slope, curvature with sigma, 1/px, and mean squares of error by order.
+    """Return the errors of the edge's fitted path: of its slope, of its curvature, and of its position by order.
 
-    The curvature is the mean second derivative. The mean squares along the rows, (order,) px^2, are those by the
+    The result holds the sigma of the slope, the curvature (mean second derivative, 1/px) and its sigma, and the mean
+    squares of the position's error. The mean squares along the rows, (order,) px^2, are those due to the errors of the
     coefficients of order 1 and up. Residuals and variances have the shape (N,).
+
+    Dimensions: N pixels.
     """
     rows, order = fitted.rows, fitted.order
     parts, near = path_parts(fitted, max(order, 2))
@@ -329,7 +344,10 @@ def _path_errors(fitted: FittedEdge, residual: Array, variance: Array) -> tuple[
 
 @dataclass(frozen=True, eq=False)
 class _Levels:
-    """Grey values (N,) of pages of a shape and their model, for the noise on both sides of the edge."""
+    """Grey values (N,) of all pixels and their fitted model, from which the noise on both sides of the edge follows.
+
+    Dimensions: N pixels.
+    """
 
     shape: tuple[int, ...]
     grey: Array
@@ -345,6 +363,8 @@ class _Levels:
         Errors that a pixel has in all pages alike do not average down. A pixel of P pages therefore counts with P times
         the variance of its mean, as if it had fallen on the same position of the edge in all of them, which is so where
         pages hardly move; where they do move, sigma is rather too large.
+
+        Dimensions: N pixels.
         """
         count, spread = self.shape[0], self.spread
         ends = np.array([spread.dark, spread.dark + spread.contrast])
@@ -376,7 +396,7 @@ class PagePositions:
     Attributes
     ----------
     position, position_sigma : (P,) ndarray
-        Position in the region's middle, px, as `EdgeMtf.position`; sigma by the noise that is new in each page.
+        Position in the region's middle, px, as `EdgeMtf.position`; sigma due to the noise that is new in each page.
     angle, angle_sigma : (P,) ndarray
         Angle, rad, as `EdgeMtf.angle`; all equal where pages do not rotate.
     chi_square, degrees_of_freedom : float, int
@@ -404,13 +424,15 @@ class PagePositions:
 
     @property
     def drift(self) -> float:
-        """Rms of the positions about their mean, px."""
+        """Rms of the edge's positions in the pages about their mean, px."""
         return float(np.std(self.position))
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeMtf:
     """MTF along the normal of one edge.
+
+    Dimensions: F frequencies, S samples, N pixels.
 
     Attributes
     ----------
@@ -454,7 +476,7 @@ class EdgeMtf:
         Rms noise of one pixel there, grey values.
     core : float
         Half width of the spline, px; beyond it the edge-spread function is level + tail / x.
-    pages : PagePlaces or None
+    pages : PagePositions or None
         Positions in the frames, if several were measured by `edge_pages.measure_pages`.
     """
 
@@ -505,7 +527,7 @@ class EdgeMtf:
         )
 
     def at(self, frequency: float) -> tuple[float, float]:
-        """Return MTF and sigma at one frequency along the normal, cycles/pixel; cubic between the samples.
+        """Return the MTF and its sigma at one frequency along the edge's normal, cycles/pixel, by cubic interpolation.
 
         Raises
         ------
@@ -520,7 +542,7 @@ class EdgeMtf:
         return float(value), float(np.interp(frequency, self.frequency, self.sigma))
 
     def frequency_at(self, value: float) -> tuple[float, float]:
-        """Return the lowest frequency, cycles/pixel, at which the MTF falls below a value, and sigma.
+        """Return the lowest frequency at which the MTF falls below a value, and its sigma, both in cycles/pixel.
 
         Both are NaN if there is none.
         """

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 class Centroid:
     """A centroid method.
 
+    Dimensions: H rows, W columns.
+
     Attributes
     ----------
     title : str

@@ -1,11 +1,11 @@
 """Spot centroids from mean frames: energy centroid, Gaussian fit and fit of the calibrated shape.
 
-All functions take `mean`, (B, H, W) mean grey values of `frames` frames each (see `mean_frames`), and the detector's
-NoiseModel, and return SpotPositions with the covariance split into temporal and fixed-pattern parts. They work on all
-spots of a batch at once. The energy centroid is the one of paper 001 (Wang et al. 2018, Fig. 4; its equation is not
-printed: the first moment over the energy). Weights always come from the model and never from the noisy data, which
-would bias the flux (Humphrey, Liu, Buote, Astrophys. J. 693, 822 (2009)). Pixel coordinates: (row, column), the centre
-of the first pixel is (0, 0).
+All functions take `mean`, B images of H rows and W columns, (B, H, W), each the mean grey values of `frames` frames,
+and the detector's NoiseModel, and return SpotPositions with the covariance split into temporal and fixed-pattern parts.
+They work on all spots of a batch at once. The energy centroid is the one of paper 001 (Wang et al. 2018, Fig. 4; its
+equation is not printed: the first moment over the energy). Weights always come from the model and never from the noisy
+data, which would bias the flux (Humphrey, Liu, Buote, Astrophys. J. 693, 822 (2009)). Pixel coordinates: (row, column),
+the centre of the first pixel is (0, 0).
 
 All three raise SpotError, naming the spots, when a spot is saturated, absent or too near the image's edge, and
 ValueError for input of the wrong shape.
@@ -28,9 +28,11 @@ _GAUSS_MOVE_PX = 4
 
 
 def mean_frames(frames: NDArray[np.integer[Any]]) -> Array:
-    """Return the mean over the frame axis as float64: (..., N, H, W) grey values to (..., H, W).
+    """Return the mean over the frame axis as float64: grey values (..., N, H, W) become (..., H, W).
 
     The sum is exact, in integers.
+
+    Dimensions: N frames, H rows, W columns.
     """
     if frames.ndim < 3 or frames.shape[-3] < 1 or not np.issubdtype(frames.dtype, np.integer):
         raise ValueError(f"mean frames: need integers (..., frames, H, W), found {frames.dtype} {frames.shape}")
@@ -47,9 +49,12 @@ def energy_centroid(
     border_px: int = 4,
     keep_maps: bool = True,
 ) -> SpotPositions:
-    """Return the first moment over the energy in a circular window that is re-centred until convergence.
+    """Return the centroids of spots: the first moment of their light in a circular window that follows the centre.
 
-    The method is that of paper 001, Fig. 4. The window must stay inside the image.
+    The window is re-centred until convergence. The method is that of paper 001 (Wang et al. 2018), Fig. 4. The window
+    must stay inside the image.
+
+    Dimensions: B spots, H rows, W columns.
 
     Parameters
     ----------
@@ -65,7 +70,7 @@ def energy_centroid(
     border_px : int
         Width in pixels of the border of the image whose mean is the background.
     keep_maps : bool
-        Keep the influence of every pixel, for covariances of differences.
+        True to keep the derivatives of the position with respect to every pixel, for covariances of differences.
     """
     image = spot_image.as_images(mean)
     count, height, width = image.shape
@@ -84,7 +89,7 @@ def energy_centroid(
 def _energy(
     image: Array, frames: int, noise: NoiseModel, radius: float, border_px: int, keep_maps: bool
 ) -> SpotPositions:
-    """Return the energy centroids of one piece of a batch."""
+    """Return the energy centroids of a few images of a batch."""
     count, height, width = image.shape
     row, column, _, _, _ = spot_image.coarse(image, frames, noise)
     border = np.ones((height, width), dtype=bool)
@@ -126,11 +131,14 @@ def _energy(
 def gaussian_fit(
     mean: ArrayLike, frames: int, noise: NoiseModel, radius_px: float | None = None, elliptical: bool = False
 ) -> SpotPositions:
-    """Fit background + amplitude exp(-q/2) by weighted least squares in a soft circular window that follows the centre.
+    """Fit a Gaussian on a background to each spot by weighted least squares in a window that follows the centre.
 
-    The exponent q is a (dr^2 + dc^2), or a dr^2 + 2 b dr dc + c dc^2 when elliptical. A diffraction spot is not a
-    Gaussian, so the covariance is the sandwich of the estimating equation with its full derivative (White, Econometrica
-    50, 1 (1982)), not the inverse of the normal matrix.
+    The model is background + amplitude exp(-q/2). With the distances dr and dc from the centre along rows and columns,
+    px, q is a (dr^2 + dc^2), or a dr^2 + 2 b dr dc + c dc^2 when elliptical. A diffraction spot is not a Gaussian, so
+    the covariance is the sandwich of the estimating equation with its full derivative (White, Econometrica 50, 1
+    (1982)), not the inverse of the normal matrix.
+
+    Dimensions: B spots, H rows, W columns.
 
     Parameters
     ----------
@@ -163,7 +171,7 @@ def _wandered(theta: Array, row: Array, column: Array) -> NDArray[np.bool_]:
 
 
 def _gauss(image: Array, frames: int, noise: NoiseModel, radius: float, elliptical: bool) -> SpotPositions:
-    """Fit the Gaussians of one piece of a batch, each on the part of its image that the window can cover."""
+    """Fit the Gaussians of a few images of a batch, each on the part of its image that the window can cover."""
     count, full_height, full_width = image.shape
     row, column, background, peak, area = spot_image.coarse(image, frames, noise)
     spot_image.check_edge(np.stack([row, column], axis=1), full_height, full_width, radius)

@@ -28,7 +28,7 @@ from analysis.spots.noise import MEASURABLE, ROUNDING_VARIANCE, NoiseModel
 FALSE_ALARM = 1e-6
 """Probability that a test rejects anything in clean frames of one spot in one state."""
 MEDIAN = math.pi / 2.0
-"""Variance of the median over that of the mean, for many normally distributed numbers."""
+"""Ratio of the variance of the median to that of the mean, for many normally distributed numbers."""
 MOST_MOVES = 4
 """Greatest number of iterations in which a frame's movement is fitted, and in which the centroid of its light is found.
 """
@@ -44,10 +44,12 @@ of the light whose centroid gives each frame's position; number of frames of tha
 
 
 def reliable_pixels(middle: Array, noise: NoiseModel, count: int, follows: Mask) -> Mask | None:
-    """Return the pixels by which light and movement of frames are fitted, (H, W); None if noise dominates the slopes.
+    """Return the pixels by which light and movement of frames are fitted, (H, W); None if noise dominates slopes.
 
     For a bright spot these are all pixels. The median of faint frames is noise where there is no light, and so are its
     slopes, so that only the pixels about the spot are used.
+
+    Dimensions: H rows, W columns.
 
     Parameters
     ----------
@@ -58,7 +60,7 @@ def reliable_pixels(middle: Array, noise: NoiseModel, count: int, follows: Mask)
     count : int
         Number of frames.
     follows : (H, W) ndarray of bool
-        Pixels that respond to the light.
+        Pixels that respond to light, so that they are neither dead nor saturated.
     """
     slopes = sum(ndimage.gaussian_filter(middle, 1.0, order, mode="nearest") ** 2 for order in ((1, 0), (0, 1)))
     low = float(np.median(middle))
@@ -79,10 +81,12 @@ def reliable_pixels(middle: Array, noise: NoiseModel, count: int, follows: Mask)
 def aligned_median(
     each: Callable[[], Iterator[tuple[Array, Mask]]], count: int, middle: Array, follows: Mask
 ) -> tuple[Array, Array]:
-    """Return the median of the frames shifted to a common position, and each frame's displacement from it, (N, 2) px.
+    """Return the median of the frames shifted to a common position, and each frame's displacement, (N, 2) px.
 
     Where the frames hardly move, these are the plain median and zeros. Positions are first moments of the light about
     the brightest pixel of the median.
+
+    Dimensions: N frames, H rows, W columns.
 
     Parameters
     ----------
@@ -125,6 +129,8 @@ def frame_basis(reference: Array) -> Array:
 
     They are the reference above its median, its first and second derivatives, and 1.
 
+    Dimensions: H rows, W columns.
+
     Parameters
     ----------
     reference : (H, W) ndarray
@@ -136,7 +142,9 @@ def frame_basis(reference: Array) -> Array:
 
 
 def robust_fit(basis: Array, frame: Array, weight: Array) -> tuple[Array, Array]:
-    """Fit the terms to a frame by robust least squares; return the solution (K,) and the inverse normal matrix (K, K).
+    """Fit terms to a frame by robust least squares; return solution (K,) and inverse normal matrix (K, K).
+
+    Dimensions: K terms, H rows, W columns.
 
     Parameters
     ----------
@@ -166,12 +174,14 @@ def robust_fit(basis: Array, frame: Array, weight: Array) -> tuple[Array, Array]
 def position_scatter(offset: Array, spread: Array, count: int) -> Array:
     """Return the covariance of the spot's positions over the frames beyond noise, (2, 2) px^2; zeros if none.
 
+    Dimensions: N frames.
+
     Parameters
     ----------
     offset : (N, 2) ndarray
         Positions of the spot in the frames, px.
     spread : (N, 2, 2) ndarray
-        Covariances of these by noise, px^2.
+        Covariances of these due to noise, px^2.
     count : int
         Number of frames.
     """
@@ -189,13 +199,13 @@ def position_scatter(offset: Array, spread: Array, count: int) -> Array:
 
 Released = Callable[[NDArray[Any]], None]
 _HELD = 1 << 25
-"""Number of bytes of frames that are processed at a time."""
+"""Number of bytes of frames that are processed at a time, to limit memory."""
 GROWTH_SIGMAS = 3.5
 """Residual, in sigmas, from which a neighbour of a transient belongs to it."""
 _DIM = 0.5
-"""Fraction of the light of the brightest frame below which a frame does not contain the spot."""
+"""Fraction of the brightest frame's light below which a frame counts as not containing the spot."""
 _UNLIKE = 0.01
-"""Fraction of deviating pixels from which a whole frame is rejected."""
+"""Fraction of deviating pixels in a frame from which on the whole frame is rejected."""
 _FEWEST_UNLIKE = 40
 _BORDER_PX = 4
 _SATURATION_SIGMAS = 4.0
@@ -210,7 +220,7 @@ differences, in standard deviations, against cosmic rays."""
 _LIT = 0.02
 """Fraction of the peak from which a pixel is illuminated, so that movement and smear look like noise there."""
 _LEAST_LEVEL_DN = 1.0
-"""Least difference of the frames' level below the dark level, DN, that counts as a subtracted dark level."""
+"""Smallest difference of the frames' level below the dark level, DN, that counts as a subtracted dark level."""
 
 
 class FramesError(MeasurementError, ValueError):
@@ -238,7 +248,7 @@ class Finding:
     text : str
         Extent, position and treatment.
     corrects : bool
-        True if the measurement was changed because of it.
+        True if the measurement was changed because of the defect.
     """
 
     kind: str
@@ -249,6 +259,8 @@ class Finding:
 @dataclass(frozen=True, eq=False)
 class ScreenedFrames:
     """Usable part of the frames of one spot in one state.
+
+    Dimensions: H rows, W columns.
 
     Attributes
     ----------
@@ -290,6 +302,8 @@ def _in_memory(frames: NDArray[Any]) -> None:
 class _Stack:
     """Frames of one state, of which a few at a time are in memory as floating-point numbers.
 
+    Dimensions: N frames, H rows, W columns, K frames that are processed.
+
     Attributes
     ----------
     frames : (N, H, W) ndarray
@@ -325,11 +339,14 @@ class _Stack:
         return self.frames.shape[1], self.frames.shape[2]
 
     def taken(self, numbers: NDArray[np.intp]) -> _Stack:
-        """Return the stack of some of the frames, by their indices among all."""
+        """Return the stack of some of the frames, selected by their indices among all recorded frames."""
         return replace(self, numbers=numbers)
 
     def each(self, backwards: bool = False) -> Iterator[tuple[Array, Mask]]:
-        """Yield each frame's values (H, W), 0 where undefined, and the mask of its defined pixels."""
+        """Yield each frame's values (H, W), 0 where undefined, and the mask of its defined pixels.
+
+        Dimensions: H rows, W columns.
+        """
         each = self.frames.itemsize * self.frames[0].size
         for k, number in enumerate(self.numbers[::-1] if backwards else self.numbers):
             yield self._read(self.frames[number], self.bad)
@@ -343,7 +360,10 @@ class _Stack:
         return np.where(finite & ~bad if self.blank else finite, values, 0.0), finite
 
     def known(self) -> tuple[Mask, Mask]:
-        """Return the pixels (H, W) that are defined in all frames, and those that are defined in any."""
+        """Return two masks (H, W): the pixels that are defined in all frames, and those that are defined in any.
+
+        Dimensions: H rows, W columns.
+        """
         all_frames, any_frame = np.ones(self.shape, dtype=bool), np.zeros(self.shape, dtype=bool)
         if np.issubdtype(self.frames.dtype, np.integer):
             return all_frames, ~any_frame
@@ -354,6 +374,8 @@ class _Stack:
 
     def median(self, filled: bool = False) -> Array:
         """Return the median over the frames, (H, W).
+
+        Dimensions: H rows, W columns.
 
         Parameters
         ----------
@@ -384,6 +406,8 @@ def screen_frames(
 
     Few of the frames are in memory at a time as floating-point numbers, so that a file may hold many.
 
+    Dimensions: N frames, H rows, W columns.
+
     Parameters
     ----------
     frames : (N, H, W) ndarray
@@ -391,7 +415,7 @@ def screen_frames(
     noise : NoiseModel
         Noise of the detector.
     bad : (H, W) ndarray of bool or None
-        Pixels that are known to be bad; None for none.
+        Pixels that are known to be bad; None if there is none.
     released : callable
         Function called after some frames have been read.
 
@@ -444,9 +468,12 @@ def screen_frames(
 
 
 def _summed(used: _Stack, comparison: _Compared | None) -> tuple[Array, Array]:
-    """Return the sum over the frames (H, W) with rejected values replaced by their model, and their number.
+    """Return the sum over the frames, with rejected values replaced, and the number of summed frames.
 
-    The sum of whole numbers is exact; divided by ``len(used)`` it is the mean of `centroid.mean_frames`.
+    Both arrays have the shape (H, W), the sum in DN. Rejected values are replaced by the model of their frame. The sum
+    of whole numbers is exact; divided by ``len(used)`` it is the mean of `centroid.mean_frames`.
+
+    Dimensions: H rows, W columns.
     """
     total, lost = np.zeros(used.shape), np.zeros(used.shape)
     for k, (values, finite) in enumerate(used.each()):
@@ -470,7 +497,7 @@ def _numbers(frames: NDArray[np.intp]) -> str:
 
 
 def _illuminated(stack: _Stack, inside: Mask, noise: NoiseModel, findings: list[Finding]) -> NDArray[np.intp]:
-    """Return the indices of the frames that contain the light; ``inside`` are pixels usable in all of them."""
+    """Return the indices of the frames that contain the spot's light; ``inside`` are pixels usable in all of them."""
     edge = np.ones(stack.shape, dtype=bool)
     edge[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX] = False
     border = inside & edge if np.any(inside & edge) else edge
@@ -493,10 +520,11 @@ def _illuminated(stack: _Stack, inside: Mask, noise: NoiseModel, findings: list[
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """Comparison of N frames of a number of pixels with their reference.
+    """Comparison of N frames with a reference image: fitted light, level and displacement, and rejected pixels.
 
-    For each frame: the number of rejected pixels (N,), the pixels that its model replaces with their values, light and
-    level (N,) with the largest sigma of each, displacements (N, 2) in px and their covariance (N, 2, 2).
+    The fields hold for each frame the number of rejected pixels (N,), the pixels that its model replaces with their
+    values, light and level (N,) with the largest sigma of each, displacements (N, 2) in px and their covariance (N, 2,
+    2).
     """
 
     pixels: int
@@ -511,7 +539,10 @@ class _Compared:
     jitter: Array
 
     def unlike(self) -> Mask:
-        """Return the mask of the frames that deviate as a whole, (N,)."""
+        """Return the mask of the frames that deviate as a whole, (N,).
+
+        Dimensions: N frames.
+        """
         return np.asarray(self.hits > max(_UNLIKE * self.pixels, _FEWEST_UNLIKE))
 
     def findings(self) -> list[Finding]:
@@ -598,11 +629,13 @@ def noise_ratio(
     where: Mask | None = None,
     released: Released = _in_memory,
 ) -> float | None:
-    """Return the ratio of the frames' noise to the specified one; None if they agree.
+    """Return the ratio of the frames' rms noise to the specified one; None if they agree.
 
     The noise is that of the differences of each frame to the next, beside the spot, among frames that contain the
     light. The result is the median over all pairs, so that one corrupted frame is not taken for noise. It is also None
     if the frames cannot show the noise.
+
+    Dimensions: N frames, H rows, W columns.
 
     Parameters
     ----------
@@ -611,7 +644,7 @@ def noise_ratio(
     noise : NoiseModel
         Specified noise of the detector.
     bad : (H, W) ndarray of bool or None
-        Unusable pixels; None for none.
+        Unusable pixels; None if there is none.
     where : (H, W) ndarray of bool or None
         Pixels to use; None for those beside the spot.
     released : callable
@@ -664,6 +697,8 @@ def observed_noise(
 ) -> NoiseModel:
     """Return the noise model with any excess noise of the frames added as read noise.
 
+    Dimensions: N frames, H rows, W columns.
+
     Parameters
     ----------
     frames : (N, H, W) ndarray
@@ -673,7 +708,7 @@ def observed_noise(
     ratio : float or None
         Result of `noise_ratio`.
     bad : (H, W) ndarray of bool or None
-        Unusable pixels; None for none.
+        Unusable pixels; None if there is none.
     released : callable
         Function called after some frames have been read.
     """
@@ -689,10 +724,12 @@ def observed_noise(
 def subtracted_level(
     frames: NDArray[Any], noise: NoiseModel, bad: Mask | None = None, released: Released = _in_memory
 ) -> float:
-    """Return by how much the frames' level lies below the dark level, DN; 0 if not significant.
+    """Return by how many DN the frames' level lies below the dark level of the detector; 0 if not significant.
 
     Light only adds, so that a level below the dark level was subtracted from the frames. Their shot noise is that of
     the light above the remaining level.
+
+    Dimensions: N frames, H rows, W columns.
 
     Parameters
     ----------
@@ -701,7 +738,7 @@ def subtracted_level(
     noise : NoiseModel
         Noise of the detector.
     bad : (H, W) ndarray of bool or None
-        Unusable pixels; None for none.
+        Unusable pixels; None if there is none.
     released : callable
         Function called after some frames have been read.
     """
@@ -714,7 +751,7 @@ def subtracted_level(
 
 
 def _grown(seed: Mask, grows: Mask) -> Mask:
-    """Return the seeds and all pixels of ``grows`` that are connected to them."""
+    """Return the marked pixels ``seed`` and all pixels of ``grows`` that are connected to them."""
     if not np.any(seed):
         return seed
     return np.asarray(ndimage.binary_propagation(seed, np.ones((3, 3)), seed | grows))

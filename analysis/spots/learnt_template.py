@@ -51,7 +51,10 @@ _CORE = 0.05
 _LOOKS, _FILLS = 3, 40
 """Number of passes that estimate the light's band of frequencies, and iterations of filling in each."""
 _UNEVEN = 0.5
-"""Rms of the slopes, in sigmas of a pixel, from which they belong to the background; rings of the spot make less."""
+"""Rms of an image's slopes, in sigmas of a pixel, from which on they belong to the background.
+
+Diffraction rings of the spot make smaller slopes.
+"""
 
 
 def without_slopes(screened: ScreenedFrames, noise: NoiseModel) -> ScreenedFrames:
@@ -92,7 +95,9 @@ def _edge(shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class LearntTemplate:
-    """Learnt spot shape, with the linear operator that relates it to the pixels of the image that it was learnt from.
+    """Learnt spot shape, with the linear operator that relates it to the image that it was learnt from.
+
+    Dimensions: H rows, W columns.
 
     Attributes
     ----------
@@ -115,7 +120,9 @@ class LearntTemplate:
     fills: tuple[NDArray[np.bool_], ...]
 
     def impulse(self, pixel: tuple[int, int]) -> Array:
-        """Return the learnt image of 1 DN in one pixel, (H, W), without the effect of missing pixels and edges.
+        """Return the learnt image, (H, W) DN, of one pixel of 1 DN, ignoring missing pixels and edges.
+
+        Dimensions: H rows, W columns.
 
         Parameters
         ----------
@@ -127,7 +134,12 @@ class LearntTemplate:
         return _filtered(image, self.passed)
 
     def returned(self, maps: Array) -> Array:
-        """Return the derivatives with respect to the image's pixels, (n, H, W), by the transpose of learning.
+        """Return derivatives with respect to the pixels of the image that was learnt from, (n, H, W).
+
+        They are the given derivatives with respect to the shape's samples times the (transposed) linear operation of
+        learning.
+
+        Dimensions: H rows, W columns, M rows of shape samples, N columns of shape samples.
 
         Parameters
         ----------
@@ -188,7 +200,7 @@ def learn_template(screened: ScreenedFrames, noise: NoiseModel) -> LearntTemplat
 
 
 def _taper(shape: tuple[int, ...]) -> Array:
-    """Return a window of an image's shape that is 1 inside and falls to 0 at the edge as a raised cosine."""
+    """Return a window of an image's size that is 1 inside and falls to 0 at the edge as a raised cosine."""
     parts = []
     for size in shape:
         away = np.minimum(np.arange(size) + 1, size - np.arange(size)) / (_TAPER_PX + 1.0)
@@ -197,12 +209,15 @@ def _taper(shape: tuple[int, ...]) -> Array:
 
 
 def _filtered(image: Array, passed: NDArray[Any]) -> Array:
-    """Return images (..., H, W) multiplied by a transmission in the frequency domain."""
+    """Return images (..., H, W) multiplied by a transmission in the frequency domain.
+
+    Dimensions: H rows, W columns.
+    """
     return np.asarray(np.real(np.fft.ifft2(np.fft.fft2(image) * passed)))
 
 
 def _completed(light: Array, good: NDArray[np.bool_], variance: Array) -> tuple[Array, tuple[NDArray[np.bool_], ...]]:
-    """Return the image with missing pixels filled by band-limited extrapolation, and the frequency masks of each pass.
+    """Return the image with missing pixels filled from the others, and the masks of frequencies that each pass used.
 
     Optics transmit light up to a cut-off frequency only: missing pixels repeatedly take the values of the low-passed
     image (Papoulis, IEEE Trans. Circuits Syst. 22, 735 (1975); Gerchberg, Opt. Acta 21, 709 (1974)).
@@ -224,7 +239,10 @@ def _completed(light: Array, good: NDArray[np.bool_], variance: Array) -> tuple[
 
 
 def _passed(light: Array, variance: Array) -> Array:
-    """Return the transmission of each frequency (H, W): it passes frequencies at which the image exceeds its noise."""
+    """Return the filter's transmission at each frequency, (H, W): high where the image exceeds its noise.
+
+    Dimensions: H rows, W columns.
+    """
     power = np.abs(np.fft.fft2(light)) ** 2
     floor = float(variance.sum())
     frequency = np.hypot(np.fft.fftfreq(light.shape[0])[:, None], np.fft.fftfreq(light.shape[1])[None, :])
@@ -239,12 +257,15 @@ def _passed(light: Array, variance: Array) -> Array:
 
 
 _LEAST = 0.4
-"""Least fraction of the normal matrix that is not noise, in any direction, for which the first-order theory holds."""
+"""Smallest fraction of the normal matrix that is not noise, in any direction, for which the first-order theory holds.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class FittedSpot:
-    """Spot in one state, with the learnt shape fitted to it.
+    """Spot in one state of the instrument, with the learnt shape fitted to its image.
+
+    Dimensions: H rows, W columns, G further spots.
 
     Attributes
     ----------
@@ -271,22 +292,34 @@ class FittedSpot:
 
     @property
     def maps(self) -> Array:
-        """Influence of each pixel on row and column, (2, H, W) px/DN."""
+        """Derivatives of the position's row and column with respect to each pixel, (2, H, W) px/DN.
+
+        Dimensions: H rows, W columns.
+        """
         assert self.positions.gain_maps is not None
         return self.positions.gain_maps[0]
 
     @property
     def light(self) -> Array:
-        """Expected light signal, (H, W) DN."""
+        """Expected light signal, (H, W) DN.
+
+        Dimensions: H rows, W columns.
+        """
         assert self.positions.light_dn is not None
         return self.positions.light_dn[0]
 
     def temporal(self, noise: NoiseModel) -> Array:
-        """Return the variance of the mean image by temporal noise, (H, W) DN^2."""
+        """Return the variance of the mean image due to temporal noise, (H, W) DN^2.
+
+        Dimensions: H rows, W columns.
+        """
         return np.asarray(noise.temporal_variance_dn2(self.light + noise.dark_level_dn, 1) / self.counts)
 
     def fixed(self, noise: NoiseModel) -> Array:
-        """Return the variance by the detector's fixed pattern, (H, W) DN^2."""
+        """Return the variance of each pixel due to the detector's fixed pattern, (H, W) DN^2.
+
+        Dimensions: H rows, W columns.
+        """
         return np.asarray(noise.fixed_variance_dn2(self.light + noise.dark_level_dn))
 
 
@@ -299,7 +332,8 @@ class LearntShift:
     covariance : (2, 2) ndarray
         Covariance of the shift, px^2.
     lean : (2,) ndarray
-        Bias of the fit, px, whose square is in the covariance.
+        Bias of the shift, px, by which the fit leans towards positions half way between pixels; its square is in the
+        covariance.
     parts : tuple of NoiseParts
         Noise of the images before and after, for the covariance of several shifts against the same image before. The
         contribution of the image before differs from shift to shift and is therefore in the part after.
@@ -313,7 +347,7 @@ class LearntShift:
 def learnt_shift(
     learnt: LearntTemplate, before: FittedSpot, after: FittedSpot, noise: NoiseModel, ccd: tuple[int, int]
 ) -> LearntShift:
-    """Compute the noise of one spot's shift.
+    """Compute the covariance and bias of one spot's shift that was measured with a learnt shape.
 
     Parameters
     ----------
@@ -363,9 +397,12 @@ def _shape_of(learnt: LearntTemplate, spot: FittedSpot) -> SpotTemplate:
 
 
 def _by_image(learnt: LearntTemplate, spot: FittedSpot, maps: Array) -> Array:
-    """Return the influence of the image before on quantities of a state through the fitted model, (2, H, W).
+    """Return the derivatives of quantities of a state with respect to the image before, by way of the learnt shape.
 
-    ``maps`` are the derivatives of these quantities with respect to the state's image.
+    The result has the shape (2, H, W); ``maps`` are the derivatives of these two quantities with respect to the state's
+    image.
+
+    Dimensions: H rows, W columns.
     """
     shape = SmearedShape(_shape_of(learnt, spot))
     position, flux = spot.positions.position[0], float(spot.positions.flux[0])
@@ -377,7 +414,10 @@ def _by_image(learnt: LearntTemplate, spot: FittedSpot, maps: Array) -> Array:
 def _second_order(
     learnt: LearntTemplate, before: FittedSpot, after: FittedSpot, noise: NoiseModel
 ) -> tuple[Array, Array]:
-    """Return the gain of the fit over that of the normal matrix, (2, 2), and its bias, (2,) px."""
+    """Return the second-order effects of the shape's noise on a fit: the factor of its response and its bias.
+
+    The factor is the matrix (2, 2) by which the fit responds more than its normal matrix says; the bias is (2,) px.
+    """
     ratio = float(after.positions.flux[0]) / learnt.light
     # kernel of the pixel at the spot's centre
     at = np.rint(before.positions.position[0]).astype(np.intp)
@@ -402,15 +442,20 @@ def _second_order(
 
 
 def _weight(spot: FittedSpot, noise: NoiseModel) -> Array:
-    """Return the weights of a fit, (H, W) 1/DN^2; 0 for excluded pixels."""
+    """Return the weights of a fit, (H, W) 1/DN^2; 0 for excluded pixels.
+
+    Dimensions: H rows, W columns.
+    """
     used = np.any(spot.maps != 0.0, axis=0)
     return np.asarray(np.where(used, 1.0 / (spot.temporal(noise) + spot.fixed(noise)), 0.0))
 
 
 def _kernel(learnt: LearntTemplate, before: FittedSpot, after: FittedSpot, pixel: tuple[int, int]) -> Array:
-    """Return the influence of a pixel of the image before on the state's model, and its two slopes, (3, H, W).
+    """Return the influence of one pixel of the image before on the state's model, and its two slopes, (3, H, W).
 
     The influence is for equal light; the slopes are its derivatives with respect to the position.
+
+    Dimensions: H rows, W columns.
     """
     wide = np.pad(learnt.impulse(pixel), MARGIN_PX)
     height, width = after.light.shape
@@ -423,7 +468,7 @@ def _kernel(learnt: LearntTemplate, before: FittedSpot, after: FittedSpot, pixel
 def _shared(
     slopes: Array, weight: Array, before: FittedSpot, after: FittedSpot, noise: NoiseModel, middle: tuple[int, int]
 ) -> Array:
-    """Return the weighted covariance of the model's slopes with the image by the fixed pattern in both, (2,)."""
+    """Return the weighted covariance of model slopes and image that the common fixed pattern causes, (2,)."""
     # the same pixels of the detector in both images
     rows, columns = (slice(max(a, b), None) for a, b in zip(before.offset, after.offset, strict=True))
     light_before = before.light[rows.start - before.offset[0] :, columns.start - before.offset[1] :]
@@ -438,7 +483,7 @@ def _shared(
 
 
 def _on_ccd(spot: FittedSpot, maps: Array, ccd: tuple[int, int]) -> SpotPositions:
-    """Return the positions with maps and light on the whole detector."""
+    """Return the positions with their derivative maps and light extended from the image to the whole detector."""
     gain, light = np.zeros((1, 2, *ccd)), np.zeros((1, *ccd))
     rows, columns = (slice(a, a + n) for a, n in zip(spot.offset, spot.light.shape, strict=True))
     gain[0, :, rows, columns], light[0, rows, columns] = maps, spot.light

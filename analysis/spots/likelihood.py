@@ -48,7 +48,7 @@ _EVERY = 4
 _HALVINGS = 6
 
 EDGE_PX = 10.0
-"""Least distance of a spot's centre from the outermost pixel centres, px."""
+"""Smallest distance of a spot's centre from the outermost pixel centres, px."""
 CORE_SHARE = 0.02
 """Fraction of a spot's peak above which a pixel belongs to its core."""
 
@@ -68,6 +68,8 @@ def maximum_likelihood_fit(
     The variance of a pixel is temporal / frames + fixed pattern, at the model's grey value; the score is that of a
     normal likelihood with known variance, which for shot noise equals the Poisson score.
 
+    Dimensions: B spots, H rows, W columns.
+
     Parameters
     ----------
     mean : (B, H, W) array_like
@@ -77,11 +79,11 @@ def maximum_likelihood_fit(
     noise : NoiseModel
         Noise of the detector.
     template : SpotTemplate
-        T shapes; spot b has shape b modulo T.
+        T shapes; the spot with index b has the shape with index b modulo T.
     edge_px : float
-        Least distance of a centre from the image's outermost pixel centres.
+        Smallest distance of a centre from the image's outermost pixel centres.
     keep_maps : bool
-        Keep the influence of every pixel, for covariances of differences.
+        True to keep the derivatives of the position with respect to every pixel, for covariances of differences.
     threads : int
         Number of threads. The batch is cut into small pieces that fit the cache; results do not depend on the number of
         threads.
@@ -110,7 +112,7 @@ def maximum_likelihood_fit(
 def _score(
     rule: _Rule, image: Array, which: NDArray[np.intp], edge_px: float, keep_maps: bool, max_iterations: int
 ) -> SpotPositions:
-    """Fit one piece of a batch by Fisher scoring; arguments as in `maximum_likelihood_fit`."""
+    """Fit a few images of a batch by Fisher scoring; arguments as in `maximum_likelihood_fit`."""
     count, height, width = image.shape
     noise, frames = rule.noise, rule.frames
     row, column, background, _, _ = spot_image.coarse(image, frames, noise)
@@ -157,9 +159,12 @@ def _score(
 
 
 def _degrees(of: NDArray[np.bool_], excess: Array) -> Array:
-    """Return the degrees of freedom (B,) of a sum of squares over some pixels (B, P), matched to its variance.
+    """Return the effective degrees of freedom, (B,), of the sum of squared residuals over some pixels (B, P).
 
-    Each square has the variance 2 + excess; the chi-square distribution has the variance of their sum.
+    They are matched to the sum's variance. Each square has the variance 2 + excess; the chi-square distribution has the
+    variance of their sum.
+
+    Dimensions: B spots, P pixels.
     """
     count = of.sum(axis=1)
     return np.asarray(2.0 * count**2 / np.maximum(np.sum(of * (2.0 + excess), axis=1), 1e-300))
@@ -167,11 +172,13 @@ def _degrees(of: NDArray[np.bool_], excess: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Scored:
-    """Result of Fisher scoring.
+    """Result of Fisher scoring: the fitted parameters and the quantities of its last step.
 
-    The parameters theta (B, 4), the step at which each spot converged (B,) (one more than allowed if it did not), and
-    of the last step level, weight and residual (B, P), design and design times weight (B, 4, P) and the inverse
-    information (B, 4, 4).
+    The fields are the parameters theta (B, 4) (row, column, flux, background), the step at which each spot converged
+    (B,) (one more than allowed if it did not), and of the last step level, weight and residual (B, P), design and
+    design times weight (B, 4, P) and the inverse information (B, 4, 4).
+
+    Dimensions: B spots, P pixels.
     """
 
     theta: Array
@@ -187,7 +194,7 @@ class _Scored:
 
 @dataclass(frozen=True, eq=False)
 class _Rule:
-    """Template, noise model and number of frames of a fit."""
+    """Template, noise model and number of frames of a fit, with its iteration."""
 
     template: SpotTemplate
     noise: NoiseModel
@@ -199,6 +206,8 @@ class _Rule:
         """Run Fisher scoring of spots (B, H, W) from given parameters; `work` (2, B, 4, P) is storage for the designs.
 
         If `damped`, a step is halved until the weighted sum of squares decreases.
+
+        Dimensions: B spots, H rows, W columns, P pixels.
         """
         flat = image.reshape(len(image), -1)
         steps = np.full(len(image), most + 1)
@@ -223,7 +232,10 @@ class _Rule:
     def _descended(
         self, flat: Array, start: Array, end: Array, which: NDArray[np.intp], weight: Array, residual: Array
     ) -> Array:
-        """Return the end of a step (B, 4), moved towards its start where the sum of squares would grow."""
+        """Return the end of an iteration step (B, 4), moved towards its start where the sum of squares would grow.
+
+        Dimensions: B spots.
+        """
         square = np.sum(residual * residual * weight, axis=1)
         for _ in range(_HALVINGS):
             _, level = spot_image.template_model(end, which, self.template)
@@ -234,18 +246,23 @@ class _Rule:
         return end
 
     def deviance(self, found: _Scored) -> Array:
-        """Return minus twice the log-likelihood of the last step, (B,)."""
+        """Return minus twice the log-likelihood of the last step, (B,).
+
+        Dimensions: B spots.
+        """
         return np.asarray(np.sum(found.residual**2 * found.weight - np.log(found.weight), axis=1))
 
 
 def _second_start(
     image: Array, first: _Scored, which: NDArray[np.intp], rule: _Rule, edge_px: float, most: int
 ) -> Array | None:
-    """Return the parameters after fits from second starts, (B, 4); None if no spot needs one.
+    """Return the fitted parameters (B, 4) after a second start from another position; None if no spot needs one.
 
-    The correlation of image and shape is greatest where the sum of squares is least, among all positions. If it has no
-    other maximum as high as at the end of the first fit, which holds for every sharp spot, both starts have the same
+    The correlation of image and shape is greatest where the sum of squares is smallest, among all positions. If it has
+    no other maximum as high as at the end of the first fit, which holds for every sharp spot, both starts have the same
     end.
+
+    Dimensions: B spots.
 
     Raises
     ------
@@ -293,7 +310,10 @@ def _second_start(
 
 
 def _start(rule: _Rule, image: Array, theta: Array, which: NDArray[np.intp]) -> Array:
-    """Return improved start parameters (B, 4) from the few pixels about each spot."""
+    """Return improved start parameters (B, 4) from the few pixels about each spot.
+
+    Dimensions: B spots.
+    """
     height, width = image.shape[1:]
     size = (min(_NEAR_PX, height), min(_NEAR_PX, width))
     corner = np.rint(theta[:, :2] - 0.5 * (np.array(size) - 1)).astype(np.intp)
@@ -308,7 +328,7 @@ def _start(rule: _Rule, image: Array, theta: Array, which: NDArray[np.intp]) -> 
 
 
 def _best_elsewhere(surface: Array) -> NDArray[np.intp]:
-    """Return the lag (row, column) in px to the best correlation away from the fit; 0 if there is none."""
+    """Return the distance (row, column) in px from the fit to the best other match of image and shape; 0 if none."""
     size = np.array(surface.shape)
     # few places are as high, and only these need to be looked at for tops
     high = np.argwhere(surface > _LIKE * surface.max())
@@ -330,6 +350,8 @@ def _step(
 
     Returns the parameters (B, 4), the length of the step (B,) in px, the inverse information (B, 4, 4) and the design
     times weight (B, 4, P), which is stored in `out` if that is given.
+
+    Dimensions: B spots, P pixels.
     """
     weighted = np.multiply(design, weight[:, None], out=out)
     inverse: Array = np.asarray(np.linalg.inv(weighted @ design.transpose(0, 2, 1)), dtype=np.float64)
@@ -343,6 +365,8 @@ def _step(
 
 def image_bound(light: ArrayLike, background: float, noise: NoiseModel, frames: int) -> Array:
     """Return the Cramer-Rao bound of the positions of spots given by noise-free images, (B, 2, 2) px^2.
+
+    Dimensions: B spots, H rows, W columns.
 
     Parameters
     ----------
@@ -370,7 +394,10 @@ def image_bound(light: ArrayLike, background: float, noise: NoiseModel, frames: 
 
 
 def _bound(design: Array, level: Array, noise: NoiseModel, frames: int) -> Array:
-    """Return the covariance of row and column, (B, 2, 2), from the derivatives and levels of all pixels."""
+    """Return the Cramer-Rao bound of row and column, (B, 2, 2) px^2, from the derivatives and levels of all pixels.
+
+    Dimensions: B spots.
+    """
     design = design / np.sqrt(spot_image.variance(level, noise, frames))[:, None]
     information = design @ design.transpose(0, 2, 1)
     return np.asarray(np.linalg.inv(information)[:, :2, :2], dtype=np.float64)
@@ -379,7 +406,7 @@ def _bound(design: Array, level: Array, noise: NoiseModel, frames: int) -> Array
 FALSE_ALARM = 1e-8
 """Probability that a spot of the calibrated shape exceeds one of the two limits of a fit.
 
-It gives 2e-7 for a run with four spots before and after, and 1e-4 for a course of a thousand times.
+It gives 2e-7 for a run with four spots before and after, and 1e-4 for a series of a thousand times.
 """
 NOT_CONVERGED = "the fit does not converge from either of two starts; the spot does not have the calibrated shape"
 """Reason given for refusing a spot whose fit does not converge."""
@@ -387,7 +414,9 @@ NOT_CONVERGED = "the fit does not converge from either of two starts; the spot d
 
 @dataclass(frozen=True, eq=False)
 class FitStates(StateArrays):
-    """Goodness of fit of spots, arrays of one shape: (B,), or (S, C) after `reshaped`.
+    """Goodness of fit of spots: arrays (B,) for B spots, or (S, C) for S states of C spots.
+
+    Dimensions: B spots, S states, C spots.
 
     Attributes
     ----------
@@ -396,7 +425,7 @@ class FitStates(StateArrays):
     whole_limit, core_limit : ndarray
         Limits of these; infinite where no shape was fitted.
     whole_sigma, core_sigma : ndarray
-        Standard deviations of these by the noise of the frames.
+        Standard deviations of these due to the noise of the frames.
     noise : ndarray
         Squared ratio of the frames' noise to the specified one, from the median of all pixels.
     """
@@ -417,9 +446,9 @@ class FitStates(StateArrays):
 
     @property
     def widening(self) -> Array:
-        """Factor of sigma: 1 for a spot that fits, else the root of the larger reduced chi-square (Birge ratio).
+        """Factor by which sigma is increased: 1 for a spot that fits, else the root of the larger reduced chi-square.
 
-        Reference: Birge, Physical Review 40, 207 (1932).
+        It is the Birge ratio: Birge, Physical Review 40, 207 (1932).
         """
         with np.errstate(invalid="ignore"):
             grown = np.sqrt(np.fmax(self.whole, self.core))
@@ -437,12 +466,12 @@ class FitStates(StateArrays):
 
 
 def fit_states(positions: SpotPositions) -> FitStates:
-    """Test the goodness of fit of B spots.
+    """Return the chi-squares of the fits of B spots, with the limits that decide whether they fit.
 
     Parameters
     ----------
     positions : SpotPositions
-        Measured positions.
+        Positions of B spots, with the chi-squares of their fits.
     """
     count = positions.row.size
     if positions.degrees is None or positions.core_chi_square is None:
@@ -456,14 +485,14 @@ def fit_states(positions: SpotPositions) -> FitStates:
 
 
 def widened(positions: SpotPositions, factor: Array) -> SpotPositions:
-    """Return the positions with their sigmas scaled by the Birge ratio of their fits.
+    """Return the positions with their standard deviations multiplied by the given factors.
 
     Parameters
     ----------
     positions : SpotPositions
         B positions.
     factor : (B,) ndarray
-        Factors of the sigmas, as `FitStates.widening`.
+        Factor of each spot's standard deviations, such as the root of its reduced chi-square.
     """
     if np.all(factor == 1.0):
         return positions
@@ -477,7 +506,7 @@ def widened(positions: SpotPositions, factor: Array) -> SpotPositions:
 
 
 def require_convergence(positions: SpotPositions) -> SpotPositions:
-    """Return the positions; raise SpotError for spots whose fit has not converged.
+    """Return the positions unchanged, or raise SpotError for spots whose fit has not converged.
 
     Parameters
     ----------

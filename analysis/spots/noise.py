@@ -82,7 +82,7 @@ def systematic_variance(electrons: ArrayLike, read_e2: ArrayLike, gain: float) -
 
 
 def temporal_part(variance: float) -> float:
-    """Return the part of the variance of grey values over frames that rounding causes, DN^2.
+    """Return the part of the variance of a pixel's grey values over frames that rounding causes, DN^2.
 
     The result is the mean over all levels between two steps, for normal noise before rounding.
 
@@ -104,9 +104,10 @@ def temporal_part(variance: float) -> float:
 
 @cache
 def _temporal_extremes() -> tuple[Array, Array, Array]:
-    """Return noise variances before rounding and the range of variances over frames that each may give.
+    """Return a table of noise variances before rounding and of the variances over frames that each may give, DN^2.
 
-    The range is the smallest and the largest variance over the levels of a pixel between two steps.
+    The three arrays are the variances before rounding, and the smallest and the largest variance over the levels of a
+    pixel between two steps.
     """
     sigma = np.linspace(0.0, FINE, 201)[1:, None, None]
     level = np.linspace(0.0, 0.5, 51)[:, None]
@@ -119,7 +120,7 @@ def _temporal_extremes() -> tuple[Array, Array, Array]:
 
 
 def noise_range(variance: float, doubt: float) -> tuple[float, float]:
-    """Return the least and greatest noise variance before rounding that agree with a measured variance, DN^2.
+    """Return the smallest and largest noise variance before rounding that agree with a measured variance, DN^2.
 
     All pixels are assumed to lie at one unknown level between two steps.
 
@@ -138,11 +139,11 @@ def noise_range(variance: float, doubt: float) -> tuple[float, float]:
 
 
 class FurtherNoise(Protocol):
-    """Noise beyond the linear model, by its variance in one pixel, electrons squared."""
+    """Interface of noise beyond the linear model, by its variances in one pixel, electrons squared."""
 
     @property
     def fixed_variance_e2(self) -> float:
-        """Variance of a pattern that is added to every frame, independent of the signal, electrons squared."""
+        """Variance over pixels of a pattern that is the same in every frame at any signal, electrons squared."""
         ...
 
     def temporal_variance_e2(self, electrons: Any) -> Any:
@@ -264,7 +265,7 @@ class NoiseModel:
         return self._variance_dn2(mean_signal_dn, 1)
 
     def temporal_variance_dn2(self, mean_signal_dn: NDArray[np.float64] | float, frames: int) -> Any:
-        """Return the variance of a mean of `frames` frames by the noise that is new in each, DN^2.
+        """Return the variance of a mean of `frames` frames due to the noise that is new in each, DN^2.
 
         Parameters
         ----------
@@ -314,9 +315,9 @@ class NoiseModel:
     def fixed_variance_dn2(self, mean_signal_dn: NDArray[np.float64] | float) -> Any:
         """Return the variance over pixels of the noise that is the same in every frame, DN^2.
 
-        It is that of the pattern, prnu^2 s^2 + (K dsnu)^2 with s the light signal, of further patterns, and of the
-        rounding error that all frames share. It does not fall with the number of frames. The pattern is the same draw
-        in every image of the same pixels; the rounding error is not.
+        It is that of the pattern, prnu^2 s^2 + (K dsnu)^2 with s the light signal in DN and K the gain in DN per
+        electron, of further patterns, and of the rounding error that all frames share. It does not fall with the number
+        of frames. The pattern is the same in every image of the same pixels; the rounding error is not.
 
         Parameters
         ----------

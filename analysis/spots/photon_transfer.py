@@ -29,12 +29,14 @@ _RESPONSE = (0.5, 1.5)
 _NOTHING = 1e-12
 """Variance of rounding, DN^2, below which its uncertainty is neglected."""
 _LEAST_LIGHT = 10.0
-"""Least level of flat over dark frames, in sigmas of a pixel of one dark frame, that counts as light."""
+"""Smallest level of flat over dark frames, in sigmas of a pixel of one dark frame, that counts as light."""
 
 
 @dataclass(frozen=True)
 class PhotonTransfer:
-    """Gain, noise and non-uniformities of a detector from dark and flat frames; <name>_sigma is the standard deviation.
+    """Gain, noise and non-uniformities of a detector, measured from dark and flat frames.
+
+    An attribute <name>_sigma is the standard deviation of <name>.
 
     Attributes
     ----------
@@ -61,7 +63,7 @@ class PhotonTransfer:
     dsnu_sigma: float
 
     def noise_model(self, sheet: NoiseModel) -> NoiseModel:
-        """Return the detector's noise model with these values and the data sheet's saturation.
+        """Return a noise model of the measured values, with the saturation of the data sheet.
 
         Parameters
         ----------
@@ -84,6 +86,8 @@ class PhotonTransfer:
 class PixelCorrection:
     """Correction of single pixels by dark level and response.
 
+    Dimensions: H rows, W columns.
+
     Attributes
     ----------
     dark : (H, W) ndarray
@@ -103,6 +107,8 @@ class PixelCorrection:
 
     def corrected(self, mean: Array) -> Array:
         """Return the corrected mean frame, (H, W) DN.
+
+        Dimensions: H rows, W columns.
 
         Parameters
         ----------
@@ -128,13 +134,16 @@ def _stack(frames: NDArray[Any], what: str) -> Array:
 
 
 def _temporal(values: Array) -> float:
-    """Return the variance of a pixel over the frames, DN^2."""
+    """Return the variance over the frames of a stack, mean over its pixels, DN^2."""
     even = values - values.mean(axis=(1, 2), keepdims=True)
     return float(np.square(even - even.mean(axis=0)).sum() / ((len(values) - 1) * values[0].size))
 
 
 def _surface(image: Array, good: Mask) -> Array:
-    """Return the quadratic surface fitted to an image, (H, W)."""
+    """Return the quadratic surface fitted to an image, (H, W).
+
+    Dimensions: H rows, W columns.
+    """
     v, u = np.meshgrid(np.linspace(-1, 1, image.shape[0]), np.linspace(-1, 1, image.shape[1]), indexing="ij")
     basis = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v]).reshape(6, -1)
     use = good.ravel()
@@ -143,7 +152,10 @@ def _surface(image: Array, good: Mask) -> Array:
 
 
 def _usable(dark: Array, flat: Array) -> Mask:
-    """Return the pixels (H, W) that are no outliers in the dark or in the flat frame."""
+    """Return the pixels (H, W) that are no outliers in the dark or in the flat frame.
+
+    Dimensions: H rows, W columns.
+    """
     good = np.ones(dark.shape, dtype=bool)
     for image in (dark, flat):
         away = np.abs(image - np.median(image))
@@ -153,6 +165,8 @@ def _usable(dark: Array, flat: Array) -> Mask:
 
 def photon_transfer(dark: NDArray[Any], flat: NDArray[Any]) -> PhotonTransfer:
     """Measure gain, noise and non-uniformity of a detector from dark and flat frames (photon transfer, EMVA 1288).
+
+    Dimensions: N frames, H rows, W columns, M frames.
 
     Parameters
     ----------
@@ -254,9 +268,9 @@ def _pattern_square(image: Array, good: Mask) -> float:
 
 
 def _pattern(image: Array, good: Mask, noise: tuple[float, ...], hidden: float) -> tuple[float, float]:
-    """Return the standard deviation of a fixed pattern corrected for noise, and its uncertainty.
+    """Return the standard deviation over pixels of a fixed pattern, corrected for noise, and its uncertainty.
 
-    ``hidden`` is the variance that rounding may have added to the pattern, or hidden of it.
+    ``hidden`` is the variance by which rounding may have changed the pattern, in either direction.
     """
     square = whole = _pattern_square(image, good)
     for part in noise:
@@ -276,6 +290,8 @@ def pixel_correction(noise: NoiseModel, dark: NDArray[Any] | None, flat: NDArray
 
     The residual pattern is the noise of the correction, which is the same in all corrected frames: it takes the place
     of the detector's own pattern.
+
+    Dimensions: N frames, H rows, W columns, M frames.
 
     Parameters
     ----------

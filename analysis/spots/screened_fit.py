@@ -30,8 +30,10 @@ from analysis.spots.spot_template import SmearedShape, SpotTemplate, TemplateRan
 
 _REST_PX, _MOST_STEPS = 1e-6, 60
 _REST_SIGMAS = 1e-4
-"""Largest last step of further spots, in sigmas: they may be so faint that their positions are uncertain by part of a
-pixel."""
+"""Largest change of further spots by the last iteration step, in sigmas of their position.
+
+It is relative to sigma because they may be so faint that their positions are uncertain by part of a pixel.
+"""
 _FLUX_SIGMAS = 5.0
 _MOST_SMEAR = 25.0
 """Largest second moment of a smear, px^2; a spot that is smeared by more is rejected as another one."""
@@ -41,7 +43,7 @@ CORE_SHARE = 0.02
 
 @dataclass(frozen=True)
 class FitTerms:
-    """Terms that are fitted beside position, flux and level.
+    """Terms that are fitted in addition to the spot's position, its flux and the level of the background.
 
     Attributes
     ----------
@@ -64,7 +66,9 @@ class FitTerms:
 
 @dataclass(frozen=True, eq=False)
 class ScreenedFit:
-    """Fitted spot with everything fitted beside it.
+    """Spot fitted to an image with defects, with everything else that was fitted together with it.
+
+    Dimensions: G further spots, H rows, W columns, K fitted parameters.
 
     Attributes
     ----------
@@ -113,6 +117,8 @@ class ScreenedFit:
     def residual(self, mean: Array) -> Array:
         """Return the image minus the model in standard deviations, (H, W); 0 where a pixel is not used.
 
+        Dimensions: H rows, W columns.
+
         Parameters
         ----------
         mean : (H, W) ndarray
@@ -121,7 +127,9 @@ class ScreenedFit:
         return np.asarray(np.where(self.used, (mean - self.level) / np.sqrt(self.variance), 0.0))
 
     def image_chi_square(self, mean: Array) -> float:
-        """Return the chi-square of the image.
+        """Return the sum of squared residuals of the fit over their variance, over all used pixels.
+
+        Dimensions: H rows, W columns.
 
         Parameters
         ----------
@@ -139,21 +147,22 @@ class ScreenedFit:
             Fit to the image that the shape was learnt from, whose noise is in the shape as well; None for a noise-free
             shape.
         noisier : float
-            Ratio of the variance in the core, by the noise of the frames, to the specified one.
+            Ratio of the real variance of the noise in the core to the specified one.
         """
         return self.core_widening(learnt_from, noisier) == 1.0
 
     def core_widening(self, learnt_from: ScreenedFit | None = None, noisier: float = 1.0) -> float:
-        """Return the factor of sigma: 1 if the core has the calibrated shape, else the root of its reduced chi-square.
+        """Return the factor by which sigma is increased: 1 if the core has the calibrated shape, else more.
 
-        The factor is that of `analysis.spots.likelihood.FitStates.widening`.
+        It is the root of the core's reduced chi-square (Birge ratio) where the core does not have the calibrated shape.
 
         Parameters
         ----------
         learnt_from : ScreenedFit or None
-            Fit to the image that the shape was learnt from, as in `core_fits`.
+            Fit to the image that the shape was learnt from, whose noise is in the shape as well; None for a noise-free
+            shape.
         noisier : float
-            Ratio of variances, as in `core_fits`.
+            Ratio of the real variance of the noise in the core to the specified one.
         """
         value, count = self.core
         spread = 1.0
@@ -208,6 +217,8 @@ def fit_screened(
 ) -> ScreenedFit:
     """Fit one spot, with further terms, to a mean image with missing pixels.
 
+    Dimensions: H rows, W columns.
+
     Parameters
     ----------
     mean : (H, W) ndarray
@@ -221,7 +232,7 @@ def fit_screened(
     template : SpotTemplate
         Template with the spot's one shape.
     terms : FitTerms or None
-        Further terms of the fit; None for none.
+        Further terms of the fit; None if there is none.
     near : ScreenedFit or None
         Fit to start from; None to search for the brightest spot.
     jitter : (2, 2) ndarray or None
@@ -302,10 +313,12 @@ def fit_screened(
 
 
 def model_parts(fit: ScreenedFit, template: SpotTemplate) -> tuple[Array, Array, Array]:
-    """Return the parts of the fitted image: design, light beside the spot, and the design of that light.
+    """Return the derivatives of the fitted image, the part of it that is not the spot, and that part's derivatives.
 
-    They are the derivatives (K, P) with respect to all parameters; the part (P,), DN, that is neither the spot nor its
-    level; and the derivatives (K, P) of that part.
+    The arrays are the derivatives (K, P) of all pixels with respect to all parameters; the part (P,), DN, that is
+    neither the spot nor its level; and the derivatives (K, P) of that part.
+
+    Dimensions: K fitted parameters, P pixels.
 
     Parameters
     ----------
@@ -328,7 +341,7 @@ def _variance(level: Array, counts: Array, noise: NoiseModel) -> Array:
 
 
 def _cost(design: Array, level: Array, frames: float, noise: NoiseModel, covariance: Array) -> float:
-    """Return the relative increase of the position's sigma over that of an undisturbed image."""
+    """Return by which fraction the position's sigma exceeds that from an undisturbed image."""
     weighted = design / _variance(level, np.full_like(level, frames), noise)
     ideal = np.linalg.inv(weighted @ design.T)[:2, :2]
     return float(np.sqrt(np.trace(covariance) / np.trace(ideal)) - 1.0)
@@ -347,10 +360,10 @@ def _start(mean: Array, counts: Array, good: Mask, noise: NoiseModel, model: _Mo
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """Model of an image by its parameters.
+    """Model of an image of a spot, further spots, smear and uneven background, as a function of its parameters.
 
     The parameters are row, column, flux, level; slopes and curvature of the background; row, column and flux of each
-    further spot; second moments of the smear (rows, across, columns).
+    further spot; second moments of the smear, px^2: along rows twice, along rows and columns, along columns twice.
     """
 
     template: SpotTemplate
@@ -389,7 +402,10 @@ class _Model:
         return theta
 
     def signed(self, theta: Array, flat: Array, use: Mask, known: int) -> Array:
-        """Return the parameters with the light of all but the first ``known`` further spots estimated."""
+        """Return the parameters with the light of new further spots estimated, which may be positive or negative.
+
+        New are all further spots but the first ``known``.
+        """
         for light in range(self._others + 3 * known + 2, self._smear, 3):
             theta[light] = 0.0
             design, level = self.design(theta)
@@ -423,7 +439,7 @@ class _Model:
         return [0, 1, *(self._others + 3 * k + axis for k in range(len(self.terms.others)) for axis in (0, 1))]
 
     def rests(self, change: Array, inverse: Array) -> bool:
-        """Return True if the positions have changed by less than their tolerance."""
+        """Return True if an iteration step has changed the positions by less than their tolerance."""
         others = self._places[2:]
         sigma = np.sqrt(np.maximum(np.diag(inverse)[others], 0.0))
         return bool(
@@ -446,7 +462,10 @@ class _Model:
 
     @cached_property
     def _bends(self) -> Array:
-        """Slopes and curvature of the background, (5, P)."""
+        """Slopes and curvature terms of the background at every pixel, (5, P).
+
+        Dimensions: P pixels.
+        """
         v, u = np.meshgrid(np.linspace(-1, 1, self.height), np.linspace(-1, 1, self.width), indexing="ij")
         return np.stack([v, u, v * v - 1.0 / 3.0, u * v, u * u - 1.0 / 3.0]).reshape(5, -1)
 
@@ -455,7 +474,10 @@ class _Model:
         return SmearedShape(self.template)
 
     def design(self, theta: Array) -> tuple[Array, Array]:
-        """Return the derivatives (K, P) and the level (P,)."""
+        """Return the derivatives of the image with respect to the parameters, (K, P), and the image itself, (P,) DN.
+
+        Dimensions: K fitted parameters, P pixels.
+        """
         pixels = self.height * self.width
         design = np.zeros((len(theta), pixels))
         level = np.full(pixels, theta[3])

@@ -45,7 +45,10 @@ class SpotFit:
 
     @property
     def sigma(self) -> Array:
-        """Standard deviations of row and column, in pixels, shape (2,) or (B, 2)."""
+        """Standard deviations of row and column, in pixels, shape (2,) or (B, 2).
+
+        Dimensions: B spots.
+        """
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
 
 
@@ -60,8 +63,10 @@ def fit_spot(
 ) -> SpotFit:
     """Fit the centre of the brightest spot of an image, with its covariance.
 
-    The weights follow from the noise model and the fitted spot, not from the noisy pixels, which would bias the flux.
-    A spot of another shape than the fitted one has a covariance that accounts for it (sandwich estimator).
+    The weights follow from the noise model and the fitted spot, not from the noisy pixels, which would bias the flux. A
+    spot of another shape than the fitted one has a covariance that accounts for it (sandwich estimator).
+
+    Dimensions: H rows, W columns, B spots.
 
     Parameters
     ----------
@@ -88,18 +93,18 @@ def fit_spot(
     Raises
     ------
     ValueError
-        Images that are too small, not real or not finite; a spot that is saturated, missing or too close to the edge;
-        a fit that does not converge; or another method.
+        Images that are too small, not real or not finite; a spot that is saturated, missing or too close to the edge; a
+        fit that does not converge; or another method.
 
     Notes
     -----
     The covariance of a Gaussian fit to another shape follows White, Econometrica 50, 1 (1982); the weights follow
     Humphrey, Liu and Buote, Astrophys. J. 693, 822 (2009). For a Gaussian spot of standard deviation s that is limited
-    by shot noise, the least possible sigma of each coordinate is s / sqrt(number of electrons).
+    by shot noise, the smallest possible sigma of each coordinate is s / sqrt(number of electrons).
 
     Examples
     --------
-    A Gaussian spot of 2 px and 20 000 electrons. Its least possible sigma is 2 / sqrt(20000) = 0.0141 px:
+    A Gaussian spot of 2 px and 20 000 electrons. Its smallest possible sigma is 2 / sqrt(20000) = 0.0141 px:
 
     >>> import numpy as np
     >>> import analysis

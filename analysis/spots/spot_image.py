@@ -32,6 +32,8 @@ _PIECE = 16
 def as_images(mean: ArrayLike) -> Array:
     """Return mean images as float64, (B, H, W), from (B, H, W) or (H, W).
 
+    Dimensions: B spots, H rows, W columns.
+
     Raises
     ------
     ValueError
@@ -48,7 +50,10 @@ def as_images(mean: ArrayLike) -> Array:
 
 
 def in_pieces(measure: Callable[[slice], SpotPositions], count: int, threads: int = 1) -> SpotPositions:
-    """Measure `count` spots a few at a time and join the results; a SpotError names the bad spots of all pieces."""
+    """Measure `count` spots a few at a time and join the results, which limits memory.
+
+    ``measure`` returns the positions of a range of the spots. A SpotError names the bad spots of all ranges.
+    """
     reasons: dict[int, str] = {}
 
     def tried(start: int, end: int) -> SpotPositions | None:
@@ -87,13 +92,18 @@ def in_pieces(measure: Callable[[slice], SpotPositions], count: int, threads: in
 
 
 def reject(bad: NDArray[np.bool_], reason: str) -> None:
-    """Raise SpotError with one reason for all spots that are marked in `bad`, (B,)."""
+    """Raise SpotError with one reason for all spots that are marked in `bad`, (B,).
+
+    Dimensions: B spots.
+    """
     if np.any(bad):
         raise SpotError({int(n): reason for n in np.flatnonzero(bad)})
 
 
 def check_edge(position: Array, height: int, width: int, distance: float) -> None:
     """Raise SpotError for centres nearer than `distance` to the outermost pixel centres.
+
+    Dimensions: B spots.
 
     Parameters
     ----------
@@ -104,7 +114,7 @@ def check_edge(position: Array, height: int, width: int, distance: float) -> Non
     width : int
         Number of columns W.
     distance : float
-        Least distance, px.
+        Smallest distance, px.
     """
     high = np.array([height, width]) - 1 - distance
     bad = ~np.all((position >= distance) & (position <= high), axis=1)
@@ -125,6 +135,8 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
 
     Row and column are in px, good to about 0.5; background and peak above it in DN; the area in px^2. The guess works
     on 4 x 4 bins, so that one hot pixel does not make a spot.
+
+    Dimensions: B spots, H rows, W columns.
 
     Parameters
     ----------
@@ -180,7 +192,9 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
 
 
 def arms(position: Array, height: int, width: int) -> Array:
-    """Return each pixel's row and column minus the centre's, (B, 2, H, W) px.
+    """Return the distance of each pixel from the centre of the spot along rows and columns, (B, 2, H, W) px.
+
+    Dimensions: B spots.
 
     Parameters
     ----------
@@ -202,6 +216,8 @@ def soft_window(position: Array, height: int, width: int, radius: float) -> tupl
 
     The window, (B, H, W), falls from 1 to 0 over one pixel at `radius`; the derivatives have the shape (B, 2, H, W).
 
+    Dimensions: B spots.
+
     Parameters
     ----------
     position : (B, 2) ndarray
@@ -221,7 +237,7 @@ def soft_window(position: Array, height: int, width: int, radius: float) -> tupl
 
 
 def sane(theta: Array) -> NDArray[np.bool_]:
-    """Return the mask of the Gaussians (see `gaussian`) that are finite, positive and of finite size."""
+    """Return the mask (B,) of fitted Gaussians whose parameters are finite, positive and of finite size."""
     good = np.all(np.isfinite(theta), axis=1) & (theta[:, 2] > 0) & (theta[:, 4] > 0)
     if theta.shape[1] > 5:
         good &= theta[:, 4] * theta[:, 6] > theta[:, 5] ** 2
@@ -231,10 +247,13 @@ def sane(theta: Array) -> NDArray[np.bool_]:
 def gaussian(
     theta: Array, height: int, width: int, radius: float, noise: NoiseModel, frames: int
 ) -> tuple[Array, Array, Array]:
-    """Return design (B, K, P), weighted design and model (B, P) of Gaussians.
+    """Return derivatives (B, K, P), weighted derivatives and grey values (B, P) of Gaussian spots in a window.
 
-    The parameters are row, column, amplitude, background, a[, b, c]. The weight is the soft circular window over the
-    model's total variance.
+    The derivatives are those of the P pixels with respect to the K parameters: row, column, amplitude, background, and
+    the coefficient a, or the coefficients a, b and c, of the squared distance in the exponent. The weight is the soft
+    circular window over the model's total variance.
+
+    Dimensions: B spots, K parameters, P pixels.
 
     Parameters
     ----------
@@ -286,7 +305,7 @@ def variance(level: Array, noise: NoiseModel, frames: int) -> Array:
 
 
 def excess(level: Array, weight: Array, noise: NoiseModel, frames: int) -> Array:
-    """Return the excess kurtosis of the noise of a mean of frames by its shot noise; 0 for a normal distribution.
+    """Return the excess kurtosis that shot noise gives a mean of frames; 0 for a normal distribution.
 
     Parameters
     ----------
@@ -311,7 +330,11 @@ def template_model(
     part: tuple[NDArray[np.intp], tuple[int, int]] | None = None,
     out: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Return the design (B, 4, P) and the grey values (B, P) of the template's model.
+    """Return the derivatives (B, 4, P) and the grey values (B, P) of spots that have calibrated shapes.
+
+    The derivatives are those of every pixel with respect to row, column, flux and background.
+
+    Dimensions: B spots, P pixels.
 
     Parameters
     ----------
@@ -322,9 +345,10 @@ def template_model(
     template : SpotTemplate
         Shapes of the spots.
     part : tuple or None
-        Part of the detector, as in `SpotTemplate.evaluate`.
+        First pixels (B, 2), one for each spot, and shape (h, w) of the part of the detector to compute; None for all of
+        it.
     out : ndarray or None
-        Array that receives the design.
+        Array (B, 4, P) that receives the derivatives; None to make a new one.
     """
     count, (height, width) = theta.shape[0], template.shape if part is None else part[1]
     design = np.empty((count, 4, height * width)) if out is None else out
@@ -335,7 +359,9 @@ def template_model(
 
 
 def propagate(maps: Array, level: Array, noise: NoiseModel, frames: int) -> tuple[Array, Array]:
-    """Return the temporal and the fixed-pattern covariance of estimators by their influence maps, (B, 2, 2) px^2 each.
+    """Return the covariance of positions due to temporal noise, and that due to fixed pattern, (B, 2, 2) px^2.
+
+    Dimensions: B spots, P pixels.
 
     Parameters
     ----------
@@ -367,10 +393,12 @@ def positions(
     iterations: int,
     chi: Array,
 ) -> SpotPositions:
-    """Return the SpotPositions of an estimator without a model of the light.
+    """Return the SpotPositions of a centroid method that has no model of the spot's light.
 
     The noise is that at the measured image itself: the variance is nearly linear in the grey value, so pixel noise
     averages out, while smoothing would fill the dark rings, where a Gaussian fit has much weight.
+
+    Dimensions: B spots, H rows, W columns.
 
     Parameters
     ----------
@@ -416,6 +444,8 @@ def positions(
 
 def filled(mean: Array, good: NDArray[np.bool_]) -> Array:
     """Return an image (H, W) with unusable pixels filled from their surroundings.
+
+    Dimensions: H rows, W columns.
 
     Parameters
     ----------

@@ -1,15 +1,16 @@
 """Measured spot positions with their uncertainty, and the uncertainty of the difference of two of them.
 
-An estimator is described to first order by its influence maps g: a change n of the image (DN) moves the position by
-sum_p g[i, p] n[p] (Hampel et al., Robust Statistics, 1986, sec. 2.1). Temporal noise is independent in two images, but
-PRNU and DSNU of the same pixels are the same draw in both, so the covariance of "after - before" is
+An estimator is described to first order by its influence maps g, the derivatives of row and column with respect to each
+pixel: a change n of the image (DN) moves the position by sum_p g[i, p] n[p], i being row or column and p the pixel
+(Hampel et al., Robust Statistics, 1986, sec. 2.1). Temporal noise is independent in two images, but PRNU and DSNU of
+the same pixels are the same in both, so the covariance of "after - before" is
 
     cov_after + cov_before - X - X^T,   X[i, j] = sum_p g_after[i, p] g_before[j, p] (prnu^2 s_after s_before + (K
     dsnu)^2)
 
 with s the light signal. A spot that stays on its pixels loses the pattern from its difference; one that moves by more
 than its own size keeps it twice. Over a series of images after one "before" the differences at two times are correlated
-by the temporal noise of "before" and by the pattern of the pixels that the spot shares at these times.
+due to the temporal noise of "before" and to the pattern of the pixels that the spot shares at these times.
 
 Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
 """
@@ -44,15 +45,17 @@ class SpotError(MeasurementError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class SpotPositions:
-    """Positions of B spots.
+    """Positions of B spots with their covariance, and the goodness of the fits.
+
+    Dimensions: H rows, W columns.
 
     Attributes
     ----------
     row, column : (B,) ndarray
         Position, px.
     temporal_covariance, fixed_covariance : (B, 2, 2) ndarray
-        Covariances in order (row, column), px^2: by noise that is new in each frame, and by the detector's fixed
-        pattern.
+        Covariances in order (row, column), px^2: due to noise that is new in each frame, and due to the detector's
+        fixed pattern.
     flux : (B,) ndarray
         Signal summed over the spot, DN.
     background : (B,) ndarray
@@ -94,22 +97,34 @@ class SpotPositions:
 
     @property
     def covariance(self) -> Array:
-        """Total covariance of one position, temporal and fixed pattern, (B, 2, 2) px^2."""
+        """Covariance of one position, temporal noise and fixed pattern together, (B, 2, 2) px^2.
+
+        Dimensions: B spots.
+        """
         return self.temporal_covariance + self.fixed_covariance
 
     @property
     def position(self) -> Array:
-        """Position (row, column), (B, 2) px."""
+        """Position (row, column), (B, 2) px.
+
+        Dimensions: B spots.
+        """
         return np.stack([self.row, self.column], axis=-1)
 
     @property
     def sigma_row(self) -> Array:
-        """Standard deviation of the row, (B,) px."""
+        """Standard deviation of the row, (B,) px.
+
+        Dimensions: B spots.
+        """
         return np.sqrt(self.covariance[:, 0, 0])
 
     @property
     def sigma_column(self) -> Array:
-        """Standard deviation of the column, (B,) px."""
+        """Standard deviation of the column, (B,) px.
+
+        Dimensions: B spots.
+        """
         return np.sqrt(self.covariance[:, 1, 1])
 
 
@@ -119,12 +134,14 @@ def difference_covariance(before: SpotPositions, after: SpotPositions, noise: No
     `before` may hold fewer spots, B0 with B = S * B0: it is then used once for each of S states (spot b against b
     modulo B0). Each result is for one difference; differences that share a `before` are correlated with one another.
 
+    Dimensions: B spots.
+
     Parameters
     ----------
     before : SpotPositions
-        Positions before, measured with maps.
+        Positions before, with their derivatives with respect to every pixel (`gain_maps`).
     after : SpotPositions
-        Positions after, measured with maps.
+        Positions after, with their derivatives with respect to every pixel.
     noise : NoiseModel
         Noise of the detector.
 
@@ -159,13 +176,15 @@ def difference_covariance(before: SpotPositions, after: SpotPositions, noise: No
 class NoiseParts:
     """Noise of the positions of B spots, separated into the part that is new in every image and the fixed pattern.
 
+    Dimensions: Q pixel properties (response and dark signal of every pixel).
+
     Attributes
     ----------
     temporal : (B, 2, 2) ndarray
-        Covariance by temporal noise, px^2.
+        Covariance due to temporal noise, px^2.
     pattern : (B, 2, Q) ndarray of float32
         Shift by one standard deviation of each pixel's response and dark signal, px. The products of two images' maps
-        are the covariance of their positions by the pattern. Single precision saves memory.
+        are the covariance of their positions due to the pattern. Single precision saves memory.
     """
 
     temporal: Array
@@ -173,12 +192,12 @@ class NoiseParts:
 
 
 def noise_parts(positions: SpotPositions, noise: NoiseModel) -> NoiseParts:
-    """Return the noise of measured positions, separated into its parts.
+    """Return the noise of measured positions, separated into that of one image and the fixed pattern.
 
     Parameters
     ----------
     positions : SpotPositions
-        Positions measured with maps.
+        Positions with their derivatives with respect to every pixel (`gain_maps`).
     noise : NoiseModel
         Noise of the detector.
 
@@ -221,7 +240,7 @@ class SeriesNoise:
         return len(self._rows)
 
     def add(self, after: NoiseParts) -> None:
-        """Append images.
+        """Append the noise of further images to the series.
 
         Parameters
         ----------
@@ -245,9 +264,11 @@ class SeriesNoise:
             self._rows.append(row)
 
     def covariance(self, images: NDArray[np.int_]) -> Array:
-        """Return the covariance of some images' differences, (n 2 C, n 2 C) px^2.
+        """Return the covariance of the shifts (after minus before) in some of the images, (n 2 C, n 2 C) px^2.
 
         The order is image by image, spot by spot, row before column.
+
+        Dimensions: n images, C spots.
 
         Parameters
         ----------

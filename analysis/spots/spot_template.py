@@ -30,7 +30,7 @@ from analysis.arrays import Array, MeasurementError, UndeterminedError
 _DEGREE = 5
 _TAPS = _DEGREE + 1
 SHARPEST = 4.0
-"""Greatest factor by which a frequency is amplified where a shape is made sharper."""
+"""Largest factor by which a spatial frequency is amplified where a shape is made sharper."""
 
 
 class TemplateRangeError(MeasurementError, ValueError):
@@ -48,7 +48,7 @@ class TemplateRangeError(MeasurementError, ValueError):
 
 
 def _tap_polynomials() -> Array:
-    """Return the weights of the six taps as polynomials of the fraction t in [0, 1), (power, tap)."""
+    """Return the six B-spline weights around a position as polynomials of the fraction of a sample, (power, weight)."""
     nodes = np.linspace(0.0, 1.0, _TAPS)
     basis = BSpline.basis_element(np.arange(_TAPS + 1) - _TAPS / 2.0)
     taps = np.arange(_TAPS) - (_TAPS // 2 - 1)
@@ -64,6 +64,8 @@ class SpotTemplate:
     """Calibrated shapes of T spots, of unit flux.
 
     `from_image` makes the template of one spot, and `stack` joins several.
+
+    Dimensions: M rows of template samples, R terms of the factorisation, N columns of template samples.
 
     Attributes
     ----------
@@ -117,6 +119,8 @@ class SpotTemplate:
         tolerance: float = 1e-8,
     ) -> SpotTemplate:
         """Calibrate a shape from one image.
+
+        Dimensions: M rows of template samples, N columns of template samples.
 
         Parameters
         ----------
@@ -216,11 +220,14 @@ class SpotTemplate:
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Rows and columns (M, N) of the calibrated image, in samples."""
+        """Rows and columns (M, N) of the calibrated image, in samples.
+
+        Dimensions: M rows of template samples, N columns of template samples.
+        """
         return int(self.row_factors.shape[1]), int(self.column_factors.shape[1])
 
     def supported(self, index: int = 0) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Return the range of positions of shape `index` in detector pixels.
+        """Return the range of positions, in detector pixels, at which a shape covers the whole detector.
 
         The result is ((row low, row high), (column low, column high)).
         """
@@ -243,6 +250,8 @@ class SpotTemplate:
 
         The three arrays are value, d value / d row and d value / d column, each (B, H, W) or (B, h, w); value is the
         fraction of the flux per pixel.
+
+        Dimensions: B spots, H rows, W columns.
 
         Parameters
         ----------
@@ -281,19 +290,22 @@ class SpotTemplate:
         index: NDArray[np.intp],
         part: tuple[NDArray[np.intp], tuple[int, int]] | None = None,
     ) -> None:
-        """Fill ``out`` with the derivatives of a spot with respect to row, column, flux and background.
+        """Fill ``out`` with the derivatives of a spot's image with respect to row, column, flux and background.
+
+        Dimensions: B spots, H rows, W columns.
 
         Parameters
         ----------
         out : (B, 4, H, W) ndarray
-            Array to fill, or (B, 4, h, w) for a part; derivatives by position are per px, those by flux and background
-            have no unit.
+            Array to fill, or (B, 4, h, w) for a part; derivatives with respect to the position are in DN/px, those with
+            respect to flux and background have no unit.
         theta : (B, 4) ndarray
             Row, column (px), flux and background (DN).
         index : (B,) ndarray of int
-            Index of each spot's shape, as in `evaluate`.
+            Index of each spot's shape in the template.
         part : tuple or None
-            Part of the detector, as in `evaluate`.
+            First pixels (B, 2), one for each spot, and shape (h, w) of the part of the detector to compute; None for
+            all of it.
 
         Raises
         ------
@@ -308,7 +320,12 @@ class SpotTemplate:
     def _fill(
         self, slopes: Array, value: Array, rows: Array, columns: Array, index: NDArray[np.intp], flux: Array
     ) -> None:
-        """Write values (B, H, W), and slopes by row and column (2, B, H, W) times flux (B,), for checked positions."""
+        """Write values (B, H, W) and derivatives with respect to row and column (2, B, H, W) times flux (B,).
+
+        The positions have been checked already.
+
+        Dimensions: B spots, H rows, W columns.
+        """
         height, width = value.shape[1:]
         a = self._shift(self._polynomials[0], self.centre[index, 0], rows, index, height, flux)
         b = self._shift(self._polynomials[1], self.centre[index, 1], columns, index, width, flux).swapaxes(2, 3)
@@ -318,7 +335,10 @@ class SpotTemplate:
 
     @cached_property
     def _polynomials(self) -> tuple[Array, Array]:
-        """Splines of rows and columns between two samples, as polynomials of the fraction: (T, power, sample, R)."""
+        """Spline factors of rows and columns as polynomials of the fraction of a sample, (T, power, sample, R).
+
+        Dimensions: T spot shapes, R terms of the factorisation.
+        """
         out = []
         for factors in (self.row_factors, self.column_factors):
             intervals = factors.shape[1] - _TAPS + 1
@@ -329,10 +349,12 @@ class SpotTemplate:
     def _shift(
         self, polynomials: Array, centre: Array, position: Array, index: NDArray[np.intp], pixels: int, flux: Array
     ) -> Array:
-        """Evaluate the spline along one axis: (B, 2, pixels, R).
+        """Evaluate the spline along one axis at shifted positions, (B, 2, pixels, R).
 
         The second axis holds the values at the detector's pixels, and the derivatives with respect to the position
         times flux (B,).
+
+        Dimensions: B spots, R terms of the factorisation.
         """
         step = self.oversampling
         start = centre - step * position
@@ -352,6 +374,8 @@ class SpotTemplate:
 
     def check_range(self, rows: Array, columns: Array, index: NDArray[np.intp]) -> None:
         """Raise TemplateRangeError for positions outside `supported`.
+
+        Dimensions: B spots.
 
         Parameters
         ----------
@@ -402,6 +426,8 @@ class SmearedShape:
     def smeared(self, covariance: Array) -> Array:
         """Return the spline coefficients (M, N) of the smeared shape, for `evaluate`.
 
+        Dimensions: M rows of template samples, N columns of template samples.
+
         Parameters
         ----------
         covariance : (2, 2) ndarray
@@ -418,8 +444,10 @@ class SmearedShape:
     def evaluate(self, coefficients: Array, row: float, column: float) -> Array:
         """Return the smeared shape at one position with its first and second derivatives, (6, H, W).
 
-        The order is value; derivatives by row and by column (1/px); by row twice, by row and column, by column twice
-        (1/px^2).
+        The order is value; derivatives with respect to row and to column (1/px); second derivatives with respect to row
+        twice, row and column, column twice (1/px^2).
+
+        Dimensions: H rows, W columns, M rows of template samples, N columns of template samples.
 
         Parameters
         ----------
@@ -448,9 +476,11 @@ class SmearedShape:
         return out
 
     def returned(self, maps: Array, row: float, column: float, covariance: Array) -> Array:
-        """Return the derivatives with respect to the samples of the shape's image, (n, M, N).
+        """Return derivatives with respect to the samples of the shape's image, (n, M, N), from those of its pixels.
 
         This is the transpose of smearing, interpolating and evaluating at one position.
+
+        Dimensions: M rows of template samples, N columns of template samples, H rows, W columns.
 
         Parameters
         ----------
@@ -461,7 +491,7 @@ class SmearedShape:
         column : float
             Column of the centre, detector pixels.
         covariance : (2, 2) ndarray
-            Covariance of the smear, as in `smeared`, px^2.
+            Covariance of the normal distribution that smears the shape, (row, column), px^2.
         """
         centre, (height, width) = self._template.centre[0], self._template.shape
         by_row, rows = self._splines(centre[0], row, height)
@@ -475,7 +505,7 @@ class SmearedShape:
         return np.asarray(along[0].T @ out @ along[1])
 
     def _splines(self, centre: float, position: float, pixels: int) -> tuple[Array, slice]:
-        """Return the samples' weights in every pixel with two derivatives, and the range of samples."""
+        """Return the weight of each sample in every pixel with its two derivatives, and the range of samples used."""
         step = self._template.oversampling
         start = centre - step * position
         base = int(np.floor(start))

@@ -6,7 +6,8 @@ that a change n of the image moves a centroid of influence g to first order by
 
     g u n + g ((1 - u) dm/dq - de/dq) Q n,     Q = (D' W D)^-1 D' W
 
-with the design D and the weights W of the fit: the covariance contains the cost of the repair.
+with the derivatives D of the model with respect to q and the weights W of the fit: the covariance contains the cost of
+the repair.
 
 All defects are detected in the residuals of the fitted shape. A pixel is bad when it differs from the prediction of the
 pixels about it: light that passes the optics has no detail of one pixel. An uneven background or a reflection is
@@ -46,6 +47,8 @@ def repaired_centroid(
 
     The cost is the relative increase of sigma over that without repair and with all frames used. It is negative where
     the inserted values have less noise than those they replace, as at the edge of a window.
+
+    Dimensions: H rows, W columns.
 
     Parameters
     ----------
@@ -97,23 +100,23 @@ NEAREST_PX = 4.0
 """Distance, px, below which a further light is not distinguished from the spot."""
 _REACH = 2
 _MISFIT = 0.05
-"""Relative error allowed for the prediction of a residual from those around it."""
+"""Allowed error of the prediction of a residual from those around it, relative to the residual."""
 _ROUGH_SIGMAS, _ROUGH_PX = 12.0, 6.0
 _BESIDE = np.array([-1.0, 4.0, 0.0, 4.0, -1.0]) / 6.0
-"""Weights by which a line is predicted from its neighbours: a parabola through them."""
+"""Weights by which a column or row is predicted from the two on either side: a parabola through them."""
 _NEAR_SPOT_PX = 15.0
 """Distance from the spot, px, within which a line's pixels do not count for the test of the line."""
 _LINE_SHARE = 0.4
 """Fraction of bad pixels of a column or row from which all its pixels count as bad."""
 _ABOVE_RING = 6.0
-"""Least height of a reflection over the other residuals at its distance from the spot, in units of their scatter."""
+"""Smallest height of a reflection over the other residuals at its distance from the spot, in units of their scatter."""
 _EDGE_LIGHT_PX = 12.0
 """Radius, px, of the area that is excluded about a light to which the shape cannot be fitted."""
 _LEAST_SHARE = 5.0
 """Significance, in sigmas, below which a further spot is dropped."""
 _ROUNDS = 8
 _GROSS = 4.0
-"""Factor of a pixel's limit while smear is not fitted yet."""
+"""Factor by which a pixel's limit for exclusion is increased while smear is not fitted yet."""
 _STEEP = 0.15
 """Fraction of the range of grey values about a pixel by which it may deviate where no shape is known."""
 
@@ -135,6 +138,8 @@ _ALONE = 0.4 * float(np.abs(_PREDICTION).sum())
 @dataclass(frozen=True, eq=False)
 class Examined:
     """Spot in one state, with its fit and its defects.
+
+    Dimensions: H rows, W columns.
 
     Attributes
     ----------
@@ -241,6 +246,8 @@ def examine(
 def outlier_pixels(screened: ScreenedFrames, noise: NoiseModel) -> Mask:
     """Return the pixels (H, W) that deviate from their surroundings, for spots without a known shape.
 
+    Dimensions: H rows, W columns.
+
     Parameters
     ----------
     screened : ScreenedFrames
@@ -264,6 +271,8 @@ def refit(
     examined: Examined, static: Mask, noise: NoiseModel, template: SpotTemplate, findings: tuple[Finding, ...] = ()
 ) -> Examined:
     """Fit a spot again with further pixels excluded that are bad in another state.
+
+    Dimensions: H rows, W columns.
 
     Parameters
     ----------
@@ -303,7 +312,10 @@ def _fit_of(screened: ScreenedFrames, noise: NoiseModel, template: SpotTemplate)
 
 
 def _rough(mean: Array, screened: ScreenedFrames, noise: NoiseModel) -> Mask:
-    """Return gross defects away from the spot, which would bias the first fit, (H, W)."""
+    """Return the pixels (H, W) of gross defects away from the spot, which would bias the first fit.
+
+    Dimensions: H rows, W columns.
+    """
     filled = spot_image.filled(mean, screened.good)
     smooth = ndimage.median_filter(filled, 5)
     sigma = np.sqrt(noise.temporal_variance_dn2(smooth, 1) / screened.counts + noise.fixed_variance_dn2(smooth))
@@ -316,7 +328,7 @@ def _rough(mean: Array, screened: ScreenedFrames, noise: NoiseModel) -> Mask:
 
 
 def _off(residual: Array, variance: Array, good: Mask, limit: float) -> Mask:
-    """Return the pixels that deviate by more than ``limit`` sigmas, found in order of their deviation."""
+    """Return the pixels whose residual exceeds ``limit`` sigmas, found in the order of their deviation."""
     use = good.copy()
     bad = np.zeros_like(good)
     for _ in range(50):
@@ -337,7 +349,7 @@ def _off(residual: Array, variance: Array, good: Mask, limit: float) -> Mask:
 
 
 def _lines(residual: Array, position: tuple[float, float], good: Mask, bad: Mask) -> Mask:
-    """Return the pixels of columns and rows that deviate as a whole, or have so many bad pixels that all are excluded.
+    """Return the pixels of columns and rows that deviate as a whole or contain too many bad pixels.
 
     ``residual`` is in standard deviations. A line is compared with its neighbours by the median of its pixels away from
     the spot.
@@ -400,7 +412,10 @@ def _uneven(fitted: _Fit, mean: Array, good: Mask, terms: FitTerms, fit: Screene
 
 
 def _spread(terms: FitTerms) -> float:
-    """Return the factor of the noise in what a smooth term explains: a learnt shape has the noise of another image."""
+    """Return the factor by which the noise in what a smooth background term explains exceeds that of one image.
+
+    It is larger than 1 for a learnt shape, which contains the noise of another image.
+    """
     return 2.0 if terms.learnt else 1.0
 
 
@@ -448,7 +463,10 @@ def _needed_spots(fitted: _Fit, good: Mask, terms: FitTerms, fit: ScreenedFit) -
 def _second_light(
     mean: Array, fit: ScreenedFit, good: Mask, template: SpotTemplate, either_sign: bool
 ) -> tuple[float, float] | None:
-    """Return the position where the residuals match a further spot, or a missing one, best; None if not significant."""
+    """Return the position (row, column) where the residuals match a further spot best; None if not significant.
+
+    With ``either_sign`` the spot may also be a missing one, with negative light.
+    """
     height, width = mean.shape
     middle = (height // 2, width // 2)
     stamp = template.evaluate(float(middle[0]), float(middle[1]))[0][0]
@@ -477,7 +495,7 @@ def _second_light(
 
 
 def _static_findings(bad: Mask, edges: Mask, fit: ScreenedFit, first: tuple[int, int]) -> list[Finding]:
-    """Return the findings of an image in words; positions count on the detector."""
+    """Return descriptions of the defects found in a mean image, with their positions on the detector."""
     out = []
     full = [np.flatnonzero(bad.sum(axis=axis) > 0.5 * bad.shape[axis]) for axis in (0, 1)]
     along = np.zeros_like(bad)

@@ -41,7 +41,7 @@ from twin.framework import provenance
 from twin.sensors.area_detector import NOISE_TERMS
 
 VARIABLE = "TWIN_CALIBRATIONS"
-"""Environment variable with the cache folder, or ``off``."""
+"""Environment variable that holds the path of the cache folder, or ``off`` to switch the cache off."""
 OFF = "off"
 NAME = "space-camera-twin"
 """Name of the folder below the user's cache folder."""
@@ -59,7 +59,7 @@ _written = 0
 
 
 class _UnnamedError(TypeError):
-    """Input that cannot be digested."""
+    """Error raised for an input that cannot be digested into a name, so that the result is not cached."""
 
 
 def cache_folder() -> Path | None:
@@ -100,7 +100,7 @@ def recomputed() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class CacheEntry:
-    """Entry of the cache.
+    """Entry of the calibration cache: one stored result of a computation.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ class CacheEntry:
 
     @classmethod
     def of(cls, backend: Backend, specs: Sequence[Spec], *inputs: Any) -> CacheEntry:
-        """Return the entry of a computation.
+        """Return the cache entry that belongs to a computation with the given inputs.
 
         Parameters
         ----------
@@ -127,19 +127,20 @@ class CacheEntry:
             Backend of the computation. Results of graphics cards are not cached, since no name of the card is known.
         specs : sequence of Spec
             Specifications that the computation starts from.
-        inputs : Any
-            All other inputs.
+        inputs : objects
+            All other inputs that the result depends on: numbers, texts, arrays, classes, functions, or containers of
+            these.
         """
         registered = SAG_TERMS.data, REFLECTORS.data, NOISE_TERMS.data, dict(GLASSES), dict(MATERIALS)
         key = None if backend.name != "llvm" else _digest(_machine(), backend.name, registered, tuple(specs), inputs)
         return cls(key, backend, tuple(specs))
 
     def part(self, *inputs: Any) -> CacheEntry:
-        """Return the entry of a computation that has further inputs."""
+        """Return the cache entry of a computation that has these inputs in addition to those of this entry."""
         return replace(self, key=None if self.key is None else _digest(self.key, inputs))
 
     def get(self, compute: Callable[[], Value]) -> Value:
-        """Return the content; compute and cache it if there is none."""
+        """Return the stored result; if there is none, call ``compute`` and store its result."""
         content: Value | None = self.read()
         if content is None:
             content = compute()
@@ -147,7 +148,7 @@ class CacheEntry:
         return content
 
     def read(self) -> Any:
-        """Return the content, or None if there is none that can be trusted."""
+        """Return the stored result, or None if there is none that can be trusted."""
         folder = _private(cache_folder()) if self.key is not None else None
         if folder is None:
             return None
@@ -161,7 +162,7 @@ class CacheEntry:
         return None
 
     def write(self, content: Any) -> None:
-        """Cache a content; if the folder cannot be written to, do nothing."""
+        """Store a result in the cache; if the folder cannot be written to, do nothing."""
         global _written
         folder = cache_folder() if self.key is not None and _written < MOST_WRITTEN else None
         if folder is None:
@@ -188,12 +189,12 @@ class CacheEntry:
             _remove_oldest(folder)
 
     def _head(self) -> bytes:
-        """Return the first line of the entry's file."""
+        """Return the first line of the entry's file, which identifies the format and the entry."""
         return f"calibration {self.key}\n".encode()
 
 
 class _Writer(pickle.Pickler):
-    """Pickler that writes references in place of the backend and the specifications."""
+    """Pickler that writes references instead of the backend and the specifications."""
 
     def __init__(self, file: io.BytesIO, entry: CacheEntry) -> None:
         super().__init__(file, pickle.HIGHEST_PROTOCOL)
@@ -350,7 +351,7 @@ def _words(value: Any) -> Iterator[str]:
 
 
 def _name(thing: Any) -> str:
-    """Return the module and name of a class or function of the program."""
+    """Return the module and qualified name of a class or function of the program, as one text."""
     if (not _of_program(thing.__module__) and thing.__module__ != "builtins") or "<" in thing.__qualname__:
         raise _UnnamedError(f"{thing!r} is no part of the program")
     return f"{thing.__module__}.{thing.__qualname__}"

@@ -1,4 +1,7 @@
-"""Response of every estimator to elementary motions, against the true change: formula factors and crosstalk."""
+"""Response of every estimator to elementary motions of bodies, compared with the true change of the camera.
+
+It gives the factors of the printed formulas and the crosstalk: readings of one parameter that changes of another cause.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ from twin.monitor.motions import ElementaryMotion, line_family, other_motions
 from twin.monitor.truth import truth_jacobian
 
 _SEEN_WITHIN = 0.1
-"""Relative error up to which the text says that a change is observed."""
+"""Relative error of a reading up to which the text says that the change is observed."""
 
 PRINTED = {("paper_single", k): f"eq. ({number})" for k, number in enumerate((3, 2, 5, 7))}
 PRINTED |= {("paper_joint", k): "Table 1, joint" for k in range(4)}
@@ -28,7 +31,7 @@ PRINTED |= {("paper_joint", k): "Table 1, joint" for k in range(4)}
 
 @dataclass(frozen=True)
 class FormulaFactor:
-    """Ratio of a printed formula's reading to the expected reading, for the motion for which the formula was derived.
+    """Ratio of a printed formula's reading to the expected one, for the motion for which it was derived.
 
     Attributes
     ----------
@@ -55,7 +58,11 @@ class FormulaFactor:
 
 @dataclass(frozen=True, eq=False)
 class CameraCrosstalk:
-    """First-order response of one camera's monitor to M elementary motions, per table unit (arcsec, µm, ppm).
+    """First-order response of one camera's monitor to each of M elementary motions.
+
+    All values are per unit of the motion in tables: arcsec, um or ppm.
+
+    Dimensions: n spots, P camera parameters.
 
     Attributes
     ----------
@@ -89,7 +96,7 @@ class CameraCrosstalk:
         return tuple(f"{channel} {axis}" for channel in self.channels for axis in ("y", "x"))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data for crosstalk.json."""
+        """Return the response as plain data for the file crosstalk.json."""
         rows, keys = [], [parameter.key for parameter in parameters.CAMERA_PARAMETERS.values()]
         for k, motion in enumerate(self.motions):
             rows.append(
@@ -136,14 +143,14 @@ class CameraCrosstalk:
 def estimator_gains(
     cameras: Mapping[str, CameraCalibration], prior: Disturbances | None, covariance: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
-    """Return the first-order gain of each estimator.
+    """Return for each estimator the linear matrix from spot shifts (px) to camera parameters (rad, m).
 
     Parameters
     ----------
     cameras : mapping of str to CameraCalibration
         Calibration of each camera.
     prior : Disturbances | None
-        Prior of the disturbances; None for none.
+        Prior of the disturbances; None if there is none.
     covariance : (2 x spots, 2 x spots) ndarray | None
         Covariance of the spots' shifts, in px^2, which weights them; None for no noise.
 
@@ -161,6 +168,8 @@ def estimator_gains(
 
 def crosstalk(experiment: MonitorExperiment, covariance: np.ndarray) -> dict[str, CameraCrosstalk]:
     """Compute the crosstalk table of every camera, for noise-free spots.
+
+    Dimensions: C spots.
 
     Parameters
     ----------

@@ -53,7 +53,7 @@ from twin.framework.record import Quantity, Record
 from twin.sensors.line_ccd import band_factors
 
 CUT_MEAN_DEGREE = 14
-"""Degree of the polynomials that continue the wavefront of a beam vignetted by edges of surfaces."""
+"""Degree of the polynomials that continue a wavefront into the part of the beam that edges of surfaces cut off."""
 
 
 class PupilMean:
@@ -91,11 +91,19 @@ class PupilMean:
         self._added = products(points.real, points.imag, degree)
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Return the mean (B,) of values as returned by ``flat``."""
+        """Return the mean (B,) over each stop of values at the nodes, prepared by ``flat``.
+
+        Dimensions: B beams.
+        """
         return np.asarray(np.sum(values * self._share, axis=-1))
 
     def flat(self, values: np.ndarray) -> np.ndarray:
-        """Remove piston and tilt from values (B, N); the result (B, N + Q) has nodes in the shadows as well."""
+        """Return values at the nodes of each stop (B, N) without their piston and tilt.
+
+        The result (B, N + Q) has additional nodes in the shadows.
+
+        Dimensions: B beams, N nodes of the stop, Q nodes in the shadows.
+        """
         values = values - values[:, :1]
         if self._added is not None:
             if self._free is None:
@@ -130,7 +138,7 @@ MOST_BLUR = 10.0
 """Wavefront error above which no MTF is computed for a vignetted pupil, in waves rms."""
 
 _DARKEST = 0.99
-"""Largest fraction of the light that bodies may block; beyond it no image quality is given."""
+"""Largest fraction of the light that bodies in the beam may block; with more no image quality is given."""
 
 COLOURS = 5
 """Number of Gauss wavelengths of a band: four are accurate to 1e-7 except near cut-offs inside the band, where the MTF
@@ -141,7 +149,7 @@ _ROUNDING = 1e-5
 """Tolerance of fractions outside 0 to 1, and of an error at best focus above that on the line CCD, in waves."""
 
 _MTF_ROUNDING = 1e-3
-"""Tolerance of an MTF outside 0 to 1."""
+"""Amount by which a computed MTF may lie outside 0 to 1 because of rounding."""
 
 _MOST_WAVES = 1e6
 """Wavefront error above which a value is not that of an image, in waves rms."""
@@ -155,12 +163,16 @@ AT_ONCE = 40
 
 @dataclass(frozen=True, eq=False)
 class PupilOutline:
-    """Pupil as seen from the image, in units of its mean radius; x along the line (Y'), y along the track (X').
+    """Outline of the pupil as seen from the image, in units of its mean radius.
+
+    The coordinate x is along the line CCD (Y'), y along the track (X').
+
+    Dimensions: K polygons, V vertices.
 
     Attributes
     ----------
     axes : (2, 2) ndarray
-        Map from the unit circle to the edge of the pupil.
+        Linear map from the unit circle to the edge of the pupil.
     pieces : (K, V, 2) ndarray
         Polygons of the shadow in the pupil.
     """
@@ -216,6 +228,8 @@ class CameraQuality:
 class ImageQuality:
     """Image quality of all cameras.
 
+    Dimensions: F fields.
+
     Attributes
     ----------
     fields : (F,) tuple of float
@@ -241,26 +255,29 @@ class ImageQuality:
         )
 
     def state(self, number: int) -> dict[str, CameraState]:
-        """Return every camera in one state, for files."""
+        """Return camera -> its image quality in the state of that number, for files of results."""
         positions = {position: self.fields.index(field) for position, field in PLACES.items() if field in self.fields}
         return {name: CameraState(camera, number, positions) for name, camera in self.cameras.items()}
 
 
 @dataclass(frozen=True, eq=False)
 class CameraState:
-    """Image quality of one camera in one state, with the fields that have names in files."""
+    """Image quality of one camera in one state of the instrument, at the fields that have names in files."""
 
     camera: CameraQuality
     number: int
     places: Mapping[str, int]
 
     def named(self, values: np.ndarray) -> dict[str, float | None]:
-        """Return position -> value, from values (S, F)."""
+        """Return name of the field -> value in this state, from values (S, F) of all states and fields.
+
+        Dimensions: S states, F fields.
+        """
         return {position: _known(values[self.number, k]) for position, k in self.places.items()}
 
 
 def _known(value: float | np.floating[Any]) -> float | None:
-    """Return a finite value, otherwise None."""
+    """Return a finite number unchanged, and None for NaN or infinity."""
     return float(value) if np.isfinite(value) else None
 
 
@@ -279,11 +296,11 @@ AT_FIELDS: Record[CameraQuality] = Record(
     Quantity("mtf_along_track", lambda c: c.mtf_along_track, "at Nyquist", "MTF at Nyquist along the track", 4),
     Quantity("light_lost", lambda c: c.light_lost, _TAKEN, "light blocked by bodies in the beam", 2, shown="percent"),
 )
-"""Quantities given at every field: the list that files, reports and scripts follow."""
+"""Quantities of image quality that are given at every field; files, reports and scripts follow this list."""
 
 
 def _at_places(quantity: Quantity[CameraQuality]) -> Quantity[CameraState]:
-    """Return the quantity at the named positions of the line, in one state."""
+    """Return a quantity of all fields and states as the quantity at the named fields in one state."""
     return Quantity(
         quantity.key,
         lambda camera_state: camera_state.named(quantity.of(camera_state.camera)),
@@ -389,7 +406,7 @@ def image_quality(
 def quality_dicts(
     instrument: Instrument, backend: Backend, states: Sequence[State], obstruction: bool = True
 ) -> list[dict[str, Any]]:
-    """Return the contents of quality.json for each of many states, traced together."""
+    """Return the contents of the file quality.json for each of many states, which are traced together."""
     quality = image_quality(instrument, backend, states, obstruction=obstruction)
     return [
         {"cameras": {k: _CAMERA(camera_state) for k, camera_state in quality.state(s).items()}}
@@ -398,12 +415,14 @@ def quality_dicts(
 
 
 _COLUMNS = ("light_lost", "wfe", "wfe_refocused", "defocus", "mtf_along_line", "mtf_along_track")
-"""Arrays of ``CameraQuality`` that are computed together; new ones go at the end."""
+"""Names of the arrays of ``CameraQuality`` that are computed together; new ones go at the end."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Traced:
-    """Beams of B images.
+    """Traced beams of B images, each for one state and one field.
+
+    Dimensions: N nodes of the stop.
 
     Attributes
     ----------
@@ -418,7 +437,7 @@ class _Traced:
     outlines : StopOutlines | None
         Outlines of edges and bodies on the stops; None for a camera whose surfaces have no edges.
     free : (B, N) ndarray | None
-        True for nodes that no edge and no body covers; None likewise.
+        True for nodes that no edge and no body covers; None for a camera whose surfaces have no edges.
     again : callable
         Function of a wavelength, in metres, that returns the rays of the same beams.
     """
@@ -433,7 +452,7 @@ class _Traced:
 
 
 class _CameraBench:
-    """Data of a camera that do not depend on its state, and the computation of its image quality."""
+    """Computation of one camera's image quality, with the data that do not depend on the state."""
 
     def __init__(
         self,
@@ -475,7 +494,7 @@ class _CameraBench:
         self.assembly = instrument.assembly
 
     def fill(self, states: list[State], which: np.ndarray, out: np.ndarray, reasons: list[str]) -> None:
-        """Compute some states; if the light of one is lost, compute both halves separately."""
+        """Compute the image quality of some states; if the light of one is lost, compute both halves separately."""
         try:
             traced = self._trace([states[s] for s in which])
         except (AimError, BeamMissedError, UnphysicalError) as error:
@@ -505,7 +524,10 @@ class _CameraBench:
                     )
 
     def bodies(self, count: int) -> dict[str, np.ndarray]:
-        """Return each body in a beam -> fraction that it blocks, (S, F); NaN where the light is lost."""
+        """Return each body in a beam -> fraction that it blocks, (S, F); NaN where the light is lost.
+
+        Dimensions: S states, F fields.
+        """
         out: dict[str, np.ndarray] = {}
         known = np.full((count, len(self.points)), np.nan)
         for which, _ in self._taken:
@@ -562,7 +584,12 @@ class _CameraBench:
         return _Traced(rays, imaging.size, origin, shadows, outlines, covers, lambda colour: launch_beams(colour)[1])
 
     def _numbers(self, traced: _Traced, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return values (V, B) of _COLUMNS, the vignetted fraction of each beam, and whether its MTF is unknown."""
+        """Return the values of the beams, the fraction of each that is cut off, and whether its MTF is unknown.
+
+        The values (V, B) are those named in _COLUMNS.
+
+        Dimensions: V quantities, B beams.
+        """
         rays, shadows, free = traced.rays, traced.shadows, traced.free
         radius = float(self.model.first_order.exit_pupil_distance[0])
         error = path_to_sphere(rays.position, rays.direction, rays.path, traced.origin, radius)
@@ -605,11 +632,13 @@ class _CameraBench:
     def _pupils(
         self, traced: _Traced, rays: ImagingRays, illuminated: np.ndarray, colour: float
     ) -> tuple[PupilStack, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Return pupils of illuminated beams, whether each is smooth at a wavelength, and the rays' direction cosines.
+        """Return the pupils of some beams at a wavelength, whether each is smooth, and the rays' direction cosines.
+
+        Dimensions: B beams, N nodes of the stop.
 
         Parameters
         ----------
-        lit : (B,) ndarray of int
+        illuminated : (B,) ndarray of int
             Indices of the beams.
         colour : float
             Wavelength, in metres.
@@ -634,7 +663,9 @@ class _CameraBench:
         return pupils, pupils.residual <= WORST_RESIDUAL * colour, (u, v)
 
     def _in_colours(self, traced: _Traced, illuminated: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return ``_transfer`` of beams through lenses, with the rays of each wavelength.
+        """Return the transfer functions of beams through lenses, from the rays of each wavelength.
+
+        They are complex (B, M), with the mask (B,) of the known ones, as from ``_transfer``.
 
         All wavelengths refer to one image point, so that lateral colour blurs.
         """
@@ -655,9 +686,11 @@ class _CameraBench:
         colours: np.ndarray,
         weights: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return complex transfer functions (B, M) and whether each is known (B,).
+        """Return the optical transfer functions of beams, complex (B, M), and whether each is known, (B,).
 
-        Vignetted pupils are integrated by lines.
+        Pupils that are partly cut off (vignetted) are integrated line by line.
+
+        Dimensions: B beams, M frequencies.
         """
         known = np.ones(len(pupils.centre), bool)
         if traced.outlines is None or traced.free is None:
@@ -678,7 +711,9 @@ class _CameraBench:
         return total, known
 
     def _hold(self, values: np.ndarray, dark: np.ndarray, shadows: shadow.Shadows | None) -> None:
-        """Check values (V, B) of _COLUMNS against physical limits.
+        """Check the values (V, B) named in _COLUMNS against physical limits.
+
+        Dimensions: V quantities, B beams.
 
         Raises
         ------

@@ -23,40 +23,48 @@ from optics.waves.diffraction import Grid, PupilField, at_intersections
 from twin.framework.provenance import SelfCheck
 
 SPOT_RANGES = (0.25, 0.5, 0.8)
-"""Fractions of the CCD's half size up to which sharp spots may be off its centre, one class of pupil nodes for each:
-the farther off a spot, the farther its farthest pixel, and the more nodes it needs. The estimators refuse spots
-beyond the last one.
+"""Fractions of the CCD's half size up to which sharp spots may be off its centre, one for each class of nodes.
+
+The farther off a spot, the farther its farthest pixel, and the more nodes over the pupil it needs. The estimators
+refuse spots beyond the last fraction.
 """
 
 _BLUR_STEP = 1.25
 """Ratio of one class to the next beyond ``SPOT_RANGES``, for blurred spots."""
 
 MOST_PHASE = 400.0
-"""Largest phase of the last class, in radians from the centre to the edge of the pupil: 42 000 nodes. A spot that needs
-more is spread over some hundred times the area of a CCD.
+"""Largest phase of the last class of pupil nodes, in radians from the centre to the edge of the pupil.
+
+It needs 42 000 nodes. A spot that needs more is spread over some hundred times the area of a CCD.
 """
 
 BLUR_PHASE = 1.5
-"""Weight of a blur's phase, relative to that of a tilt as steep as its steepest ray. A tilt varies along one direction;
-astigmatism and trefoil vary two and three times around the pupil, and their harmonics decay correspondingly later
-(compared with 72 800 nodes: 3e-6 of the peak for trefoil, less for all other terms to Z37).
+"""Weight of a blur's phase, relative to that of a tilt as steep as the blur's steepest ray.
+
+A tilt varies along one direction; astigmatism and trefoil vary two and three times around the pupil, and their
+harmonics decay correspondingly later (compared with 72 800 nodes: 3e-6 of the peak for trefoil, less for all other
+terms to Z37).
 """
 
 _SHARP_PHASE = 1.0
-"""Phase of a blur that the margins of ``quadrature.disk_for`` already include, in radians."""
+"""Phase due to blur that the margins of ``quadrature.disk_for`` already include, in radians."""
 
 _WIDER_BEAM = 1.001
 """Relative growth of the beam's aperture that needs no additional nodes."""
 
 GOOD = 1e-4
-"""Difference of the two rules, relative to the peak, above which an image is recomputed with more nodes."""
+"""Difference of an image between two quadratures, relative to its peak, above which more nodes are used."""
 
 WRONG = 1e-3
-"""Difference above which an image is refused: the shot-noise sigma of a pixel with a million electrons."""
+"""Difference of an image between two quadratures, relative to its peak, above which the image is refused.
+
+It is the shot-noise sigma of a pixel with a million electrons.
+"""
 
 WINGS = 12.0
-"""Distance over which diffraction may carry light across a CCD's edge, as a phase 2 pi NA r / wavelength; less than
-``LOST`` of an Airy pattern lies farther out (2 / (pi z)).
+"""Distance over which diffraction may carry light across a CCD's edge, as a phase 2 pi NA r / wavelength.
+
+NA is the numerical aperture and r the distance; less than ``LOST`` of an Airy pattern's light lies farther out.
 """
 
 LOST = 0.08
@@ -72,7 +80,7 @@ class ImageChecks:
     images : int
         Number of images.
     difference : float
-        Largest difference of the two rules, relative to the peak; the limit is `WRONG`.
+        Largest difference between two quadratures over the pupil, relative to the peak; the limit is `WRONG`.
     light : float
         Largest excess or deficit of light, as a fraction of a channel's light beyond what rays and diffraction allow;
         the limit is 0.
@@ -85,12 +93,15 @@ class ImageChecks:
     def add(self, difference: np.ndarray, light: np.ndarray) -> None:
         """Add the checks of further images.
 
+        Dimensions: B images.
+
         Parameters
         ----------
         difference : (B,) ndarray
-            Differences of the two rules.
+            Differences of each image between two quadratures, relative to its peak.
         light : (B,) ndarray
-            Light beyond the allowed range, either sign.
+            Light beyond the allowed range, as a fraction of the channel's light: positive for an excess, negative for a
+            deficit.
         """
         self.images += difference.size
         self.difference = max(self.difference, float(np.max(difference, initial=0.0)))
@@ -114,7 +125,7 @@ class UncertainImageError(BeamMissedError):
 
 @dataclass(frozen=True)
 class NodeClasses:
-    """Sizes of pupil quadrature, from sharp spots near the centre of a CCD to the largest that is tried.
+    """Ladder of pupil quadratures (classes of nodes), from sharp spots near a CCD's centre to the most blurred ones.
 
     Attributes
     ----------
@@ -129,7 +140,7 @@ class NodeClasses:
 
     @property
     def reached(self) -> np.ndarray:
-        """Largest distance from the centre of the rays for each class, in half diagonals of the CCD."""
+        """Largest distance of rays from the centre that each class allows, in half diagonals of the CCD."""
         most = MOST_PHASE / (self.phase_per_pixel * float(np.hypot(*self.half)))
         steps = 1.0 + SPOT_RANGES[-1]
         out = [1.0 + share for share in SPOT_RANGES]
@@ -139,7 +150,7 @@ class NodeClasses:
         return np.array(out)
 
     def phase(self, number: int) -> float:
-        """Return the largest phase of a class, in radians."""
+        """Return the largest phase from the centre to the edge of the pupil that a class allows, in radians."""
         return float(self.phase_per_pixel * np.hypot(*self.half) * self.reached[number])
 
     @property
@@ -149,17 +160,19 @@ class NodeClasses:
         return rings * arms
 
     def nodes(self, number: int) -> PupilNodes:
-        """Return the pupil nodes of a class."""
+        """Return the nodes over the pupil that belong to the class of a number."""
         return quadrature.disk_for(self.phase(number))
 
     def second_nodes(self, number: int) -> PupilNodes:
-        """Return the pupil nodes of the second quadrature, which checks a class."""
+        """Return the nodes of a second quadrature over the pupil, which checks the images of a class."""
         return quadrature.second_disk_for(self.phase(number))
 
     def class_of(
         self, position: np.ndarray, margin: int = 0, blur: np.ndarray | float = 0.0, widening: np.ndarray | float = 1.0
     ) -> np.ndarray:
         """Return the first class that suffices for all spots of each state; the number of classes if none does.
+
+        Dimensions: C columns, S states.
 
         Parameters
         ----------
@@ -185,9 +198,11 @@ class NodeClasses:
 
 
 def quadrature_difference(images: np.ndarray, second: PupilField, x: Grid, y: Grid) -> np.ndarray:
-    """Return the largest difference of each image from a second quadrature, relative to its peak, (B,).
+    """Return the largest difference of each image from a second pupil quadrature, relative to its peak, (B,).
 
     The images are compared at their corners, at their peak and beside it.
+
+    Dimensions: B images, R rows, C columns.
 
     Parameters
     ----------
@@ -220,6 +235,8 @@ def energy_excess(
     """Return the fraction of each image's light outside the range that the traced rays allow, (B,).
 
     It is positive for an excess and negative for a deficit.
+
+    Dimensions: B images, N rays.
 
     Parameters
     ----------

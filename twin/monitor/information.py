@@ -1,8 +1,9 @@
-"""Information of a layout's light: posterior covariance of all parameters from traced derivatives and spot noise.
+"""Information of a monitor's light on camera parameters: posterior covariance from derivatives and noise.
 
-The M motions x ~ N(0, C), in standard deviations, move the spots by A x and the cameras by B x. Spots with noise R hold
-the Fisher information A' R^-1 A on them. The posterior covariance of the cameras' parameters is B (C^-1 + A' R^-1 A)^-1
-B', which equals B C B' - B C A' (A C A' + R)^-1 A C B' also for singular C.
+The amounts x ~ N(0, C) of M motions, in standard deviations with correlations C, move the spots by A x and change the
+cameras' parameters by B x. Spots with noise R hold the Fisher information A' R^-1 A on them. The posterior covariance
+of the cameras' parameters is B (C^-1 + A' R^-1 A)^-1 B', which equals B C B' - B C A' (A C A' + R)^-1 A C B' also for
+singular C.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from twin.monitor.truth import ground_geometry
 from twin.sensors.area_detector import EmvaDetector
 
 NOISE = "noise"
-"""Name of the variance that the images add to that of the disturbances."""
+"""Name, among the causes of variance, of the noise of the images."""
 _SLOPE = 2  # pixels more on every side of an image, for its slopes
 _PARAMETERS = 4
 
@@ -39,14 +40,17 @@ _PARAMETERS = 4
 class Information:
     """Information of a layout's spots about its cameras.
 
+    Dimensions: n rows of coefficients, C spots.
+
     Attributes
     ----------
     disturbances : Disturbances
         Prior with its derivatives: D spot coordinates, K cameras.
     noise : (D, D) ndarray
-        Covariance of the shifts by the noise of the images before and after, in px^2.
+        Covariance of the shifts due to the noise of the images before and after, in px^2.
     quantities : mapping of str to (n, 4 K) ndarray
-        Name -> rows on all parameters; the quantity's variance is the mean of the rows' variances.
+        Name -> n rows of coefficients on the parameters of all cameras; the quantity's variance is the mean of the
+        variances of these linear combinations.
     brightest : (C,) ndarray
         Expected signal of every spot's brightest pixel, as a fraction of saturation.
     """
@@ -58,12 +62,15 @@ class Information:
 
     @cached_property
     def gain(self) -> np.ndarray:
-        """Gain of the estimate with the least variance, (4 K, D), in rad and m per pixel."""
+        """Matrix from spot shifts to camera parameters with the smallest variance, (4 K, D), in rad and m per pixel.
+
+        Dimensions: K cameras, D spot coordinates (row and column of every spot).
+        """
         return self.disturbances.best_gain(self.noise)
 
     @cached_property
     def splits(self) -> Mapping[str, Split]:
-        """Quantity -> its variances by motion, in SI units."""
+        """Quantity -> contributions of each motion to its variance, in SI units squared."""
         return {name: split(rows, self.disturbances, self.noise, self.gain) for name, rows in self.quantities.items()}
 
     def sigma(self, name: str) -> float:
@@ -75,10 +82,14 @@ class Information:
         return float(np.sqrt(np.mean(self.splits[name].sigma_before ** 2)))
 
     def slopes(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return the derivatives of a quantity's sigma by A, (D, M), and by the noise R, (D, D), per px and px^2.
+        """Return the derivatives of a quantity's posterior sigma with respect to A, (D, M), and to R, (D, D).
 
-        The gain has the least variance, so its own change does not contribute: with w = gain' row, the variance
-        changes by 2 w' dA C (A' w - B' row) + w' dR w.
+        A are the spot shifts (px) per standard deviation of each motion and R is the noise covariance of the spots
+        (px^2); the derivatives are in the quantity's SI unit per px and per px^2. The gain has the smallest variance,
+        so its own change does not contribute: with w = gain' row, the variance changes by 2 w' dA C (A' w - B' row) +
+        w' dR w.
+
+        Dimensions: D spot coordinates (row and column of every spot), M motions.
         """
         prior, rows = self.disturbances, self.quantities[name]
         weights = rows @ self.gain
@@ -87,7 +98,7 @@ class Information:
         return 2.0 * weights.T @ residual / scale, weights.T @ weights / scale
 
     def shares(self, name: str, measured: bool = True) -> dict[str, float]:
-        """Return the variance of a quantity by cause, in SI units; causes are independent, so the variances add up.
+        """Return cause -> its contribution to the variance of a quantity, in SI units squared; causes are independent.
 
         Parameters
         ----------
@@ -103,7 +114,10 @@ class Information:
 
     @property
     def spot_sigma(self) -> np.ndarray:
-        """Prior standard deviations of the spot coordinates, (D,), in pixels."""
+        """Prior standard deviations of the spot coordinates, (D,), in pixels.
+
+        Dimensions: D spot coordinates (row and column of every spot).
+        """
         return np.sqrt(np.diag(self.disturbances.spot_covariance))
 
 
@@ -154,10 +168,12 @@ def information_of(
 
 
 def quantity_rows(instrument: Instrument, ground: GroundGeometry | None) -> dict[str, np.ndarray]:
-    """Return name -> (n, 4 K) rows of the quantities on all parameters.
+    """Return name of a quantity -> its coefficients on the parameters of all cameras, (n, 4 K).
 
     The quantities are d_alpha, d_beta, d_gamma (rad) and d_f (m) of every camera, as ``camera/d_alpha``; the
     intersection angle of the first two cameras (rad); and the height (m) at the line's centre.
+
+    Dimensions: n rows of coefficients, K cameras.
     """
     names = list(instrument.cameras)
     unit = np.eye(_PARAMETERS * len(names))
@@ -190,10 +206,12 @@ def ground_of(instrument: Instrument) -> GroundGeometry | None:
 def spot_noise(
     path: MonitorPath, detector: EmvaDetector, same_shape: bool = False, single: bool = True
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the noise covariance of all shifts, and how full each spot's brightest pixel is.
+    """Return the noise covariance of all spot shifts, and how full each spot's brightest pixel is.
 
     The covariance of each spot is twice (images before and after) the Cramer-Rao bound of any unbiased fit of its
     image, with the light of its channel and the instrument's number of frames.
+
+    Dimensions: D spot coordinates (row and column of every spot), C spots.
 
     Parameters
     ----------
@@ -232,9 +250,12 @@ def spot_noise(
 
 
 def noise_as_built(path: MonitorPath, detector: EmvaDetector, states: Sequence[State]) -> np.ndarray:
-    """Return the noise covariance of all shifts for instruments as built, (S, D, D), in px^2, as ``spot_noise`` does.
+    """Return the noise covariance of all spot shifts for S instruments as built, (S, D, D), in px^2.
 
-    Both images, before and after, are those of the instrument as built.
+    The covariance of each spot is twice the Cramer-Rao bound of its image. Both images, before and after, are those of
+    the instrument as built.
+
+    Dimensions: D spot coordinates (row and column of every spot).
 
     Parameters
     ----------
@@ -255,9 +276,12 @@ def noise_as_built(path: MonitorPath, detector: EmvaDetector, states: Sequence[S
 
 
 def _image_bounds(photons: np.ndarray, path: MonitorPath, detector: EmvaDetector) -> tuple[np.ndarray, np.ndarray]:
-    """Return Cramer-Rao bounds (S, C, 2, 2), px^2, and the saturation of the brightest pixels (S, C), from images.
+    """Return the smallest covariance of each spot's position, (S, C, 2, 2) px^2, and its peak signal, (S, C).
 
-    The images have the margin ``_SLOPE``.
+    The covariance is the Cramer-Rao bound; the signal is that of the brightest pixel as a fraction of saturation. The
+    images are wider than the CCD by ``_SLOPE`` pixels on every side.
+
+    Dimensions: S states, C spots.
     """
     spec = path.instrument.spec.autocollimator
     exposure = spec.area_ccd.exposure

@@ -32,16 +32,18 @@ from twin.monitor.image_sampling import UncertainImageError
 class AimedRays:
     """Rays from the pinholes, aimed at the nodes, for C channels x S states (channel-major).
 
+    Dimensions: N nodes of the aperture.
+
     Attributes
     ----------
     position, direction : (C*S, N, 3) ndarray
         Launch points and unit directions in the world frame.
     axes : (C*S, 1, 2, 3) ndarray
-        Transverse axes of the aim parameters.
+        Two axes perpendicular to each channel's beam, along which the aim parameters count.
     parameters : (C*S, N, 2) ndarray
-        Aim parameters.
+        Aim parameters: components along these axes by which a ray's direction is chosen.
     jacobian : (C*S, N, 2, 2) ndarray
-        Derivative d(node)/d(parameters).
+        Derivatives of the point where each ray hits the return face with respect to its aim parameters.
     """
 
     position: np.ndarray
@@ -53,7 +55,9 @@ class AimedRays:
 
 @dataclass(frozen=True, eq=False)
 class CoarseTrace:
-    """Trace with a few rays for C channels x S states (channel-major).
+    """Trace with a few rays that finds the spots of C channels in S states (all states of a channel together).
+
+    Dimensions: T Zernike terms.
 
     Attributes
     ----------
@@ -68,7 +72,7 @@ class CoarseTrace:
     centre : (C, S, 2) ndarray
         Centres of the spots, (row, column) in pixels from the CCD's centre.
     blur : (C, S) ndarray
-        Distance of the farthest rays from there, extrapolated to the aperture's edge, in pixels.
+        Distance of the farthest rays from the spot's centre, extrapolated to the aperture's edge, in pixels.
     aperture : (C, S) ndarray
         Numerical apertures of the beams (largest half width).
     """
@@ -83,7 +87,7 @@ class CoarseTrace:
     aperture: np.ndarray
 
     def take(self, states: np.ndarray, backend: Backend) -> CoarseTrace:
-        """Return the states of the given indices."""
+        """Return the coarse trace of some of the states, selected by their indices."""
         channels, count = self.centre.shape[:2]
         if np.array_equal(states, np.arange(count)):
             return self
@@ -96,7 +100,9 @@ class CoarseTrace:
 
 @dataclass(frozen=True, eq=False)
 class CcdRays:
-    """Rays at the CCDs in each CCD's frame.
+    """Traced rays where they arrive at the area CCDs, in each CCD's own frame.
+
+    Dimensions: B beams, N nodes of the aperture.
 
     Attributes
     ----------
@@ -105,7 +111,7 @@ class CcdRays:
     direction : (B, N, 3) ndarray
         Unit directions.
     path : (B, N) ndarray
-        Optical path, in metres.
+        Optical path from the pinhole, in metres.
     valid : (B, N) ndarray of bool
         True for rays that arrive.
     size : (B,) ndarray
@@ -121,7 +127,9 @@ class CcdRays:
 
 @dataclass(frozen=True, eq=False)
 class SpotFocus:
-    """Sharpness of the unperturbed instrument's spots, by channel.
+    """Sharpness of the spots of the unperturbed instrument, channel by channel.
+
+    Dimensions: C channels.
 
     Attributes
     ----------
@@ -141,13 +149,19 @@ leaves a residual below 1e-7 for smooth surfaces; figures of prisms and mirrors 
 """
 
 SMOOTH = 1e-6
-"""Largest residual of that map, relative to the beam's aperture, that is neglected: 5e-5 of the density of rays."""
+"""Largest neglected residual of the map from aperture to direction, relative to the beam's aperture.
+
+It corresponds to an error of 5e-5 in the density of rays.
+"""
 
 TOO_ROUGH = 2e-5
-"""Residual beyond all terms above which an image is refused: 1e-3 of the density of rays."""
+"""Residual of the map from aperture to direction, relative to the aperture, above which an image is refused.
+
+It corresponds to an error of 1e-3 in the density of rays, and is what all Zernike terms leave.
+"""
 
 _COARSE_RINGS = 6
-"""Rings of the quadrature for means: exact for polynomials to degree 23."""
+"""Number of rings of the quadrature over the aperture for means, exact for polynomials up to degree 23."""
 
 _SCOUT_RINGS = 4
 """Rings of the rays that are aimed in every state to find how the launch directions of the others change."""
@@ -192,7 +206,7 @@ class MonitorBeams:
 
     @property
     def nodes(self) -> PupilNodes:
-        """Pupil quadrature."""
+        """Nodes and weights of the quadrature over the aperture."""
         assert self._nodes is not None
         return self._nodes
 
@@ -204,7 +218,7 @@ class MonitorBeams:
         return 0.5 * widest / float(np.min(scales))
 
     def _with(self, nodes: PupilNodes) -> MonitorBeams:
-        """Return these beams with other nodes."""
+        """Return the beams of the same instrument with other nodes over the aperture."""
         return MonitorBeams(self.instrument, self.backend, nodes, self.cameras)
 
     @cached_property
@@ -219,19 +233,29 @@ class MonitorBeams:
 
     @cached_property
     def _smooth(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Matrices of Zernike series for smooth functions.
+        """Matrices of a Zernike series on the nodes, for functions over the aperture that are smooth.
 
-        They are the terms from values on the nodes (T, N), and values, d/dx and d/dy from terms (N, T).
+        The first gives the T terms from values on the N nodes, (T, N); the others give the values and their derivatives
+        with respect to x and y from the terms, (N, T) each.
+
+        Dimensions: T Zernike terms, N nodes of the aperture.
         """
         return self._series(MAP_TERMS)
 
     @cached_property
     def _rough(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Matrices of Zernike series for functions with fine structure, as in `_smooth`."""
+        """Matrices of a Zernike series on the nodes, for functions over the aperture with fine structure.
+
+        They are the terms from values, and values, x derivatives and y derivatives from terms.
+        """
         return self._series(ROUGH_TERMS)
 
     def _series(self, terms: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the matrices of a Zernike series with a number of terms, as in `_smooth`."""
+        """Return the matrices of a Zernike series with a given number of terms.
+
+        The first gives the terms from values on the nodes; the others give the values and their derivatives with
+        respect to x and y from the terms.
+        """
         x, y = self.nodes.x, self.nodes.y
         basis = zernike.basis(terms, x, y)
         # the terms are orthonormal over the disk, and the quadrature is exact for their products
@@ -240,7 +264,11 @@ class MonitorBeams:
         return solve, basis, dx, dy
 
     def area_ratio(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the determinant d(u, v)/d(x, y) of maps from the unit disk, given on the nodes, (..., N).
+        """Return the local ratio of areas of maps (x, y) -> (u, v) from the unit disk, at the nodes, (..., N).
+
+        It is the determinant of the derivatives of u and v with respect to x and y.
+
+        Dimensions: N nodes of the aperture.
 
         Raises
         ------
@@ -273,16 +301,22 @@ class MonitorBeams:
 
     @cached_property
     def target(self) -> np.ndarray:
-        """Nodes on the return faces, (C, N, 2), in metres of the nominal size."""
+        """Points on the return faces that the rays are aimed at, (C, N, 2), in metres of the nominal size.
+
+        Dimensions: C channels, N nodes of the aperture.
+        """
         return self.face_radius[:, None, None] * np.stack([self.nodes.x, self.nodes.y], axis=-1)
 
     def targets(self, states: int) -> np.ndarray:
-        """Return `target` repeated for each state, channel-major, (C*S, N, 2)."""
+        """Return the points that the rays are aimed at, repeated for each state, (C*S, N, 2), channel by channel.
+
+        Dimensions: C channels, S states, N nodes of the aperture.
+        """
         return np.repeat(self.target, states, axis=0)
 
     @cached_property
     def nominal(self) -> AimedRays:
-        """Aimed rays of the unperturbed instrument, from which all other states start.
+        """Rays of the unperturbed instrument aimed at the nodes, from which all other states start.
 
         They are aimed first at the centre of the face, then at the nodes around it.
         """
@@ -306,7 +340,7 @@ class MonitorBeams:
         Raises
         ------
         BeamMissedError, AimError
-            Light is lost, see ``rays``.
+            A perturbation moves a beam off the mirrors or a spot off its CCD; the message names it.
         """
         scout, count = self.scout, len(states)
         placed = self.instrument.assembly.place(states) if placed is None else placed
@@ -335,20 +369,25 @@ class MonitorBeams:
 
     @cached_property
     def centre_at_rest(self) -> np.ndarray:
-        """Spot centres of the unperturbed instrument from ``coarse_trace``, (C, 1, 2), in pixels."""
+        """Spot centres of the unperturbed instrument from ``coarse_trace``, (C, 1, 2), in pixels.
+
+        Dimensions: C channels.
+        """
         return self.coarse_trace([{}]).centre
 
     def mean_spots(self, states: Sequence[State]) -> np.ndarray:
-        """Return the means of the rays, (S, C, 2), row and column in pixels from the first pixel's centre.
+        """Return the mean position of each spot's rays, (S, C, 2), row and column in px from the first pixel's centre.
 
-        They are the energy centroids of the images. Raises the errors of ``rays``.
+        They are the energy centroids of the images. BeamMissedError or AimError is raised if light is lost.
+
+        Dimensions: S states, C channels.
         """
         mean = np.einsum("n,bnk->bk", self.nodes.share, self.rays(states).position[..., 1::-1]) / self.pitch
         middle = 0.5 * (np.array(self.shape) - 1.0)
         return np.asarray(np.swapaxes(mean.reshape(len(self.channels), len(states), 2), 0, 1) + middle)
 
     def rays(self, states: Sequence[State], coarse: CoarseTrace | None = None) -> CcdRays:
-        """Trace rays to the CCDs for C channels x S states, channel-major.
+        """Trace rays from the pinholes to the CCDs for C channels in S states, all states of a channel together.
 
         Parameters
         ----------
@@ -390,18 +429,27 @@ class MonitorBeams:
         return rays
 
     def _where_lost(self, channel: Channel, state: State, position: np.ndarray, direction: np.ndarray) -> str:
-        """Return the element and the body at which the last of a channel's rays (N, 3) are lost."""
+        """Return the element and the body at which the last of a channel's rays (N, 3) are lost.
+
+        Dimensions: N nodes of the aperture.
+        """
         names = self.instrument.assembly.sequences[f"{channel.key}/monitor"]
         steps = surviving_rays(self.backend, self.instrument.assembly, names, position, direction, state)
         count, element = next((i, element) for i, (element, alive) in enumerate(steps, 1) if not alive.any())
         return f"{element.name} on {element.body}, at surface {count} of {len(names)} of its path"
 
     def fields(self, states: Sequence[State]) -> PupilField:
-        """Return the plane waves at the CCDs for C channels x S states. Raises the errors of ``rays``."""
+        """Return the light at the CCDs as one plane wave for each ray, for C channels in S states.
+
+        BeamMissedError or AimError is raised if light is lost.
+        """
         return self.field_of(self.rays(states))
 
     def field_of(self, rays: CcdRays) -> PupilField:
-        """Return the plane waves of traced rays, channel-major, in each chip's x, y about its centre."""
+        """Return the light of traced rays at the CCDs as one plane wave for each ray.
+
+        Beams are ordered channel by channel; x and y count from the centre of each CCD.
+        """
         direction = rays.direction
         u, v = direction[..., 0], direction[..., 1]
         # sqrt(|d(u, v)/dA| / A) dA of the module docstring of optics.waves.diffraction, with A the face's area
@@ -411,7 +459,10 @@ class MonitorBeams:
         return PupilField(u, v, phase, amplitude, self.wavelength).scaled_by(rays.size)
 
     def _require_on_ccd(self, channel: Channel, position: np.ndarray) -> None:
-        """Raise BeamMissedError if the centre of a spot (S, 2), in pixels from the CCD's centre, is outside its CCD."""
+        """Raise BeamMissedError if the centre of a spot (S, 2), in pixels from the CCD's centre, is outside its CCD.
+
+        Dimensions: S states.
+        """
         half = 0.5 * (np.array(self.shape) - 1)
         beyond = np.linalg.norm(np.maximum(np.abs(position) - half, 0.0), axis=-1)
         if np.any(beyond > 0.0):
@@ -425,12 +476,12 @@ class MonitorBeams:
 
     @cached_property
     def focus(self) -> SpotFocus:
-        """Sharpness of the unperturbed instrument's spots.
+        """Sharpness of the unperturbed instrument's spots: wavefront error and defocus of each channel.
 
         Raises
         ------
         BeamMissedError, AimError
-            Light is lost, see ``rays``.
+            A beam misses the mirrors or a spot its CCD.
         """
         rays, weight = self.coarse.rays([{}]), self.coarse.nodes.weight
         paths = eikonal(rays.position, rays.direction, rays.path, np.zeros(3))
@@ -461,7 +512,12 @@ class MonitorBeams:
 def _area_ratio(
     u: np.ndarray, v: np.ndarray, series: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the determinant d(u, v)/d(x, y) of maps (..., N) by a series, and its relative residual (...,)."""
+    """Return the local ratio of areas of maps (x, y) -> (u, v), (..., N), and the series' relative residual, (...).
+
+    The ratio is the determinant of the derivatives of u and v with respect to x and y, from a Zernike series.
+
+    Dimensions: N nodes of the aperture.
+    """
     solve, basis, dx, dy = series
     a, b = product(u, solve.T), product(v, solve.T)
     ratio = product(a, dx.T) * product(b, dy.T) - product(a, dy.T) * product(b, dx.T)

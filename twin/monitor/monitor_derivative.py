@@ -1,9 +1,10 @@
-"""Derivatives of the monitor's spots by motions of any body, and the motion models of the estimators.
+"""Derivatives of the monitor's spots with respect to motions of bodies, and the motion models of the estimators.
 
 A spot is the mean of its rays at the area CCD. In reverse mode, two backward passes (row and column) through the
-monitor's sequence give its derivative by the numbers of every surface and by the launch direction of each ray. That
-direction is such that the ray hits its node of the return face, hit(direction, numbers) = node. By the implicit
-function theorem the passes therefore continue through the sequence from pinhole to return face with the weights
+monitor's sequence give its derivative with respect to the numbers of every surface and to the launch direction of each
+ray. That direction is such that the ray hits its node of the return face, hit(direction, numbers) = node. By the
+implicit function theorem the passes therefore continue through the sequence from pinhole to return face with the
+weights
 
     w = -(d hit / d direction)^-T  dS / d direction.
 
@@ -46,12 +47,12 @@ from twin.monitor.truth import LineSight, trace_truth, truth_jacobian
 
 
 def _size_steps(placed: PlacedBodies, bodies: Sequence[str]) -> np.ndarray:
-    """Return the derivative of the sizes of C bodies by the steps of M states, (C, M)."""
+    """Return the derivative of the sizes of C bodies with respect to the step of each of M states, (C, M)."""
     return np.stack([placed.scale[:, placed.index[body]].imag for body in bodies]) / COMPLEX_STEP
 
 
 def ray_tangents(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> tuple[RayTangents, np.ndarray]:
-    """Propagate motions through the trace about the unperturbed instrument, with rays fixed to their nodes.
+    """Return the derivatives of the monitor's rays with respect to motions, with each ray fixed to its node.
 
     The motions of the bodies are differentiated by a complex step in the rigid-body tree, the trace by Dr.Jit.
 
@@ -85,7 +86,7 @@ def ray_tangents(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> tup
 
 
 def _of_one_structure(path: MonitorBeams, states: list[State]) -> list[State]:
-    """Return the states with the same structure, so that all derivatives by motions share one compiled kernel.
+    """Return states with the same structure, so that the derivatives with respect to all motions share one kernel.
 
     The first state gets the highest figure term of every mirror, with amplitude 0.
     """
@@ -102,7 +103,9 @@ def _of_one_structure(path: MonitorBeams, states: list[State]) -> list[State]:
 def hit_slopes(
     backend: Backend, systems: SystemBatch, position: np.ndarray, direction: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the exact derivative of where rays hit the last element by their launch directions.
+    """Return the derivative of the points where rays hit the last element with respect to their launch directions.
+
+    Dimensions: N nodes of the aperture.
 
     Parameters
     ----------
@@ -128,9 +131,11 @@ def hit_slopes(
 
 
 def spot_jacobian(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> np.ndarray:
-    """Return the derivative of every spot's position by elementary motions, in forward mode.
+    """Return the derivative of every spot's position with respect to elementary motions, by forward differentiation.
 
     The position is the mean of the rays over the aperture, which is the energy centroid of the diffraction image.
+
+    Dimensions: C channels (one spot each).
 
     Parameters
     ----------
@@ -159,7 +164,9 @@ CHUNK = 1 << 17
 def spot_gradient(
     path: MonitorBeams, motions: Sequence[ElementaryMotion], about: State | None = None, chunk: int = CHUNK
 ) -> np.ndarray:
-    """Return the derivative of every spot's position by elementary motions, as `spot_jacobian`, in reverse mode.
+    """Return the derivative of every spot's position with respect to elementary motions, by reverse differentiation.
+
+    Dimensions: C channels (one spot each).
 
     Parameters
     ----------
@@ -243,11 +250,20 @@ def spot_gradient(
 
 
 _Tangents = list[dict[Path, np.ndarray]]
-"""Derivatives of one sequence's numbers by M motions, for C channels: per element, path -> (C, M), not all zero."""
+"""For each element of one sequence, number's path -> its derivative with respect to M motions, (C, M).
+
+C is the number of channels; derivatives that are all zero are left out.
+"""
 
 
 def _dot(tangents: _Tangents, slopes: Sequence[Mapping[Path, np.ndarray]]) -> np.ndarray:
-    """Return the sum over numbers of slope (C, 2) times derivative by the motions, (C, 2, M)."""
+    """Return the derivatives of spots with respect to motions, (C, 2, M), by the chain rule.
+
+    It is the sum over the surfaces' numbers of the derivative of the spot with respect to a number, (C, 2), times that
+    of the number with respect to the motions.
+
+    Dimensions: C channels (one spot each), M motions.
+    """
     parts = [
         slope[name].reshape(len(table), 2)[:, :, None] * table[:, None]
         for tangent, slope in zip(tangents, slopes, strict=True)
@@ -302,7 +318,10 @@ def _union(states: Sequence[State], about: State) -> State:
 
 
 def _aimed(path: MonitorBeams, about: State) -> tuple[np.ndarray, np.ndarray]:
-    """Return launch points and directions (C, N, 3) of the rays that hit the nodes of the return faces in the state."""
+    """Return launch points and directions (C, N, 3) of the rays that hit the nodes of the return faces in the state.
+
+    Dimensions: C channels (one spot each), N nodes of the aperture.
+    """
     nominal = path.nominal
     start = np.broadcast_to(nominal.position, nominal.direction.shape)
     if not about:
@@ -326,7 +345,7 @@ STEPS = {"temperature": 0.1, "gradient": 0.1, "index_gradient": 1e-6, "radius": 
 def disturbances_of(
     prior: DisturbancePrior, path: MonitorPath, thermal: ThermalModel, instrument: Instrument, backend: Backend
 ) -> Disturbances:
-    """Return the motions of a prior with their derivatives, for the analysis.
+    """Return the motions of a prior with their effects on spots and camera parameters, as the analysis uses them.
 
     Rigid motions, scale and figures are differentiated by automatic differentiation. Temperatures and index gradients
     affect light through many bodies at once, and radii, conic constants and indices are rare in priors; all of these
@@ -380,7 +399,7 @@ def disturbances_of(
 
 
 def _elementary(component: Component) -> ElementaryMotion:
-    """Return the elementary motion of a component."""
+    """Return the elementary motion (body, kind and axis) that a component of the prior describes."""
     return ElementaryMotion(component.body, component.kind, component.axis, component.pivot, component.name)
 
 
@@ -409,7 +428,12 @@ def single_states(components: Sequence[Component], amounts: np.ndarray, thermal:
 def _by_differences(
     components: Sequence[Component], path: MonitorPath, thermal: ThermalModel, instrument: Instrument, backend: Backend
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return derivatives of spots (2 C, M), px, and parameters (4 K, M), per SI unit, by central differences."""
+    """Return derivatives of spots (2 C, M), px, and camera parameters (4 K, M), by central differences.
+
+    They are per SI unit of each component.
+
+    Dimensions: C channels (one spot each), M motions, K cameras.
+    """
     steps = np.array([STEPS[c.kind] for c in components])
     # all bodies have their own temperature in every state, as in drawn states, so that none inherits one
     states = states_of(np.concatenate([np.diag(steps), np.diag(-steps)]), components, thermal)
@@ -422,15 +446,16 @@ def _by_differences(
 
 
 SMALL: Mapping[str, float] = {"rotate": 1e-6, "shift": 1e-6, "scale": 1e-6, "figure": 1e-8}
-"""Steps of rigid motions, scale and figures, in SI units, for the comparison of two derivatives with the same steps."""
+"""Step of each kind of motion, in SI units, for the difference of two derivatives with the same steps."""
 
 
 def derivative_changes(
     prior: DisturbancePrior, path: MonitorPath, sight: LineSight, thermal: ThermalModel, built: Sequence[State]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the differences of the derivatives of ``disturbances_of`` between instruments as built and as designed.
+    """Return how the derivatives of spots and cameras differ between instruments as built and as designed.
 
-    Both are one-sided differences of exact traces with the same steps, so that their truncation errors cancel.
+    The derivatives are with respect to the motions of the prior. Both are one-sided differences of exact traces with
+    the same steps, so that their truncation errors cancel.
 
     Parameters
     ----------
@@ -490,7 +515,7 @@ def derivative_changes(
 
 
 def _law(law: TimeLawSpec) -> TimeLaw:
-    """Return the time law of a specification."""
+    """Return the time law that the analysis uses for a time law in a disturbances file."""
     return TimeLaw(
         law.kind == "white",
         law.drift,
@@ -505,13 +530,14 @@ def _law(law: TimeLawSpec) -> TimeLaw:
 
 
 NEAR = 3.0
-"""Shift of a spot, in pixels, up to which the motions of the prior are treated as linear. The leading nonlinear term is
-a product of two motions: a shift s by one times an angle by the other, s over the distance of the spots, some 10 000
-px. For 3 px that is 1e-3 px, the noise of a spot, while sigmas of a prior are tens of times larger; the few motions
-of `model` are retraced in every state.
+"""Shift of a spot, in pixels, up to which the motions of the prior are treated as linear.
+
+The leading nonlinear term is a product of two motions: the shift by one of them times the angle of the other, which is
+its shift over the distance of the spots, some 10 000 px. For 3 px that is 1e-3 px, the noise of a spot, while sigmas of
+a prior are tens of times larger; the few motions of `model` are traced again in every state.
 """
 LOST = (PhysicalError, ArithmeticError)
-"""Exceptions of a state that cannot be traced."""
+"""Exceptions that mean that a state cannot be traced."""
 
 
 def motion_models(
@@ -522,7 +548,7 @@ def motion_models(
     prior: DisturbancePrior | None,
     disturbances: Disturbances | None,
 ) -> dict[str, MotionModel]:
-    """Return the motion model of each estimator that retraces.
+    """Return for each estimator that is checked by a ray trace the motions that it assumes.
 
     The models are the line families of all cameras, and the motions of the prior.
 
@@ -537,7 +563,7 @@ def motion_models(
     thermal : ThermalModel
         Thermal model of the instrument.
     prior : DisturbancePrior | None
-        Motions of the prior; None for none.
+        Motions of the prior; None if there is none.
     disturbances : Disturbances | None
         The same motions with their derivatives.
 
@@ -560,12 +586,15 @@ def motion_models(
 
 
 def _prior_states(prior: DisturbancePrior, thermal: ThermalModel, amounts: np.ndarray) -> list[State]:
-    """Return the states of the prior's amounts (S, P), in standard deviations."""
+    """Return the states of the prior's amounts (S, P), in standard deviations.
+
+    Dimensions: S states, P motions.
+    """
     return states_of(amounts * prior.sigma, prior.components, thermal)
 
 
 def _of_families(cameras: Mapping[str, CameraCalibration], trace: Callable[[Sequence[State]], Retraced]) -> MotionModel:
-    """Return the motion model of each camera's four motions of paper 001."""
+    """Return the model of the four motions of each camera for which paper 001 derives its formulas."""
     families = {name: line_family(name) for name in cameras}
     spot_slices, count = _spots_of(cameras), sum(map(len, families.values()))
     spots, parameters = np.zeros((spot_slices[-1].stop, count)), np.zeros((4 * len(cameras), count))
@@ -583,7 +612,12 @@ def _spots_of(cameras: Mapping[str, CameraCalibration]) -> list[slice]:
 
 
 def _family_amounts(cameras: Mapping[str, CameraCalibration], noise: np.ndarray) -> np.ndarray:
-    """Return the gain of the cameras' own motions, (S, P, D), for covariances of the shifts (S, D, D), in px^2."""
+    """Return the matrix from spot shifts (px) to the amounts of the cameras' own four motions, (S, P, D).
+
+    ``noise`` holds the covariances of the shifts, (S, D, D), in px^2.
+
+    Dimensions: S states, P motions, D spot coordinates (row and column of every spot).
+    """
     spot_slices = _spots_of(cameras)
     out = np.zeros((len(noise), 4 * len(cameras), spot_slices[-1].stop))
     for k, (camera, spot_rows) in enumerate(zip(cameras.values(), spot_slices, strict=True)):
@@ -595,7 +629,10 @@ def _family_amounts(cameras: Mapping[str, CameraCalibration], noise: np.ndarray)
 
 
 def _together(motions: Sequence[ElementaryMotion], amounts: np.ndarray) -> list[State]:
-    """Return the states of amounts (S, P), in SI units, of motions that have one pivot for each body."""
+    """Return the states of amounts (S, P), in SI units, of motions that have one pivot for each body.
+
+    Dimensions: S states, P motions.
+    """
     states: list[State] = []
     for row in amounts.tolist():
         out: dict[str, Motion] = {}
@@ -608,7 +645,7 @@ def _together(motions: Sequence[ElementaryMotion], amounts: np.ndarray) -> list[
 
 
 def _traced(path: MonitorPath, sight: LineSight, states: Sequence[State]) -> Retraced:
-    """Return the effects of S states; NaN for a state whose light is lost."""
+    """Return the spot shifts and camera changes of S states; NaN for a state whose light is lost."""
     try:
         return traced_states(path, sight, states)
     except LOST:

@@ -82,7 +82,7 @@ class MonitorExperiment:
     backend
         Backend of the ray trace.
     free_beams
-        See ``build_instrument``.
+        True to refuse bodies that block the monitor's beams.
 
     Raises
     ------
@@ -111,7 +111,7 @@ class MonitorExperiment:
         self._patterns: dict[int | tuple[int, ...], FixedPattern] = {}
 
     def _keep(self) -> None:
-        """Cache the calibration for later processes."""
+        """Store the calibration in the disk cache for later processes."""
         self._entry.write({name: vars(self)[name] for name in _CALIBRATED if name in vars(self)})
 
     @property
@@ -131,7 +131,7 @@ class MonitorExperiment:
 
     @cached_property
     def path(self) -> MonitorPath:
-        """Optical path of the monitor."""
+        """Optical path of the monitor's light, which computes spots and images."""
         self.resolved.instrument.autocollimator  # noqa: B018 - raises an error if there is none
         return MonitorPath(self.instrument, self.backend)
 
@@ -145,12 +145,15 @@ class MonitorExperiment:
             raise self.resolved.instrument.error(problem, key, allowed=error.remedy) from error
 
     def size(self, frames: int = 1, times: int = 0, pictures: int = 0) -> MonitorSize:
-        """Return the numbers that determine the memory of a job; arguments as for ``MonitorSize``."""
+        """Return the numbers from which the memory of a job is estimated.
+
+        The arguments are the numbers of frames of each state, of times, and of pixels of other images.
+        """
         phase = self.path.node_classes.phase_per_pixel
         return MonitorSize(len(self.path.channels), *self.path.shape, phase, frames, times, pictures)
 
     def stating(self, resolved: ResolvedJob) -> MonitorExperiment:
-        """Return an experiment on the same instrument with the prior of another job, sharing everything computed.
+        """Return an experiment on the same instrument with the prior of another job, sharing all that is computed.
 
         Parameters
         ----------
@@ -185,6 +188,8 @@ class MonitorExperiment:
 
         They are in double precision: rounding to single precision adds noise that the template's factors would have to
         follow.
+
+        Dimensions: C channels.
         """
         return self.path.expected_photons([{}], margin=TEMPLATE_MARGIN, single=False)[0]
 
@@ -211,9 +216,9 @@ class MonitorExperiment:
         return job_state(job, self.thermal, progress, self.motions(job), self.heated(job))
 
     def motions(self, job: JobSpec, time: int | None = None) -> State:
-        """Return the state that a job describes without its ``fields``.
+        """Return the state that a job describes at a time, without its temperatures (``fields``).
 
-        It is ``motions_of`` on top of the deformations of the bodies.
+        The motions of the job are added to the deformations of bodies from tables of nodes.
 
         Raises
         ------
@@ -223,7 +228,7 @@ class MonitorExperiment:
         return on_deformed(self.instrument, self.deformed(job), motions_of(job, time), self.heated(job))
 
     def fields(self, job: JobSpec, time: int | None = None) -> dict[str, Temperature]:
-        """Return the linear temperatures of a job's bodies at time number ``time``, including those of tables.
+        """Return body -> linear temperature field of a job at time number ``time``, including those of tables.
 
         Raises
         ------
@@ -270,7 +275,10 @@ class MonitorExperiment:
 
     @property
     def nominal_photons(self) -> np.ndarray:
-        """Expected photons per pixel and frame of the unperturbed instrument, (C, rows, columns)."""
+        """Expected photons per pixel and frame of the unperturbed instrument, (C, rows, columns).
+
+        Dimensions: C channels.
+        """
         m = TEMPLATE_MARGIN
         return self.wide_photons[:, m:-m, m:-m]
 
@@ -300,7 +308,7 @@ class MonitorExperiment:
 
     @cached_property
     def _truth_by_family(self) -> dict[str, np.ndarray]:
-        """Camera -> (4, 4) true parameters per unit of the four motions of its line family."""
+        """Camera -> true change of its four parameters, (4, 4), per unit of each of the four motions of paper 001."""
         names = list(self.instrument.cameras)
         motions = [motion for name in names for motion in line_family(name)]
         jacobians = truth_jacobian(self.instrument, self.backend, motions)
@@ -308,7 +316,7 @@ class MonitorExperiment:
 
     @cached_property
     def cameras(self) -> dict[str, CameraCalibration]:
-        """Calibration of every camera without images: geometry and Jacobians of the nominal instrument."""
+        """Camera -> its calibration without images: geometry, and Jacobians of spots and parameters."""
         families = {name: line_family(name) for name in self.instrument.cameras}
         spots = spot_jacobian(self.path, [motion for family in families.values() for motion in family])
         cameras = {}
@@ -353,7 +361,7 @@ class MonitorExperiment:
 
     @cached_property
     def stated(self) -> DisturbancePrior | None:
-        """Motions of the job's prior, by component; None without a prior.
+        """Motions of the bodies in the job's prior, by component; None without a prior.
 
         Raises
         ------
@@ -367,9 +375,9 @@ class MonitorExperiment:
 
     @cached_property
     def disturbances(self) -> Disturbances | None:
-        """Prior with its derivatives for the analysis; None without a prior.
+        """Prior of the job with its effects on spots and cameras, for the analysis; None without a prior.
 
-        Raises the InputError of `stated`.
+        InputError is raised if the prior names a body that does not exist or cannot move in this way.
         """
         prior = self.stated
         if prior is None:
@@ -380,14 +388,18 @@ class MonitorExperiment:
 
     @cached_property
     def motion_models(self) -> Mapping[str, MotionModel]:
-        """Estimator -> motion model for retracing. Raises the InputError of `stated`."""
+        """Estimator -> the motions that it assumes, by which its results are checked with a ray trace.
+
+        InputError is raised if the prior names a body that does not exist or cannot move in this way.
+        """
         prior, known = self.stated, self.disturbances
         return motion_models(self.path, self.sight, self.cameras, self.thermal, prior, known)
 
     def geometry(self, camera: str) -> MonitorGeometry:
-        """Return the calibrated numbers of the formulas: principal distance, plate scale, distortion, L, pixel pitch.
+        """Return the calibrated numbers that the formulas of paper 001 use for one camera.
 
-        The papers leave alpha and beta of their cos^2 undefined; they are taken as the field angles of the area CCDs.
+        They are principal distance, plate scale, distortion, distance of the area CCDs and pixel pitch. The papers
+        leave alpha and beta of their cos^2 undefined; they are taken as the field angles of the area CCDs.
         """
         by_x, by_y, *_ = self._truth_by_family[camera].T
         channels = self.instrument.spec.channels_of(camera)
@@ -409,9 +421,11 @@ class MonitorExperiment:
         return SpotTemplate.from_image(image, float(row), float(column), self.path.shape)
 
     def pattern(self, seed: int | Sequence[int]) -> FixedPattern:
-        """Return PRNU and DSNU of all area CCDs, (C, rows, columns), the same before and after.
+        """Return the fixed pattern (response and offset of every pixel) of all area CCDs, (C, rows, columns).
 
-        Several seeds give (seeds, C, rows, columns).
+        It is the same before and after. Several seeds give (seeds, C, rows, columns).
+
+        Dimensions: C channels.
         """
         key = tuple(seed) if isinstance(seed, Sequence) else seed
         pattern = self._patterns.get(key)
@@ -422,7 +436,7 @@ class MonitorExperiment:
         return pattern
 
     def _drawn_pattern(self, seed: int | tuple[int, ...]) -> FixedPattern:
-        """Draw PRNU and DSNU of all area CCDs."""
+        """Draw at random the response (PRNU) and offset (DSNU) of every pixel of all area CCDs."""
         if isinstance(seed, tuple):
             patterns = [self._drawn_pattern(pattern) for pattern in seed]
             return FixedPattern(
@@ -432,6 +446,8 @@ class MonitorExperiment:
 
     def frames_before(self, frames: int, seed: int | Sequence[int], stray: np.ndarray | float = 0.0) -> np.ndarray:
         """Return frames of the nominal state with stray light, uint16 (C, frames, rows, columns).
+
+        Dimensions: C channels.
 
         Parameters
         ----------
@@ -455,6 +471,8 @@ class MonitorExperiment:
         self, photons: np.ndarray, frames: int, seed: int | Sequence[int], first: int | np.ndarray = 0
     ) -> np.ndarray:
         """Return frames of perturbed states, uint16 (S, C, frames, rows, columns).
+
+        Dimensions: S states, C channels.
 
         Parameters
         ----------

@@ -30,7 +30,7 @@ LARGEST_FRAMES = 200_000_000
 
 
 def largest_piece(each: int) -> int:
-    """Return the number of states of a series that are rendered at once.
+    """Return the number of states of a series that are rendered at once, so that memory is limited.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def largest_piece(each: int) -> int:
 
 
 def pieces(count: int, each: int) -> Iterator[slice]:
-    """Yield slices of the states of a series whose frames are processed at once.
+    """Yield slices of the states of a series; the frames of one slice are processed at once.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ _RAY = 600.0
 GREY = 2.0
 """Bytes per pixel of a recorded frame."""
 _OF_COURSE = 6.0
-"""Bytes per pixel and time of a course: expected photons in single precision, and a first frame."""
+"""Bytes per pixel and time of a course (time series of states): single-precision photons and a first frame."""
 WRITTEN = 60.0
 """Bytes per pixel of a spot's image for drawing and writing: photons, their file, means."""
 _OF_STATE = 24.0
@@ -89,7 +89,7 @@ class MonitorSize:
     frames : int
         Number of frames of each state.
     times : int
-        Number of times of a course, 0 for none.
+        Number of times of a course (time series of states), 0 if there is none.
     pictures : int
         Pixels of the frames of all other images.
     """
@@ -104,7 +104,7 @@ class MonitorSize:
 
     @classmethod
     def stated(cls, resolved: ResolvedJob, frames: int, times: int = 0, pictures: int = 0) -> MonitorSize:
-        """Return the size according to an instrument's files, before it is built.
+        """Return the size as given by an instrument's files, before the instrument is built.
 
         Parameters
         ----------
@@ -113,7 +113,7 @@ class MonitorSize:
         frames : int
             Number of frames of each state.
         times : int
-            Number of times of a course, 0 for none.
+            Number of times of a course (time series of states), 0 if there is none.
         pictures : int
             Pixels of the frames of all other images.
 
@@ -135,7 +135,7 @@ class MonitorSize:
         return self.spots * NodeClasses(self.phase, (0.5 * self.rows, 0.5 * self.columns)).sharp_count
 
     def parts(self, detector: EmvaDetector) -> Mapping[str, float]:
-        """Return the memory of the CCDs, frames, times and other pictures, in bytes.
+        """Return name of a part of the job -> its memory in bytes: CCDs, frames, times and other pictures.
 
         Parameters
         ----------
@@ -195,7 +195,7 @@ def require_memory(resolved: ResolvedJob, size: MonitorSize, detector: EmvaDetec
 
 
 def _lowered(resolved: ResolvedJob, size: MonitorSize, part: str, detector: EmvaDetector) -> tuple[str, Lowered]:
-    """Return a description of one of the ``parts``, and the number that determines it."""
+    """Return a description of a part of the memory, and the number in the files that must be lowered to reduce it."""
     job, rows, columns, frames = resolved.job, size.rows, size.columns, size.frames
     owner: Spec = job
     least = 1

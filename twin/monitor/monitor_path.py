@@ -93,7 +93,7 @@ class MonitorPath(MonitorBeams):
         Raises
         ------
         BeamMissedError, AimError
-            Light is lost, see ``rays``.
+            A beam misses the mirrors or a spot its CCD.
         UncertainImageError
             No quadrature is sufficient.
         """
@@ -103,14 +103,14 @@ class MonitorPath(MonitorBeams):
 
     @cached_property
     def _own_class(self) -> int:
-        """Class of nodes of the unperturbed instrument."""
+        """Number of the class of pupil nodes that the unperturbed instrument needs."""
         coarse = self.coarse_trace([{}])
         far = np.broadcast_to((1.0 - 1e-9) * SPOT_RANGES[-1] * 0.5 * np.array(self.shape), coarse.centre.shape)
         number = int(self.node_classes.class_of(far, 0, coarse.blur, coarse.aperture / self.numerical_aperture)[0])
         return self._require_class(number, coarse, 0)
 
     def class_beams(self, number: int) -> MonitorBeams:
-        """Return beams with the number of nodes of a class."""
+        """Return the monitor's beams with the pupil nodes of the class of a number."""
         if not self._sized or number == self._own_class:
             return self
         if number not in self._class_beams:
@@ -119,6 +119,8 @@ class MonitorPath(MonitorBeams):
 
     def class_of(self, coarse: CoarseTrace, margin: int = 0) -> np.ndarray:
         """Return the class of nodes that suffices for all spots of each state, (S,), as estimated from a few rays.
+
+        Dimensions: S states.
 
         Parameters
         ----------
@@ -135,7 +137,10 @@ class MonitorPath(MonitorBeams):
         return self.node_classes.class_of(position, margin, coarse.blur, widening)
 
     def _require_class(self, number: int, coarse: CoarseTrace, state: int) -> int:
-        """Return the number of a class if it exists. Raises UncertainImageError for a spot that is blurred too much."""
+        """Return the number of a class of pupil nodes if it exists.
+
+        UncertainImageError is raised for a spot that is blurred too much for any class.
+        """
         if number >= len(self.node_classes.reached):
             worst = int(np.argmax(coarse.blur[:, state]))
             raise UncertainImageError(
@@ -148,7 +153,7 @@ class MonitorPath(MonitorBeams):
 
     @property
     def response(self) -> PixelResponse:
-        """Response of pixel and pinhole for the unperturbed instrument.
+        """Combined response of a pixel and the pinhole's image, for the unperturbed instrument.
 
         A pinhole is assumed to expand with the CCD beside it.
 
@@ -160,7 +165,7 @@ class MonitorPath(MonitorBeams):
         return self._response(0)
 
     def _response(self, wider: int) -> PixelResponse:
-        """Return the response for beams that are wider by some steps of ``WIDEST``."""
+        """Return the response of pixel and pinhole for beams whose aperture is wider by some factors of ``WIDEST``."""
         if wider not in self._responses:
             pinhole = self.instrument.spec.autocollimator.reticle.pinhole
             cutoff = 2.0 * self.numerical_aperture * WIDEST**wider / self.wavelength
@@ -185,7 +190,9 @@ class MonitorPath(MonitorBeams):
     def expected_photons(
         self, states: Sequence[State], margin: int = 0, chunk: int = 32, single: bool = True
     ) -> np.ndarray:
-        """Return the expected photons per pixel and frame.
+        """Return the expected photons per pixel and frame of all area CCDs in S states.
+
+        Dimensions: C channels.
 
         Parameters
         ----------
@@ -196,7 +203,7 @@ class MonitorPath(MonitorBeams):
         chunk : int
             Number of states rendered at once, to limit memory.
         single : bool
-            True for single precision, see ``optics.waves.diffraction.image``.
+            True to compute the images in single precision.
 
         Returns
         -------
@@ -211,7 +218,7 @@ class MonitorPath(MonitorBeams):
     def iterate_photons(
         self, states: Sequence[State], margin: int = 0, chunk: int = 32, single: bool = True
     ) -> Iterator[tuple[slice, np.ndarray]]:
-        """Yield ``expected_photons`` piece by piece: (slice of the states, photons)."""
+        """Yield the images of ``expected_photons`` for some states at a time: (slice of the states, photons)."""
         for start in range(0, len(states), chunk):
             chunk_states = states[start : start + chunk]
             with one_blas_thread():
@@ -224,6 +231,8 @@ class MonitorPath(MonitorBeams):
         They equal ``expected_photons`` to the last bit; channels of cameras without moved bodies are rendered only
         once.
 
+        Dimensions: C channels.
+
         Parameters
         ----------
         state : State
@@ -231,12 +240,12 @@ class MonitorPath(MonitorBeams):
         placed : PlacedBodies | None
             Bodies of the state, if already placed.
         single : bool
-            True for single precision, see ``optics.waves.diffraction.image``.
+            True to compute the images in single precision.
 
         Raises
         ------
         BeamMissedError, AimError
-            Light is lost, see ``rays``.
+            A perturbation moves a beam off the mirrors or a spot off its CCD.
         """
         with one_blas_thread():
             placed = self.instrument.assembly.place([state]) if placed is None else placed
@@ -293,7 +302,10 @@ class MonitorPath(MonitorBeams):
         return self._parts[names]
 
     def _at_rest(self, single: bool) -> tuple[np.ndarray, int]:
-        """Return the photons of the unperturbed instrument (C, rows, columns), and their class."""
+        """Return the photons of the unperturbed instrument, (C, rows, columns), and the class of pupil nodes they need.
+
+        Dimensions: C channels.
+        """
         if single not in self._rested:
             photons, number = self._render([{}], 0, single)
             self._rested[single] = photons[0], int(number[0])
@@ -302,7 +314,9 @@ class MonitorPath(MonitorBeams):
     def _render(
         self, states: Sequence[State], margin: int, single: bool, coarse: CoarseTrace | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the expected photons, each state with the nodes of its class, and these classes.
+        """Return the expected photons, each state with the pupil nodes of its class, and the classes.
+
+        Dimensions: S states, C channels.
 
         Returns
         -------
@@ -336,10 +350,13 @@ class MonitorPath(MonitorBeams):
     def _images(
         self, states: Sequence[State], coarse: CoarseTrace, number: int, margin: int, single: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return photons of states with the nodes of a class, (S, C, ...), and the class that each needs, (S,).
+        """Return the photons of states, (S, C, ...), with nodes of one class, and the class that each needs, (S,).
 
-        States for which two rules disagree need a larger class. A vignetted beam gets the last class: each rule has its
-        own error at the beam's edge, and two may agree by chance.
+        States for which two quadratures over the pupil disagree need a larger class. A beam that is partly cut off
+        (vignetted) gets the last class: each quadrature has its own error at the beam's edge, and two may agree by
+        chance.
+
+        Dimensions: S states, C channels.
 
         Raises
         ------
@@ -371,7 +388,12 @@ class MonitorPath(MonitorBeams):
         return np.swapaxes(photons, 0, 1), wanted
 
     def _require_alike(self, difference: np.ndarray, rays: CcdRays) -> None:
-        """Raise UncertainImageError if the difference (C, S) of two rules, relative to the peaks, is too large."""
+        """Raise UncertainImageError if two quadratures over the pupil give images that differ too much.
+
+        ``difference`` is relative to the images' peaks, (C, S).
+
+        Dimensions: C channels, S states.
+        """
         channel, state = np.unravel_index(np.argmax(difference), difference.shape)
         if difference[channel, state] > WRONG:
             lost = 1.0 - float(np.mean(rays.valid[channel * difference.shape[1] + state]))
@@ -390,6 +412,8 @@ class MonitorPath(MonitorBeams):
         self, images: np.ndarray, rays: CcdRays, share: np.ndarray, margin: int, known_bad: np.ndarray
     ) -> np.ndarray:
         """Raise UncertainImageError if the light of images (C*S, R, C) does not equal that of their rays.
+
+        Dimensions: C channels, S states, R rows.
 
         Returns
         -------
@@ -416,6 +440,8 @@ class MonitorPath(MonitorBeams):
         """Factor from an image of unit power to photons per pixel and frame, (C,), in m^2.
 
         It is photons per frame times the pixel's area.
+
+        Dimensions: C channels.
         """
         return np.array([channel.photons * self.pitch**2 for channel in self.channels])
 
@@ -443,5 +469,8 @@ class SpotPath(_OnSpots, MonitorPath):
     """
 
     def class_of(self, coarse: CoarseTrace, margin: int = 0) -> np.ndarray:
-        """Return the class of nodes that suffices for all spots of each state at the centres of their CCDs, (S,)."""
+        """Return the class of pupil nodes that suffices for all spots of each state, centred on their CCDs, (S,).
+
+        Dimensions: S states.
+        """
         return super().class_of(replace(coarse, centre=np.zeros_like(coarse.centre)), margin)

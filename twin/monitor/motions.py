@@ -14,12 +14,12 @@ from scenes.specs.instrument import BASE, CENTRAL_PRISM
 _UNITS = {"rotate": ("arcsec", ARCSEC), "shift": ("um", 1e-6), "scale": ("ppm", 1e-6), "figure": ("nm", 1e-9)}
 _AXES = "XYZ"
 FIGURE_TERMS = {4: "power", 5: "astigmatism", 6: "astigmatism", 7: "coma", 8: "coma"}
-"""Noll index of the figure terms in the tables -> name."""
+"""Noll index of each Zernike term of a mirror's figure in the tables -> its name."""
 
 
 @dataclass(frozen=True)
 class ElementaryMotion:
-    """Component of the motion of one body.
+    """One component of the motion of one body: a rotation, a shift, a change of size or a figure term.
 
     Attributes
     ----------
@@ -48,16 +48,16 @@ class ElementaryMotion:
 
     @property
     def unit_size(self) -> float:
-        """Size of the table unit, in SI units."""
+        """Size of the unit used in tables, in SI units (1e-6 for um)."""
         return _UNITS[self.kind][1]
 
     @property
     def step(self) -> tuple[str, str, int]:
-        """Step for the derivative in ``Assembly.place``."""
+        """Body, kind and axis of the motion, as ``Assembly.place`` needs them for the derivative."""
         return self.body, self.kind, self.axis
 
     def motion(self, amount: float) -> Motion:
-        """Return the motion of this amount, in SI units."""
+        """Return the motion of the body by an amount in SI units."""
         along = triple(amount if self.axis == a else 0.0 for a in range(3))
         match self.kind:
             case "rotate":
@@ -123,5 +123,5 @@ def _six(body: str, name: str, pivot: str) -> list[ElementaryMotion]:
 
 
 def pivot_states(motions: Sequence[ElementaryMotion]) -> list[State]:
-    """Return unperturbed states with each motion's pivot and figure term, for derivatives about them."""
+    """Return for each motion the unperturbed state with its pivot and figure term, for derivatives about that state."""
     return [m.state(0.0) for m in motions]

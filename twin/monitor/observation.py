@@ -1,7 +1,7 @@
 """Observation of states of an instrument: trace, render, expose and recover them.
 
-The main job, courses, studies, the live twin, error budgets and random states all use it; their differences are in
-`ObservationOptions`.
+The main job, courses (time series of states), studies, the live twin, error budgets and random states all use it; their
+differences are in `ObservationOptions`.
 """
 
 from __future__ import annotations
@@ -26,12 +26,16 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import Truth
 
 LOST = (AimError, BeamMissedError)
-"""Exceptions of a state whose light is lost."""
+"""Exceptions that mean that the light of a state does not reach the area CCDs."""
 
 Record: TypeAlias = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray | MeasuredSpots, np.ndarray]]
-"""Function that exposes the detectors, with its own random streams. From expected photons (S, C, rows, columns) and
-state numbers (S,) it returns the frames before, (C, frames, rows, columns) for all states or (S, C, frames, rows,
-columns), or already measured spots before; and the frames after, (S, C, frames, rows, columns).
+"""Function that exposes the detectors, with its own random streams.
+
+From expected photons (S, C, rows, columns) of S states and C channels, and state numbers (S,), it returns the frames
+before, (C, frames, rows, columns) for all states or (S, C, frames, rows, columns), or already measured spots before;
+and the frames after, (S, C, frames, rows, columns).
+
+Dimensions: S states, C channels.
 """
 
 
@@ -42,18 +46,19 @@ class ObservationOptions:
     Attributes
     ----------
     record : Record
-        Exposes the detectors.
+        Function that exposes the detectors: from expected photons and state numbers to frames before and after.
     centroid : str
-        Centroid method, see ``analysis.monitor.recovery.recover_monitor``.
+        Centroid method of the spots: ``ml``, ``gaussian`` or ``energy``.
     chunk : int
         Number of states processed at once; the last digits of a state depend on the others in its chunk.
     single : bool
         True to render in single precision.
     omit : callable | None
-        Called with number and reason of each state that is omitted because its light does not arrive or a spot cannot
-        be measured; None to raise the error instead.
+        Function that is called with the number and reason of each state that is omitted because its light does not
+        arrive or a spot cannot be measured; None to raise the error instead.
     use_prior : bool
-        True to use the experiment's prior and retrace its motions; False for noise alone.
+        True to use the experiment's prior, and to check results by a ray trace of its motions; False to report standard
+        deviations due to noise alone.
     keep_parts : bool
         True to return the parts of the noise, which are large.
     frames : int | None
@@ -73,7 +78,9 @@ class ObservationOptions:
 @shows()
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Light of S states on the area CCDs.
+    """Light of S states on the area CCDs before detection, with the true changes of the cameras.
+
+    Dimensions: C channels.
 
     Attributes
     ----------
@@ -132,7 +139,9 @@ def observe(
     how: ObservationOptions,
     numbers: Sequence[int] | np.ndarray | None = None,
 ) -> Iterator[Observation]:
-    """Trace, render, expose and recover states, piece by piece.
+    """Trace, render, expose and recover states, some at a time.
+
+    Dimensions: S states.
 
     Parameters
     ----------
@@ -187,6 +196,8 @@ def light_of(
 ) -> Light:
     """Trace and render states together.
 
+    Dimensions: C channels.
+
     Parameters
     ----------
     experiment : MonitorExperiment
@@ -225,7 +236,7 @@ def why_lost(experiment: MonitorExperiment, state: State) -> str:
 
 
 def read(experiment: MonitorExperiment, light: Light, how: ObservationOptions) -> Observation | None:
-    """Expose and recover states; None if no state can be measured.
+    """Expose the area CCDs to the light of states and recover the changes; None if no state can be measured.
 
     Parameters
     ----------
@@ -311,7 +322,7 @@ class StateReader:
     seed
         Seed of all noise.
     centroid
-        Centroid method, see ``analysis.monitor.recovery.recover_monitor``.
+        Centroid method of the spots: ``ml``, ``gaussian`` or ``energy``.
     """
 
     def __init__(self, experiment: MonitorExperiment, frames: int, seed: int, centroid: str = "ml") -> None:
@@ -319,7 +330,10 @@ class StateReader:
 
     @cached_property
     def before(self) -> np.ndarray:
-        """Frames of the unperturbed instrument, uint16 (C, frames, rows, columns)."""
+        """Frames of the unperturbed instrument, uint16 (C, frames, rows, columns).
+
+        Dimensions: C channels.
+        """
         return self.experiment.frames_before(self.frames, self.seed)
 
     @cached_property
@@ -334,6 +348,8 @@ class StateReader:
     def read(self, state: State, noise: bool = True, number: int = 0, single: bool = False) -> Observation:
         """Trace, render and recover a state.
 
+        Dimensions: C channels.
+
         Parameters
         ----------
         state : State
@@ -342,7 +358,8 @@ class StateReader:
             True to expose frames. False to measure the expected images, (1, C, rows, columns); sigmas are those that
             the noise of the frames would cause.
         number : int
-            Number of the state, which selects its random stream; for a course, the number of the time.
+            Number of the state, which selects its random stream; for a course (time series of states), the number of
+            the time.
         single : bool
             True to render in single precision, as for all times of a course.
 

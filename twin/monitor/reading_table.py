@@ -1,7 +1,7 @@
-"""Table of readings of states: the value, sigmas and truth of every change by every estimator.
+"""Table of what every estimator reads in each state: value, standard deviations and true change.
 
-The table is made once for a state or a course. JSON files, the terminal, reports, CSV tables, scripts, studies and the
-live page are views of it. The parameters are declared in `analysis.monitor.parameters`.
+The table is made once for a state or a course (time series of states). JSON files, the terminal, reports, CSV tables,
+scripts, studies and the live page are views of it. The parameters are declared in `analysis.monitor.parameters`.
 """
 
 from __future__ import annotations
@@ -27,9 +27,11 @@ from twin.monitor.truth import Truth
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """Reading of one change by one estimator: a row of the table, in the parameter's unit.
+    """One change as read by one estimator: a row of the table, in the unit of the parameter.
 
-    Numbers are arrays over the states (S,), or floats of one state. For a whole course they are root mean squares.
+    Numbers are arrays over S states, (S,), or floats of one state. For a whole time series they are root mean squares.
+
+    Dimensions: S states.
 
     Attributes
     ----------
@@ -39,15 +41,15 @@ class Reading:
         Parameter that changes.
     estimator : str
         Name of the estimator.
-    true : Any
+    true : float or (S,) ndarray
         True change from the exact trace; NaN for a measurement.
-    value : Any
+    value : float or (S,) ndarray
         Value of the reading.
-    error : Any
+    error : float or (S,) ndarray
         Value minus true change.
-    sigma : Any
+    sigma : float or (S,) ndarray
         Total standard deviation of the error.
-    noise : Any
+    noise : float or (S,) ndarray
         Standard deviation from the noise of the images alone.
     """
 
@@ -67,7 +69,7 @@ class Reading:
 
     @property
     def where(self) -> str:
-        """Camera; ``both`` for the angle between two cameras, ``ground`` for errors on the ground."""
+        """Name of the camera; ``both`` for the angle between two cameras, ``ground`` for errors on the ground."""
         return {ANGLE_GROUP: "both"}.get(self.group, self.group)
 
     @property
@@ -79,19 +81,22 @@ class Reading:
 
     @property
     def ratio(self) -> float:
-        """Error in sigmas; without noise, infinite unless it is rounding error; NaN for a missing reading."""
+        """Error divided by its standard deviation; NaN for a missing reading.
+
+        Without noise it is infinite unless the error is only rounding.
+        """
         if self.sigma > 0.0 or math.isnan(self.sigma):
             return float(self.error / self.sigma)
         return 0.0 if abs(self.error) < SAME else math.copysign(math.inf, self.error)
 
     @property
     def size(self) -> float:
-        """Value in sigmas."""
+        """Value divided by its standard deviation."""
         return float(self.value / self.sigma) if self.sigma > 0.0 else 0.0
 
     @property
     def far(self) -> bool:
-        """True if reports mark the error."""
+        """True if the error is so many standard deviations large that reports mark it."""
         return abs(self.ratio) > FAR
 
     def shown(self, value: float, sign: bool = False) -> str:
@@ -108,21 +113,21 @@ class Reading:
 
     @property
     def read(self) -> str:
-        """Value, sigma and unit as text."""
+        """Text of the value with its standard deviation and unit."""
         return f"{self.shown(self.value)} ± {self.shown(self.sigma)} {self.parameter.unit}"
 
     def group_in(self, nested: dict[str, Any]) -> dict[str, Any]:
-        """Return the reading's group in JSON files as `ReadingTable.groups` nests them; it is added if missing.
+        """Return the part of nested results to which this reading belongs; it is added if missing.
 
         Parameters
         ----------
         nested : dict
-            Groups, including ``cameras``.
+            Results by group: ``cameras``, ``intersection_angle`` and ``ground``, each by estimator.
         """
         return nested["cameras"].setdefault(self.camera, {}) if self.camera else nested.setdefault(self.group, {})
 
     def each(self, of: Callable[[Any], Any]) -> Reading:
-        """Return the reading with a function applied to its numbers.
+        """Return the reading with a function applied to each of its numbers.
 
         Parameters
         ----------
@@ -191,14 +196,14 @@ class ReadingTable:
         return list(out.values())
 
     def row(self, group: str, key: str, estimator: str) -> Reading:
-        """Return one row.
+        """Return the reading of one change by one estimator.
 
         Parameters
         ----------
         group : str
-            Group of the change.
+            Camera, ``intersection_angle`` or ``ground``.
         key : str
-            Key of the change.
+            Name of the change in files, such as ``d_f_um``.
         estimator : str
             Name of the estimator.
         """
@@ -228,7 +233,7 @@ class ReadingTable:
         return out
 
     def true(self) -> dict[str, Any]:
-        """Return the true changes as JSON files nest them: as `groups`, without estimators."""
+        """Return the true changes as plain data, nested by group as in JSON files."""
         out: dict[str, Any] = {"cameras": {}}
         for row in self.rows:
             group = row.group_in(out)
@@ -238,7 +243,7 @@ class ReadingTable:
 
     @staticmethod
     def joined(parts: Sequence[ReadingTable]) -> ReadingTable:
-        """Return one table of the states of several tables.
+        """Return one table for the states of several tables, one table after the other.
 
         Parameters
         ----------
@@ -273,7 +278,9 @@ def reading_table(
     ground: GroundGeometry | None = None,
     prior: Disturbances | None = None,
 ) -> ReadingTable:
-    """Return the table of estimates; a change that no motion of the prior causes has no posterior, NaN.
+    """Return the table of all readings from the results of the estimators.
+
+    A change that no motion of the prior causes has no estimate by the estimators that need a prior; it is NaN.
 
     Parameters
     ----------
@@ -286,7 +293,7 @@ def reading_table(
     ground : GroundGeometry | None
         Ground geometry of a pair of known altitude, for the true ground errors.
     prior : Disturbances | None
-        Prior of the estimators that need one; None for none.
+        Prior of the estimators that need one; None if there is none.
     """
     rows: list[Reading] = []
     fixed_changes = frozenset() if prior is None else unchanged_quantities(prior, cameras, ground)
@@ -294,7 +301,10 @@ def reading_table(
     def add(
         group: str, which: Iterable[Parameter], true: np.ndarray | None, read: Mapping[str, Sequence[np.ndarray]]
     ) -> None:
-        """Append rows from arrays of numbers (S, P)."""
+        """Append the rows of a group of changes from arrays (S, P) of their numbers.
+
+        Dimensions: S states, P changes.
+        """
         for k, parameter in enumerate(which):
             for estimator, (values, sigmas, noises) in read.items():
                 value = values[:, k]
@@ -339,5 +349,10 @@ def reading_table(
 
 
 def _sigma(combination: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return (S, P) standard deviations of combinations (P, 4) of parameters with covariances (S, 4, 4)."""
+    """Return the standard deviations (S, P) of P linear combinations of a camera's four parameters.
+
+    ``combination`` holds the coefficients (P, 4), ``covariance`` the covariances of the parameters (S, 4, 4).
+
+    Dimensions: S states, P changes.
+    """
     return np.asarray(np.sqrt(np.einsum("pi,sij,pj->sp", combination, covariance, combination)))

@@ -1,4 +1,4 @@
-"""Error budget of a monitor by mechanism: random states of each cause, rendered, measured and converted to angles.
+"""Error budget of a monitor: random states of each cause, rendered, measured and converted to angles.
 
 The first line is the noise of the centroid; each other line is one cause of a disturbances file. A line is the error of
 one spot's position as an angle, displacement / principal distance, at 3 sigma: three times the rms over random states,
@@ -31,7 +31,7 @@ _CENTROID = "centroid"
 """Name of the line for the noise of the image alone."""
 
 ALLOWED = 0.1 * ARCSEC
-"""Error of one line for which the allowed input is computed, 3 sigma, in radians."""
+"""Error of one line for which the allowed input is computed: three standard deviations, in radians."""
 _SEARCH_STEPS = 4
 
 _PARAMETER_FIELDS = ("d_alpha_rad", "d_beta_rad", "d_gamma_rad", "d_f_m")
@@ -41,12 +41,12 @@ Progress = Callable[[float, str], None]
 
 @dataclass(frozen=True)
 class BudgetLine:
-    """Simulated line of the budget.
+    """One line of the error budget: the effect of one cause on the position of a spot, as an angle.
 
     Attributes
     ----------
     name : str
-        CENTROID or a cause.
+        ``centroid`` for the noise of the image, or the name of a cause in the disturbances file.
     three_sigma : float
         Three times the rms of a spot's angle error per axis, in radians.
     sigma : float
@@ -54,11 +54,12 @@ class BudgetLine:
     by_axis : tuple of float
         Three times the rms for the spots' rows (along Y) and columns (along X), in radians.
     value : float
-        Input of the line, 3 sigma; 1 if the components of a cause have different sigmas.
+        Three standard deviations of the cause (input of the line); 1 if the components of a cause have different
+        sigmas.
     unit : str
         Unit of the input; "times the prior" if the components of a cause have different sigmas.
     allowed : float
-        Input for an error of 0.1 arcsec, in the unit of ``value``.
+        Input that causes an error of 0.1 arcsec (3 sigma), in the unit of ``value``.
     """
 
     name: str
@@ -129,17 +130,17 @@ class ErrorBudget:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """Names of all lines."""
+        """Names of all lines of the budget: the centroid's noise, then the causes."""
         return (_CENTROID, *self.causes)
 
     @cached_property
     def radians_per_pixel(self) -> float:
-        """Angle error of a spot per pixel of displacement: pixel pitch over principal distance."""
+        """Angle error of a spot per pixel of its displacement: pixel pitch divided by principal distance."""
         distances = list(self.experiment.nominal_truth.principal_distance.values())
         return self.experiment.path.pitch / float(np.mean(distances))
 
     def line(self, name: str, progress: Progress = lambda fraction, text: None) -> BudgetLine:
-        """Simulate one line.
+        """Simulate one line of the budget: the noise of the centroid, or one cause.
 
         Raises
         ------
@@ -155,7 +156,7 @@ class ErrorBudget:
         return self._line(name, _shifts(self.experiment, states), value, unit)
 
     def input_of(self, cause: str) -> tuple[float, str]:
-        """Return a cause's input, 3 sigma, and its unit. Raises ValueError if there is no such cause."""
+        """Return three standard deviations of a cause, and their unit; raise ValueError if there is no such cause."""
         components = self.prior.of_causes((cause,)).components
         if not components:
             raise ValueError(f"error budget: no cause {cause!r}; there are {', '.join(self.causes)}")
@@ -182,7 +183,9 @@ class ErrorBudget:
         return states_of(amounts, prior.components, self.experiment.thermal)
 
     def warmed_focal_planes(self, warmer: float) -> tuple[float, float]:
-        """Return the true d_f of warmer focal planes and its reading by paper 001, eq. (7), in metres.
+        """Return the true change of principal distance of warmer focal planes, and its reading, in metres.
+
+        The reading is by eq. (7) of paper 001.
 
         Parameters
         ----------
@@ -261,7 +264,10 @@ class ErrorBudget:
         return self._line(_CENTROID, scatter, light, "photons per frame", light * float(np.exp(share[-1])))
 
     def _centroid_scatter(self, light: float) -> np.ndarray:
-        """Return energy centroids of single frames about their mean, px, (frames, C, 2), at a fraction of the light."""
+        """Return the energy centroids of single frames minus their mean, (frames, C, 2) px, at a fraction of the light.
+
+        Dimensions: C channels.
+        """
         count = max(self.spec.trials, 2)
         setup, stream = self.experiment, np.random.SeedSequence(self.seed, spawn_key=(8,))
         pattern = setup.pattern(self.seed)
@@ -274,7 +280,12 @@ class ErrorBudget:
         return np.asarray((position - position.mean(axis=0)) * np.sqrt(count / (count - 1.0)))
 
     def _line(self, name: str, shifts: np.ndarray, value: float, unit: str, allowed: float | None = None) -> BudgetLine:
-        """Return the line of spot displacements (S, C, 2), px; without ``allowed`` it is proportional to its input."""
+        """Return the line of the budget from spot displacements (S, C, 2), px.
+
+        Without ``allowed`` the error is taken as proportional to the input.
+
+        Dimensions: S states, C channels.
+        """
         angle = self.radians_per_pixel * shifts
         three_sigma, sigma = _three_sigma(angle)
         axes = 3.0 * np.sqrt(np.mean(angle**2, axis=(0, 1)))
@@ -282,7 +293,10 @@ class ErrorBudget:
         return BudgetLine(name, three_sigma, sigma, (float(axes[0]), float(axes[1])), value, unit, float(allowed))
 
     def together(self, progress: Progress = lambda fraction, text: None) -> CombinedErrors:
-        """Simulate all causes together through noisy images and every estimator, with the mean of ``frames``."""
+        """Simulate all causes together through noisy images and every estimator.
+
+        Each image is the mean of as many frames as the budget's ``frames``.
+        """
         progress(0.0, "all causes: states")
         states = self.states(self.causes, self.spec.all_together, len(self.lines))
         record = shared_detector(self.experiment, self.spec.frames, self.seed)
@@ -301,7 +315,10 @@ class ErrorBudget:
 
 
 def _shifts(experiment: MonitorExperiment, states: Sequence[State]) -> np.ndarray:
-    """Return the measured displacement of every spot in noise-free images, (S, C, 2), row and column in pixels."""
+    """Return the measured displacement of every spot in noise-free images, (S, C, 2), row and column in pixels.
+
+    Dimensions: S states, C channels.
+    """
     before = experiment.expected_frames(experiment.nominal_photons)
 
     def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -312,7 +329,12 @@ def _shifts(experiment: MonitorExperiment, states: Sequence[State]) -> np.ndarra
 
 
 def _three_sigma(values: np.ndarray) -> tuple[float, float]:
-    """Return three times the rms of values (S, ...) about zero, and its standard deviation between states."""
+    """Return three times the rms of values (S, ...) about zero, and the standard deviation of that number.
+
+    The standard deviation follows from the scatter between the S states.
+
+    Dimensions: S states.
+    """
     square = np.mean(values.reshape(len(values), -1) ** 2, axis=1)
     mean = float(np.mean(square))
     spread = float(np.std(square, ddof=1)) / np.sqrt(len(square))

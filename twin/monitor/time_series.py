@@ -1,4 +1,4 @@
-"""Course of an instrument: the state at each time, the monitor's images, and their analysis."""
+"""Course of an instrument (time series of its states): states, the monitor's images and their analysis."""
 
 from __future__ import annotations
 
@@ -33,12 +33,17 @@ from twin.monitor.observation import LOST, ObservationOptions, observe, shared_d
 from twin.monitor.reading_table import ReadingTable, reading_table
 
 LARGEST_SERIES = 200_000_000
-"""Largest number of pixels of one image per time and channel, which stay in memory: about 1.2 GB."""
+"""Largest number of pixels of a series' first frames, which stay in memory: about 1.2 GB.
+
+There is one such frame for each time and channel.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class TimeSeries:
-    """Results of a course of T times.
+    """Results of a course, a time series of T states of an instrument.
+
+    Dimensions: C spots.
 
     Attributes
     ----------
@@ -49,7 +54,7 @@ class TimeSeries:
     motions : mapping
         Node path -> its motion at each time, perturbation included, for the nodes that the course moves.
     shown : int
-        Number of the time that the rest of the run shows in full.
+        Index of the time for which the run's other files and figures are made.
     angle : float
         Angle between two cameras in the nominal state, in radians; NaN unless there are two.
     readings : ReadingTable
@@ -95,9 +100,11 @@ class TimeSeries:
 
     @property
     def sigma_holds(self) -> np.ndarray:
-        """Validity of the sigmas at each time, (T,): spots and readings agree with their assumptions.
+        """True at the times at which the standard deviations are valid, (T,): spots and readings are as assumed.
 
         It is False at all times if the measurements together contradict the prior or its time laws.
+
+        Dimensions: T times.
         """
         agrees = self.agrees & (self.smoothed is None or self.smoothed.consistency.agrees)
         return agrees & np.all(
@@ -134,7 +141,7 @@ class TimeSeries:
         return tuple(out)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the contents of course.json.
+        """Return the contents of course.json, the file of results of a time series.
 
         They are those of truth.json and recovered.json, with a list over the times for each number.
         """
@@ -158,7 +165,7 @@ class TimeSeries:
 
 
 def _angle(course: TimeSeries) -> dict[str, Any] | None:
-    """Return the readings of the intersection angle with its nominal value, or None."""
+    """Return what is read of the intersection angle over the course, with its nominal value; None without an angle."""
     group = course.group("intersection_angle")
     return None if group is None else {"nominal_deg": float(np.degrees(course.angle))} | group
 
@@ -178,12 +185,12 @@ _MOTIONS: Record[Sequence[Motion]] = Record(
 
 
 def _agreement(course: TimeSeries) -> dict[str, Any] | None:
-    """Return the consistency test of the whole course, or None."""
+    """Return the test of all measurements of the course against the prior as plain data; None without a prior."""
     return None if course.smoothed is None else course.smoothed.to_dict()
 
 
 def _between(course: TimeSeries) -> dict[str, Any] | None:
-    """Return the smoothed changes between the times of the course, or None."""
+    """Return the smoothed changes at times between those of the course as plain data; None if there are none."""
     return course.smoothed.between_dict() if course.smoothed and len(course.smoothed.times) else None
 
 
@@ -203,7 +210,7 @@ COURSE: Record[TimeSeries] = Record(
 
 
 def series_states(experiment: MonitorExperiment, job: JobSpec) -> list[State]:
-    """Return the state at each time of a job's course.
+    """Return the state of the instrument at each time of a job's course (time series).
 
     Parameters
     ----------
@@ -349,7 +356,7 @@ def too_large(job: JobSpec, k: int, reason: str) -> InputError:
 
 
 def _course(job: JobSpec) -> CourseSpec:
-    """Return the course of a job."""
+    """Return the course of a job: its times, and the temperatures and motions at these."""
     assert job.course is not None
     return job.course
 
@@ -388,7 +395,9 @@ MOST_BETWEEN, LARGEST_BETWEEN = 7, 400
 
 @dataclass(frozen=True, eq=False)
 class SmoothedCourse:
-    """Estimates from all measurements of a course together, by the time laws of the prior.
+    """Estimates over a course (time series) from all its measurements together, using the time laws of the prior.
+
+    Dimensions: F times, T times.
 
     Attributes
     ----------
@@ -443,7 +452,7 @@ class SmoothedCourse:
         )
 
     def between_dict(self) -> dict[str, Any]:
-        """Return the changes between the times of the course as course.json has those at its times."""
+        """Return the changes at times between those of the course as plain data for course.json."""
         return {"times_s": self.times.tolist(), **self.between.groups()}
 
     def to_dict(self) -> dict[str, Any]:
@@ -530,6 +539,8 @@ class CourseSmoother:
     def take(self, shift: np.ndarray, before: NoiseParts, after: NoiseParts) -> None:
         """Store the shifts and the noise of states that were measured elsewhere.
 
+        Dimensions: S states.
+
         Parameters
         ----------
         shift : (S, 2 C) ndarray
@@ -545,7 +556,7 @@ class CourseSmoother:
         self._shifts.append(shift)
 
     def smoothed(self) -> SmoothedCourse | None:
-        """Return the smoothed course of all stored states; None without a prior, and for a single time."""
+        """Return the smoothed changes of all stored states; None without a prior, and for a single time."""
         prior, noise, times = self._prior, self._noise, self._times
         if prior is None or noise is None or len(times) < 2:
             return None

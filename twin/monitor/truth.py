@@ -21,7 +21,7 @@ from scenes.specs.instrument import BASE
 from twin.monitor.motions import ElementaryMotion
 
 LINE_POINTS = 41
-"""Number of points of the line CCD from which roll and principal distance are determined."""
+"""Number of points along the line CCD from which its roll and the principal distance are determined."""
 
 ACROSS = np.array([0.0, 1.0, 0.0])
 """Direction in the world near which the first transverse axis of a chief ray is taken."""
@@ -71,6 +71,8 @@ class Truth:
     def vector(self, camera: str) -> np.ndarray:
         """Return the true d_alpha, d_beta, d_gamma (rad) and d_f (m) of a camera, (S, 4).
 
+        Dimensions: S states.
+
         Parameters
         ----------
         camera : str
@@ -82,6 +84,8 @@ class Truth:
         """Return the errors (S, 3) of ground points located with the nominal cameras, in metres.
 
         The components are along track, across track and up.
+
+        Dimensions: S states.
 
         Parameters
         ----------
@@ -149,7 +153,7 @@ def line_in_world(instrument: Instrument, camera: str, placed: PlacedBodies) -> 
 
 
 class LineSight:
-    """Trace of the lines of sight of the line CCDs' points.
+    """Ray trace of the lines of sight: directions from points of the line CCDs toward the scene.
 
     Parameters
     ----------
@@ -199,7 +203,7 @@ class LineSight:
         Raises
         ------
         AimError, BeamMissedError
-            Light is lost, see `trace`.
+            A perturbation moves the image off the mirrors.
         """
         return self.truth_of(self.trace(states, placed) if states else self.nominal[:, :0])
 
@@ -222,23 +226,26 @@ class LineSight:
 
     @cached_property
     def nominal(self) -> np.ndarray:
-        """Directions of sight of the unperturbed instrument, (cameras, 1, LINE_POINTS, 3), see `trace`."""
+        """Unperturbed directions from the line CCDs' points to the scene, in the world: (cameras, 1, LINE_POINTS, 3)."""
         return self.trace([{}])
 
     @cached_property
     def _aimed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Aim parameters and Jacobian of the unperturbed instrument's chief rays, from which all others are aimed."""
+        """Aim parameters and their Jacobian for the chief rays of the unperturbed instrument.
+
+        All other states are aimed starting from these.
+        """
         to_stop, points, guess = self._from_the_image([{}], self.instrument.assembly.place())
         return aim_chief_rays(self.backend, to_stop, points, guess, ACROSS)[1:]
 
     @cached_property
     def axes(self) -> dict[str, np.ndarray]:
-        """Camera -> nominal X, Y, Z of its changes, as columns (3, 3) in the base frame.
+        """Camera -> the axes X, Y, Z about which its changes count, as columns (3, 3) in the base frame.
 
         Z is the nominal line of sight.
 
-        The line of sight of an instrument as built differs from the design; Y is then perpendicular to it, as near
-        as possible to the camera's Y.
+        The line of sight of an instrument as built differs from the design; Y is then perpendicular to it, as near as
+        possible to the camera's Y.
         """
         axes = {name: self.instrument.camera_axes(name) for name in self.instrument.cameras}
         if not self.instrument.as_built:
@@ -249,7 +256,12 @@ class LineSight:
     def _from_the_image(
         self, states: Sequence[State], placed: PlacedBodies
     ) -> tuple[SystemBatch, np.ndarray, np.ndarray]:
-        """Return systems to the stops, points of the line CCDs (B, LINE_POINTS, 3), and directions (B, 1, 3)."""
+        """Return the optical systems from line CCD to stop, the points of the line CCDs, and the launch directions.
+
+        The points have the shape (B, LINE_POINTS, 3), the directions (B, 1, 3).
+
+        Dimensions: B systems.
+        """
         instrument, names = self.instrument, list(self.instrument.cameras)
         to_stop = assemble(instrument.assembly, [f"{n}/image_to_stop" for n in names], states, placed=placed)
         points = np.concatenate([line_in_world(instrument, name, placed) for name in names])
@@ -265,7 +277,10 @@ def _about(sight: np.ndarray, across: np.ndarray) -> np.ndarray:
 
 
 def trace_truth(instrument: Instrument, backend: Backend, states: Sequence[State]) -> Truth:
-    """Return `LineSight.truth` for a single call."""
+    """Return the true changes of all cameras in some states, for a single call.
+
+    For several calls make a `LineSight`, which traces the unperturbed instrument only once.
+    """
     return LineSight(instrument, backend).truth(states)
 
 
@@ -278,9 +293,11 @@ result.
 def truth_jacobian(
     instrument: Instrument, backend: Backend, motions: Sequence[ElementaryMotion]
 ) -> dict[str, np.ndarray]:
-    """Return the derivatives of the true parameters of every camera by elementary motions.
+    """Return the derivatives of the true parameters of every camera with respect to elementary motions.
 
     They are central differences of the exact trace.
+
+    Dimensions: M motions.
 
     Returns
     -------

@@ -2,15 +2,16 @@
 
 The signal chain is the linear camera model of EMVA Standard 1288 (release 3.1, chapter 2, eq. 1-12):
 
-    n_e  = Poisson( QE * (1 + prnu) * photons + dark_current * exposure )         electrons, exact Poisson n_e  =
-    min(n_e, full_well)                                                    the well fills before the read-out y    = K *
-    (n_e + dsnu_offset + dark_noise * normal + further) + offset       grey value, not yet digitised y_DN =
-    clip(rint(y), 0, 2**bit_depth - 1)                                     uint16
+- n_e = Poisson(QE * (1 + prnu) * photons + dark_current * exposure): electrons collected;
+- n_e = min(n_e, full_well): the well fills before the read-out;
+- y = K * (n_e + dsnu_offset + dark_noise * normal + further) + offset: grey value, not yet digitised;
+- y_DN = clip(rint(y), 0, 2**bit_depth - 1): recorded grey value, uint16.
 
-PRNU scales the response to light only; DSNU is a fixed additive pattern in electrons that adds no shot noise. Further
-noise is what a data sheet lists beyond the model, term by term (``NOISE_TERMS``). The Poisson numbers are exact at
-every mean (``twin.sensors.poisson_numbers``); no normal approximation is used. Pixel coordinates are (row, column);
-arrays are (..., H, W).
+QE is the quantum efficiency, K the gain in grey values per electron, prnu and dsnu_offset the fixed differences of the
+pixels' response and offset, and normal a standard normal number. PRNU scales the response to light only; DSNU is a
+fixed additive pattern in electrons that adds no shot noise. Further noise is what a data sheet lists beyond the model,
+term by term (``NOISE_TERMS``). The Poisson numbers are exact at every mean (``twin.sensors.poisson_numbers``); no
+normal approximation is used. Pixel coordinates are (row, column); arrays are (..., H, W).
 """
 
 from __future__ import annotations
@@ -47,13 +48,19 @@ class NoiseTerm(FurtherNoise, Protocol):
     """
 
     def fixed_e(self, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray | None:
-        """Return electrons (..., H, W) that stay the same in all frames of detectors of that shape; None for none."""
+        """Return the electrons of a noise that stays the same in all frames, (..., H, W); None without such noise.
+
+        Dimensions: H rows, W columns.
+        """
         ...
 
     def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
-        """Return new electrons for every frame, in the shape (frames, H, W) of those collected; None for none.
+        """Return the electrons of a noise that is new in every frame, (frames, H, W); None without such noise.
 
-        Many frames come in pieces, one after the other with the same ``rng``.
+        ``electrons`` holds the collected ones, in the same shape. Many frames are passed in several calls, one after
+        the other with the same ``rng``.
+
+        Dimensions: H rows, W columns.
         """
         ...
 
@@ -80,11 +87,11 @@ class ReadNoise:
         return self.sigma_e**2
 
     def fixed_e(self, shape: tuple[int, ...], rng: np.random.Generator) -> None:
-        """Return None, since nothing is fixed."""
+        """Return None, since this noise has no part that stays the same from frame to frame."""
         return
 
     def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
-        """Return electrons drawn for every pixel of every frame; for a sigma of zero nothing is drawn."""
+        """Return the random read noise of every pixel of every frame, in electrons; None for a sigma of zero."""
         if self.sigma_e <= 0:
             return None
         out = rng.standard_normal(electrons.shape)
@@ -114,17 +121,18 @@ class FixedOffsets:
         return 0.0
 
     def fixed_e(self, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-        """Return electrons drawn for every pixel."""
+        """Return the random offset of every pixel, in electrons."""
         return self.sigma_e * rng.standard_normal(shape)
 
     def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> None:
-        """Return None, since nothing changes from frame to frame."""
+        """Return None, since this noise has no part that changes from frame to frame."""
         return
 
 
 NOISE_TERMS = ExtensionTable[Callable[[float], NoiseTerm]]("noise_terms", {"read": ReadNoise, "offset": FixedOffsets})
-"""Name under ``noise`` of a data sheet -> function of the number there (electrons rms unless the term defines it
-otherwise) that returns the noise term. New terms are added here.
+"""Name under ``noise`` of a data sheet -> function that makes the noise term from the number there.
+
+The number is in electrons rms unless the term defines it otherwise. New terms are added here.
 """
 
 
@@ -143,6 +151,8 @@ _SATURATION_SIGMAS = 4.0
 @dataclass(frozen=True, eq=False)
 class FixedPattern:
     """Pixel-to-pixel differences of one detector, the same in every frame.
+
+    Dimensions: H rows, W columns.
 
     Attributes
     ----------
@@ -260,7 +270,7 @@ class EmvaDetector:
 
     @cached_property
     def _sheet(self) -> DetectorSpec:
-        """Data sheet with these numbers, which checks their limits and derives further numbers."""
+        """Data sheet with this detector's numbers, which checks their limits and derives further numbers."""
         return DetectorSpec.model_validate({"name": "detector", **self._numbers()})
 
     def _numbers(self) -> dict[str, Any]:
@@ -292,7 +302,10 @@ class EmvaDetector:
         )
 
     def fixed_pattern(self, shape: tuple[int, ...], seed: Seed) -> FixedPattern:
-        """Draw the fixed pattern of detectors of `shape` (..., H, W); the same seed and shape give the same bits."""
+        """Draw the fixed pattern of detectors of `shape` (..., H, W); the same seed and shape give the same bits.
+
+        Dimensions: H rows, W columns.
+        """
         if len(shape) < 2 or any(int(n) != n or n < 1 for n in shape):
             raise ValueError(f"fixed pattern: shape must be (..., H, W) of positive integers, found {shape!r}")
         rng = np.random.Generator(np.random.SFC64(_sequence(seed)))
@@ -310,6 +323,8 @@ class EmvaDetector:
         """Return noise-free, unrounded grey values (..., H, W), clipped at the well and the converter.
 
         Near saturation this is the clipped mean and not the mean of clipped values.
+
+        Dimensions: H rows, W columns.
 
         Parameters
         ----------
@@ -337,6 +352,8 @@ class EmvaDetector:
         threads: int | None = None,
     ) -> NDArray[np.uint16]:
         """Record frames of images.
+
+        Dimensions: H rows, W columns.
 
         Parameters
         ----------
@@ -448,13 +465,15 @@ class EmvaDetector:
 
     @property
     def _reading(self) -> Reading:
-        """Read-out of electrons to grey values."""
+        """Read-out of electrons to grey values, with this detector's numbers."""
         return Reading(self.dark_noise_e, self.system_gain_dn_per_e, self.full_well_e, self.max_dn)
 
     def _read_out(self, level: np.ndarray, shift: np.ndarray, each: Sequence[np.random.Generator]) -> np.ndarray:
         """Return grey values of frames (N, H, W) from electrons, in whose array they are written.
 
         Each noise term draws from its own generator.
+
+        Dimensions: N frames, H rows, W columns.
         """
         np.minimum(level, self.full_well_e, out=level)
         before = level.copy() if self.noise else level
@@ -467,6 +486,8 @@ class EmvaDetector:
 
         A pixel is saturated if it comes within 4 sigmas of the full well (of the read noise and further temporal noise
         at a full well), or reaches the converter's largest value.
+
+        Dimensions: H rows, W columns.
         """
         if frames.ndim < 3:
             raise ValueError(f"detector: frames must be (..., frames, H, W), found shape {frames.shape}")
@@ -484,7 +505,7 @@ class EmvaDetector:
 
 
 def _streams(seed: Seed | Sequence[Seed], lead: tuple[int, ...]) -> list[np.random.SeedSequence]:
-    """Return the random stream of each image of some leading axes."""
+    """Return the random stream of each image; ``lead`` is the shape of the array of images."""
     if not isinstance(seed, Sequence):
         root = _sequence(seed)
         return [stream(root, number) for number in range(math.prod(lead))]
@@ -557,7 +578,7 @@ def coarse_warnings(setup: Spec) -> tuple[str, ...]:
     Raises
     ------
     InputError
-        A data sheet is invalid, see `EmvaDetector.from_sheet`.
+        The dark current alone saturates the pixels, or a sheet names an unknown noise term.
     """
     instrument, sheet = getattr(setup, "instrument", None), getattr(setup, "detector", None)
     if not isinstance(instrument, InstrumentSpec) or not isinstance(sheet, DetectorSpec):

@@ -62,12 +62,12 @@ _NORMAL_ERROR = 4e-6
 """Upper bound of the error of the normal quantile in single precision, for arguments up to 6."""
 
 _SINGLE = 4e-7
-"""Upper bound of the single-precision rounding of a distribution function, and of u."""
+"""Upper bound of single-precision rounding of a distribution function and of the uniform number u."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """Read-out of electrons to grey values.
+    """Read-out of electrons to grey values: the numbers of the detector that it needs.
 
     Attributes
     ----------
@@ -114,13 +114,15 @@ class Reading:
         together: int,
         threads: int,
     ) -> None:
-        """Expose images.
+        """Record frames of images with compiled kernels.
+
+        Dimensions: F frames, P pixels.
 
         Parameters
         ----------
         expected : callable
-            Function of the number of an image that returns its expected electrons, and ``shift`` as in ``read_out``, P
-            numbers each.
+            Function of the number of an image that returns its expected electrons, and the black level with the pixels'
+            own offsets (grey values), P numbers each.
         streams : sequence of SeedSequence
             Random streams of the I images, each for words, Poisson numbers of huge means and normal numbers; some may
             be equal.
@@ -179,7 +181,7 @@ class _Numbers:
     mean : (lanes,) ndarray
         Expected electrons of all pixels.
     shift : (lanes,) ndarray
-        Black level with offsets, see ``Reading.read_out``.
+        Black level with the pixels' own offsets, in grey values.
     words : (frames, lanes) ndarray of uint64
         Random words, frame by frame.
     normals : (frames, lanes) ndarray | None
@@ -193,7 +195,7 @@ class _Numbers:
 
     @classmethod
     def room(cls, frames: int, pixels: int, noisy: bool) -> _Numbers:
-        """Return memory for a number of frames of all pixels of a group."""
+        """Allocate memory for the random numbers of a number of frames of all pixels of a group."""
         lanes = -(-pixels // _LANES) * _LANES
         mean, shift = _aligned(np.float64, 2, lanes)
         normals = _aligned(np.float64, frames, lanes) if noisy else None
@@ -227,7 +229,7 @@ class _SharedNumbers:
         ----------
         numbers : _Numbers
             Numbers of a group of images.
-        own : slice
+        lanes : slice
             Lanes of the image.
         count : int
             Number of frames.
@@ -285,7 +287,7 @@ class _Group:
             self.sources.append((*split_stream(rng, mean[self.huge[image]], frames, pixels, together), rng))
 
     def own(self, image: int) -> slice:
-        """Return the lanes of an image."""
+        """Return the range of lanes (entries of the kernels' arrays) that hold an image's pixels."""
         return slice(image * self.pixels, (image + 1) * self.pixels)
 
     def draw(self, numbers: _Numbers, out: np.ndarray, pool: ThreadPoolExecutor) -> _Drawn:
@@ -348,7 +350,7 @@ class _Drawn:
     work: Sequence[Future[np.ndarray | None]]
 
     def read_out(self) -> None:
-        """Fill the frames."""
+        """Fill the frames with grey values once their random numbers have been drawn."""
         huge = [drawing.result() for drawing in self.work]
         numbers, group = self.numbers, self.group
         frame, lane = _kernels(group.how, numbers, self.out)
@@ -360,7 +362,7 @@ class _Drawn:
                 self._put(frame, image * group.pixels + which[lane], huge_numbers.astype(np.float64).reshape(-1))
 
     def _put(self, frame: np.ndarray, lane: np.ndarray, electrons: np.ndarray) -> None:
-        """Read electrons out into some pixels of some frames."""
+        """Convert electrons to grey values and write them into some pixels of some frames."""
         numbers, how = self.numbers, self.group.how
         noise = [] if numbers.normals is None else [numbers.normals[frame, lane] * how.sigma_e]
         image, pixel = np.divmod(lane, self.group.pixels)
@@ -390,7 +392,7 @@ class _Table:
     Attributes
     ----------
     known : UInt32
-        Four cells per word: the least quantile of each, and in its highest bit whether it has others.
+        Four cells per word: the smallest quantile of each, and in its highest bit whether it has others.
     law : Float32
         Distribution functions at the rows' means.
     bound : Float32
@@ -404,7 +406,7 @@ class _Table:
 
 @cache
 def _table() -> _Table:
-    """Return the table of quantiles in the kernels' memory."""
+    """Return the table of Poisson quantiles in the kernels' memory, made once."""
     import drjit as dr
     from drjit.llvm import Float32, UInt32
 
@@ -415,7 +417,10 @@ def _table() -> _Table:
 
 
 def _kernels(how: Reading, numbers: _Numbers, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fill frames (images, frames, pixels), and return frames and lanes of the numbers that are uncertain."""
+    """Fill frames (images, frames, pixels) by kernels, and return which numbers are still uncertain.
+
+    The two arrays are the frames and the lanes (entries of the kernels' arrays) of these numbers.
+    """
     import drjit as dr
     from drjit.llvm import Float64, UInt32, UInt64
 
@@ -449,7 +454,7 @@ def _kernels(how: Reading, numbers: _Numbers, out: np.ndarray) -> tuple[np.ndarr
 
 
 def _grey(electrons: Any, normal: Any, shift: Any, numbers: Sequence[Any]) -> Any:
-    """Return grey values as ``Reading.read_out`` does."""
+    """Return grey values of electrons with read noise and black level, as the detector's read-out gives them."""
     import drjit as dr
     from drjit.llvm import UInt32
 
@@ -461,7 +466,7 @@ def _grey(electrons: Any, normal: Any, shift: Any, numbers: Sequence[Any]) -> An
 
 
 def _cell(mean: Any, word: Any) -> tuple[Any, Any, Any]:
-    """Return the row of the table, the least quantile in its cell, and whether the cell has others."""
+    """Return the row of the table, the smallest quantile in its cell, and whether the cell has others."""
     import drjit as dr
     from drjit.llvm import UInt32
 
@@ -537,9 +542,9 @@ def _compared(
 
 
 def _by_series(mean: Any, word: Any) -> tuple[Any, Any]:
-    """Return quantiles of means from ``TABLE_END`` on, and whether they are uncertain.
+    """Return Poisson quantiles of means from ``TABLE_END`` on, and whether each is uncertain.
 
-    The method is that of ``poisson_numbers._by_series``.
+    The method is Giles' expansion of the quantile for large means.
     """
     import drjit as dr
     from drjit.llvm import Float32, Float64

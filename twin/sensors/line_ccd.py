@@ -3,13 +3,13 @@
 The second part is the exact effect of image oscillations of any frequency during the collection of a TDI line.
 
 The charge of a pixel is collected in M = stages x phases steps, one every D = line time / phases; light falls in during
-a fraction o of each step. A displacement x(t) of the image, relative to charge that follows the image's mean motion,
-multiplies the image's spectrum at nu cycles per pixel by
+a fraction o of each step. A displacement x(t), in pixels, of the image, relative to charge that follows the image's
+mean motion, multiplies the image's spectrum at nu cycles per pixel by
 
     T(nu) = mean over the light of exp(-2 pi i nu x(t)).
 
-For x = A sin(2 pi f t + p) the Jacobi-Anger expansion turns each term into an integral over the steps with a closed
-form,
+For an oscillation of amplitude A (pixels), frequency f (hertz) and phase p (radians), x = A sin(2 pi f t + p), the
+Jacobi-Anger expansion turns each term into an integral over the steps with a closed form,
 
     T(nu) = sum over n of J_n(2 pi nu A) exp(-i n p) W(n f),    W(f) = sinc(o D f) sin(pi M D f) / (M sin(pi D f)),
 
@@ -45,21 +45,27 @@ if TYPE_CHECKING:
     from scenes.specs.detector import DetectorSpec
 
 WIDEST_STEP = 100e-9
-"""Mean spacing of the wavelengths of a band, in metres: mean transfer functions are then accurate to 1e-4."""
+"""Largest mean spacing of the wavelengths by which a band is sampled, in metres.
+
+Mean transfer functions are then accurate to 1e-4.
+"""
 
 _SIGMAS = 5.0
 
 
 def band_wavelengths(band: BandSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Return Gauss wavelengths (K,), in metres, and weights with sum 1, for means over the band's signal."""
+    """Return Gauss wavelengths (K,), in metres, and weights with sum 1, for means over the band's signal.
+
+    Dimensions: K nodes.
+    """
     first, last = band.spectrum.ends
     return band.spectrum.rule(2 + int(np.ceil((last - first) / WIDEST_STEP)))
 
 
 def band_factors(band: BandSpec, fx: np.ndarray, fy: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the factors of a line CCD's transfer function.
+    """Return name of each effect of a line CCD -> its transfer function at spatial frequencies.
 
-    The frequencies fx are along the line and fy along the track, in cycles/m.
+    The frequencies fx are along the line and fy along the track, in cycles/m, of either sign.
 
     Returns
     -------
@@ -106,18 +112,25 @@ class LineCcd:
         return cls(band, EmvaDetector.from_sheet(sheet, band.exposure))
 
     def factors(self, fx: np.ndarray, fy: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the transfer function of each effect, see ``band_factors``."""
+        """Return name of each effect of the line CCD -> its transfer function at spatial frequencies.
+
+        The effects are pixel area, charge diffusion, and image motion during a step and over the stages; fx is along
+        the line and fy along the track, in cycles/m.
+        """
         return band_factors(self.band, fx, fy)
 
     def transfer(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
-        """Return the product of all factors."""
+        """Return the transfer function of the line CCD, the product of the factors of all effects.
+
+        The frequencies fx are along the line and fy along the track, in cycles/m.
+        """
         out: np.ndarray = np.ones(np.broadcast_shapes(np.shape(fx), np.shape(fy)))
         for factor in self.factors(fx, fy).values():
             out = out * factor
         return out
 
     def white_photons(self, share: float) -> float:
-        """Return the photons per pixel over all stages that fill the well to a fraction ``share``."""
+        """Return the photons per pixel, summed over all stages, that fill the well to a fraction ``share``."""
         return share * self.detector.full_well_e / self.detector.quantum_efficiency
 
     @property
@@ -144,7 +157,7 @@ class LineCcd:
 
     @property
     def noise(self) -> NoiseModel:
-        """Noise model of one frame, for the analysis."""
+        """Noise model of one frame (sum over all stages), for the analysis."""
         return self.detector.noise_model(self.exposure)
 
     def pattern(self, seed: np.random.SeedSequence) -> FixedPattern:
@@ -157,6 +170,8 @@ class LineCcd:
         """Return frames of images (..., H, W), uint16 (..., frames, H, W).
 
         ``column`` is the pixel of the line at their first column.
+
+        Dimensions: H rows, W columns.
 
         Raises
         ------
@@ -171,16 +186,19 @@ class LineCcd:
 
 
 _BEYOND = 30
-"""Number of terms of the expansion beyond its argument; they fall off faster than (e z / 2 n)^n."""
+"""Number of terms of the Jacobi-Anger expansion that are kept beyond its argument.
+
+With the argument z, the term n falls off faster than (e z / 2 n)^n.
+"""
 _PER_STEP = 8
-"""Number of nodes per step, if light falls in during only a part of the step."""
+"""Number of integration nodes per step, if light falls in during only a part of the step."""
 _PER_CYCLE = 6
-"""Gauss points per cycle of the function that is averaged over a step."""
+"""Number of Gauss points per cycle of a function that is averaged over a step."""
 
 
 @dataclass(frozen=True)
 class Collection:
-    """Times at which the charge of a pixel is collected, about the middle.
+    """Times at which a TDI line CCD collects the charge of a pixel, counted from the middle of the collection.
 
     Attributes
     ----------
@@ -204,7 +222,7 @@ class Collection:
 
     @classmethod
     def of(cls, tdi: TdiSpec, line_time: float | None = None) -> Collection:
-        """Return the collection of a line CCD; line_time, in seconds, replaces that of the file."""
+        """Return the collection times of a line CCD; ``line_time``, in seconds, replaces that of the file."""
         time = tdi.line_time if line_time is None else line_time
         return cls(tdi.stages * tdi.phases, time / tdi.phases, tdi.open_share)
 
@@ -214,7 +232,10 @@ class Collection:
         return self.steps * self.step
 
     def mean(self, frequency: np.ndarray | float) -> np.ndarray:
-        """Return the collection of a line CCD; line_time, in seconds, replaces that of the file."""
+        """Return the mean of exp(2 pi i f t) over the times t of the collection, for frequencies f in hertz.
+
+        It is real, since the times are symmetric about the middle of the collection, and 1 at frequency 0.
+        """
         cycles = self.step * np.asarray(frequency, np.float64)
         near = np.sinc(cycles)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -229,6 +250,8 @@ class Collection:
 
         Polynomials in time up to degree 2 K - 1 are averaged exactly; K is ``count``, or the number of nodes of the
         collection if that is smaller.
+
+        Dimensions: K nodes.
         """
         if self.open_share == 1.0:
             x, w = np.polynomial.legendre.leggauss(count)
@@ -240,12 +263,12 @@ class Collection:
         return _gauss(nodes, mass, min(count, len(nodes)), self.length)
 
     def transfer(self, nu: np.ndarray | float, frequency: float, amplitude: float, phase: float) -> np.ndarray:
-        """Return the transfer function T of one oscillation, complex, (...).
+        """Return the complex transfer function by which one oscillation of the image multiplies its spectrum, (...).
 
         Parameters
         ----------
         nu : (...) ndarray | float
-            Spatial frequency, in cycles per pixel.
+            Spatial frequency along the motion, in cycles per pixel.
         frequency : float
             Frequency of the oscillation, in hertz.
         amplitude : float
@@ -260,16 +283,20 @@ class Collection:
         return np.asarray(np.tensordot(jv(order, z[..., None]), weight, axes=(-1, 0)))
 
     def mean_square(self, nu: np.ndarray | float, motion: Motion) -> np.ndarray:
-        """Return E |T|^2 over random phases, (...), at ``nu`` (...) cycles per pixel.
+        """Return the mean square, over random phases, of the modulus of the transfer function of a motion, (...).
 
-        The oscillations and bands are independent.
+        ``nu`` is the spatial frequency along the motion, (...) cycles per pixel. The oscillations and bands of noise
+        are independent.
         """
         frequency = np.asarray(nu, np.float64)
         lag, weight = self._lags(motion.highest + 2.0 * motion.speed * float(np.max(np.abs(frequency), initial=0.0)))
         return np.asarray(np.tensordot(motion.characteristic(frequency[..., None], lag), weight, axes=(-1, 0)))
 
     def mtf(self, nu: np.ndarray | float, motion: Motion) -> np.ndarray:
-        """Return the root mean square of the MTF over random phases, (...)."""
+        """Return the root mean square of the MTF of a motion over random phases, (...).
+
+        ``nu`` is the spatial frequency along the motion, (...) cycles per pixel.
+        """
         return np.sqrt(np.maximum(self.mean_square(nu, motion), 0.0))
 
     def smear(self, motion: Motion) -> float:
@@ -279,7 +306,10 @@ class Collection:
         return float(np.sqrt(max(float(weight @ (motion.variance - motion.covariance(lag))), 0.0)))
 
     def _lags(self, highest: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return a quadrature over the lag between two times of the collection, for functions up to a frequency."""
+        """Return nodes and weights for the mean over the lag (s) between two random times of the collection.
+
+        They are accurate for functions up to the frequency ``highest``, in hertz.
+        """
         if self.open_share == 1.0:
             # the whole collection is one step: its density falls linearly
             points = 16 + int(np.ceil(_PER_CYCLE * highest * self.length))
@@ -301,6 +331,8 @@ class Collection:
 class Motion:
     """Random motion of the image in one direction: independent oscillations of random phase and bands of noise.
 
+    Dimensions: K nodes, B bands.
+
     Attributes
     ----------
     frequency, amplitude : (K,) ndarray
@@ -317,7 +349,9 @@ class Motion:
 
     @classmethod
     def of(cls, lines: Sequence[tuple[float, float]] = (), bands: Sequence[tuple[float, float, float]] = ()) -> Motion:
-        """Return the motion of lines (frequency, amplitude) and bands (first, last, level).
+        """Return the motion of oscillations (frequency, amplitude) and of bands of noise (first, last, level).
+
+        Frequencies, also those of the bands' edges, are in hertz, amplitudes in pixels, levels in pixels^2/Hz.
 
         Raises
         ------
@@ -338,7 +372,7 @@ class Motion:
 
     @property
     def speed(self) -> float:
-        """Speed that the motion hardly exceeds, in pixels per second."""
+        """Speed of the image that the motion hardly exceeds, in pixels per second."""
         square = self.level @ (self.last**3 - self.first**3) / 3.0
         return float(2.0 * np.pi * (self.frequency @ self.amplitude + 4.0 * np.sqrt(square)))
 
@@ -348,18 +382,24 @@ class Motion:
         return float(0.5 * self.amplitude @ self.amplitude + self.level @ (self.last - self.first))
 
     def covariance(self, lag: np.ndarray) -> np.ndarray:
-        """Return the autocovariance of the motion at lags (...), in seconds; (...) in pixels^2."""
+        """Return the autocovariance of the motion, (...) pixels^2, at time lags (...) in seconds."""
         s = np.asarray(lag, np.float64)[..., None]
         lines = np.cos(2.0 * np.pi * self.frequency * s) @ (0.5 * self.amplitude**2)
         return np.asarray(lines + self._of_bands(s))
 
     def _of_bands(self, s: np.ndarray) -> np.ndarray:
-        """Return the autocovariance of the bands at lags (..., 1) -> (...): the integral of level cos(2 pi f s)."""
+        """Return the autocovariance of the bands of noise, (...) pixels^2, at time lags (..., 1) in seconds.
+
+        It is the integral of level cos(2 pi f s) over the frequency f, s being the lag.
+        """
         ends = self.last * np.sinc(2.0 * self.last * s) - self.first * np.sinc(2.0 * self.first * s)
         return np.asarray(ends @ self.level)
 
     def characteristic(self, nu: np.ndarray, lag: np.ndarray) -> np.ndarray:
-        """Return E exp(-2 pi i nu (x(t) - x(t + lag))) over all phases and draws; the arguments broadcast."""
+        """Return the mean of exp(-2 pi i nu (x(t) - x(t + lag))) over all phases and realisations of the motion x.
+
+        ``nu`` is a spatial frequency in cycles per pixel, ``lag`` a time in seconds; their shapes broadcast.
+        """
         nu, lag = np.broadcast_arrays(np.asarray(nu, np.float64), np.asarray(lag, np.float64))
         out: np.ndarray = np.ones(nu.shape)
         for frequency, amplitude in zip(self.frequency, self.amplitude, strict=True):
@@ -371,7 +411,10 @@ class Motion:
 
 
 def _gauss(position: np.ndarray, mass: np.ndarray, count: int, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Gauss rule of a discrete even measure (Stieltjes' procedure, Golub and Welsch)."""
+    """Return positions and weights of the Gauss rule with ``count`` nodes for a symmetric distribution of points.
+
+    The distribution is given by positions and masses; the method is Stieltjes' procedure (Golub and Welsch).
+    """
     before, now = np.zeros_like(position), np.full_like(position, 1.0 / np.sqrt(mass.sum()))
     off, last = [], 0.0
     for _ in range(count - 1):

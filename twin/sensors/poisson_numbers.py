@@ -31,9 +31,12 @@ import numpy as np
 from scipy.special import gammainc, gammaincc, ndtri
 
 TABLE_END = 32.0
-"""Mean from which no table is used."""
+"""Smallest mean for which no table of quantiles is used."""
 SERIES_END = 65536.0
-"""Mean from which NumPy draws; SciPy's incomplete gamma functions keep full precision in the tails up to 1e5."""
+"""Smallest mean for which NumPy's own generator is used.
+
+SciPy's incomplete gamma functions keep full precision in the tails up to means of 1e5.
+"""
 
 CELLS_PER_UNIT = 32
 """Cells of the table per unit of the mean, in electrons."""
@@ -45,8 +48,10 @@ MOST_IN_TABLE = 120
 _UNDECIDED = 255
 _LAST = 2**64 - 1
 _INTERPOLATED = 1.01 * (1.0 / CELLS_PER_UNIT) ** 2 / 8.0
-"""Largest error of a linear interpolation of F between two means of the table: dF/dm = -p(n), so the second derivative
-is p(n) - p(n - 1), nowhere larger than 1.
+"""Largest error of a linear interpolation of the distribution function F between two means of the table.
+
+With the probability p(n) of the number n, dF/dm = -p(n) for the mean m, so the second derivative is p(n) - p(n - 1),
+nowhere larger than 1.
 """
 _ROOM = 1 << 17
 """Numbers drawn at once, for arrays of a megabyte: with fewer, the calls take as long as the work."""
@@ -54,7 +59,9 @@ _ROOM = 1 << 17
 
 @dataclass(frozen=True, eq=False)
 class _Guide:
-    """Quantiles in the cells of mean and u, row-major: 32 cells of the mean per electron, 2^10 of u.
+    """Table of Poisson quantiles in cells of the mean and of the uniform number u.
+
+    It is row-major: 32 cells of the mean per electron, 2^10 cells of u.
 
     Attributes
     ----------
@@ -63,7 +70,7 @@ class _Guide:
     least : ndarray of uint8
         Smallest quantile in the cell.
     law : ndarray
-        F of the numbers below ``MOST_IN_TABLE`` at the cells' means and at the table's end.
+        Distribution function of the numbers below ``MOST_IN_TABLE`` at the cells' means and at the table's end.
     """
 
     known: np.ndarray
@@ -73,7 +80,7 @@ class _Guide:
 
 @cache
 def _guide() -> _Guide:
-    """Return the guide table."""
+    """Return the guide table of Poisson quantiles for all means below ``TABLE_END``, made once."""
     means = np.arange(round(TABLE_END * CELLS_PER_UNIT) + 1) / CELLS_PER_UNIT
     buckets = 1 << TABLE_BITS
     law = gammaincc(np.arange(1.0, MOST_IN_TABLE + 1.0), means[:, None])
@@ -92,12 +99,12 @@ def _guide() -> _Guide:
 
 @cache
 def quantile_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the guide table in the form that kernels read.
+    """Return the guide table of Poisson quantiles in the form that compiled kernels read.
 
     Returns
     -------
     cells : ndarray of uint8
-        Least quantile in each cell of mean and u, row-major, with the highest bit set if the cell has others.
+        Smallest quantile in each cell of mean and u, row-major, with the highest bit set if the cell has others.
     law : ndarray
         F of the numbers below ``MOST_IN_TABLE`` at the cells' means, one after the other.
     bound : ndarray
@@ -138,12 +145,12 @@ def poisson_numbers(mean: np.ndarray, count: int, rng: np.random.Generator) -> n
 
 
 def poisson_pieces(mean: np.ndarray, count: int, rng: np.random.Generator, together: int) -> Iterator[np.ndarray]:
-    """Yield the numbers of ``poisson_numbers`` in pieces, to limit memory.
+    """Yield the numbers that ``poisson_numbers`` would draw, some draws at a time, to limit memory.
 
     Parameters
     ----------
     mean : (...) ndarray
-        Means, see ``poisson_numbers``.
+        Means, finite and >= 0; not checked.
     count : int
         Number of draws for each mean.
     rng : np.random.Generator
@@ -169,7 +176,7 @@ def poisson_pieces(mean: np.ndarray, count: int, rng: np.random.Generator, toget
 
 
 def _steps(first: int, last: int, size: int) -> Iterator[tuple[int, int]]:
-    """Return ranges of numbers that are drawn at once."""
+    """Return ranges (start, end) of draws that are made at once."""
     step = max(1, _ROOM // max(size, 1))
     return ((start, min(start + step, last)) for start in range(first, last, step))
 
@@ -177,9 +184,11 @@ def _steps(first: int, last: int, size: int) -> Iterator[tuple[int, int]]:
 def split_stream(
     rng: np.random.Generator, huge: np.ndarray, count: int, size: int, together: int
 ) -> tuple[np.random.Generator, np.random.Generator]:
-    """Return generators for the words and for the numbers of huge means.
+    """Return two random generators: one for 64-bit words, one for the numbers of huge means.
 
     Their streams follow each other in that of ``rng``.
+
+    Dimensions: H means.
 
     Parameters
     ----------
@@ -207,7 +216,9 @@ def split_stream(
 
 
 def words_of(rng: np.random.Generator, count: int, size: int) -> np.ndarray:
-    """Draw words of 64 bits, (count, size); not raw words, which have 32 bits in some bit generators.
+    """Draw random words of 64 bits, (count, size).
+
+    They are not raw words of the bit generator, which have 32 bits in some.
 
     Parameters
     ----------
@@ -223,6 +234,8 @@ def words_of(rng: np.random.Generator, count: int, size: int) -> np.ndarray:
 
 def poisson_quantile(mean: np.ndarray, word: np.ndarray) -> np.ndarray:
     """Return quantiles of Poisson distributions.
+
+    Dimensions: N means.
 
     Parameters
     ----------
@@ -244,7 +257,9 @@ def poisson_quantile(mean: np.ndarray, word: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """Means (N,), sorted by method.
+    """Means (N,), sorted by the method that draws their numbers: table, series or NumPy.
+
+    Dimensions: N means.
 
     Attributes
     ----------
@@ -262,13 +277,16 @@ class _Plan:
 
     @classmethod
     def of(cls, mean: np.ndarray) -> _Plan:
-        """Return the plan of means."""
+        """Return which method each of some means needs, and where the table has it."""
         small = np.where(mean < TABLE_END, mean, 0.0)
         row = (small * CELLS_PER_UNIT).astype(np.int64) << TABLE_BITS
         return cls(mean, row, np.flatnonzero((mean >= TABLE_END) & (mean < SERIES_END)))
 
     def fill(self, out: np.ndarray, word: np.ndarray) -> None:
-        """Write quantiles of words (K, N) into ``out``; entries of means beyond ``SERIES_END`` are meaningless."""
+        """Write quantiles of words (K, N) into ``out``; entries of means beyond ``SERIES_END`` are meaningless.
+
+        Dimensions: K draws, N means.
+        """
         guide = _guide()
         cell = (word >> _SHIFT).view(np.int64)
         cell += self.row
@@ -303,7 +321,7 @@ class _Plan:
 
 
 def _tail(word: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether u is in the upper half, and its distance from the nearer end of [0, 1]."""
+    """Return whether each word's uniform number u is in the upper half, and its distance from the nearer end."""
     sign = word.view(np.int64) >> 63  # -1 in the upper half
     tail = (word.view(np.int64) ^ sign).astype(np.float64)
     tail += 0.5
@@ -312,7 +330,7 @@ def _tail(word: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _beyond(number: np.ndarray, mean: np.ndarray, upper: np.ndarray, tail: np.ndarray) -> np.ndarray:
-    """Return True where u exceeds F(number)."""
+    """Return True where u exceeds the Poisson distribution function at a number."""
     below = np.empty(number.shape, bool)
     low = ~upper
     below[low] = gammaincc(number[low] + 1.0, mean[low]) < tail[low]
@@ -321,7 +339,10 @@ def _beyond(number: np.ndarray, mean: np.ndarray, upper: np.ndarray, tail: np.nd
 
 
 def _climbed(number: np.ndarray, mean: np.ndarray, word: np.ndarray) -> np.ndarray:
-    """Return quantiles (N,), searched upwards from lower bounds; ``number`` is overwritten."""
+    """Return Poisson quantiles (N,), searched upwards from lower bounds ``number``, which are overwritten.
+
+    Dimensions: N means.
+    """
     upper, tail = _tail(word)
     left = np.arange(number.size)
     while left.size:
@@ -331,7 +352,10 @@ def _climbed(number: np.ndarray, mean: np.ndarray, word: np.ndarray) -> np.ndarr
 
 
 def _by_series(mean: np.ndarray, word: np.ndarray) -> np.ndarray:
-    """Return quantiles (K, N) of means (N,) from ``TABLE_END`` on."""
+    """Return Poisson quantiles (K, N) of means (N,) from ``TABLE_END`` on, by Giles' expansion.
+
+    Dimensions: K draws, N means.
+    """
     upper, tail = _tail(word)
     x = ndtri(tail)
     x *= 1.0 - 2.0 * upper
