@@ -35,7 +35,7 @@ _GROUPS = (
     Named("twin.validation.paper_004.distortion:FIGURES"),
     Named("twin.validation.paper_017.bundle:GROUP"),
 )
-"""Place of each group in the source. A new group is added here."""
+"""Module and name of each group of checks; a new group is added here."""
 
 GROUPS: tuple[CheckGroup, ...]
 """All groups in the order in which they run; they are imported at the first access."""
@@ -52,7 +52,7 @@ def __getattr__(name: str) -> Any:
 
 
 class UnknownCheck(Exception):
-    """Error raised for a prefix that no check has; the message names the nearest one."""
+    """Error raised for a prefix that no check's id begins with; the message names the nearest one."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Run the selected groups of checks; one that fails is reported and does not stop the others."""
+"""Execution of the selected groups of checks; one that fails is reported and does not stop the others."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FILES = "artefacts"
 """Folder of the groups' artefacts in the run folder; each group has a folder named by its prefix there."""
 
 Progress = Callable[[float, str], None]
-"""Function that takes the estimated seconds of work done, of ``rough_seconds``, and the name of the present work."""
+"""Callable with the estimated seconds of work done, out of ``rough_seconds``, and the name of the present work."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,7 @@ class Validation:
 
     @property
     def unexpected(self) -> tuple[tuple[CheckResult, Verdict], ...]:
-        """Results with another verdict than the expected one, and the expected one; failed checks are among them."""
+        """Results whose verdict differs from the expected one, and the expected verdict, failed checks included."""
         expected = {check.id: check.expected for run in self.runs for check in run.group.checks}
         return tuple((r, expected[r.id]) for r in self.results if r.verdict != expected[r.id])
 

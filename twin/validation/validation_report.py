@@ -132,7 +132,7 @@ def _cell(text: str) -> str:
 
 _LOOKS = "confirmed", "reproduced", "consistent", "corrected", "refuted", "undecided", "silent", "failed"
 MARKS: dict[Verdict, tuple[str, str]] = dict(zip(VERDICTS, zip("=⊜∼≈≠±?✕", _LOOKS, strict=True), strict=True))
-"""Mark and CSS class of each verdict; the mark makes the meaning independent of the colour."""
+"""Character and CSS class of each verdict; the character makes the meaning independent of the colour."""
 
 
 def render_report(validation: Validation) -> str:

@@ -1,4 +1,4 @@
-"""The checks of how far paper 001's formulas hold, with their figures, tables and data."""
+"""Checks of the ranges of validity of paper 001's formulas, with their figures, tables and data."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from twin.validation.paper_001.formulas import PARAMETERS as NAMES
 from twin.validation.paper_001.ranges import CALIBRATED, CLAIMED, CORRECTED, FINE, FORMS, JOINT, PRINTED
 
 OTHER = "gf7_pair"
-"""A camera of another focal length than that which Table 5 implies, in full runs."""
+"""Name of an instrument whose focal length differs from that which Table 5 implies; it is used in full runs."""
 FIELDS = (1.0, 1.5, 2.0, 2.4, 2.72, 2.8)
-"""Fields of the area CCDs, degrees. At smaller fields the left and right prisms overlap."""
+"""Field angles of the area CCDs, degrees; at smaller ones the left and right prisms overlap."""
 OFFSETS_X = (-0.28, -0.24, -0.12, 0.0, 0.12, 0.24, 0.28)
 OFFSETS_Y = (-0.24, -0.12, 0.12, 0.24)
-"""Offsets of the sub-aperture, metres; the pupil's radius is 0.32 m."""
+"""Offsets of the monitor's sub-aperture along Y, metres; the pupil's radius is 0.32 m."""
 _BY_EQUATION = {"eq2": "d_beta", "eq3": "d_alpha", "eq5": "d_gamma", "eq7": "d_f"}
 _ORDER = tuple(_BY_EQUATION.values())
 _SINGLE = (*(f"001.{equation}.range" for equation in _BY_EQUATION), "001.small_angles.range")
@@ -36,7 +36,7 @@ _COLOURS = {PRINTED: VERMILION, JOINT: ORANGE, CORRECTED: BLUE, CALIBRATED: GREE
 _MARKS = {PRINTED: "o", JOINT: "D", CORRECTED: "s", CALIBRATED: "^"}
 _OF_PARAMETER = {"d_alpha": VERMILION, "d_beta": BLUE, "d_gamma": GREEN, "d_f": PURPLE}
 Data = dict[str, Any]
-"""All ranges as data, to which each part of the checks adds its own."""
+"""Contents of the data file with all ranges, to which each part of the checks adds its own."""
 
 
 def _shown(name: str) -> tuple[float, str, str]:
@@ -52,7 +52,7 @@ def _size(value: float, name: str) -> str:
 
 
 def run(context: Context) -> Iterator[CheckResult]:
-    """All checks of the group."""
+    """Yield the results of all checks of the ranges of validity."""
     resolved = resolve_job(JobSpec(instrument=INSTRUMENT))
     context.progress(0.0, f"build {INSTRUMENT}")
     camera = next(iter(resolved.instrument.cameras))
@@ -74,7 +74,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 def ranges_of(
     context: Context, resolved: ResolvedJob, bench: ranges.Bench, begin: float, share: float
 ) -> dict[str, list[ranges.Range]]:
-    """Parameter -> its ranges in both directions."""
+    """Return parameter -> its ranges of validity in both directions."""
     wide = ranges.Bench(
         ranges.variant(resolved, context.backend, bench.cameras[0], pixels=ranges.WIDE_PX), bench, shapes=True
     )
@@ -102,12 +102,12 @@ def _singles(context: Context, resolved: ResolvedJob, bench: ranges.Bench, data:
 
 
 def limit_of(both: Sequence[ranges.Range], form: str, kind: str) -> tuple[float, str]:
-    """Limit in the worse of the two directions, table units, and whence it is known or what ends it."""
+    """Return the limit in the worse of the two directions, table units, and its source or what ends it, as text."""
     return min(r.limit(ranges.criterion(form, kind)) for r in both)
 
 
 def limit_text(both: Sequence[ranges.Range], form: str, kind: str) -> str:
-    """Return the limit of `limit_of` as text."""
+    """Return the limit of a set of formulas in the worse of the two directions, with its source, as text."""
     size, whence = limit_of(both, form, kind)
     if size == 0.0:
         return "nowhere"
@@ -207,7 +207,7 @@ def _joint(context: Context, data: Data) -> Iterator[CheckResult]:
 
 
 def _box_limits(geometry: MonitorGeometry) -> dict[str, list[float]]:
-    """To first order, the box in which Table 1 stays within the claims, from the factors that it lacks."""
+    """Return the box in which Table 1 stays within the claims, to first order, from the factors that it lacks."""
     f, f_x = focal_lengths(geometry)
     anamorphism = f_x / f
     alpha, beta, gamma, d_f = ranges.BOX
@@ -294,7 +294,7 @@ def _returns(context: Context, resolved: ResolvedJob, bench: ranges.Bench, data:
 
 
 def _four(value: float) -> str:
-    """Four decimals, and no minus sign before zero."""
+    """Return a number with four decimals as text, without a minus sign before zero."""
     return f"{round(float(value), 4) + 0.0:.4f}"
 
 
@@ -302,7 +302,7 @@ def _four(value: float) -> str:
 
 
 def _thinned(points: np.ndarray) -> np.ndarray:
-    """Remove points (N, 2) that nearly coincide with the previous one."""
+    """Remove those of N points, (N, 2), that nearly coincide with the previous one."""
     indices = [0]
     for i in range(1, len(points)):
         if points[i, 0] > 1.25 * points[indices[-1], 0]:
@@ -345,7 +345,7 @@ def singles_svg(figure: Figure, reference_ranges: Mapping[str, Sequence[ranges.R
 
 @drawing("ranges-001-joint", 6.2)
 def joint_svg(figure: Figure, corners: ranges.Corners) -> None:
-    """Draw a panel per parameter: the worst corner as a share of the claim over the share of the box."""
+    """Draw a panel per parameter: the largest error at a corner as a share of the claim, over the share of the box."""
     panels = figure.subplots(2, 2, sharex=True).ravel()
     for axes, name in zip(panels, _ORDER, strict=True):
         axes.axhline(1.0, color=INK, lw=1.0, ls=":")
@@ -367,7 +367,7 @@ def joint_svg(figure: Figure, corners: ranges.Corners) -> None:
 
 @drawing("ranges-001-defocus", 3.9)
 def defocus_svg(figure: Figure, pupil: ranges.PupilStudy, curves: ranges.Curves, focal: tuple[float, float]) -> None:
-    """Draw false readings per piston over the pupil, and false readings over the piston."""
+    """Draw false changes per metre of piston over the pupil, and false changes over the piston."""
     left, right = figure.subplots(1, 2)
     grid = np.array([-0.3, 0.3])
     for axis, name, length, sign in ((0, "d_alpha", focal[0], -1.0), (1, "d_beta", focal[1], 1.0)):
@@ -396,7 +396,7 @@ def defocus_svg(figure: Figure, pupil: ranges.PupilStudy, curves: ranges.Curves,
 
 @drawing("ranges-001-field", 3.2)
 def field_svg(figure: Figure, points: Sequence[ranges.FieldPoint]) -> None:
-    """Deviation of the readings' scale over the field."""
+    """Draw the relative scale error of the estimates over the field angle of the area CCDs."""
     axes = figure.subplots()
     field = np.array([p.field for p in points])
     fine = np.linspace(0.0, float(field.max()), 60)
@@ -427,7 +427,10 @@ def _show_causes(
     local: float,
     data: Data,
 ) -> None:
-    """Add the limits of every formula by itself; the local focal length is along the line at its centre, metres."""
+    """Add the limits of every single formula to the report.
+
+    The local focal length is along the line at its centre, metres.
+    """
     f, f_x = focal_lengths(geometry)
     cos2 = math.cos(geometry.field_beta_rad) ** 2
     causes: tuple[tuple[str, str, float | None, str], ...] = (
@@ -458,7 +461,7 @@ def _show_causes(
 def _show_singles(
     context: Context, ranges_by_instrument: Mapping[str, Mapping[str, list[ranges.Range]]], data: Data
 ) -> None:
-    """Add the domains of every formula by itself."""
+    """Add the domains of validity of every single formula to the report."""
     rows: list[list[Cell]] = []
     listed: dict[str, dict[str, Any]] = {instrument: {} for instrument in ranges_by_instrument}
     for instrument, name in ((instrument, name) for instrument in ranges_by_instrument for name in NAMES):
@@ -480,7 +483,7 @@ def _show_singles(
 
 
 def _show_joint(context: Context, corners: ranges.Corners, separation: ranges.Separation, data: Data) -> None:
-    """All four at once."""
+    """Add the results for all four changes at once to the report."""
     rows: list[list[Cell]] = []
     for form in (JOINT, CORRECTED, CALIBRATED):
         for read in NAMES:
@@ -514,9 +517,9 @@ def _show_defocus(
     focal: tuple[float, float],
     data: Data,
 ) -> None:
-    """Add the false readings by defocus.
+    """Add the false changes due to defocus to the report.
 
-    The change is that of the gain; the focal lengths are across and along the line, in metres.
+    ``change`` is that of the gain; the focal lengths are across and along the line, in metres.
     """
     theory = {name: 1.0 / f**2 / ARCSEC for name, f in zip(("d_alpha", "d_beta"), focal, strict=True)}
     rows: list[list[Cell]] = []
@@ -545,7 +548,7 @@ def _show_defocus(
 
 
 def _show_field(context: Context, points: Sequence[ranges.FieldPoint], data: Data) -> None:
-    """Add the results of the area CCDs at other fields."""
+    """Add the results of the area CCDs at other field angles to the report."""
     rows: list[list[Cell]] = []
     listed = []
     for p in points:

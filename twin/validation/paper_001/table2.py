@@ -1,11 +1,12 @@
 """Checks of paper 001's principle experiment (section 3.1), Table 2: two autocollimators, two mirrors on a turntable.
 
-What "about Z" can mean. X is up and Y horizontal, so Z is the view of autocollimator 1, along the normal of mirror 1:
-autocollimator 1 cannot see a turn about it, and reads its own unrest. Mirror 2 turns about Z1 = Y2 sin b + Z2 cos b; of
-that the autocollimator sees d_gamma sin b, about Y2. The printed column of mirror 1 grows by 0.8657 of the table's
-angle and not by 1 or 0: it is d_gamma sin 60 deg, and times 2/sqrt(3) it is the column of mirror 2 in all digits. It is
-therefore the unscaled reading of autocollimator 2. A stand with both mirrors theta off Z would read
-d_gamma sin(theta) = 0.5 d_gamma on both, and a turn about the vertical d_gamma; neither is printed.
+The rotation "about Z" has to be interpreted. X is up and Y horizontal, so Z is the view of autocollimator 1, along the
+normal of mirror 1: autocollimator 1 cannot observe a rotation about it, and reads its own noise. Mirror 2 rotates about
+Z1 = Y2 sin b + Z2 cos b, with the angle b between the mirrors' normals; of a rotation d_gamma its autocollimator
+observes d_gamma sin b, about Y2. The printed column of mirror 1 grows by 0.8657 of the table's angle and not by 1 or 0:
+it is d_gamma sin 60 deg, and times 2/sqrt(3) it is the column of mirror 2 in all digits. It is therefore the unscaled
+reading of autocollimator 2. A stand with both mirrors at an angle theta = b/2 from Z would read d_gamma sin(theta) =
+0.5 d_gamma on both, and a rotation about the vertical d_gamma; neither is printed.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ _AXES = {"d_beta": "X", "d_alpha": "Y", "d_gamma": "Z"}
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Rendered and read: the ideal bench, benches with the declared errors, and what they were read with."""
+    """Readings of the ideal bench and of benches with the specified errors, with the setup and calibration used."""
 
     setup: AutocollimatorSetup
     reader: laboratory.Reader
@@ -52,7 +53,7 @@ class Measured:
 
 
 def measured(context: Context) -> Measured:
-    """Render the benches."""
+    """Render and read the ideal bench and benches with the specified errors."""
     setup = load_autocollimator_test()
     context.progress(0.0, "calibrate the autocollimators")
     reader = laboratory.Reader(setup, context.backend)
@@ -67,7 +68,7 @@ def measured(context: Context) -> Measured:
 
 
 def run(context: Context) -> Iterator[CheckResult]:
-    """Render the benches and set them beside the printed table and its text."""
+    """Yield the results of the checks of Table 2 and of its text."""
     for name, claimed in _CLAIMED.items():
         value = printed_mean_difference(_AXES[name])
         explained = [MEAN_DIFFERENCE[_AXES[name]]]
@@ -96,14 +97,17 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 
 def printed_mean_difference(axis: str) -> float:
-    """Last line of Table 2 worked out from its rows, arcsec: mirror 1 - mirror 2 (X, Y), turntable - mirror 2 (Z)."""
+    """Return the mean absolute difference computed from the rows of Table 2, arcsec, to compare with its last line.
+
+    It is mirror 1 - mirror 2 (X, Y) or turntable - mirror 2 (Z).
+    """
     return mean_difference(ANGLES if axis == "Z" else MIRROR_1[axis], MIRROR_2[axis])
 
 
 def _mean_difference(context: Context, measurement: Measured, series: laboratory.Series) -> CheckResult:
     """Check the last line of Table 2 for one axis by the mean over the benches.
 
-    The noise is the standard deviation of one bench under the errors that the scene declares.
+    The noise is the standard deviation of one bench under the errors that the scene's file specifies.
     """
     axis, spec = series.axis, measurement.setup.spec
     perfect, result = measurement.ideal[axis], measurement.real[0][axis]
@@ -152,12 +156,12 @@ def _z_columns(context: Context, measurement: Measured) -> CheckResult:
 
 
 def _errors(measured: float) -> Chosen:
-    """All errors of the bench, to which mean differences are proportional."""
+    """Return all errors of the bench together as a chosen input, to which mean differences are proportional."""
     return Chosen.power("errors of the bench (scenes/lab/principle_experiment.yaml), times", 1.0, "1", measured)
 
 
 def _relations(context: Context, measurement: Measured) -> Iterator[CheckResult]:
-    """Section 3.1.1's relations on the ideal bench, where nothing but they can differ."""
+    """Check the relations of section 3.1.1 on the ideal bench, which has no errors."""
     for axis in "XYZ":
         result, component = measurement.ideal[axis], column_component(axis)
         between = 2.0 * result.series.half_angle
@@ -211,7 +215,10 @@ def bench_png(reader: laboratory.Reader, tables: Sequence[laboratory.ReadingTabl
 
 
 def _plan(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project points (..., 3) of the bench onto paper, seen from above (X up): Z to the right, Y down, millimetres."""
+    """Project points of the bench, (..., 3), onto the drawing, in millimetres.
+
+    They are seen from above (X up): Z to the right, Y down.
+    """
     return 1e3 * points[..., 2], -1e3 * points[..., 1]
 
 

@@ -42,15 +42,15 @@ SCHEMES = {
     5: "each field its own",
 }
 INNER = tuple(f"{line} {part}" for line in LINES for part in INTERIOR)
-"""Unknowns of the interior, line by line."""
+"""Names of the unknowns of the interior orientation, ordered by line."""
 MEDIAN = float(np.sqrt(np.pi / 2.0))
-"""Standard deviation of a median over that of a mean, for normal noise and many draws."""
+"""Ratio of the standard deviations of a median and a mean, for normal noise and many samples."""
 SLOW = 1.5 * ARCSEC, 10.0
-"""Slow errors of the attitude that third differences are tried on: sigma of a value, seconds between values."""
+"""Slow attitude errors for a test of third differences: sigma of a value, radians, and seconds between values."""
 _EDGE = 1e-9
 _SIGNIFICANT = 3.0
 _QUARTILE = 0.6745
-"""Sigmas from the median of normal noise."""
+"""Distance of the quartiles of normal noise from its median, in sigmas."""
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, INK)
 _MARKERS = "osD^vPX"
 _CURVES = 40
@@ -58,29 +58,33 @@ _CURVES = 40
 
 @dataclass(frozen=True, eq=False)
 class Flights:
-    """N campaigns over K fields, S schemes; the last scheme lets each field use its own parameters.
+    """Results of N campaigns over K fields by S schemes of parameters.
+
+    The last scheme lets each field use its own parameters.
 
     Attributes
     ----------
     fields : tuple[str, ...]
-        names. latitude: (K,) radians.
+        Names of the fields.
+    latitude : np.ndarray
+        (K,) latitudes of the fields, radians.
     bias, bias_sigma, true_bias : np.ndarray
-        (N, K, 3) of each field calibrated by itself, radians; roll, pitch, yaw.
+        (N, K, 3) attitude bias of each field calibrated by itself, radians; roll, pitch, yaw.
     interior, interior_sigma : np.ndarray
-        (N, K, 9) in the order of INNER, metres; sigma 0 where held.
+        (N, K, 9) elements of the interior orientation in the order of INNER, metres; sigma 0 where held.
     plan, height : np.ndarray
         (N, S, K) RMS at check points without ground control, metres.
     plan_before, height_before : np.ndarray
-        (N, K) with the laboratory's camera.
+        (N, K) RMS at check points with the laboratory's camera, metres.
     plan_floor, height_floor : np.ndarray
-        (N, K) with the true camera and the true bias: the check points' own noise.
+        (N, K) RMS with the true camera and the true bias, metres: the check points' own noise.
     expected : np.ndarray
-        (N, S, K) RMS in plan that the true biases of fields and scheme imply.
+        (N, S, K) RMS in plan that the true biases of fields and scheme imply, metres.
     fits : tuple[tuple[LatitudeFit, ...], ...]
-        Campaign -> roll, pitch, yaw against latitude, from the estimated biases.
+        Campaign -> fits of roll, pitch, yaw against latitude, from the estimated biases.
     true_amplitude, true_significance : np.ndarray
-        (N, 3) amplitude from the true biases, by unweighted least squares, and how many of its standard deviations it
-        is.
+        (N, 3) amplitude of these fits to the true biases, by unweighted least squares, radians, and its ratio to its
+        standard deviation.
     """
 
     fields: tuple[str, ...]
@@ -103,7 +107,7 @@ class Flights:
 
     @property
     def count(self) -> int:
-        """Campaigns."""
+        """Number of campaigns."""
         return len(self.plan)
 
 
@@ -122,7 +126,7 @@ def flown(
 
 
 def flights_of(campaigns: Sequence[Campaign]) -> Flights:
-    """Calibrate and test all of them."""
+    """Calibrate and test all campaigns, and return their results as arrays."""
     first = campaigns[0]
     names = tuple(p.name for p in first.passes)
     latitude = np.array([p.latitude for p in first.passes])
@@ -159,7 +163,7 @@ def flights_of(campaigns: Sequence[Campaign]) -> Flights:
 
 
 def _expected(campaign: Campaign, names: tuple[str, ...], floor: np.ndarray) -> np.ndarray:
-    """Return the (S, K) RMS in plan that the true biases imply.
+    """Return the (S, K) RMS in plan at K fields that the true biases imply for S schemes of parameters, metres.
 
     It is a field's roll and pitch minus the scheme's mean, times the height of flight, and the noise of the check
     points. Yaw moves the ends of the swath by 0.2 m for 1 arcsec.
@@ -175,7 +179,10 @@ def _expected(campaign: Campaign, names: tuple[str, ...], floor: np.ndarray) -> 
 
 
 def _slopes(latitude: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the (3,) amplitudes of sin(latitude - middle) in true biases (K, 3), and their ratios to sigma."""
+    """Return amplitudes of sin(latitude - middle) in the true biases of K fields, (3,), and their ratios to sigma.
+
+    The biases ``true`` are (K, 3): roll, pitch, yaw, radians.
+    """
     reference = 0.5 * (latitude.min() + latitude.max())
     design = np.column_stack([np.sin(latitude - reference), np.ones_like(latitude)])
     best, square, _, _ = np.linalg.lstsq(design, true, rcond=None)
@@ -184,14 +191,14 @@ def _slopes(latitude: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _above(field_pass: FieldPass) -> float:
-    """Height of the flight above the check points, metres."""
+    """Return the height of the flight above the check points, metres."""
     earth = field_pass.data.earth
     flight = float(earth.geodetic(field_pass.trajectory.position(0.0))[2])
     return flight - float(np.mean(earth.geodetic(field_pass.check_ground)[2]))
 
 
 def lines_of(part: str) -> list[int]:
-    """Return the indices in INNER of an element, ``f``, ``x`` or ``y``, of all lines."""
+    """Return the indices in INNER of one element of interior orientation, ``f``, ``x`` or ``y``, for all lines."""
     return [INNER.index(f"{line} {part}") for line in LINES]
 
 
@@ -199,8 +206,8 @@ def lines_of(part: str) -> list[int]:
 class Quality:
     """Quality of orbit and attitude of the passes of all campaigns.
 
-    All arrays are (N, K, 3): metres for the orbit's x, y, z in the Earth-fixed frame, radians for roll, pitch, yaw of
-    the attitude against the orbital frame.
+    All arrays are (N, K, 3) for N campaigns and K fields: metres for the orbit's x, y, z in the Earth-fixed frame,
+    radians for roll, pitch, yaw of the attitude against the orbital frame.
 
     Attributes
     ----------
@@ -225,7 +232,7 @@ class Quality:
 
 
 def quality_of(setup: CalibrationSetup, campaigns: Sequence[Campaign]) -> Quality:
-    """Third differences of every pass; truth from the true trajectories."""
+    """Return the third differences of orbit and attitude of every pass, and the true errors for comparison."""
     rows = [[_pass(setup, p) for p in campaign.passes] for campaign in campaigns]
     return Quality(*(np.array([[p[k] for p in row] for row in rows]) for k in range(7)))
 
@@ -249,7 +256,7 @@ def _pass(setup: CalibrationSetup, field_pass: FieldPass) -> tuple[np.ndarray, .
 
 
 def _readings(first: float, last: float, interval: float) -> np.ndarray:
-    """Return the times of the readings inside a span, seconds."""
+    """Return the times, in seconds, of the orbit's or attitude's readings inside a time span."""
     return interval * np.arange(np.ceil(first / interval - _EDGE), np.floor(last / interval + _EDGE) + 1.0)
 
 
@@ -334,7 +341,10 @@ def _interior(context: Context, flights: Flights, number: int, parts: tuple[str,
 
 @drawing("paper-003-schemes", 4.6)
 def schemes_svg(figure: Figure, flights: Flights, plan: float, height: float) -> None:
-    """Draw the RMS in plan and height on logarithmic axes with the limits; scheme 0 is before calibration."""
+    """Draw the RMS in plan and height by scheme on logarithmic axes, with the limits of the map scale.
+
+    Scheme 0 is before calibration.
+    """
     panels = figure.subplots(1, 2)
     names = ["0\nlaboratory", "1\n1 field", "2\n2 fields", "3\n4 fields", "4\n6 fields", "5\nits own"]
     for axes, what, limit in zip(panels, ("plan", "height"), (plan, height), strict=True):
@@ -360,7 +370,7 @@ def schemes_svg(figure: Figure, flights: Flights, plan: float, height: float) ->
 
 @drawing("paper-003-latitude", 3.8)
 def latitude_svg(figure: Figure, flights: Flights) -> None:
-    """Three angles: estimates, truth and fits."""
+    """Draw roll, pitch and yaw biases over latitude: estimates, truth and fits."""
     degrees = np.degrees(flights.latitude)
     reach = np.linspace(flights.latitude.min() - 0.03, flights.latitude.max() + 0.03, 61)
     for k, (axes, axis) in enumerate(zip(figure.subplots(1, 3), BIAS, strict=True)):
@@ -381,7 +391,10 @@ def latitude_svg(figure: Figure, flights: Flights) -> None:
 
 @one_blas_thread()
 def run(context: Context) -> Iterator[CheckResult]:
-    """Fly, calibrate, test; drawn image points, whose noise 003.model.points justifies."""
+    """Yield the results of the checks over campaigns: simulate, calibrate and test.
+
+    Image points are drawn at random, with a noise that the check 003.model.points justifies.
+    """
     setup = without_light(setup_of(FIELDS))
     count = context.count(FULL, FAST)
     seed = np.random.SeedSequence(context.seed, spawn_key=(3, 2))
@@ -411,7 +424,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 
 def _schemes(context: Context, flights: Flights, setup: CalibrationSetup) -> Iterator[CheckResult]:
-    """Accuracy in plan and height by scheme, at the limits of 1:50 000, and before calibration."""
+    """Check the accuracy in plan and height of each scheme against the limits of 1:50 000, and before calibration."""
     for k in SCHEMES:
         fields, expected = flights.plan[:, k - 1], flights.expected[:, k - 1]
         value = float(np.median(fields.mean(axis=1)))
@@ -446,7 +459,10 @@ def _schemes(context: Context, flights: Flights, setup: CalibrationSetup) -> Ite
 
 
 def _per_shift(setup: CalibrationSetup) -> float:
-    """Error of a height for a shift of the forward line along the track: flat ground, met with the backward line."""
+    """Return the error of a height per shift of the forward line along the track in the image, metres per metre.
+
+    Points on flat ground are intersected from the forward and the backward line.
+    """
     line = setup.camera.lines["forward"]
     turn = np.cos(line.look) ** 2 / line.principal_distance
     return float(height_error(turn, setup.test.altitude / np.cos(line.look), 2.0 * line.look, line.look))
@@ -455,8 +471,8 @@ def _per_shift(setup: CalibrationSetup) -> float:
 def _varied(measured: float, flights: Flights, statistic: Callable[[np.ndarray], np.ndarray]) -> Chosen:
     """Return the variation of the biases between the fields as a chosen input.
 
-    A factor on it scales what the true biases imply of the (N, S, K) RMS in plan; the response is the median of a
-    statistic (N,).
+    A factor on it scales what the true biases imply of the RMS in plan, (N, S, K) for N campaigns, S schemes and K
+    fields; the response is the median of a statistic, (N,).
     """
     floor = flights.plan_floor[:, None, :]
     turned = np.sqrt(np.maximum(flights.expected**2 - floor**2, 0.0))
@@ -469,12 +485,12 @@ def _varied(measured: float, flights: Flights, statistic: Callable[[np.ndarray],
 
 
 def _span(values: np.ndarray) -> np.ndarray:
-    """Return the (N,) ratios of largest to smallest value of (N, K)."""
+    """Return the (N,) ratios of the largest to the smallest of K values in each of N campaigns, (N, K)."""
     return np.asarray(values.max(axis=1) / values.min(axis=1))
 
 
 def _findings(context: Context, flights: Flights) -> Iterator[CheckResult]:
-    """Check the paper's statements about the schemes by statistics of the RMS in plan."""
+    """Check the paper's statements about the schemes of parameters by statistics of the RMS in plan."""
     plan = flights.plan
     # of RMS (N, S, K): scatter over the fields by one scheme over that by six fields; largest over smallest and mean by
     # six fields over those by one; the same of the field that is in no mean

@@ -1,7 +1,7 @@
 """Checks of the rigorous model of paper 003.
 
-They use exact points, marks on the ground and matched points in rendered images, and drawn points. A figure shows the
-combination of parameters that the points cannot determine.
+They use exact points, bright targets on the ground and matched points in rendered images, and points drawn at random. A
+figure shows the combination of parameters that the points cannot determine.
 """
 
 from __future__ import annotations
@@ -58,17 +58,23 @@ FREE_INTERIOR = tuple(n for n in (f"{line} {k}" for line in LINES for k in INTER
 TOLERANCE = 1e-3
 """Largest last step of a round of the stepwise solution, in conditional sigmas."""
 PLACES = (700.0, 6000.0, 11300.0)
-"""Pixels of the nadir line, whose 12 000 see the swath, that see the middles of the windows."""
+"""Pixels of the nadir line at the middles of the windows; the line has 12 000 pixels over the swath."""
 _FOCAL = 0.65
-"""Metres; angles are drawn as image motion."""
+"""Focal length, metres, with which angles are drawn as image motion."""
 _NO_LIGHT = EffectsSpec(light_time=False, aberration=False, refraction=False)
 _STEP = {"f": 1e-5, "x": 1e-5, "y": 1e-5}
-"""Metres: how far an element is changed to either side, 1.5 px; what is left of third order is 1e-9 of it."""
+"""Change of an element of interior orientation for numerical derivatives, metres, to either side: 1.5 px.
+
+The error of third order is 1e-9 of the derivative.
+"""
 _TURN = 1.5e-5
-"""Radians, likewise."""
+"""Change of an attitude angle for numerical derivatives, radians, to either side."""
 _SIDE = 190
 _SIGMA = 2.5
-"""Metres: of a mark, half a pixel. The terrain's curvature under it moves its centroid by 0.004 px at most."""
+"""Standard deviation of the brightness of a target on the ground, metres: half a pixel.
+
+The terrain's curvature under it moves its centroid by 0.004 px at most.
+"""
 _APART = 300.0
 _REACH = MARGIN + 4
 _TERRAIN: dict[str, Any] = {"kind": "fractal", "relief": "30 m", "exponent": 2.4}
@@ -110,7 +116,10 @@ def exact_and_images() -> CalibrationSetup:
 
 
 def all_errors(value: float) -> Chosen:
-    """Return the errors of biases, orbit, attitude and points, to which those of a calibration are proportional."""
+    """Return the errors of biases, orbit, attitude and points as one input.
+
+    The errors of a calibration are proportional to it.
+    """
     return Chosen.power("biases and errors of scenes/orbit/calibrate.yaml, times", 1.0, "1", value)
 
 
@@ -120,18 +129,18 @@ def true_sensors(
     trajectory: Platform | None = None,
     interior: Mapping[str, np.ndarray] = FrozenMap(),
 ) -> dict[str, Sensor]:
-    """Line -> the camera as it is after launch, on the true trajectory of a pass or on another one.
+    """Return line -> sensor model of the camera as it is after launch, on a trajectory.
 
     Parameters
     ----------
     setup : CalibrationSetup
-        cameras.
-    one : FieldPass
-        The pass.
+        Setup with the cameras.
+    field_pass : FieldPass
+        Pass over a field.
     trajectory : Platform | None
-        Another one, None for the true.
+        Trajectory to be used; None for the true one of the pass.
     interior : Mapping[str, np.ndarray]
-        Line -> change of its f, x, y (3,), metres.
+        Line -> change of its f, x, y, (3,), metres.
     """
     payload = changed_payload(setup.test, setup.camera)
     lines = dict(payload.lines)
@@ -148,25 +157,25 @@ def true_sensors(
 
 @dataclass(frozen=True, eq=False)
 class Turned:
-    """A platform with its body turned, attitude -> attitude Rx(roll) Ry(pitch) Rz(yaw).
+    """Platform with its body rotated: attitude -> attitude Rx(roll) Ry(pitch) Rz(yaw).
 
     Attributes
     ----------
     base : Platform
-        The platform.
+        The platform without the rotation.
     angles : np.ndarray
-        (3,) roll, pitch, yaw, radians.
+        (3,) roll, pitch, yaw of the rotation, radians.
     """
 
     base: Platform
     angles: np.ndarray
 
     def position(self, seconds: np.ndarray) -> np.ndarray:
-        """Position of the base."""
+        """Return the position of the platform, which the rotation does not change."""
         return self.base.position(seconds)
 
     def inertial_velocity(self, seconds: np.ndarray) -> np.ndarray:
-        """Inertial velocity of the base."""
+        """Return the inertial velocity of the platform, which the rotation does not change."""
         return self.base.inertial_velocity(seconds)
 
     def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
@@ -193,8 +202,8 @@ def derivatives(setup: CalibrationSetup, field_pass: FieldPass, bias: np.ndarray
     Parameters
     ----------
     setup : CalibrationSetup
-        Cameras.
-    one : FieldPass
+        Setup with the cameras.
+    field_pass : FieldPass
         Pass whose check points are used.
     bias : (3,) ndarray
         Rotation from the measured to the true attitude, radians.
@@ -238,12 +247,12 @@ def places_seen(
 
 
 def exact_campaign(setup: CalibrationSetup, seed: np.random.SeedSequence) -> Campaign:
-    """Image points of the rigorous sensor without noise."""
+    """Return a campaign whose image points are computed by the rigorous sensor model, without noise."""
     return source_of(setup, seed).independent
 
 
 def recovered(campaign: Campaign, pitch: float) -> tuple[float, str]:
-    """Largest error of a calibration of exact points, pixels of image motion, and which unknown has it."""
+    """Return the largest error of a calibration of exact points, in pixels of image motion, and the unknown with it."""
     field_pass = campaign.passes[0]
     adjustment = calibrated_alone(campaign, field_pass)
     worst, which = 0.0, ""
@@ -255,7 +264,7 @@ def recovered(campaign: Campaign, pitch: float) -> tuple[float, str]:
 
 
 def errors_of(campaign: Campaign, field_pass: FieldPass, adjustment: Adjustment | Stepwise) -> dict[str, float]:
-    """Unknown, without a field -> estimated minus true, metres and radians."""
+    """Return unknown, without the field's name -> estimated minus true value, metres or radians."""
     value = dict(zip(adjustment.names, adjustment.values, strict=True))
     out = {
         f"{line} {name}": float(value[f"{line} {name}"] - true)
@@ -267,7 +276,7 @@ def errors_of(campaign: Campaign, field_pass: FieldPass, adjustment: Adjustment 
 
 @dataclass(frozen=True, eq=False)
 class Rank:
-    """Combinations that the twelve unknowns of a field leave undetermined.
+    """Combinations of the twelve unknowns of a field that its points leave undetermined.
 
     Attributes
     ----------
@@ -278,10 +287,10 @@ class Rank:
     weak_sigma : float
         Sigma of nadir y, in metres, with nadir x fixed.
     moved : float
-        RMS displacement of the rigorous sensor's image points, in pixels, by the undetermined combination with 0.1 mm
-        in x of every line.
+        RMS displacement of the rigorous sensor's image points, in pixels, due to the undetermined combination with 0.1
+        mm in x of every line.
     alone : float
-        RMS displacement by the changes of x alone, in pixels.
+        RMS displacement due to the changes of x alone, in pixels.
     """
 
     unknowns: int
@@ -292,12 +301,12 @@ class Rank:
 
     @property
     def rank(self) -> int:
-        """Unknowns less open combinations."""
+        """Rank of the normal equations: the unknowns minus the undetermined combinations."""
         return self.unknowns - len(self.open)
 
 
 def rank_of(setup: CalibrationSetup, campaign: Campaign) -> Rank:
-    """Compute the null vectors of one field, and apply the first of them to the sensor."""
+    """Compute the undetermined combinations (null vectors) of one field, and apply the first of them to the sensor."""
     field_pass = campaign.passes[0]
     independent = campaign.independent
     adjustment = adjust([field_pass.control], independent.laboratory, independent.noise, gauge=GAUGE)
@@ -320,14 +329,18 @@ def rank_of(setup: CalibrationSetup, campaign: Campaign) -> Rank:
 
 @dataclass(frozen=True, eq=False)
 class Walk:
-    """The stepwise solution of a field against the simultaneous one.
+    """Comparison of the stepwise solution of a field with the simultaneous one.
 
     Attributes
     ----------
     found : Stepwise
-        stepwise. together: simultaneous. distance: largest difference, sigmas.
+        Stepwise solution.
+    together : Adjustment
+        Simultaneous solution.
+    distance : float
+        Largest difference between them, in sigmas.
     after : Mapping[int, float]
-        Rounds -> largest difference after so many, sigmas.
+        Number of rounds -> largest difference after so many, sigmas.
     """
 
     found: Stepwise
@@ -337,7 +350,7 @@ class Walk:
 
 
 def walked(campaign: Campaign, field_pass: FieldPass, rounds: tuple[int, ...] = (1, 10, 100)) -> Walk:
-    """Both solutions of one field, and how far the stepwise one is after some rounds."""
+    """Compute both solutions of one field, and their difference after some rounds of the stepwise one."""
     observations = [field_pass.control], campaign.laboratory, campaign.noise
     together = adjust(*observations, gauge=GAUGE)
     free = np.array([name not in GAUGE.held for name in together.names])
@@ -353,12 +366,14 @@ def walked(campaign: Campaign, field_pass: FieldPass, rounds: tuple[int, ...] = 
 
 @dataclass(frozen=True, eq=False)
 class FoundMarks:
-    """Marks of all windows of one line.
+    """Bright targets measured in all windows of one line.
 
     Attributes
     ----------
     line, pixel : np.ndarray
-        (n,) of their centroids. ground: (n, 3) true places, ITRS, metres.
+        (n,) image line and pixel of the n centroids.
+    ground : np.ndarray
+        (n, 3) true positions on the ground, ITRS, metres.
     """
 
     line: np.ndarray
@@ -368,7 +383,7 @@ class FoundMarks:
 
 @dataclass(frozen=True, eq=False)
 class _Spots:
-    """Apparent reflectance of bright marks on black ground."""
+    """Apparent reflectance of bright targets on black ground, as a function of position on the ground."""
 
     east: np.ndarray
     north: np.ndarray
@@ -383,7 +398,10 @@ class _Spots:
 
 
 def rendered_marks(setup: CalibrationSetup, campaign: Campaign, seed: np.random.SeedSequence) -> dict[str, FoundMarks]:
-    """Line -> its marks, four in each window over the first field of a campaign, found by their centroids."""
+    """Return line -> bright targets measured in it, four in each window over the first field of a campaign.
+
+    They are located by their centroids.
+    """
     field_pass = campaign.passes[0]
     height = setup.test.fields[field_pass.name].height
     sensors = true_sensors(setup, field_pass)
@@ -415,7 +433,7 @@ def rendered_marks(setup: CalibrationSetup, campaign: Campaign, seed: np.random.
 
 
 def missed(setup: CalibrationSetup, campaign: Campaign, marks: dict[str, FoundMarks]) -> dict[str, np.ndarray]:
-    """Return the (n, 2) misclosures of the analysis's model at the marks of each line, in pixels.
+    """Return line -> (n, 2) misclosures of the analysis's model at the line's n bright targets, in pixels.
 
     The model has the true interior orientation and bias, the measured attitude and the known ground.
     """
@@ -429,7 +447,7 @@ def missed(setup: CalibrationSetup, campaign: Campaign, marks: dict[str, FoundMa
 
 
 def _brightest(image: np.ndarray, count: int) -> list[tuple[int, int]]:
-    """Brightest pixels, each farther from the ones before than a mark's image reaches."""
+    """Return the brightest pixels, each farther from the previous ones than the image of a target extends."""
     rest = image.copy()
     out = []
     for _ in range(count):
@@ -440,7 +458,7 @@ def _brightest(image: np.ndarray, count: int) -> list[tuple[int, int]]:
 
 
 def _centroid(image: np.ndarray, row: int, column: int) -> np.ndarray:
-    """Centroid of all pixels within the reach of the point spread function from a pixel."""
+    """Return the centroid of all pixels that the point spread function reaches from a given pixel, in pixels."""
     part = image[row - _REACH : row + _REACH + 1, column - _REACH : column + _REACH + 1]
     if part.shape != (2 * _REACH + 1,) * 2:
         raise ValueError("a mark lies too near to the window's border")
@@ -449,7 +467,10 @@ def _centroid(image: np.ndarray, row: int, column: int) -> np.ndarray:
 
 
 def _matched(predicted: tuple[np.ndarray, np.ndarray], at: np.ndarray, ground: np.ndarray) -> np.ndarray:
-    """Ground points in the order of the marks found; marks lie 60 px apart, so that the nearest is meant."""
+    """Return ground points in the order of the targets found in the image.
+
+    Targets are 60 px apart, so that the nearest predicted position is the right one.
+    """
     away = np.hypot(predicted[0] - at[:, :1], predicted[1] - at[:, 1:])
     order = away.argmin(axis=1)
     if len(set(order.tolist())) != len(order):
@@ -459,17 +480,17 @@ def _matched(predicted: tuple[np.ndarray, np.ndarray], at: np.ndarray, ground: n
 
 @dataclass(frozen=True, eq=False)
 class FromImages:
-    """Calibration of one field from images.
+    """Calibration of one field from rendered images.
 
     Attributes
     ----------
     name : str
         Name of the field.
     control, check : int
-        Numbers of accepted points.
+        Numbers of accepted control points and check points.
     way : Stepwise
         Stepwise solution.
-    together : object
+    together : Adjustment
         Simultaneous solution, for sigmas.
     error : dict of str to float
         Stepwise estimate minus truth of each free unknown, radians and metres.
@@ -490,7 +511,7 @@ class FromImages:
     after: CheckErrors
 
     def rms(self, names: tuple[str, ...]) -> tuple[float, float]:
-        """Return the RMS error of some unknowns and its standard deviation by their covariance."""
+        """Return the RMS error of some unknowns and its standard deviation according to their covariance."""
         where = [list(self.error).index(n) for n in names]
         part = self.covariance[np.ix_(where, where)]
         # variance of a sum of squares of correlated normal errors is twice the trace of the squared covariance
@@ -501,7 +522,7 @@ class FromImages:
 
 
 def calibrated(campaign: Campaign) -> tuple[FromImages, ...]:
-    """Every field by itself."""
+    """Calibrate every field of a campaign by itself."""
     return tuple(_field(campaign, field_pass) for field_pass in campaign.passes)
 
 
@@ -564,7 +585,7 @@ def summary(from_images: FromImages, names: tuple[str, ...]) -> str:
 
 @drawing("paper-003-open", 3.4)
 def open_svg(figure: Figure, rank: Rank, walk: Walk) -> None:
-    """Draw bars of the undetermined combination, and sigmas over rounds."""
+    """Draw the undetermined combination as bars, and the stepwise solution's difference in sigmas over its rounds."""
     left, right = figure.subplots(1, 2)
     combination = rank.open[0]
     names = [n if n.split()[-1] in "fxy" else n.split()[-1] for n in combination.names]
@@ -596,7 +617,7 @@ def open_svg(figure: Figure, rank: Rank, walk: Walk) -> None:
 
 @one_blas_thread()
 def run(context: Context) -> Iterator[CheckResult]:
-    """Exact data first, then one drawn field, then rendered ones."""
+    """Yield the results of the checks of the model: with exact data, then a simulated field, then rendered images."""
     seed = np.random.SeedSequence(context.seed, spawn_key=(3, 1))
     if {"003.model", "003.equations", "003.equations.exact"} & context.selected:
         yield from _exact(context, seed)

@@ -43,17 +43,20 @@ RAW, COMPENSATED = (np.array(_PRINTED.column(f"table2.{name}_um")) for name in (
 TESTS, FAST_TESTS = 60, 14
 """Simulated tests: another turntable, calibration, zero, axis, detector and noise in each."""
 FEW = 5
-"""Every fifth point, for the effect of their number."""
+"""Step between the points of a reduced set (every fifth point), to check the effect of the number of points."""
 UNEVEN = slice(0, 44)
-"""Points from one end of the line to six tenths of the other half: there f and p of (2) hang on each other, and the
-camera's radial distortion makes a p of 54 mm, which no noise hides.
+"""Points from one end of the line to six tenths of the other half, for the check of uneven spacing.
+
+There f and p of eq. (2) are correlated, and the camera's radial distortion causes a p of 54 mm, which no noise hides.
 """
 _PRINTED_ONLY = {f"004.table2.{name}" for name in ("reduction", "mean", "largest", "bound")}
 
 
 @dataclass(frozen=True, eq=False)
 class Perspective:
-    """The camera without distortion, L = f tan(W - w) + f tan w, that is nearest to chief rays.
+    """Distortion-free camera that fits chief rays best, L = f tan(W - w) + f tan w.
+
+    L is the position along the line, W the angle of the direction, w the tilt of the camera's axis.
 
     Attributes
     ----------
@@ -62,7 +65,7 @@ class Perspective:
     p : float
         Principal point f tan w, metres.
     rest : Array
-        Distortion of the rays, (N,), metres.
+        Distortion of the N rays, (N,), metres.
     """
 
     f: float
@@ -73,7 +76,7 @@ class Perspective:
     def slope(self) -> float:
         """Slope dL / d tan W at the middle, f / cos² w, in metres.
 
-        It takes the place of f in eq. (1), which expands to first order in w; it differs from f by p² / f.
+        It replaces f in eq. (1), which expands to first order in the tilt w; it differs from f by p² / f.
         """
         return self.f + self.p**2 / self.f
 
@@ -103,54 +106,55 @@ class Perspective:
 
 @dataclass(frozen=True, eq=False)
 class SpotTest:
-    """Data of one rendered test for the equations, with the truth."""
+    """Positions and angles of one rendered test for the equations, with their true values."""
 
     run: SimulatedDistortion
 
     @cached_property
     def place(self) -> Array:
-        """L by the images, (N,), metres."""
+        """Positions L of the N points along the line, measured in the images, (N,), metres."""
         return self.run.compensated.fit.position
 
     @cached_property
     def turn(self) -> Array:
-        """W by compensated readings, from the zero that the operator set, (N,), radians."""
+        """Angles W of the N points by compensated readings, from the zero that the operator set, (N,), radians."""
         return self.run.compensated.fit.angle
 
     @cached_property
     def zeroed(self) -> Array:
-        """W from the zero that the constant of a fit finds, (N,), radians."""
+        """Angles W of the N points, from the zero that a fit with a constant term estimates, (N,), radians."""
         return np.asarray(self.turn - self.run.compensated.zero)
 
     @cached_property
     def true_place(self) -> Array:
-        """L of the chief rays, (N,), metres."""
+        """True positions L of the N chief rays along the line, (N,), metres."""
         return self.run.means.mean(self.run.truth.position[..., 0])
 
     @cached_property
     def true_turn(self) -> Array:
-        """W, (N,), radians."""
+        """True angles W of the N points, (N,), radians."""
         return self.run.means.mean(self.run.truth.field_angle)
 
     @cached_property
     def camera(self) -> Perspective:
-        """The traced camera's principal distance, principal point and distortion."""
+        """Principal distance, principal point and distortion of the traced camera."""
         return Perspective.nearest(self.true_place, self.true_turn)
 
     @cached_property
     def part(self) -> Perspective:
-        """The traced camera's parameters, fitted over the uneven points alone."""
+        """Principal distance, principal point and distortion of the traced camera from the uneven points alone."""
         return Perspective.nearest(self.true_place[UNEVEN], self.true_turn[UNEVEN])
 
     @property
     def zero(self) -> float:
-        """Error of the zero of W, mean over the points, in radians."""
+        """Error of the zero of the angles W, mean over the points, in radians."""
         return float(np.mean(self.turn - self.true_turn))
 
     def shifted(self, *powers: int) -> tuple[Array, Array]:
         """Return the effect of the wrong zero alone on a least-squares fit of powers of tan W to the chief rays.
 
-        The effect consists of coefficients (P,) and of the residuals (N,), in metres.
+        The effect consists of the coefficients of the P powers, (P,), and of the residuals at the N points, (N,), in
+        metres.
         """
         columns = np.tan(self.true_turn)[:, None] ** np.array(powers)
         # what the camera images to W stands beside W + zero
@@ -159,7 +163,10 @@ class SpotTest:
         return coefficients, np.asarray(moved - columns @ coefficients)
 
     def errors(self, turn: Array, points: slice | NDArray[np.intp]) -> tuple[float, float]:
-        """Error of f and RMS error of D, metres, of constant, f and p fitted to these points with these angles."""
+        """Return the error of f and the RMS error of the distortion, metres, for some points and angles.
+
+        A constant, f and p are fitted to these points.
+        """
         fits = [_fitted(self.place[points], turn[points]), _fitted(self.true_place[points], self.true_turn[points])]
         (f, rest), (f_true, rest_true) = fits
         return f - f_true, rms(rest - rest_true)
@@ -172,7 +179,7 @@ def _fitted(where: Array, turn: Array) -> tuple[float, Array]:
 
 
 def run(context: Context) -> Iterator[CheckResult]:
-    """Table 2 by itself, and distortion tests from rendered spots."""
+    """Yield the results of the checks of Table 2 and of distortion tests from rendered spots."""
     yield from _table2(context)
     if not context.selected - _PRINTED_ONLY:
         return
@@ -208,7 +215,7 @@ def measured_tests(context: Context) -> list[SimulatedDistortion]:
 
 
 def lower(raw: float | np.floating, compensated: float | np.floating) -> float:
-    """Reduction, percent."""
+    """Return the reduction of an error by the compensation, in percent of the raw error."""
     return float(100.0 * (1.0 - compensated / raw))
 
 
@@ -253,7 +260,7 @@ def _eq1(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[
 
 
 def _by_eq1(test: SpotTest, turn: Array) -> float:
-    """Return the RMS error of D by eq. (1) with f and p of eq. (2), in metres."""
+    """Return the RMS error of the distortion by eq. (1) with f and p of eq. (2), in metres."""
     f, p = principal_distance_and_point(test.place, turn)
     return rms(distortion(test.place, turn, f, p) - test.camera.rest)
 
@@ -277,7 +284,7 @@ def _eq2(context: Context, tests: Sequence[SpotTest], facts: Facts) -> Iterator[
         return context.row("004.eq2.f", value, sigma, truth, equation=equation, scatter=scatter, **facts)
 
     def zero(found: Array, predicted: Array, equation: str) -> CheckResult:
-        """Check the principal point by a printed equation; the error of the zero appears as p."""
+        """Check the principal point by a printed equation, into which the error of the zero of the angles enters."""
         error, turn = found - p_true, rms([t.zero for t in tests])
         more: dict[str, Any] = {
             "equation": equation,
@@ -363,7 +370,7 @@ def _sensitivity(context: Context, tests: Sequence[SpotTest], facts: Facts) -> I
 
 
 def _ratio(over: Array, under: Array, column: int) -> float:
-    """Return the standard deviation of a ratio of RMS over tests by the jackknife."""
+    """Return the jackknife standard deviation of a ratio of RMS values over tests."""
     n = len(over)
     keep = ~np.eye(n, dtype=bool)
     values = np.array([rms(over[k, column]) / rms(under[k, column]) for k in keep])
@@ -404,7 +411,7 @@ def _errors_of_tests(context: Context, tests: Sequence[SpotTest], facts: Facts) 
 
 
 def _moved(test: SpotTest) -> Array:
-    """Return the change of the distortion at each point by a correction of the readings, (N,), in metres.
+    """Return the change of the distortion at N points due to a correction of the readings, (N,), in metres.
 
     It is f times the correction, without the part that zero, f and p absorb.
     """
@@ -414,7 +421,7 @@ def _moved(test: SpotTest) -> Array:
 
 
 def _errors(tests: Sequence[SpotTest]) -> Array:
-    """Return the RMS errors of the distortion with raw and with compensated angles, (T, 2), in micrometres."""
+    """Return the RMS errors of the distortion in T tests with raw and with compensated angles, (T, 2), micrometres."""
     runs = [test.run for test in tests]
     return np.array([[UM * rms(run.error(m)) for m in (run.raw, run.compensated)] for run in runs])
 
@@ -445,7 +452,7 @@ def _show(context: Context, tests: Sequence[SpotTest]) -> None:
 
 
 def _statistics(raw: Array, compensated: Array) -> list[Cell]:
-    """Return RMS, mean and maximum over the points of each test (T, N), with reductions, as medians of the tests."""
+    """Return RMS, mean and maximum over the N points of T tests, (T, N), with reductions, as medians of the tests."""
     out: list[Cell] = []
     for size in (lambda v: np.sqrt(np.mean(v**2, axis=1)), lambda v: np.mean(v, axis=1), lambda v: np.max(v, axis=1)):
         before, after = size(raw), size(compensated)
@@ -456,7 +463,7 @@ def _statistics(raw: Array, compensated: Array) -> list[Cell]:
 
 @drawing("reduction-004", 4.2)
 def reduction_svg(figure: Figure, errors: NDArray[np.float64], paper: tuple[float, float], reduction: float) -> None:
-    """Draw the RMS with compensated over the RMS with raw angles, of each test and of the paper.
+    """Draw the RMS with compensated over the RMS with raw angles, of each of T tests and of the paper.
 
     The errors are (T, 2), raw and compensated, in micrometres; the reduction is the one that the paper claims.
     """
@@ -503,8 +510,8 @@ def points_svg(figure: Figure, by_eq2: NDArray[np.float64], free: NDArray[np.flo
 def chief_rays(setup: DistortionSetup, backend: Backend) -> Callable[[Array], Array]:
     """Return the exact mapping of the camera as designed from rotations of a table to image positions.
 
-    Rotations W (N,), in radians, are about the camera's X; positions L (N,), in metres, are those of chief rays along
-    the line, from the image of W = 0.
+    Rotations W of N points, (N,), in radians, are about the camera's X; positions L, (N,), in metres, are those of
+    chief rays along the line, from the image of W = 0.
     """
     test = setup.test
     camera = build_camera_under_test(test, setup.camera, backend)
@@ -537,12 +544,12 @@ def run_equations(context: Context) -> Iterator[CheckResult]:
 
 
 def _turn_to(places: Callable[[Array], Array], wanted: float, most: float) -> float:
-    """Return the W within +-``most`` that is imaged to a position on the line, in radians."""
+    """Return the rotation within ±``most`` that is imaged to a given position on the line, in radians."""
     return float(brentq(lambda w: float(places(np.array([w]))[0]) - wanted, -most, most, xtol=1e-14))
 
 
 def _ignored(context: Context, places: Callable[[Array], Array], turn: Array, pitch: float) -> CheckResult:
-    """Count L and W from a point one pixel beside the middle, and apply (3) to the same chief rays."""
+    """Check eq. (3) with positions and angles counted from a point one pixel beside the middle of the line."""
     where, beside = places(turn), _turn_to(places, pitch, float(turn[-1]))
     shift = float(places(np.array([beside]))[0])
     first = distortion(where, turn, principal_distance(where, turn))
@@ -585,4 +592,4 @@ def _solutions(context: Context, places: Callable[[Array], Array], edge: float) 
 GROUP = group_of("004.distortion", run)
 EQUATIONS = group_of("004.equations", run_equations)
 FIGURES = group_of("004.figures")
-"""Figures printed without numbers: rows with which nothing can be compared."""
+"""Group of the figures that are printed without numbers, so that nothing can be compared."""

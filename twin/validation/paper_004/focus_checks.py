@@ -1,4 +1,4 @@
-"""Checks of paper 004's focal-plane alignment."""
+"""Checks of paper 004's focal-plane alignment: coupling of the adjustments, MTF, accuracy and result."""
 
 from __future__ import annotations
 
@@ -32,9 +32,12 @@ CONFOCAL_MM = load_printed("004").number("alignment.confocal_mm")
 LINE_LEVEL_ARCMIN = load_printed("004").number("alignment.line_level_arcmin")
 PARAMETERS = ("Δα", "Δβ", "Δγ", "Δx", "Δy", "Δz")
 ADJUSTMENTS = ("tilt about the surface's x", "tilt about its y", "turn in it", "slide along x", "slide along y", "lift")
-"""Tilts and lift by shims, the others by hand."""
+"""Names of the six adjustments of the mount: tilts and lift are made by shims, the others by hand."""
 LIMITS = np.array([10.0 * ARCSEC, 10.0 * ARCSEC, 10.0 * ARCSEC, 7e-6, 7e-6, 5e-6])
-"""Smallest changes that count: the theodolite's 10 arcsec, a panchromatic pixel, a step of the shims."""
+"""Smallest change of each of the six parameters that counts, radians and metres.
+
+They are the theodolite's 10 arcsec, a panchromatic pixel, and a step of the shims.
+"""
 TEST = "focus"
 ALIGNMENTS, FAST_ALIGNMENTS = 12, 1
 """Alignments from random mis-settings."""
@@ -43,15 +46,15 @@ _ALL_LOSSES = "what the scene file assumes beyond the paper, in waves, pixels or
 
 
 def effects(bench: FocusBench, inclined: float = 1.0) -> Array:
-    """Change of each parameter (6) by each adjustment (6), as far as the assembly is mis-set: radians and metres.
+    """Return the change of each of six parameters due to each of six adjustments, (6, 6), radians and metres.
 
-    Δα, Δβ and Δz are those of the plane through the traced defocus of all sites; Δγ is the line's turn, Δx and Δy where
-    its middle goes.
+    The size of each adjustment is the initial error of the assembly. The changes Δα, Δβ and Δz are those of the plane
+    through the traced defocus of all sites; Δγ is the rotation of the line, Δx and Δy the displacement of its middle.
 
     Parameters
     ----------
     bench : FocusBench
-        With the mount.
+        Bench with the mount.
     inclined : float
         Factor on the inclination of the mounting surface.
     """
@@ -114,7 +117,7 @@ def coupled(change: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Result of the analysis for the MTF curves of an alignment's first state."""
+    """Planned correction from the MTF curves of an alignment's first state."""
 
     alignment: SimulatedFocus
 
@@ -128,7 +131,7 @@ class Plan:
 
     @cached_property
     def shims(self) -> ShimPlan:
-        """Under the assembly."""
+        """Changes of the shims under the assembly that the correction requires."""
         test = self.alignment.bench.setup.test
         return shim_plan(self.motion, mount_of(test), np.full(len(test.mount.holes), test.mount.thickness))
 
@@ -139,13 +142,16 @@ class Plan:
 
     @property
     def left(self) -> Array:
-        """True defocus of every site there, (N,), metres."""
+        """True defocus of the N sites after the planned motion, (N,), metres."""
         heights = self.alignment.states[0].placement.heights
         return np.array([site.defocus(self.moved, heights[site.band]) for site in self.alignment.bench.sites])
 
     @property
     def asked(self) -> Array:
-        """Changes of the shims (H,), metres, for the traced defocus and the true turn of the line."""
+        """Changes of the shims at H holes that the traced defocus and the line's true rotation require, (H,).
+
+        The unit is metres.
+        """
         alignment = self.alignment
         piston, slope_x, slope_y = alignment.true_plane(0)
         mount = mount_of(alignment.bench.setup.test)
@@ -160,7 +166,10 @@ class Plan:
 
 
 def measured_defocus(state: FocusState) -> tuple[Array, Array]:
-    """Return the distance of each CCD downstream of best focus by its MTF curves, and sigma, (N,), in metres."""
+    """Return the distances of the CCDs downstream of best focus at N sites, and their sigmas, (N,), metres.
+
+    They are measured by MTF curves through focus.
+    """
     out = []
     for scan in state.scans:
         vertices = [focus_vertex(scan.shift[edge], scan.mtf[edge], scan.sigma[edge]) for edge in scan.shift]
@@ -171,7 +180,7 @@ def measured_defocus(state: FocusState) -> tuple[Array, Array]:
 
 
 def run(context: Context) -> Iterator[CheckResult]:
-    """Align mis-set focal planes, one if only the MTF is wanted."""
+    """Yield the results of the checks, from random misalignments; from one only if nothing but the MTF is selected."""
     context.progress(0.0, "build the bench")
     with one_blas_thread():
         bench = FocusBench(FocusSetup.read(TEST), context.backend)
@@ -225,7 +234,7 @@ def _losses(factors: Mapping[str, float], value: float) -> list[Chosen]:
 
 
 def _slope(edges: Sequence[EdgeMtf]) -> float:
-    """Change of the logarithm of the frequency that has an MTF, per change of the MTF's logarithm; at Nyquist."""
+    """Return -d ln(frequency) / d ln(MTF) of the measured MTF curves at the Nyquist frequency."""
     below, there = (float(np.mean([edge.at(share * NYQUIST)[0] for edge in edges])) for share in (0.9, 1.0))
     return float(np.log(1.0 / 0.9) / np.log(below / there))
 
@@ -306,14 +315,17 @@ def _chips(placed: Sequence[tuple[SimulatedFocus, Pose, Mapping[str, float]]]) -
 
 
 def _theodolite(alignments: Sequence[SimulatedFocus], value: float) -> Chosen:
-    """Return the error of measuring and setting the line's rotation, to which the result is proportional."""
+    """Return the error of measuring and setting the line's rotation as an input.
+
+    The result is proportional to it.
+    """
     return Chosen.power(
         "error of the theodolite and of the setting", alignments[0].bench.setup.test.level / ARCSEC, "arcsec", value
     )
 
 
 def _reached(context: Context, alignments: Sequence[SimulatedFocus], facts: Mapping[str, Any]) -> Iterator[CheckResult]:
-    """Check the result of the loop of measuring, shimming and measuring."""
+    """Check the result of repeated measuring and shimming."""
     plan = alignments[0].bench.setup.test
     far = np.array([[MM_PER_M * np.max(np.abs(s.true_defocus)) for s in a.states] for a in alignments])
     turns = np.array([[abs(s.true_level) / ARCMIN for s in a.states] for a in alignments])
@@ -339,10 +351,10 @@ def _reached(context: Context, alignments: Sequence[SimulatedFocus], facts: Mapp
 def alignment_svg(
     figure: Figure, far: NDArray[np.float64], turns: NDArray[np.float64], far_bound: float, turn_bound: float
 ) -> None:
-    """Draw alignments before and after, with the results of the paper.
+    """Draw A alignments before and after, with the results of the paper.
 
-    Shown are the largest distance from best focus of each state, in mm, and rotations of the line, in arcmin, both (A,
-    S).
+    Shown are the largest distance from best focus of each of S states, in mm, and rotations of the line, in arcmin,
+    both (A, S).
     """
     labels = ("farthest CCD from best focus [mm]", "turn of the line [arcmin]")
     panels = zip(figure.subplots(1, 2), (far, turns), (far_bound, turn_bound), labels, strict=True)
@@ -361,7 +373,7 @@ def alignment_svg(
 
 
 def _second_round(alignment: SimulatedFocus) -> float:
-    """Largest change of a shim that the last measurement asks for, metres."""
+    """Return the largest change of a shim that the last measurement would still require, metres."""
     state = alignment.states[-1]
     where, sigma = measured_defocus(state)
     motion = fit_focal_plane(alignment.places, -where, sigma, estimate_extra=True).correction()

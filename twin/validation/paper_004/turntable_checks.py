@@ -1,4 +1,4 @@
-"""Paper 004, sections 3.2 and 3.3: the turntable's dividing error, its repeats and its fits."""
+"""Checks of paper 004, sections 3.2 and 3.3: the turntable's dividing error, its repeated readings and its fits."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FIT_RMS_ARCSEC = load_printed("004").number("turntable.fit_rms_arcsec")
 TABLES, FAST_TABLES = 1000, 200
 """Turntables that are calibrated; quick."""
 FURTHER = 1.6
-"""Factor on an input at which tables are calibrated again, to see what hangs on it."""
+"""Factor on an input with which tables are calibrated again, to find how the result depends on it."""
 FITTED, FAST_FITTED = 60, 12
 """Turntables whose calibration is fitted."""
 NETWORK = "network"
@@ -56,7 +56,7 @@ class FittedTable:
 
 
 def run(context: Context) -> Iterator[CheckResult]:
-    """Calibrate many tables; fit some of them."""
+    """Yield the results of the turntable checks: calibrate many tables and fit some of them."""
     spec = TurntableSetup.read(TEST).test
     # two streams, so that what one part draws does not hang on whether the other runs
     first, second = np.random.SeedSequence(context.seed).spawn(2)
@@ -92,7 +92,7 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 
 def _criterion(context: Context, series: Sequence[CalibrationSeries]) -> CheckResult:
-    """Check the rejection limit of the rule by the readings that it accepted and rejected."""
+    """Check the limit of the rejection criterion by the readings that it accepted and rejected."""
     readings, keep = (np.concatenate([getattr(s, name) for s in series]) for name in ("comparisons", "keep"))
     size = np.abs(readings - readings.mean(axis=1, keepdims=True)) / readings.std(axis=1, ddof=1, keepdims=True)
     largest_accepted, smallest_rejected = float(np.max(size[keep])), float(np.min(size[~keep]))
@@ -103,7 +103,7 @@ def _criterion(context: Context, series: Sequence[CalibrationSeries]) -> CheckRe
 
 
 def fit_table(spec: TurntableTestSpec, seed: int) -> FittedTable:
-    """Calibrate a table, fit it in all five ways, and look at the readings in between."""
+    """Calibrate a table, fit its dividing error with all five models, and test them at readings in between."""
     done = run_turntable(spec, seed, names=CLOSED_FORMS)
     series, held = done.series, done.held_out
     assert held is not None
@@ -143,9 +143,9 @@ def _repeats(
 
 
 def _readings(spec: TurntableTestSpec, seeds: NDArray[np.integer], identifier: str, value: float) -> list[Chosen]:
-    """Return the inputs of the largest RMS of the repeats.
+    """Return the inputs on which the largest RMS of repeated readings depends.
 
-    They are the scatter of a reading and, before the criterion, gross errors.
+    They are the scatter of a reading and, before the rejection criterion, gross errors.
     """
     scatter = float(np.hypot(spec.dividing_error.repeatability, spec.reference.noise)) / ARCSEC
     if identifier.endswith("chauvenet"):
@@ -183,7 +183,7 @@ def dividing(value: float, power: float = 1.0) -> Chosen:
 
 
 def _ranks(tables: Sequence[FittedTable]) -> dict[str, Array]:
-    """Rank of each fit on each table, 1 the best."""
+    """Return fit -> its rank on each table, 1 for the smallest error."""
     return {
         name: np.array([1.0 + sum(v < t.held_out[name] for v in t.held_out.values()) for t in tables]) for name in FITS
     }

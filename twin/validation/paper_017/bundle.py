@@ -1,8 +1,8 @@
 """Heights by a bundle of coarse three-line images and by intersection in fine ones, with equal errors of the attitude.
 
-A strip of twice the base is flown by TH-1's three lines of 5 m. Its ties hold the attitudes of all times together; an
-image of 0.5 m, of the same look angles, is intersected line by line with the attitudes as they are read. Orbit and
-cameras are known in both, so that attitudes and image points alone differ.
+A strip of twice the base is flown by TH-1's three lines with 5 m pixels. Its tie points connect the attitudes of all
+times; an image with 0.5 m pixels and the same look angles is intersected line by line with the attitudes as measured.
+Orbit and cameras are known in both, so that attitudes and image points alone differ.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from twin.validation.check import CheckResult, Chosen, Supposed, mean_of
 from twin.validation.group import Context, group_of
 
 FINER = 10.0
-"""Times that pixels of 5 m are larger than those of 0.5 m."""
+"""Ratio of the pixel sizes of the coarse (5 m) and the fine (0.5 m) images."""
 IMAGE, FINE = 0.3, 0.1
 """Errors of an image point, pixels."""
 ERRORS = (0.35, 0.7, 1.4)
-"""Arcseconds of the attitude, between which the limit is looked for."""
+"""Standard deviations of the attitude, arcsec, between which the limit is searched."""
 STATED = 0.5
 STRIPS, FAST_STRIPS = 5, 3
 TIES, CHECKS = 800, 150
@@ -45,7 +45,7 @@ def strip(image: float, attitude: float) -> AdjustSetup:
     image : float
         Standard deviation of an image point, in pixels of 5 m.
     attitude : float
-        Standard deviation of a reading of the attitude, twice a second, in arcseconds.
+        Standard deviation of an attitude measurement, twice a second, in arcseconds.
     """
     setup = AdjustSetup.read(SCENES / ORBIT / "adjust.yaml")
     test, lines = setup.test, ("forward", "nadir", "backward")
@@ -83,7 +83,7 @@ def height_error(drawn: DrawnBlock, bundle: bool) -> float:
 
 @one_blas_thread()
 def ratios(image: float, seed: np.random.SeedSequence) -> np.ndarray:
-    """Return height errors of a bundle at 5 m over those of intersection at 0.5 m, at `ERRORS` of the attitude."""
+    """Return height errors of a bundle at 5 m over those of intersection at 0.5 m, for the attitude errors `ERRORS`."""
     return np.array(
         [
             height_error(draw_block(strip(image, error), seed), True)
@@ -105,7 +105,7 @@ def limit(height_ratios: np.ndarray) -> float:
 
 
 def run(context: Context) -> Iterator[CheckResult]:
-    """Check the row."""
+    """Yield the result of the only check: the attitude error above which the bundle is more accurate."""
     count = context.count(STRIPS, FAST_STRIPS)
     root = np.random.SeedSequence(context.seed)
     ratio_list = []
