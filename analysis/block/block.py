@@ -31,7 +31,7 @@ class Term:
 
 @dataclass(frozen=True)
 class Pass:
-    """Pass of the satellite.
+    """Pass of the satellite over the block, during which attitude and orbit errors are correlated.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class JointCameraPrior:
     covariance: Array
 
     def of(self, camera: str) -> CameraPrior:
-        """Return the marginal prior of one camera."""
+        """Return the marginal prior of one camera's changes in all passes."""
         k, size = self.cameras.index(camera), 4 * self.mean.shape[1]
         rows = slice(k * size, (k + 1) * size)
         return CameraPrior(self.mean[k], self.covariance[rows, rows])
@@ -113,7 +113,7 @@ class JointCameraPrior:
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Ground points.
+    """Ground points of a block: control, tie and check points.
 
     Attributes
     ----------
@@ -224,7 +224,7 @@ class TrackerAngle:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Block of scenes.
+    """Block of line-camera images with all measurements, priors and error models that are adjusted together.
 
     Attributes
     ----------

@@ -119,7 +119,7 @@ _HUBER_ROUNDS = 4
 
 @dataclass(frozen=True, eq=False)
 class BlockAdjustment:
-    """Solution of a block adjustment.
+    """Solution of a block adjustment: points, unknowns, covariances and tests.
 
     Attributes
     ----------
@@ -169,7 +169,7 @@ class BlockAdjustment:
 
     @property
     def factors(self) -> dict[str, float]:
-        """Variance factor of each group."""
+        """Estimated factor on the a-priori variance of each group of observations or priors, by its name."""
         return {name: test.factor for name, test in self.groups.items()}
 
     @cached_property
@@ -179,7 +179,7 @@ class BlockAdjustment:
 
     @property
     def state(self) -> State:
-        """Final state of the adjustment."""
+        """Unknowns, points, weights and variance factors at the end of the adjustment."""
         return State(self.x, self._filled, self.weight, self.factors)
 
     def point_covariance(self, points: Indices) -> Array:
@@ -265,7 +265,7 @@ class _Factor:
         return np.asarray(size * self._solve(size * right))
 
     def inverse(self) -> Array:
-        """Return the full (P, P) inverse.
+        """Return the full inverse of the matrix, dense.
 
         It is several times faster from a dense factorisation than column by column from a sparse one.
         """

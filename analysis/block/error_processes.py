@@ -38,7 +38,7 @@ from analysis.orbit.forward_intersection import spline_blend, spline_precision
 
 Kind = Literal["constant", "rate", "white", "walk", "slow", "orbital", "jitter"]
 KINDS: tuple[Kind, ...] = ("constant", "rate", "white", "walk", "slow", "orbital", "jitter")
-"""Names of the error models."""
+"""Names of the kinds of error models: stochastic processes and constants of attitude and station errors."""
 STEPPED = ("white", "walk", "slow", "jitter")
 """Error models with unknowns at multiples of an interval."""
 _GAP = 18

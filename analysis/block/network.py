@@ -35,7 +35,7 @@ _MOST = 12
 
 @dataclass(frozen=True)
 class Network:
-    """Connected parts of a block.
+    """Groups of scenes of a block that are connected by common points.
 
     Attributes
     ----------

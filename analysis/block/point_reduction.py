@@ -42,7 +42,7 @@ class Packets(Protocol):
 
     @property
     def group(self) -> str:
-        """Name of the variance group."""
+        """Name of the variance group, whose measurements share one variance factor."""
 
     @property
     def rows(self) -> int:
@@ -67,7 +67,7 @@ class Packets(Protocol):
         which : (k,) ndarray of int
             Indices of packets.
         x : (P,) ndarray
-            All unknowns.
+            Values of all P unknowns.
         ground : (k, 3) ndarray
             Points of these packets, ITRS, in metres.
         """
@@ -449,7 +449,7 @@ class Reduced(Eliminated):
     Attributes
     ----------
     prior : (P, P) csc_matrix
-        Precision of the priors, with the variance factors.
+        Precision of the P unknowns by the priors, with the variance factors.
     """
 
     prior: sparse.csc_matrix
@@ -693,7 +693,7 @@ class Reduction:
         equations : Eliminated
             Normal equations of this state.
         step : (P,) ndarray
-            Step of the unknowns.
+            Step of the P unknowns.
         """
         steps = equations.start.copy()
         for rows in self.rows(state):
@@ -712,7 +712,7 @@ class Reduction:
         spread : (m, 3, 3) ndarray
             Covariance of the points for known x, in m^2.
         covariance : callable
-            Function that returns the (w, w) covariance of selected unknowns (w,).
+            Function from the indices of w unknowns to their covariance (w, w).
         """
         sets = self.sets
         standard = [np.zeros((len(packets.point), packets.rows)) for packets in sets]
@@ -824,7 +824,7 @@ class Pool(Protocol):
 
     @property
     def count(self) -> int:
-        """Number of processes."""
+        """Number of worker processes."""
 
     def hold(self, things: Sequence[Any]) -> Sequence[Any]:
         """Send each object to a process and return handles, which serve as the first argument of work."""

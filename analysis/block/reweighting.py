@@ -89,7 +89,7 @@ class GroupTest:
 
 
 class UnsettledError(MeasurementError, ValueError):
-    """Weights that do not converge."""
+    """Error for robust weights or variance factors that do not converge."""
 
 
 def standardised_packets(residual: Array, cofactors: Array, weight: Array, unit: float) -> Array:
@@ -204,7 +204,7 @@ class Weighted(Protocol):
 
     @property
     def factor(self) -> Mapping[str, float]:
-        """Variance factor of each group."""
+        """Factor on the a-priori variance of each group of observations, by its name."""
 
 
 class Reweighted(Protocol[S, T]):
@@ -217,7 +217,7 @@ class Reweighted(Protocol[S, T]):
         """Return the standardised residuals of each set of observations."""
 
     def tests(self, at: S, found: T) -> Mapping[str, GroupTest]:
-        """Return the test of each variance group."""
+        """Return the test of the residuals' variance of each group of observations, by its name."""
 
     def weighed(self, at: S, weight: tuple[Array, ...], factor: Mapping[str, float]) -> S:
         """Return the state with other weights, and with zero weight at points with too few remaining observations.

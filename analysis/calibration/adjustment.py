@@ -130,7 +130,7 @@ class SlowVariations:
 
     @property
     def size(self) -> int:
-        """Number of terms."""
+        """Number of omitted terms: the cosines of all lines and fields."""
         return sum(2 * count for *_, count in self.waves.values())
 
     def columns(self, field: calibration_parameters.CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
@@ -158,7 +158,7 @@ class Steps:
 
     @property
     def size(self) -> int:
-        """Number of terms."""
+        """Number of omitted terms: a step in x and one in y for each position."""
         return 2 * len(self.places)
 
     def columns(self, field: calibration_parameters.CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
@@ -218,12 +218,12 @@ class OmittedTermsTest:
 
     @property
     def estimate(self) -> Array:
-        """Estimates (G,) of all terms together; 0 for a term that the residuals do not determine."""
+        """Estimates of the G omitted terms together; 0 for a term that the residuals do not determine."""
         return np.asarray(-self._inverse @ self.score)
 
     @property
     def sigma(self) -> Array:
-        """Standard deviations (G,) of `estimate`; infinite for a term that the residuals do not determine."""
+        """Standard deviations of the G estimates; infinite for a term that the residuals do not determine."""
         spread = np.diag(self._inverse)
         return np.sqrt(np.where(np.diag(self.cofactor) > _RANK * self._largest, spread, np.inf))
 
@@ -489,7 +489,7 @@ class Adjustment:
 
     @property
     def correlation(self) -> Array:
-        """Correlation matrix (P, P); rows of fixed unknowns are NaN."""
+        """Correlation matrix of the P unknowns, (P, P); rows and columns of fixed unknowns are NaN."""
         sigma = np.sqrt(np.diag(self.covariance))
         with np.errstate(invalid="ignore"):
             return np.asarray(self.covariance / sigma / sigma[:, None])
@@ -684,7 +684,7 @@ class _Problem:
         )
 
     def tests(self, state: _Iteration, solution: _Solved) -> dict[str, reweighting.GroupTest]:
-        """Return the tests of the variance groups."""
+        """Return the test of the residuals' variance of each group of observations, by its name."""
         return solution.equations.tests(solution.covariance, solution.cofactors, state.weights, self.priors)
 
     def weighed(self, state: _Iteration, weight: tuple[Array, ...], factor: Mapping[str, float]) -> _Iteration:

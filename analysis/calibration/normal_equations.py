@@ -150,7 +150,7 @@ class SharedNoise:
 
 
 def _law(term: NoiseTerm, interval: float) -> Law:
-    """Return the error model of a noise term."""
+    """Return the stochastic process that describes a noise term of attitude or station readings."""
     return Law(term.group, "walk" if term.walks else "white", (term.sigma,) * 3, interval)
 
 
@@ -169,12 +169,12 @@ _CHUNK = 512
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """Weights of the observations.
+    """Robust weights of the image points, and variance factors of the groups of observations.
 
     Attributes
     ----------
     image : (M,) ndarray
-        Robust weights of the image points, 0 to 1.
+        Robust weights of the M image points, 0 to 1.
     factor : mapping of str to float
         Variance factor of each group; 1 for the a-priori sigmas.
     """
@@ -246,7 +246,7 @@ class Equations:
     row_weight : (2M,) ndarray
         Robust weight, with variance factor, of each row of the design matrices.
     design_prior : (K, P) ndarray
-        Whitened design of the priors.
+        Whitened derivatives of the K priors with respect to x.
     prior_weight : (K,) ndarray
         Weights of the priors.
     control_weight : (3m, 3m) csr_matrix
@@ -354,9 +354,9 @@ class Equations:
         Parameters
         ----------
         covariance : (P, P) ndarray
-            Covariance of the unknowns, SI units.
+            Covariance of the P unknowns, SI units.
         cofactors : (M, 2, 2) ndarray
-            Cofactors of the adjusted image points, whitened.
+            Covariances of the M adjusted image points, whitened.
         weights : Weights
             Weights of the observations.
         priors : sequence of Prior
@@ -481,7 +481,7 @@ class OmittedTermsModel(Protocol):
 
     @property
     def size(self) -> int:
-        """Number of terms."""
+        """Number of omitted terms."""
 
     def columns(self, field: CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
         """Return the derivatives of n image points' misclosures (x, y) with respect to the terms, (n, 2, size).

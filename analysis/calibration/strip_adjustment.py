@@ -251,7 +251,7 @@ class Stepwise:
 
     @property
     def rounds(self) -> int:
-        """Number of rounds."""
+        """Number of rounds of the alternating iteration."""
         return len(self.steps)
 
 

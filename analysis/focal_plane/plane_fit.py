@@ -63,7 +63,7 @@ class RigidMotion:
 
     @classmethod
     def of(cls, rotation: ArrayLike, shift: ArrayLike, covariance: ArrayLike | None = None) -> RigidMotion:
-        """Return a validated motion.
+        """Return a rigid motion after checking its values.
 
         Parameters
         ----------

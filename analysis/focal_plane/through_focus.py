@@ -50,7 +50,9 @@ _AT_REST = 1e-6
 
 
 def _main_peak(z: Array, v: Array, weight: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Return the index (B,) of the largest smoothed value, and a mask (B, Z) of its neighbours above `FRACTION`.
+    """Return the index of the largest smoothed value of each of B curves, and a mask of its high neighbours.
+
+    The mask, (B, Z) for Z positions, holds neighbours above `FRACTION` of the peak.
 
     The smoothing is a binomial of a twelfth of the scan's points, at least 1-2-1, weighted by the inverse variances.
 
@@ -115,7 +117,7 @@ class _Lobe:
         self.x0 = x0
 
     def settle(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Fit and select the points near the vertex in turn until both converge; return their mask (B, Z).
+        """Fit B curves and select the points near their vertices in turn until both converge; return the mask.
 
         A curve that does not converge gets all rounds, whether alone or among others.
         """
@@ -136,7 +138,7 @@ class _Lobe:
         return (distance <= self.reach(fraction)[:, None]) & (self.weight > 0)
 
     def reach(self, fraction: float) -> Array:
-        """Return the distance (B,) from the vertex at which the fitted curve has fallen to a fraction of its peak."""
+        """Return the distance from the vertex at which each of B fitted curves falls to a fraction of its peak."""
         u = (1.0 - np.sqrt(1.0 - 4 * QUARTIC * (1.0 - fraction))) / (2 * QUARTIC)
         return np.asarray(np.sqrt(u / self.a) * self.scale)
 
@@ -295,7 +297,7 @@ class FocusVertex:
     degrees_of_freedom : int
         Degrees of freedom of the fit.
     used : (Z,) ndarray of bool
-        True for points that were used, in the order of the input.
+        True for the points, of Z in all, that were used, in the order of the input.
     """
 
     position: float
@@ -349,7 +351,7 @@ def focus_vertex(position: ArrayLike, value: ArrayLike, sigma: ArrayLike) -> Foc
     Parameters
     ----------
     position : (Z,) array_like
-        Focus positions, in metres or any other unit, in any order.
+        Z focus positions, in metres or any other unit, in any order.
     value : (Z,) array_like
         Quantity with a peak at best focus, such as the MTF at one spatial frequency.
     sigma : float or (Z,) array_like
@@ -395,7 +397,7 @@ def focus_vertices(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, *, s
     Parameters
     ----------
     position : (Z,) or (..., Z) array_like
-        Focus positions, in any unit of length.
+        Z focus positions, in any unit of length.
     value : (..., Z) array_like
         Values, such as the MTF.
     sigma : array_like
@@ -466,7 +468,7 @@ def outlying_points(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, lim
     Parameters
     ----------
     position : (Z,) array_like
-        Focus positions, in any unit of length.
+        Z focus positions, in any unit of length.
     value : (Z,) array_like
         Values, such as the MTF.
     sigma : (Z,) array_like
@@ -521,7 +523,7 @@ def _deviations(z: Array, v: Array, s: Array, groups: NDArray[np.intp]) -> tuple
 def _faults(
     model: _Lobe, mask: NDArray[np.bool_], vertex: Array, second_derivative: Array, covariance: Array
 ) -> NDArray[np.str_]:
-    """Return the reason (B,) why a curve has no vertex; empty if it has one."""
+    """Return, for each of B curves, the reason why it has no vertex; empty if it has one."""
     fault = np.full(len(vertex), "", dtype="<U12")
     scarce = model.positions(model.window(WIDEST_FRACTION)) < LEAST_POINTS
     enough = model.positions(model.weight > 0) >= LEAST_POINTS

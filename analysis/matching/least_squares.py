@@ -248,7 +248,7 @@ def _bend(
 
 
 def _inverse(square: Array, curvature: Array) -> Array:
-    """Return the inverse (n, q, q) of the curvature of the sum of squares; NaN where too little curvature is left.
+    """Return the inverse curvature of the sum of squares in q unknowns, (n, q, q); NaN with too little curvature.
 
     It is inverted within the range of the normal matrix.
     """

@@ -39,7 +39,7 @@ sigmas are right, 2.3 to 4.3 if positions lock to whole pixels.
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Matched points.
+    """Positions of n matched windows, with covariances and verdicts.
 
     Attributes
     ----------

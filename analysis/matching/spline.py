@@ -38,8 +38,8 @@ def resampled(image: ArrayLike, rows: ArrayLike, columns: ArrayLike, *, smoothin
     image : (H, W) array_like
         Image of any real type; NaN marks missing pixels.
     rows : (..., k, l) array_like
-        Rows of the samples. Each (k, l) is one patch and is cut out with a halo, so that only the patches and not the
-        image are filtered.
+        Rows of the samples. Each array of k rows and l columns is one patch and is cut out with a halo, so that only
+        the patches and not the image are filtered.
     columns : (..., k, l) array_like
         Columns of the samples.
     smoothing : float

@@ -58,7 +58,7 @@ kilometres come out far beyond it.
 
 
 class CalibrationError(MeasurementError, ValueError):
-    """Invalid input of a calibration."""
+    """Error for invalid input of an in-orbit calibration."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationField:
-    """Pass over one test field.
+    """Image points and ground points of one pass over a test field.
 
     Attributes
     ----------
@@ -183,7 +183,7 @@ class CalibrationField:
         sigma: float | tuple[float, float] | Array,
         control: ArrayLike | None = None,
     ) -> CalibrationField:
-        """Return a validated field.
+        """Return a calibration field after checking its image and ground points.
 
         Parameters
         ----------
@@ -493,7 +493,7 @@ class Parameters:
         Parameters
         ----------
         values : (P,) ndarray
-            Values of all unknowns, SI units.
+            Values of all P unknowns, SI units.
         name : str
             Name of the field.
         line : str
@@ -513,7 +513,7 @@ class Parameters:
         Parameters
         ----------
         values : (P,) ndarray
-            Values of all unknowns, SI units.
+            Values of all P unknowns, SI units.
         name : str
             Name of the field.
         line : str

@@ -358,17 +358,17 @@ class IntersectionError(MeasurementError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class CalibratedLine:
-    """Calibrated geometry of a line camera.
+    """Calibrated geometry of a line camera: look direction and origin of the ray of every pixel.
 
     Attributes
     ----------
     pixels : int
         Number of pixels of the line; pixel coordinates count from 0 at the centre of the first pixel.
     directions : (K, 3) ndarray
-        Chebyshev coefficients over the line, from -0.5 to pixels - 0.5, of a vector along the look direction in the
+        K Chebyshev coefficients over the line, from -0.5 to pixels - 0.5, of a vector along the look direction in the
         body's axes; its length does not matter.
     origins : (J, 3) ndarray
-        Chebyshev coefficients of a point on the ray, body frame, in metres.
+        J Chebyshev coefficients of a point on the ray, body frame, in metres.
     axes : (3, 3) ndarray
         Columns X, Y, Z of the camera in the body: Y along the line, Z the line of sight.
     principal_distance : float
@@ -557,7 +557,7 @@ _FARTHEST = 40.0
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Accuracy of a set of points.
+    """90 % errors of a set of ground points in plan and height.
 
     Attributes
     ----------

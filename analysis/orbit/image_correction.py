@@ -101,7 +101,7 @@ def _basis(kind: Kind, middle: Array, size: Array, position: Array) -> Array:
 
 
 def _rows(basis: Array) -> Array:
-    """Return the (N, 2, 2 K) derivatives of line and sample with respect to the coefficients."""
+    """Return the derivatives of line and sample at N points with respect to the 2 K coefficients, (N, 2, 2 K)."""
     nothing = np.zeros_like(basis)
     return np.stack([np.concatenate([basis, nothing], 1), np.concatenate([nothing, basis], 1)], axis=1)
 

@@ -126,7 +126,7 @@ class Observations:
         kind: ArrayLike | None = None,
         mix: ArrayLike | None = None,
     ) -> Observations:
-        """Return validated observations.
+        """Return observations of attitude differences after checking shapes and values.
 
         Parameters
         ----------
@@ -289,7 +289,7 @@ class Observations:
 
     @cached_property
     def _row(self) -> NDArray[np.intp]:
-        """Number (R,) of each observation within its group."""
+        """Number of each of R observations among those of its ground point, from 0 on."""
         return _within(self.group, len(self.time))
 
     def _of_groups(self, columns: Array) -> Array:
@@ -307,7 +307,10 @@ class Observations:
 
 
 def _within(group: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """Return the number of each observation within its group, for ascending group numbers (R,)."""
+    """Return the number of each of R observations among those of its ground point, from 0 on.
+
+    `group` is ascending.
+    """
     return np.asarray(np.arange(len(group)) - np.searchsorted(group, np.arange(count))[group])
 
 
@@ -331,7 +334,7 @@ class Periodogram:
     Attributes
     ----------
     frequency : (F,) ndarray
-        Evenly spaced frequencies, in hertz.
+        F evenly spaced frequencies, in hertz.
     power : (F,) ndarray
         Reduction of the weighted sum of squares by fitting an oscillation of this frequency about all axes.
     amplitude : (F, A) ndarray
@@ -742,7 +745,7 @@ class Lines:
 
 @dataclass(frozen=True, eq=False)
 class JitterSearch:
-    """Result of a search for jitter.
+    """Result of a search for attitude oscillations (jitter) in R observations.
 
     Attributes
     ----------
@@ -987,7 +990,7 @@ def _beside(observations: Observations, lines: Lines | None) -> Observations:
 
 
 def _columns(observations: Observations, lines: Lines) -> Array:
-    """Return the (R, P) derivatives of the observations with respect to the parameters of the lines."""
+    """Return the derivatives of R observations with respect to the P parameters of the lines, (R, P)."""
     design = np.zeros((len(observations.value), lines.covariance.shape[0]))
     for j in range(observations.time.shape[1]):
         design += np.einsum(
@@ -1026,7 +1029,7 @@ def _good(observations: Observations, lines: Lines | None) -> NDArray[np.bool_]:
 
 
 def _fitted(observations: Observations, frequency: Array, chance: Array) -> Lines:
-    """Fit all lines together by Gauss-Newton from start frequencies (K,), in hertz.
+    """Fit K oscillations together by Gauss-Newton from their start frequencies, in hertz.
 
     Raises
     ------

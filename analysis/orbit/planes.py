@@ -91,7 +91,7 @@ class Station:
 
     @classmethod
     def of(cls, position: ArrayLike, noise: ArrayLike = 0.0) -> Station:
-        """Return a validated station.
+        """Return a station after checking coordinates and covariance.
 
         Parameters
         ----------
@@ -128,7 +128,7 @@ class Strip:
 
     @classmethod
     def of(cls, points: ArrayLike, noise: ArrayLike) -> Strip:
-        """Return a validated strip.
+        """Return a strip of ground points after checking coordinates and covariances.
 
         Parameters
         ----------

@@ -94,7 +94,7 @@ class ObservedLine:
         look: float = float("nan"),
         offset: ArrayLike = (0.0, 0.0, 0.0),
     ) -> ObservedLine:
-        """Return a validated line.
+        """Return an observed line after checking shapes and values.
 
         Parameters
         ----------
@@ -133,7 +133,7 @@ class ObservedLine:
 
 @dataclass(frozen=True, eq=False)
 class Resection:
-    """Solution of a space resection.
+    """Attitude, look angles and station that a space resection estimated, with their covariance.
 
     Attributes
     ----------

@@ -95,7 +95,7 @@ class LineModel:
         k2: float = 0.0,
         half_length: float = 0.0,
     ) -> LineModel:
-        """Return a validated model.
+        """Return the model of a line camera after checking its values.
 
         Parameters
         ----------
@@ -284,7 +284,7 @@ class Rays:
     def of(
         cls, point: ArrayLike, image: ArrayLike, station: ArrayLike, attitude: ArrayLike, time: ArrayLike | None = None
     ) -> Rays:
-        """Return validated rays.
+        """Return image points with station and attitude after checking shapes and values.
 
         Parameters
         ----------

@@ -266,7 +266,7 @@ def slope(angle: ArrayLike, terms: Sequence[str], values: ArrayLike) -> Array:
     terms : sequence of str
         Names out of `TERMS`.
     values : (P,) array_like
-        Values of the terms, in metres.
+        Values of the P terms, in metres.
     """
     t = np.tan(np.asarray(angle, dtype=np.float64))
     powers = [_POWER[term] for term in terms]
@@ -513,7 +513,7 @@ class InteriorOrientation:
 
     @property
     def correlation(self) -> Array:
-        """Correlation matrix (P, P), in the order of the terms."""
+        """Correlation matrix of the P terms, in their order."""
         sigma = np.sqrt(np.diagonal(self.covariance))
         return np.asarray(self.covariance / np.outer(sigma, sigma))
 
@@ -826,7 +826,7 @@ class PointMeans:
     sigma: Array
 
     def mean(self, values: Array) -> Array:
-        """Return the mean of values (N, S) over the kept sets of each point, (N,)."""
+        """Return the mean of values (N, S) over those of S sets that are kept at each of N points, (N,)."""
         return np.asarray(np.mean(values, axis=1, where=self.keep))
 
 
@@ -841,7 +841,7 @@ def reduce_sets(
     Parameters
     ----------
     angle : (N, S) ndarray
-        Angles W from the readings, in radians.
+        Angles W of N points in S sets, from the readings of the turntable, in radians.
     spots : Spots
         Located spots.
     principal_distance : float
@@ -917,12 +917,12 @@ class Distortion:
     def measure(
         cls, angle: Array, spots: Spots, means: PointMeans, angle_covariance: ArrayLike | None = None
     ) -> Distortion:
-        """Fit interior orientation and distortion.
+        """Fit interior orientation and distortion of a line camera to located spots.
 
         Parameters
         ----------
         angle : (N, S) ndarray
-            Angles, in radians.
+            Angles W of N points in S sets, in radians.
         spots : Spots
             Located spots.
         means : PointMeans

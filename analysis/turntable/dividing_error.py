@@ -165,7 +165,7 @@ class CrossValidation:
     name : str
         Name of the fit.
     angle : (K,) ndarray
-        Angles of the excluded points, in radians.
+        Angles of the K excluded points, in radians.
     residual : (K,) ndarray
         Value of an excluded point minus its prediction from the others.
     variance : (K,) ndarray
@@ -179,7 +179,7 @@ class CrossValidation:
 
     @property
     def rms(self) -> float:
-        """RMS of the residuals."""
+        """RMS of the prediction errors at the excluded points, in the unit of the values."""
         return float(np.sqrt(np.mean(self.residual**2)))
 
     @property
@@ -926,7 +926,7 @@ class DividingCompensation:
         return np.asarray(self.smooth * wide ** GAP_ORDER[self.fit.name])
 
     def sigma(self, reading: ArrayLike) -> Array:
-        """Return the standard deviation (M,) of each corrected angle, in radians."""
+        """Return the standard deviations of the corrected angles at M readings, in radians."""
         return np.sqrt(np.diag(self.covariance(reading)))
 
 

@@ -31,7 +31,7 @@ from analysis.images.image_file import FITS_MAGIC, ImageError, ImageFile, fits_c
 WAVES = "waves"
 """Unit of values in wavelengths, whose conversion to metres needs the wavelength."""
 _LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "pm": 1e-12}
-"""Metres in each unit of length."""
+"""Size of each unit of length, in metres."""
 _NAMES = {
     **{name: name for name in _LENGTHS},
     "micron": "um",
@@ -379,7 +379,7 @@ def read_codev(path: Path, lines: list[Line]) -> WavefrontMap:
 
 
 def read_zemax(path: Path, lines: list[Line]) -> WavefrontMap:
-    """Read a Zemax Grid Sag file.
+    """Read a surface from a Zemax Grid Sag file.
 
     The first line holds sizes, steps and unit; then there is a line per point, sag before its slopes.
 

@@ -63,7 +63,7 @@ class Orientation:
 
     @classmethod
     def named(cls, name: str, sign: int = 1) -> Orientation:
-        """Return the orientation with a name.
+        """Return the orientation with a given name and sign.
 
         Parameters
         ----------
@@ -294,7 +294,7 @@ _ROUND_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Pupil:
-    """Circle of a pupil in a map.
+    """Centre and radius of the circular pupil in a wavefront map.
 
     Attributes
     ----------

@@ -311,7 +311,7 @@ def _keyword(path: Path, key: str, found: str | None, known: Mapping[str, Any]) 
 
 
 def _table(path: Path, text: str) -> tuple[list[int], Array, dict[str, tuple[str, ...]], set[str | None]]:
-    """Return term indices (Z,), coefficients (F, Z), other columns, and units in the heads of a CSV table."""
+    """Return Z term indices, coefficients of F wavefronts (F, Z), other columns and units of a CSV table."""
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and line.strip()[0] != "#"]
     if not lines:
         raise map_files.MapError(f"{path} holds no table")

@@ -305,7 +305,7 @@ class PngFigure(Artefact):
         return "data:image/png;base64," + base64.b64encode(self.png).decode("ascii")
 
     def content(self) -> bytes:
-        """Return the PNG file."""
+        """Return the content of the PNG file."""
         if not self.png.startswith(b"\x89PNG"):
             raise ValueError(f"artefact {self.name!r}: not a PNG file")
         return self.png
@@ -433,7 +433,7 @@ class Piece(Artefact):
     markup: Markup
 
     def content(self) -> bytes:
-        """Return the HTML."""
+        """Return the HTML as bytes."""
         return self.markup.encode()
 
 
@@ -461,7 +461,7 @@ class Undrawn(Artefact):
 
     @property
     def shown_caption(self) -> str:
-        """Note as a sentence."""
+        """Note about the missing figure as a sentence, instead of a caption."""
         return f"{self.note[0].upper()}{self.note[1:]}."
 
 
@@ -472,7 +472,7 @@ class CameraFile(Data):
     kind: ClassVar[str] = "yaml"
 
     def content(self) -> bytes:
-        """Return the file."""
+        """Return the YAML text of the camera as bytes."""
         return str(self.data).encode()
 
 

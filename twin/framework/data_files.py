@@ -414,7 +414,7 @@ class MissingPackage(Exception):
 
 @dataclass(frozen=True, eq=False)
 class DataColumn:
-    """Column of a data table.
+    """Column of a data table, with unit and description.
 
     Attributes
     ----------

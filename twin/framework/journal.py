@@ -168,7 +168,7 @@ def read_pieces(content: bytes, classes: Sequence[type[Any]]) -> tuple[Any, dict
 
 
 def _line(data: Any) -> bytes:
-    """Return a line with its checksum."""
+    """Return data as a line of the journal, preceded by its checksum."""
     text = json.dumps(data).encode()
     return b"%s %s\n" % (_checksum(text), text)
 

@@ -109,7 +109,7 @@ def seeded(procedure: Procedure, setup: Any, seed: int | None) -> tuple[Any, int
 
 @dataclass(frozen=True)
 class Session:
-    """Command in progress.
+    """Command in progress: its run folder, backend, progress function and start time.
 
     Attributes
     ----------

@@ -255,7 +255,7 @@ class Record(Generic[S]):
         label: str = "",
         digits: int = 6,
     ) -> Table:
-        """Return a table of a report.
+        """Return a report's table with the quantities of the record as columns.
 
         Parameters
         ----------

@@ -151,7 +151,7 @@ class PlaceTargets:
 
 @dataclass(frozen=True, eq=False)
 class CameraTargets:
-    """Targets of one camera.
+    """Images and MTF measurements of the test targets of one camera.
 
     Attributes
     ----------
@@ -160,7 +160,7 @@ class CameraTargets:
     pitch : float
         Pixel pitch, in metres.
     places : mapping of str to PlaceTargets
-        Positions left, centre, right.
+        Targets by position on the line: left, centre, right.
     """
 
     band: str
@@ -170,7 +170,7 @@ class CameraTargets:
 
 @dataclass(frozen=True, eq=False)
 class TargetRun:
-    """Targets of all cameras.
+    """Images and MTF measurements of the test targets of all cameras.
 
     Attributes
     ----------
