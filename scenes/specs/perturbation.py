@@ -82,7 +82,7 @@ class PlainPerturbationSpec(Spec):
         return job_tables.TemperatureSpec() if self.temperature is None else self.temperature
 
     def uses(self) -> tuple[str, ...]:
-        """Return the ACTIONS that have an effect.
+        """Return the names in ACTIONS of the changes that have an effect.
 
         A temperature of 0 K has one: it differs from that of a heated carrier.
         """
@@ -96,14 +96,14 @@ class PlainPerturbationSpec(Spec):
         return tuple(name for name, does in done.items() if does)
 
     def needs(self) -> tuple[str, ...]:
-        """Return the ACTIONS that a node has to allow.
+        """Return the names in ACTIONS of the changes that a node must allow for this perturbation.
 
-        A temperature of 0 K is not one of them, since a node without thermal properties may have it.
+        A temperature change of 0 K is not one of them, since a node without thermal properties may have it.
         """
         return tuple(name for name in self.uses() if name != "temperature" or self.heat.warms)
 
     def motion(self) -> Motion:
-        """Return the perturbation without its temperature as a motion of a state."""
+        """Return the motion, SI, that the perturbation without its temperature gives the body in a state."""
         figure = {noll(term): value for term, value in self.figure.items()}
         return Motion(
             self.rotate,
@@ -137,9 +137,9 @@ class NodeInfo:
     pivots : tuple[str, ...]
         Names of the pivots.
     allows : frozenset[str]
-        Those of ACTIONS that are allowed.
+        Names in ACTIONS of the changes that are allowed.
     cold : str
-        Reason why the body has no temperature, where it is not obvious.
+        Reason why the body has no temperature of its own; empty if it has one or the reason is obvious.
     """
 
     pivots: tuple[str, ...] = (DEFAULT_PIVOT,)
@@ -148,7 +148,7 @@ class NodeInfo:
 
     @property
     def known_pivots(self) -> tuple[str, ...]:
-        """Names of the body's pivots and of the one that every body has."""
+        """Names of all pivots that a perturbation may name: those of the body, and its origin."""
         return tuple(dict.fromkeys((*self.pivots, DEFAULT_PIVOT)))
 
 
@@ -178,7 +178,7 @@ Perturbed = TypeVar("Perturbed", bound=PlainPerturbationSpec)
 def with_full_paths(
     perturb: Mapping[str, Perturbed], nodes: Mapping[str, NodeInfo], issue: Callable[[Problem, str], Issue]
 ) -> FrozenMap[str, Perturbed]:
-    """Return perturbations by the full paths of their nodes; unknown names stay unchanged.
+    """Return perturbations with the full paths of their nodes as keys; unknown names stay unchanged.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ def with_full_paths(
 def perturbation_issues(
     owner: Spec, nodes: Mapping[str, NodeInfo], path: str, what: PlainPerturbationSpec, key: KeyPath
 ) -> list[Issue]:
-    """Return the issues of a perturbation of the node ``path`` at ``key`` of a specification.
+    """Return the issues of a perturbation: an unknown node, an unknown pivot, or changes that are not allowed.
 
     Parameters
     ----------

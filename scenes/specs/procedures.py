@@ -28,18 +28,18 @@ class Procedure:
     ----------
     kind : str
         Name of the result file without .json, for example ``focus``.
-    setup : Any
-        Class of the simulated test with the content of its references, an `ExperimentSetup`; or a function that reads
-        the file.
-    run : Any
+    setup : type or callable
+        Class, derived from `ExperimentSetup`, that holds the simulated test with the content of all its files; or a
+        function that reads the file.
+    run : callable
         Function from set-up, backend, seed and progress to the complete result. Raises InputError, BenchError.
-    numbers : Any
+    numbers : callable
         Function from the result to the plain data of KIND.json, whose keys end in their unit.
-    report : Any
+    report : callable
         Function from the result to a `twin.framework.report.Report`.
-    measured : Any
+    measured : type or None
         Class of the test on measurements, chosen by the keys of the file; None if there is none.
-    export : Any
+    export : callable or None
         Function from the result to paths and contents of files with the measured data, for the option ``--export``;
         None if there is none.
     files : tuple[FileKind, ...]
@@ -78,11 +78,11 @@ class Procedure:
 
     @property
     def model(self) -> Any:
-        """Class of the simulated test's set-up."""
+        """Class that holds the simulated test with the content of all its files."""
         return Named(self.setup).get() if isinstance(self.setup, str) else self.setup
 
     def resolve(self, path: Path | str, *named: str | None) -> Any:
-        """Read a test with the content of its references.
+        """Read a test's file and all files to which it refers.
 
         Parameters
         ----------
@@ -108,8 +108,7 @@ BASES: dict[str, Named] = {
     "render": Named("twin.study.runs.render_base:RenderBase"),
     "tolerance": Named("twin.tolerance.samples:ToleranceBase"),
 }
-"""Command -> class that evaluates many of its runs at once for a study; tests of `PROCEDURES` run one after the other.
-"""
+"""Command -> class that evaluates many of its runs at once for a study; other tests run one after the other."""
 
 
 def studied_commands() -> tuple[str, ...]:

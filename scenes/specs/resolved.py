@@ -26,7 +26,7 @@ TestType = TypeVar("TestType", bound=Spec)
 
 
 class ResolvedJob(Spec):
-    """Job with its instrument, cameras and detectors.
+    """Job with the content of all files to which it refers: instrument, cameras, detectors, disturbances.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class ResolvedJob(Spec):
 
     @property
     def frames(self) -> int:
-        """Number of frames: that of the job, else that of the monitor, else one."""
+        """Number of frames of an exposure: that of the job, else that of the monitor, else one."""
         monitor = self.instrument.monitor
         return self.job.render.frames or (1 if monitor is None else monitor.frames)
 
@@ -77,7 +77,7 @@ class ResolvedJob(Spec):
 
     @property
     def seed(self) -> int:
-        """Seed of all noise."""
+        """Seed of the random numbers of all noise."""
         return self.job.render.seed
 
     def with_seed(self, seed: int) -> ResolvedJob:
@@ -85,7 +85,7 @@ class ResolvedJob(Spec):
         return self.with_render(self.frames, seed)
 
     def with_job(self, job: JobSpec) -> ResolvedJob:
-        """Return another job on the same instrument."""
+        """Return a job on the same instrument, with the content of its files, for another job specification."""
         return self.model_copy(update={"job": job})
 
     def with_render(self, frames: int, seed: int) -> ResolvedJob:
@@ -94,7 +94,7 @@ class ResolvedJob(Spec):
         return self.model_copy(update={"job": self.job.model_copy(update={"render": render})})
 
     def instrument_file(self) -> dict[str, Any]:
-        """Return the content of an instrument's file without references and without disturbances."""
+        """Return the content of a self-contained instrument file, without references and disturbances."""
         plain = self.plain()
         instrument: dict[str, Any] = plain["instrument"]
         instrument.pop("disturbances", None)
@@ -124,7 +124,13 @@ def resolve(path: str | Path) -> ResolvedJob:
 
 
 def resolve_job(job: JobSpec) -> ResolvedJob:
-    """Return a job with the content of its references. Raises InputError as `resolve` does."""
+    """Return a job with the content of all files to which it refers.
+
+    Raises
+    ------
+    InputError
+        A file cannot be read or is not valid.
+    """
     return _with_instrument(job, load.load_instrument(job.instrument, job, ("instrument",)))
 
 
@@ -148,7 +154,7 @@ def _with_instrument(job: JobSpec, instrument: InstrumentSpec) -> ResolvedJob:
 
 
 def resolve_budget(budget: ErrorBudgetSpec) -> ResolvedJob:
-    """Return the nominal job on an error budget's instrument, with the budget's disturbances.
+    """Return the job of the unperturbed instrument of an error budget, with the budget's disturbances.
 
     Raises
     ------
@@ -163,7 +169,7 @@ def resolve_budget(budget: ErrorBudgetSpec) -> ResolvedJob:
 
 
 def resolve_on(owner: Spec, instrument: str, disturbances: Any = None) -> ResolvedJob:
-    """Return the nominal job on the instrument of another file.
+    """Return the job of the unperturbed instrument to which another file refers.
 
     Parameters
     ----------
@@ -184,7 +190,7 @@ def resolve_on(owner: Spec, instrument: str, disturbances: Any = None) -> Resolv
 
 
 def resolve_with(file: str | Path, disturbances: str | None = None) -> ResolvedJob:
-    """Return a job, or the nominal job of an instrument, with the content of its references.
+    """Read a job, or an instrument as the job without perturbation, with the content of all its files.
 
     Parameters
     ----------
@@ -257,7 +263,7 @@ def _complete(resolved: ResolvedJob) -> ResolvedJob:
 
 
 class ExperimentSetup(Spec, Generic[TestType]):
-    """Test with the content of its references, so that one file documents all inputs of a run.
+    """Test with the content of all its files, so that one config.yaml documents all inputs of a run.
 
     Each kind of test is a subclass: its fields hold the content, ``parts`` reads it, and ``checked`` checks that the
     parts fit together.
@@ -275,7 +281,7 @@ class ExperimentSetup(Spec, Generic[TestType]):
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """Read a test with the content of its references.
+        """Read a test's file and all files to which it refers.
 
         Parameters
         ----------
@@ -296,16 +302,25 @@ class ExperimentSetup(Spec, Generic[TestType]):
 
     @classmethod
     def parts(cls, test: Any) -> dict[str, Any]:
-        """Return the content of a test's references by field; raise `InputError` if it cannot be read."""
+        """Read the files to which a test refers; return field of the set-up -> content.
+
+        Raises InputError if a file cannot be read.
+        """
         return {}
 
     def checked(self) -> Self:
-        """Return the complete set-up; raise `InputError` if test and parts do not fit together."""
+        """Check that the test and the content of its files fit together; return the complete set-up.
+
+        Raises InputError if they do not.
+        """
         return self
 
     @classmethod
     def measured_by(cls, keys: Mapping[str, Any]) -> bool:
-        """Return whether a file with these keys is a test on measurements; only asked of set-ups for measurements."""
+        """Return whether a file with these keys is a test on measurements of this kind.
+
+        Only set-ups for measurements are asked.
+        """
         return MEASURED in keys
 
     @property
@@ -320,7 +335,7 @@ class ExperimentSetup(Spec, Generic[TestType]):
         return self.with_test(seed=seed)
 
     def with_test(self, **values: Any) -> Self:
-        """Return the set-up with other, already checked values of the test's keys."""
+        """Return the set-up with other values of some keys of the test, which must already be checked."""
         return self.model_copy(update={"test": self.test.model_copy(update=values)})
 
     def to_yaml(self) -> str:
@@ -331,11 +346,11 @@ class ExperimentSetup(Spec, Generic[TestType]):
 MEASURED = "measured"
 """Key of a test whose data come from files instead of a simulated bench."""
 DATA_FILES = ("comparisons", "held_out", "spots", "mtf", "images")
-"""Keys of `measured` that are paths of files."""
+"""Keys of the section `measured` whose values are paths of files."""
 
 
 class CameraTestSetup(ExperimentSetup[TestType], Generic[TestType]):
-    """Laboratory test of a camera.
+    """Laboratory test of a camera, with the content of the files of camera and detectors.
 
     Attributes
     ----------
@@ -350,12 +365,12 @@ class CameraTestSetup(ExperimentSetup[TestType], Generic[TestType]):
 
     @classmethod
     def parts(cls, test: Any) -> dict[str, Any]:
-        """Return the camera with its detectors, and the test with the camera's deviations in `as_built`."""
+        """Read the camera with its detectors, and add the camera's deviations to the test; return field -> content."""
         test, camera = load.load_camera_under_test(test)
         return {"test": test, "camera": camera, "detectors": load.load_band_detectors(camera)}
 
     def checked(self) -> Self:
-        """Check that the camera has line CCDs and that their data sheets are present."""
+        """Check that the camera has line CCDs and that their data sheets are present; return the set-up."""
         if not self.camera.bands:
             text = f"the camera {self.camera.name} has no line CCDs"
             raise self.test.error(text, ("camera",), allowed="a camera with `bands:` in its file")
@@ -365,10 +380,10 @@ class CameraTestSetup(ExperimentSetup[TestType], Generic[TestType]):
 
 
 class FocusSetup(CameraTestSetup[FocusTestSpec]):
-    """Focal-plane alignment with its camera and detectors."""
+    """Focal-plane alignment, with the content of the files of camera and detectors."""
 
     def checked(self) -> Self:
-        """Check also that the bands have different offsets X', which the tilt about the line requires."""
+        """Check the camera, and that its bands have different offsets X', which the tilt about the line requires."""
         super().checked()
         if len({band.offset for band in self.camera.bands.values()}) < 2:
             text = (
@@ -379,7 +394,7 @@ class FocusSetup(CameraTestSetup[FocusTestSpec]):
 
 
 class DistortionSetup(CameraTestSetup[DistortionTestSpec]):
-    """Distortion test with its camera, detectors and turntable.
+    """Distortion test, with the content of the files of camera, detectors and turntable.
 
     Attributes
     ----------
@@ -391,12 +406,12 @@ class DistortionSetup(CameraTestSetup[DistortionTestSpec]):
 
     @classmethod
     def parts(cls, test: DistortionTestSpec) -> dict[str, Any]:
-        """Return the parts of a camera test and the turntable."""
+        """Read the camera with its detectors, and the turntable; return field -> content."""
         turntable = load.load_named(TurntableTestSpec, load.LAB, test.turntable, test, ("turntable",))
         return {**super().parts(test), "turntable": turntable}
 
     def checked(self) -> Self:
-        """Check also that the camera has the band."""
+        """Check the camera, and that it has the band that is measured; return the set-up."""
         super().checked()
         if self.test.band not in self.camera.bands:
             raise self.test.error(unknown("no such band", self.test.band, self.camera.bands), ("band",))
@@ -404,29 +419,29 @@ class DistortionSetup(CameraTestSetup[DistortionTestSpec]):
 
 
 class TurntableSetup(ExperimentSetup[TurntableTestSpec]):
-    """Turntable test, which has no references."""
+    """Simulated turntable test, which refers to no other files."""
 
 
 class MeasuredSetup(ExperimentSetup[TestType], Generic[TestType]):
-    """Laboratory test on measurements."""
+    """Base of laboratory tests on measurements."""
 
     def checked(self) -> Self:
-        """Make the paths of the data absolute, so that a run's config.yaml is valid from any folder."""
+        """Return the set-up with absolute paths of the data, so that a run's config.yaml is valid from any folder."""
         folder = Path(self.test.source.file).parent.absolute()
         measured = _absolute(getattr(self.test, MEASURED), folder)
         return self.model_copy(update={"test": self.test.model_copy(update={MEASURED: measured})})
 
 
 class MeasuredFocusSetup(MeasuredSetup[MeasuredFocusSpec]):
-    """Focal-plane alignment on measurements."""
+    """Focal-plane alignment from a measured through-focus series."""
 
 
 class MeasuredDistortionSetup(MeasuredSetup[MeasuredDistortionSpec]):
-    """Distortion test on measurements."""
+    """Distortion test from measured angles and spot positions."""
 
 
 class MeasuredTurntableSetup(MeasuredSetup[MeasuredTurntableSpec]):
-    """Turntable test on measurements."""
+    """Turntable test from measured comparisons with a reference."""
 
 
 def test_keys(path: str | Path) -> Mapping[str, Any]:
@@ -443,7 +458,7 @@ def test_keys(path: str | Path) -> Mapping[str, Any]:
 
 
 def _absolute(files: Spec, folder: Path) -> Spec:
-    """Return a section with absolute paths."""
+    """Return a section of a test in which the paths of files are absolute."""
     changed: dict[str, Any] = {}
     for name in type(files).model_fields:
         value = getattr(files, name)
@@ -458,7 +473,7 @@ ALLOWED = "the file of a camera or of an instrument, or the config.yaml of a run
 
 
 class CameraSetup(Spec):
-    """Camera, alone or as mounted in its instrument.
+    """Camera, alone or as mounted in its instrument, with the content of all its files.
 
     Attributes
     ----------
@@ -487,7 +502,10 @@ class CameraSetup(Spec):
 
     @property
     def mounted_instrument(self) -> tuple[InstrumentSpec, Mapping[str, CameraSpec], str]:
-        """Instrument, its cameras and the name of this one in it; a camera alone forms an instrument."""
+        """Instrument that carries the camera, prescriptions of all its cameras, and the name of this camera in it.
+
+        A camera alone forms an instrument.
+        """
         if self.instrument is not None and self.mounted is not None:
             return self.instrument, self.cameras, self.mounted
         name = self.camera.name
@@ -526,7 +544,7 @@ class CameraSetup(Spec):
 
     @property
     def where(self) -> str:
-        """Name of the instrument, empty for a camera alone."""
+        """Name of the instrument that carries the camera; empty for a camera alone."""
         return "" if self.instrument is None else self.instrument.name
 
     def to_yaml(self) -> str:
@@ -535,7 +553,7 @@ class CameraSetup(Spec):
 
 
 def resolve_camera(file: Path | str, name: str | None = None) -> CameraSetup:
-    """Read a camera with the content of its references.
+    """Read a camera with the content of all files to which it refers.
 
     Parameters
     ----------
@@ -592,7 +610,7 @@ def _mounted(instrument: InstrumentSpec, file: str, name: str | None) -> CameraS
 
 
 def _of_run(yaml: YamlFile, name: str | None) -> CameraSetup:
-    """Return a camera of a run's config.yaml; that of a study has its base below ``base``."""
+    """Return a camera of a run's config.yaml; the config.yaml of a study has the camera's job below ``base``."""
     below = yaml.data if isinstance(yaml.data, dict) else {}
     if "study" in below and isinstance(below.get("base"), dict):
         yaml, below = yaml.part("base"), below["base"]

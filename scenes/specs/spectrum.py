@@ -52,10 +52,10 @@ law is a polynomial to rounding; and points of all pieces together, at least: fa
 
 
 class SpectrumSpec(Spec):
-    """Spectrum: relative signal by wavelength of a source that looks the same everywhere. Signal is counted in photons.
+    """Spectrum: relative signal, counted in photons, by wavelength.
 
-    ``weights`` and a table's response are signal per photon (transmission times quantum efficiency), and a black body
-    emits photons. Only ratios matter.
+    The source has the same spectrum everywhere. ``weights`` and a table's response are signal per photon (transmission
+    times quantum efficiency), and a black body emits photons. Only ratios matter.
 
     Attributes
     ----------
@@ -147,10 +147,10 @@ class SpectrumSpec(Spec):
         return float(points @ weights)
 
     def rule(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return wavelengths and weights for means over the signal, by the Gauss rule of this spectrum.
+        """Return wavelengths and weights of a quadrature rule for means over the signal.
 
-        The mean of a function of the wavelength is exact if it is a polynomial of degree below 2 ``count``, for any
-        response. For lines, all of them are returned instead of a rule.
+        It is the Gauss rule of this spectrum: the mean of a function of the wavelength is exact if it is a polynomial
+        of degree below 2 ``count``, for any response. For lines, all of them are returned instead of a rule.
 
         Parameters
         ----------
@@ -160,7 +160,7 @@ class SpectrumSpec(Spec):
         Returns
         -------
         tuple[np.ndarray, np.ndarray]
-            (K,) wavelengths in metres, and (K,) weights that sum to 1.
+            K wavelengths, (K,), in metres, and K weights, (K,), that sum to 1.
 
         Raises
         ------
@@ -221,7 +221,7 @@ class SpectrumSpec(Spec):
 
 @lru_cache(maxsize=64)
 def _parts(spectrum: SpectrumSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Return wavelengths with signal and their weights, fine enough to represent the whole spectrum."""
+    """Return wavelengths with signal, in metres, and their weights, fine enough for the whole spectrum."""
     if spectrum.wavelengths is not None:
         weights = np.ones(len(spectrum.wavelengths)) if spectrum.weights is None else np.array(spectrum.weights)
         return np.array(spectrum.wavelengths)[weights > 0.0], weights[weights > 0.0]
@@ -238,7 +238,7 @@ def _parts(spectrum: SpectrumSpec) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _corners(spectrum: SpectrumSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Return the wavelengths between which the response is linear, and the response at them."""
+    """Return the wavelengths, in metres, between which the response is linear, and the response at them."""
     if spectrum.between is not None:
         corners = np.linspace(*spectrum.between, _PIECES + 1)
         return corners, np.ones_like(corners)

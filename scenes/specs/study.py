@@ -35,7 +35,7 @@ from scenes.yaml.spec import (
 from scenes.yaml.units import split_quantity, unit_ratio
 
 GRID = "grid"
-"""Kind of design without random numbers: every combination."""
+"""Kind of design of experiments without random numbers: every combination of the values."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Sampler:
 
 
 SMALLEST = 2.0**-53
-"""Draws lie in [SMALLEST, 1 - SMALLEST], where normal quantiles are finite (8.2 sigma)."""
+"""Random numbers lie in [SMALLEST, 1 - SMALLEST], where normal quantiles are finite (8.2 sigma)."""
 
 
 def _latin_hypercube(runs: int, factors: int, generator: np.random.Generator) -> np.ndarray:
@@ -93,7 +93,7 @@ SAMPLERS = ExtensionTable("samplers", _SAMPLERS, Sampler)
 
 
 def unit_cube(kind: str, runs: int, factors: int, seed: int) -> np.ndarray:
-    """Return the points of a design in the open unit cube, (runs, factors).
+    """Return the points of a design of experiments in the open unit cube, (runs, factors).
 
     Parameters
     ----------
@@ -126,9 +126,9 @@ Scalar = (
     | Annotated[float, Field(strict=True, allow_inf_nan=False)]
     | Annotated[str, Field(strict=True, max_length=1000)]
 )
-"""Value in the form of the base's file: a quantity with its unit, a number, a name, true or false."""
+"""Value as written in the file of the base job or test: a quantity with its unit, a number, a name, true or false."""
 Key = Annotated[tuple[Annotated[str, Field(strict=True)] | Whole, ...], Field(min_length=1)]
-"""Keys and list indices from the root of a tree."""
+"""Key path in a file or a result: keys and list indices from the root on."""
 MOST_RUNS = 10_000_000
 Count = Annotated[Whole, Field(ge=2, le=MOST_RUNS)]
 KINDS = ("values", "range", "uniform", "normal", "truncated", "table")
@@ -187,9 +187,9 @@ class TableSpec(Spec):
 
 
 class ScaleSpec(Spec):
-    """Value that is scaled by a power of the ratio of a factor to its value in the base.
+    """Number in the base that a factor scales: it is multiplied by a power of factor / factor in the base.
 
-    The scaled value is the base's, or that set by another factor. Several factors may scale one value.
+    The scaled number is that of the base, or the one set by another factor. Several factors may scale one number.
 
     Attributes
     ----------
@@ -204,7 +204,7 @@ class ScaleSpec(Spec):
 
 
 class FactorSpec(Spec):
-    """Factor of a study: the value that varies and its values.
+    """Factor of a study: a number or text of the base that varies, and the values that it takes.
 
     It has one of key, motion and keys, or scales alone, and exactly one of values, range, uniform, normal, truncated
     and table.
@@ -283,25 +283,25 @@ class FactorSpec(Spec):
 
     @property
     def kind(self) -> str:
-        """Source of the values, one of KINDS."""
+        """Key that gives the values, one of KINDS, such as ``range``."""
         return next(kind for kind in KINDS if getattr(self, kind) is not None)
 
     @property
     def places(self) -> tuple[KeyPath, ...]:
-        """All key paths that get the value."""
+        """All key paths in the base that get the value of the factor."""
         return self.keys if self.keys is not None else (self.key,) if self.key is not None else ()
 
     def key_of(self, k: int) -> KeyPath:
-        """Return the key in this factor of key path number k."""
+        """Return the key path, within this factor, of entry number ``k`` of ``places``."""
         return ("key",) if self.key is not None else ("keys", k)
 
     @property
     def unit(self) -> str | None:
-        """Unit of the numbers, the first one in the file; None without unit."""
+        """Unit of the factor's numbers, taken from the first one in the file; None without unit."""
         return Numbers.of(self.scalars(), self.kind).unit
 
     def scalars(self) -> tuple[Any, ...]:
-        """Return all values or parameters in the form of the file."""
+        """Return all values of the factor, or parameters of its distribution, as the file writes them."""
         if self.normal is not None:
             return (self.normal.mean, self.normal.sigma)
         if self.truncated is not None:
@@ -311,7 +311,7 @@ class FactorSpec(Spec):
         return self.values or self.range or self.uniform or ()
 
     def numbers(self) -> Numbers:
-        """Return all values or parameters as numbers in one unit."""
+        """Return all values of the factor, or parameters of its distribution, as numbers in one unit."""
         return Numbers.of(self.scalars(), self.kind)
 
     def _check_scales(self) -> None:
@@ -368,7 +368,7 @@ class Numbers(tuple[float, ...]):
 
     @property
     def values(self) -> tuple[float, ...]:
-        """Tuple of the numbers."""
+        """The numbers as a tuple, in the common unit."""
         return tuple(self)
 
     @classmethod
@@ -415,7 +415,7 @@ class DesignSpec(Spec):
     runs : int | None
         Number of runs; a grid has as many as there are combinations.
     seed : int
-        Seed of the draws, and of the noise of every run.
+        Seed of the random values of the factors, and of the noise of every run.
     """
 
     kind: Annotated[str, OneOf(lambda: (GRID, *SAMPLERS))] = GRID
@@ -457,7 +457,7 @@ class LimitsSpec(Spec):
 
     @property
     def bytes(self) -> float:
-        """Memory in bytes."""
+        """Largest memory of all processes together, in bytes."""
         return float(self.memory[:-2]) * (1e9 if self.memory.endswith("GB") else 1e6)
 
 
@@ -469,7 +469,7 @@ UNITS = {
     "k_per_m": "K/m",
     "m_per_s": "m/s",
 }
-"""Suffix of a result's key -> unit."""
+"""Last word of a result's key, such as `um` in `d_f_um` -> unit."""
 
 
 class BaseSpec(Spec):
@@ -505,8 +505,8 @@ class ResponseSpec(Spec):
         Key path of its total standard deviation, if the results have one; for readings of the monitor it covers noise
         and motions that the spots cannot separate.
     noise : tuple[str | int, ...] | None
-        Key path of its standard deviation by the noise of a run alone, which differs from run to run; for readings of
-        the monitor the key that ends in ``_sigma_noise``.
+        Key path of its standard deviation due to the noise of a run alone, which differs from run to run; for readings
+        of the monitor the key that ends in ``_sigma_noise``.
     minus : tuple[str | int, ...] | None
         Key path of a number that is subtracted, such as the true value, so that the response is an error.
     """
@@ -527,18 +527,20 @@ class ResponseSpec(Spec):
 
     @property
     def units(self) -> str:
-        """Unit, empty for a pure number."""
+        """Unit of the response; empty for a number without unit."""
         return self.unit if self.unit is not None else unit_of(self.key)
 
     @property
     def sigma_keys(self) -> dict[str, KeyPath]:
-        """Suffix of a column of the result -> key path of the standard deviation in it."""
+        """Suffix of a result column, total or noise -> key path of the standard deviation that it holds."""
         sigmas = {TOTAL: self.sigma, NOISE: self.noise}
         return {ending: key for ending, key in sigmas.items() if key is not None}
 
 
 class ThresholdSpec(Spec):
-    """Requirement on a response, in the response's unit. The report gives the fraction of runs that meet it.
+    """Requirement on a response, in the response's unit.
+
+    The report gives the fraction of runs that meet it.
 
     Attributes
     ----------
@@ -609,7 +611,7 @@ class StudyReportSpec(Spec):
     thresholds: Named[ThresholdSpec] = Field(default_factory=dict, validate_default=True)
 
     def names(self) -> list[tuple[KeyPath, str, bool]]:
-        """Return (key path, name, whether it must be a response) for every name in the report."""
+        """Return (key path, name, whether it must be a response) for every factor or response that the report names."""
         out: list[tuple[KeyPath, str, bool]] = [
             (("histograms", k), name, True) for k, name in enumerate(self.histograms or ())
         ]
@@ -694,7 +696,7 @@ class StudySpec(TitledSpec):
 
 
 _UNIT_WORDS = frozenset(UNITS) | {"m2", "mm2", "um2"}
-"""Words of a key that end its unit."""
+"""Words at the end of a key that belong to its unit."""
 
 
 def unit_of(key: KeyPath) -> str:

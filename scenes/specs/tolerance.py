@@ -51,11 +51,11 @@ MOST_ABBE = 0.1
 would be left.
 """
 SPECTRUM = "figure"
-"""Kind of a motion that, without a term, is a whole figure error."""
+"""Kind of a motion, `figure`, that without a Zernike term means a figure error of many terms."""
 
 
 class Varied(Spec):
-    """Motion of a body without its amount, as text.
+    """Base of tolerances, compensators and actuators: a motion of a body without its amount, as text.
 
     Attributes
     ----------
@@ -79,11 +79,11 @@ class Varied(Spec):
 
     @property
     def parts(self) -> tuple[str, str, str, str, str]:
-        """Node, kind, axis or term, amount (empty) and pivot."""
+        """Parts of the motion's text: node, kind, axis or term, amount (empty) and pivot."""
         return motion_of(self.motion)
 
     def si(self, value: Amount, key: str, positive: bool = False) -> float:
-        """Return an amount of the motion in the SI unit.
+        """Return an amount of this motion in the SI unit.
 
         Raises
         ------
@@ -110,7 +110,7 @@ def amount_si(value: Amount, kind: str) -> float:
 
 
 def amount_text(value: float, kind: str) -> str | float:
-    """Return an amount in the form of the files."""
+    """Return an amount of a kind of motion as files write it: with its unit, or as a number without one."""
     return value if kind in PURE else format_quantity(value, MEASURES[kind])
 
 
@@ -212,34 +212,34 @@ class ToleranceSpec(Varied):
 
     @property
     def cost_points(self) -> tuple[tuple[float, float], ...]:
-        """Limits relative to the specified one with their costs, ascending, at least two."""
+        """Known costs: limits relative to the specified limit, ascending, and the cost of each; at least two."""
         if self.costs is None:
             return (1.0, self.cost), (2.0, self.cost * 2.0**-self.exponent)
         return tuple(sorted((amount_si(limit, self.parts[1]) / self.limit_si, cost) for limit, cost in self.costs))
 
     @property
     def spectrum(self) -> tuple[int, ...]:
-        """Noll indices of the terms of a whole figure error; empty for other parameters."""
+        """Noll indices of the Zernike terms of a figure error of many terms; empty for other parameters."""
         return () if self.terms is None else tuple(range(noll(self.terms[0]), noll(self.terms[1]) + 1))
 
     @property
     def words(self) -> str:
-        """Motion as text, `M1 figure` for a whole figure error."""
+        """Text of the motion that varies; `M1 figure` for a figure error of many terms."""
         return self.motion if self.terms is None else self.motion.rsplit(maxsplit=1)[0]
 
     @property
     def limit_si(self) -> float:
-        """Limit in the SI unit."""
+        """Largest deviation in either direction, in the SI unit."""
         return amount_si(self.limit, self.parts[1])
 
     @property
     def mean_share(self) -> float:
-        """Mean in units of the limit."""
+        """Mean of the distribution, divided by the limit."""
         return 0.0 if self.mean is None else amount_si(self.mean, self.parts[1]) / self.limit_si
 
     @property
     def measured_shares(self) -> tuple[float, ...]:
-        """Measured deviations in units of the limit."""
+        """Measured deviations, divided by the limit."""
         return tuple(amount_si(value, self.parts[1]) / self.limit_si for value in self.measured or ())
 
 
@@ -257,7 +257,7 @@ class CompensatorSpec(Varied):
     step : str | float | None
         Step of which the amount is a multiple; by default any amount is possible.
     accuracy : str | float | None
-        Standard deviation of a move; zero by default.
+        Standard deviation of the error of an adjustment; zero by default.
     """
 
     range: Amount
@@ -276,17 +276,17 @@ class CompensatorSpec(Varied):
 
     @property
     def range_si(self) -> float:
-        """Range in the SI unit."""
+        """Largest amount of the adjustment in either direction, in the SI unit."""
         return amount_si(self.range, self.parts[1])
 
     @property
     def step_si(self) -> float:
-        """Step in the SI unit; 0 for none."""
+        """Step of which the adjustment is a multiple, in the SI unit; 0 if any amount is possible."""
         return 0.0 if self.step is None else amount_si(self.step, self.parts[1])
 
     @property
     def accuracy_si(self) -> float:
-        """Standard deviation of a move in the SI unit; 0 for none."""
+        """Standard deviation of the error of an adjustment, in the SI unit; 0 if it is exact."""
         return 0.0 if self.accuracy is None else amount_si(self.accuracy, self.parts[1])
 
 
@@ -307,7 +307,7 @@ MERIT_UNITS: Mapping[str, Kind | None] = FrozenMap(
         "monitor_focus": LENGTH,
     }
 )
-"""Kind of a merit -> kind of its quantity; None for a pure number (waves of the design wavelength, MTF)."""
+"""Kind of a merit -> kind of quantity of its value; None for a number (waves of the design wavelength, MTF)."""
 MORE_IS_BETTER = ("mtf",)
 OF_MONITOR = ("monitor_angle", "monitor_focus")
 """Kinds of merits that concern the readings of a monitor."""
@@ -323,11 +323,11 @@ class MeritSpec(Spec):
     kind : str
         Quantity: `wavefront`, rms wavefront error in waves of the design wavelength; `mtf` of the optics; `boresight`,
         rotation of the line of sight; `roll` of the line about the line of sight; `principal_distance`, its change;
-        `distortion`, largest change of an image position along the line that these three do not explain; `chief_ray`,
-        largest rotation of a chief ray at the line CCD; `obstruction`, largest fraction of a field's beam, by area of
-        the stop, that bodies of the instrument block; `monitor_angle` and `monitor_focus`, standard deviation of the
-        monitor's readings of a rotation and of `d_f` under the disturbances. The budget's `light` selects the light for
-        wavefronts and MTFs.
+        `distortion`, largest change of an image position along the line that rotation, roll and principal distance do
+        not explain; `chief_ray`, largest rotation of a chief ray at the line CCD; `obstruction`, largest fraction of a
+        field's beam, by area of the stop, that bodies of the instrument block; `monitor_angle` and `monitor_focus`,
+        standard deviation of the monitor's readings of a rotation and of `d_f` under the disturbances. The budget's
+        `light` selects the light for wavefronts and MTFs.
     fields : tuple[tuple[float, float], ...]
         Fields for wavefront, mtf, chief_ray and obstruction, of which the worst one counts: fractions of the half
         field, [along the line, along the track].
@@ -404,12 +404,12 @@ class MeritSpec(Spec):
 
     @property
     def more_is_better(self) -> bool:
-        """True if large values are good."""
+        """True if the merit passes for large values, as an MTF does."""
         return self.kind in MORE_IS_BETTER
 
     @property
     def requirement(self) -> float:
-        """Value that just passes, in the SI unit."""
+        """Value of the merit that just passes, in the SI unit."""
         if self.at_least is not None:
             return float(self.at_least)
         assert self.at_most is not None
@@ -417,7 +417,7 @@ class MeritSpec(Spec):
 
     @property
     def loss_si(self) -> float | None:
-        """Loss that a single tolerance may cause, in the SI unit; None for the default."""
+        """Loss of the merit that a single tolerance may cause, in the SI unit; None for the default."""
         return None if self.loss is None else self._si(self.loss, "loss")
 
 
@@ -494,14 +494,15 @@ class ToleranceBudgetSpec(Spec):
 
 
 class ToleranceSetup(ExperimentSetup[ToleranceBudgetSpec]):
-    """Tolerance budget with its instrument.
+    """Tolerance budget, with the content of its instrument's files.
 
     Attributes
     ----------
     base : ResolvedJob
         Nominal job of the instrument.
     draws : dict[str, float]
-        Name of a varying number -> value in one camera, in units of its limit; missing numbers are zero.
+        Name of a varied parameter -> its deviation in one camera of the Monte Carlo run, in units of its limit; zero
+        for missing names.
     """
 
     base: ResolvedJob
@@ -509,5 +510,5 @@ class ToleranceSetup(ExperimentSetup[ToleranceBudgetSpec]):
 
     @classmethod
     def parts(cls, test: ToleranceBudgetSpec) -> dict[str, Any]:
-        """Return the nominal job."""
+        """Read the instrument as the job without perturbation; return field -> content."""
         return {"base": resolve_on(test, test.instrument, test.disturbances)}

@@ -21,7 +21,7 @@ MOST_LINES = 10_000_000
 
 
 class GraduationSpec(Spec):
-    """Errors of the grating's lines: a random curve of harmonics of the full circle.
+    """Errors of the lines of the turntable's grating: a random curve of harmonics of the full circle.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class SubdivisionSpec(Spec):
 
     @property
     def period(self) -> float:
-        """Period of the signal, in radians."""
+        """Angle of one period of the grating's signal, in radians."""
         return 2.0 * math.pi / self.lines
 
 
@@ -164,7 +164,7 @@ class CalibrationPlanSpec(Spec):
 
     @property
     def count(self) -> int:
-        """Number of calibrated readings."""
+        """Number of readings of the turntable that are calibrated."""
         return round((self.last - self.first) / self.step) + 1
 
     @model_validator(mode="after")
@@ -198,7 +198,7 @@ class CalibrationPlanSpec(Spec):
 
 
 class TurntableTestSpec(TitledSpec):
-    """Turntable test.
+    """Test of a simulated turntable: calibration of its dividing error against a reference.
 
     Attributes
     ----------
@@ -235,7 +235,7 @@ class TurntableTestSpec(TitledSpec):
 
 
 class TurntableFiles(Spec):
-    """Readings of a turntable and their comparisons with a reference.
+    """Files with readings of a turntable and their comparisons with a reference.
 
     Attributes
     ----------

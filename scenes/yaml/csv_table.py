@@ -76,7 +76,7 @@ class Table:
     file : str
         Path as the user wrote it.
     lines : np.ndarray
-        (N,) line number of each row in the file, counted from 1.
+        (N,) line number of each of the N rows in the file, counted from 1.
     heads : Mapping[str, str]
         Name of a column -> its head as written in the file.
     columns : Mapping[str, ndarray]
@@ -98,7 +98,7 @@ class Table:
         return self.columns[name]
 
     def stacked(self, *names: str) -> np.ndarray:
-        """Return K columns of numbers as one (N, K) array."""
+        """Return columns of numbers side by side, as one array (rows, columns), in SI units."""
         return np.stack([self.columns[name] for name in names], axis=-1)
 
     def error(
@@ -158,7 +158,7 @@ def _numbers(
     heads: Sequence[str],
     layout: Sequence[tuple[Column, int, _Scale]],
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return the line numbers of some rows, and the SI numbers or names in their columns."""
+    """Convert some rows of a table to numbers; return their line numbers, and the columns in SI units."""
     width = len(heads)
     uneven = next((k for k, row in enumerate(rows) if len(row) != width), None)
     if uneven is not None:
@@ -208,9 +208,10 @@ def lines_of(text: str) -> Iterator[str]:
 
 
 def rows_apart(path: str | Path, most: int) -> list[tuple[int, list[str] | str]]:
-    """Return line number and cells of every row of a small table whose rows are accepted or refused one by one.
+    """Return line number and cells of every row of a small table, keeping rows that cannot be read.
 
-    Each line is a row: a quotation mark that is never closed invalidates its own row alone.
+    The caller accepts or refuses the rows one by one. Each line is a row: a quotation mark that is never closed
+    invalidates its own row alone.
 
     Parameters
     ----------
@@ -253,12 +254,12 @@ def _delimiter(text: str) -> str:
 
 
 def _holds(row: Sequence[str]) -> bool:
-    """Return whether a row has content and is not a comment."""
+    """Return whether a row has cells with content and is not a comment."""
     return bool(row) and not row[0].lstrip().startswith("#") and any(map(str.strip, row))
 
 
 def _rows(file: str, text: str) -> Iterator[tuple[list[int], list[list[str]]]]:
-    """Iterate over line numbers and cells of the rows with content, ``_TOGETHER`` rows at a time."""
+    """Yield line numbers and cells of the rows with content, up to ``_TOGETHER`` rows at a time."""
     reader = csv.reader(lines_of(text), delimiter=_delimiter(text), strict=True)
     lines: list[int] = []
     rows: list[list[str]] = []
@@ -325,8 +326,9 @@ def _heads(
 
 
 _Scale = tuple[float, float]
-"""Factor and offset from the unit of a head to the SI unit: SI = factor * (number + offset). Only degrees Celsius have
-an offset.
+"""Factor and offset that convert a number in the unit of a head to SI: SI = factor * (number + offset).
+
+Only degrees Celsius have an offset.
 """
 
 

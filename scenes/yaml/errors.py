@@ -116,11 +116,11 @@ class Problem(ValueError):
         return self.problem
 
     def below(self, *key: str | int) -> Problem:
-        """Return the problem with a key put before its position."""
+        """Return the problem with a key put before its position, for a value inside a mapping or list."""
         return Problem(self.problem, self.found, self.allowed, self.suggestion, (*key, *self.within))
 
     def at(self, file: str = "", line: int | None = None, key: KeyPath = ()) -> Issue:
-        """Return the issue for this problem of the value at a file, line and key."""
+        """Return the issue of this problem for a value at a given file, line and key."""
         return Issue(self.problem, file, line, (*key, *self.within), self.found, self.allowed, self.suggestion)
 
 
@@ -186,7 +186,10 @@ def shown(value: object) -> str:
 
 
 def printable(text: str) -> str:
-    """Return the text on one line, with control characters, on which a terminal would act, as escapes."""
+    """Return the text on one line, with control characters replaced by escape sequences.
+
+    A terminal would otherwise act on them.
+    """
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 

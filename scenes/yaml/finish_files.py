@@ -51,8 +51,8 @@ LARGEST = 64 << 20
 """Largest size of a file, in bytes."""
 MOST_ANGLES = {"SampleRotation": 360, "AngleOfIncidence": 181, "ScatterAzimuth": 721, "ScatterRadial": 2000}
 TIS_TOLERANCE = 0.25
-"""Largest relative difference between the TIS that a file states and the integral of its table; coarse lists of angles
-cause differences of this order.
+"""Largest relative difference between the total integrated scatter (TIS) that a file states and the integral of its
+table; coarse lists of angles cause differences of this order.
 """
 WORDS = {
     "Source": ("Measured",),
@@ -107,7 +107,7 @@ class _Lines:
         return self.rows[self.at][1]
 
     def word(self, key: str) -> str:
-        """Read the word after a key, in the spelling of the format."""
+        """Read the word that follows a key, and return it in the spelling of the format."""
         cells = self._keyed(key)
         known = {word.lower(): word for word in WORDS[key]}
         if len(cells) != 2 or cells[1].lower() not in known:
@@ -121,7 +121,7 @@ class _Lines:
         return known[cells[1].lower()]
 
     def angles(self, key: str) -> np.ndarray:
-        """Read a number of angles and the angles after it; return them in radians."""
+        """Read a number of angles and then the angles, in degrees; return them in radians."""
         cells = self._keyed(key)
         most = MOST_ANGLES[key]
         plain = len(cells) == 2 and cells[1].isascii() and cells[1].isdigit() and len(cells[1]) < 7
@@ -236,7 +236,7 @@ def read_bsdf(path: str | Path) -> MeasuredScatter:
 
 
 def _agrees(file: str, table: ScatterTable, stated_tis: Sequence[tuple[int, float]]) -> None:
-    """Raise `InputError` if the integral of a table differs from the TIS that its file states."""
+    """Raise `InputError` if the integral of a BSDF table differs from the total scatter that its file states."""
     for (line, value), angle in zip(stated_tis, table.incidence, strict=True):
         total = table.total(float(angle))
         if abs(total - value) > TIS_TOLERANCE * max(total, value):
@@ -252,12 +252,15 @@ COLUMNS = (
     *(Column(name, SCALE, needed=False, least=0.0, most=1.0 + 1e-12, bare=True) for name in SHARES),
 )
 OVER = 5e-3
-"""Largest excess over 1 of the sum of measured reflectance and transmittance; the transmittance is then reduced."""
+"""Largest allowed excess over 1 of the sum of measured reflectance and transmittance.
+
+If there is an excess, the transmittance is reduced.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredCoating:
-    """Contents of a coating file: wavelength in metres -> coating, wavelengths ascending."""
+    """Contents of a coating file: wavelength in metres -> coating, by ascending wavelength."""
 
     by_wavelength: Mapping[float, CoatingTable]
 
@@ -330,7 +333,7 @@ def read_coating(path: str | Path) -> MeasuredCoating:
 
 
 def _mean(table: Table, name: str) -> np.ndarray | None:
-    """Return the column for unpolarised light, or the mean of those for s and p; None if there is neither."""
+    """Return the column of R or T for unpolarised light, or the mean of those for s and p; None without either."""
     s, p = f"{name}s", f"{name}p"
     if name in table:
         both = next((other for other in (s, p) if other in table), None)

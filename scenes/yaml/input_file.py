@@ -58,12 +58,23 @@ def read_bytes(path: str | Path, what: str, most: int, ends: Sequence[str]) -> b
 
 
 def read_text(path: str | Path, what: str, most: int, ends: Sequence[str]) -> str:
-    """Read the text of a file, UTF-8 with or without byte order mark; arguments as in `read_bytes`.
+    """Read the text of a file, UTF-8 with or without byte order mark.
+
+    Parameters
+    ----------
+    path : str | Path
+        Path of the file.
+    what : str
+        Noun phrase for the expected file, for messages.
+    most : int
+        Largest size, in bytes.
+    ends : Sequence[str]
+        Suffixes of files in the same folder that may be suggested if the file is missing.
 
     Raises
     ------
     InputError
-        The file cannot be read as in `read_bytes`, or is not UTF-8 text.
+        The file is missing, cannot be read, is too large or is not UTF-8 text.
     """
     content = read_bytes(path, what, most, ends)
     try:

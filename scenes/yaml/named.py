@@ -51,7 +51,8 @@ class FileKind:
     name : str
         Name of the kind, and of its JSON Schema.
     described : str
-        Model of the file's contents, as ``module:Class``; a leading dot means a module of `scenes.specs`.
+        Name of the pydantic model of the file's contents, as ``module:Class``; a leading dot means a module of
+        `scenes.specs`.
     what : str
         Noun phrase for messages, with its article: "a focus test".
     needs : str
@@ -60,7 +61,7 @@ class FileKind:
     command : str
         Command that reads the file, as the user types it; empty for a file that only other files refer to.
     place : str
-        Key of another file that refers to this kind; empty for a file that only a command reads.
+        Key of another file whose value is the path of such a file; empty for a file that only a command reads.
     one_of : str
         Keys, separated by spaces, at least one of which the file has.
     """

@@ -55,7 +55,10 @@ DECKS_NEED = "a table with the heads 'x [mm]', 'y [mm]', 'z [mm]', 'dx [mm]', 'd
 
 @dataclass(frozen=True, eq=False)
 class DisplacedNodes:
-    """Nodes and their displacements, (N, 3) arrays in metres, in the frame that the specification names."""
+    """N nodes of a finite-element program and their displacements.
+
+    Both are (N, 3) arrays in metres, in the frame that the specification names.
+    """
 
     points: np.ndarray
     moves: np.ndarray
@@ -63,7 +66,7 @@ class DisplacedNodes:
 
 @dataclass(frozen=True, eq=False)
 class WarmNodes:
-    """Nodes and their temperatures.
+    """N nodes of a finite-element program and their temperatures.
 
     Attributes
     ----------
@@ -178,7 +181,7 @@ def _table(path: str | Path, columns: tuple[Column, ...]) -> Table:
 
 
 def _one_load_case(table: Table, points: np.ndarray, values: np.ndarray, what: str) -> None:
-    """Raise `InputError` if a node occurs twice with different (N, K) values."""
+    """Raise `InputError` if a node occurs twice with different values, as in a file of several load cases."""
     first: dict[bytes, int] = {}
     for row, point in enumerate(points):
         other = first.setdefault(point.tobytes(), row)
@@ -188,9 +191,14 @@ def _one_load_case(table: Table, points: np.ndarray, values: np.ndarray, what: s
 
 
 def _of_mesh(path: Path, unit: str, field: str | None, what: str, need: str) -> tuple[np.ndarray, np.ndarray]:
-    """Read nodes (N, 3) in metres and vectors (N, 3) or temperatures (N,), in the mesh's unit, by meshlane.
+    """Read the nodes of a mesh file, with displacements or temperatures, by the library meshlane.
 
     The readers of meshlane may raise any exception.
+
+    Returns
+    -------
+    tuple of ndarray
+        Coordinates of N nodes, (N, 3), in metres; and displacements (N, 3) or temperatures (N,), in the mesh's unit.
     """
     import meshlane  # slow to import, and only needed for a job with a mesh
 
@@ -260,7 +268,7 @@ def _in_time(path: Path, read: Callable[[], Any]) -> Any:
 
 
 def _within(file: str, values: np.ndarray, most: float, what: str, allowed: str) -> None:
-    """Raise `InputError` if (N, K) numbers of nodes are not finite or too large."""
+    """Raise `InputError` if values at nodes are not finite, or larger than ``most`` in absolute value."""
     bad = ~np.all(np.isfinite(values) & (np.abs(values) <= most), axis=1)
     if np.any(bad):
         number = int(np.argmax(bad))

@@ -41,15 +41,15 @@ from scenes.yaml.yaml_file import YamlFile, dump_yaml
 Value = TypeVar("Value")
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-"""A plain number, for values that have no unit by nature, such as a conic constant."""
+"""A number without unit, for values that have none by nature, such as a conic constant."""
 Whole = Annotated[int, Field(strict=True)]
-"""A whole number; 3.0 and true are not."""
+"""An integer; 3.0 and true are refused."""
 Name = Annotated[str, StringConstraints(strict=True, pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,63}$")]
-"""Name: letters, digits, _ and -, beginning with a letter."""
+"""Name of an item: letters, digits, _ and -, beginning with a letter."""
 Text = Annotated[str, Field(strict=True, max_length=2000)]
-"""Free text."""
+"""Free text of at most 2000 characters."""
 Flag = Annotated[bool, Field(strict=True)]
-"""True or false; no number and no word."""
+"""The value true or false; numbers and words are refused."""
 
 
 @dataclass(frozen=True)
@@ -102,11 +102,11 @@ class OneOf:
     names: Callable[[], Iterable[str]]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
-        """Return a schema that checks with ``_known``."""
+        """Return the pydantic schema that accepts one of the names registered at this moment."""
         return core_schema.no_info_plain_validator_function(self._known)
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """Return an enumeration of the names registered at this moment."""
+        """Return the JSON Schema that lists the names registered at this moment."""
         return {"enum": list(self.names()), "type": "string"}
 
     def _known(self, value: Any) -> str:
@@ -117,7 +117,7 @@ class OneOf:
 
 
 def _nothing_is_empty(value: Any) -> Any:
-    """Return an empty mapping for None: `perturb:` with nothing after it."""
+    """Return an empty mapping for None, which is the value of a section such as `perturb:` without contents."""
     return {} if value is None else value
 
 
@@ -132,7 +132,9 @@ Reference = Annotated[str, Field(strict=True, min_length=1, max_length=1000)]
 
 
 class Inline(str):
-    """Reference replaced by the mapping itself; as text it is the mapping's name.
+    """Reference that is replaced by the content itself, a mapping written where a name or path is allowed.
+
+    As text it is the mapping's name.
 
     Attributes
     ----------
@@ -173,7 +175,7 @@ class Inline(str):
 
 
 def _referred(value: Any, handler: ValidatorFunctionWrapHandler, within: KeyPath = ()) -> Any:
-    """Return a name, a path or a mapping as a reference; each may also be given as ``{camera: ...}``."""
+    """Return a name, a path or a mapping in the form of a reference; each may also be given as ``{camera: ...}``."""
     if isinstance(value, Inline):
         return value
     if isinstance(value, Mapping):
@@ -193,8 +195,10 @@ Ref = Annotated[
     WrapValidator(_referred, json_schema_input_type=Reference | dict[str, Any]),
 ]
 """Reference to another specification: its name in the library (`gf7`), the path of its file relative to the file that
-refers to it, or the mapping itself. ``{camera: ...}`` instead of an instrument means the camera alone.
-`scenes.specs.load` reads the specification.
+refers to it, or the mapping itself.
+
+``{camera: ...}`` instead of an instrument means an instrument that consists of this camera alone. `scenes.specs.load`
+reads the specification.
 """
 
 Named = Annotated[dict[Name, Value], AfterValidator(_freeze)]
@@ -218,7 +222,7 @@ class Source:
     lines : Mapping[KeyPath, int]
         Key path -> line, counted from 1.
     prefix : KeyPath
-        Key path of the specification inside the file.
+        Key path of the specification inside the file; empty if it is the whole file.
     """
 
     file: str = ""
@@ -238,7 +242,7 @@ class Source:
 
 
 class _IssueDetails(TypedDict, total=False):
-    """Details of an issue besides the problem."""
+    """Optional parts of an issue besides the problem: value found, values allowed, suggestion."""
 
     found: object
     allowed: str | None
@@ -277,8 +281,8 @@ class Spec(BaseModel):
             Short text of the fault; or a Problem, which holds everything but the key.
         key : KeyPath
             Key path in this specification.
-        told : Unpack[_Told]
-            The value found, the values allowed, and the nearest valid name as `suggestion`.
+        details : keyword arguments
+            `found`, the value found; `allowed`, the values allowed; and `suggestion`, the nearest valid name.
         """
         if not isinstance(problem, Problem):
             found = details.get("found")
@@ -326,7 +330,7 @@ class Spec(BaseModel):
 
 
 class TitledSpec(Spec):
-    """Base of the files that have a name.
+    """Base of the specifications of files that have a name and a description.
 
     Attributes
     ----------
@@ -528,7 +532,7 @@ def _issue(model: type[Spec], detail: ErrorDetails, source: Source) -> Issue:
 
 
 def _fields(model: type[Spec], key: KeyPath) -> list[str]:
-    """Return the allowed keys of the mapping at `key`; empty if they are free or there is no mapping."""
+    """Return the keys that the mapping at `key` may have; empty if any are allowed or there is no mapping."""
     annotation = annotation_at(model, key)
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return list(annotation.model_fields)

@@ -121,7 +121,7 @@ class Vector:
     length : int
         Number of items.
     alike : bool
-        True if `3 um` is allowed for `3 3 3 um`.
+        True if one number, `3 um`, may stand for equal components, `3 3 3 um`.
     """
 
     of: Quantity
@@ -168,7 +168,7 @@ class Terms:
     Attributes
     ----------
     of : Mapping[str, Quantity]
-        Name of a term -> its annotation.
+        Name of a term -> kind and limits of its quantity.
     """
 
     of: Mapping[str, Quantity]
@@ -201,7 +201,7 @@ AngleSigmas = Annotated[tuple[float, float, float], Vector(Quantity(units.ANGLE,
 LengthSigma = Annotated[float, Quantity(units.LENGTH, smallest="0 um", largest="5 mm")]
 """Standard deviation of a length, in metres."""
 Scale = Annotated[float, Quantity(units.SCALE)]
-"""Relative change, dimensionless: 1e-6 for 1 ppm."""
+"""Relative change, without unit: 1e-6 for 1 ppm."""
 Time = Annotated[float, Quantity(units.TIME)]
 """Time, in seconds."""
 Temperature = Annotated[float, Quantity(units.TEMPERATURE, smallest="0 K")]
@@ -213,7 +213,7 @@ class RadiusQuantity(Quantity):
     """Radius of curvature: a length, or ``flat`` for a plane, whose radius is infinite."""
 
     def parse(self, text: object) -> float:
-        """Return the SI value of a text, as ``Quantity.parse`` does; infinity for ``flat``."""
+        """Return the radius that a text gives, in metres; infinity for ``flat``."""
         return math.inf if text == FLAT else super().parse(text)
 
     def format(self, value: float) -> str:
@@ -235,9 +235,9 @@ AsphereTerms = Annotated[
 written are zero.
 """
 Vector2 = Annotated[tuple[float, float], Vector(Quantity(units.LENGTH, largest="100 m"), 2)]
-"""Two lengths, metres."""
+"""Two lengths, in metres."""
 Vector3 = Annotated[tuple[float, float, float], Vector(Quantity(units.LENGTH, largest="100 m"), 3)]
-"""Three lengths, metres."""
+"""Three lengths, in metres."""
 
 
 class SagTerms:
@@ -247,12 +247,12 @@ class SagTerms:
     """
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Return a schema that reads by ``_read`` and writes the terms in the form of the file."""
+        """Return the pydantic schema that reads sag terms from a file and writes them in the form of the file."""
         as_text = core_schema.plain_serializer_function_ser_schema(self._written, when_used="json-unless-none")
         return core_schema.no_info_plain_validator_function(self._read, serialization=as_text)
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """Return the schema of the terms registered at this moment, with their coefficients."""
+        """Return the JSON Schema of the sag terms registered at this moment, with their coefficients."""
 
         def value(power: int) -> JsonSchemaValue:
             if not power:
@@ -296,7 +296,7 @@ def _mapping(value: object, names: Mapping[str, Any], problem: str, within: KeyP
 
 
 def _number(value: object, power: int, within: KeyPath) -> float:
-    """Return the value of a quantity in metres to a power, or of a plain number for the power 0."""
+    """Return the SI value of a quantity in a power of metres, or a number without unit for the power 0."""
     try:
         if power:
             return units.parse_quantity(value, units.power_of_length(power))
@@ -376,7 +376,7 @@ def example_of(quantity: Quantity, key: KeyPath) -> str:
 
 
 def written(metadata: Iterable[Any], key: KeyPath) -> str | None:
-    """Return an example of the value of a field, if it is a quantity or a row of them.
+    """Return an example of the value of a field that is a quantity or a list of them; None for others.
 
     Parameters
     ----------
@@ -403,7 +403,7 @@ def allowed_at(metadata: Iterable[Any], key: KeyPath, allowed: str | None) -> st
 
 
 TimeScale = Literal["UTC", "GPS", "TAI", "TT", "GAL", "QZS", "BDT"]
-"""Time scale of a clock."""
+"""Time scale of a clock: UTC, that of a navigation system, or an atomic time."""
 
 
 def _reading(value: Any) -> str:
@@ -415,4 +415,4 @@ def _reading(value: Any) -> str:
 
 
 ClockReading = Annotated[str, BeforeValidator(_reading)]
-"""Date and time at 0 s of a table, in the file's time scale."""
+"""Date and time, in the file's time scale, at which the times of a table are 0 s."""

@@ -60,7 +60,7 @@ class Kind:
         return self.asked(self.example)
 
     def asked(self, example: str) -> str:
-        """Return the description of what may be written for such a quantity, with another example."""
+        """Return the description of what may be written for such a quantity, with the given example."""
         return f"{self.name} with its unit ({names_text(self.units)}), e.g. '{example}'"
 
 
@@ -154,7 +154,10 @@ _KNOWN: dict[str, tuple[Decimal, str]] = {
     "1/m^7": (Decimal(1), "1/m**7"),
     "1/mm^7": (Decimal("1e21"), "1/m**7"),
 }
-"""Suggested units with the result of `_look_up`, so that pint, which takes half a second to start, is rarely needed."""
+"""Suggested unit -> its factor to SI and its base units.
+
+With this table pint, which takes half a second to start, is rarely needed.
+"""
 _ALIASES = ("µm", "μm", "µrad", "μrad", "%", "hour", "day")
 """Further spellings of units that the patterns for editors accept."""
 
@@ -344,12 +347,12 @@ def _to_si(number: str, unit: str, kind: Kind) -> float:
 
 
 def _in_si(number: Decimal, unit: str, factor: Decimal) -> float:
-    """Return the SI value of a number in a unit whose factor to the SI unit is ``factor``."""
+    """Return the SI value of a number in a unit; ``factor`` is the size of the unit in SI."""
     return float(number + _ZERO_CELSIUS if unit in _CELSIUS else number * factor)
 
 
 def _look_up_checked(unit: str, kind: Kind) -> tuple[Decimal, str]:
-    """Return `_look_up` of a unit; raise `Problem` if it is unknown or measures another kind of quantity."""
+    """Return factor and base units of a unit; raise `Problem` if it is unknown or of another kind."""
     match = _look_up(unit)
     if match is None:
         raise _unknown(unit, kind)
@@ -401,7 +404,7 @@ def _look_up(unit: str) -> tuple[Decimal, str] | None:
 
 
 def _look_up_by_pint(unit: str) -> tuple[Decimal, str] | None:
-    """Return `_look_up` of a unit that is not in `_KNOWN`, by pint."""
+    """Return the factor to SI base units and the base units of a unit that is not in `_KNOWN`, from pint."""
     import pint
 
     registry = _registry()

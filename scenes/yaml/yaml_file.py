@@ -57,8 +57,8 @@ class YamlFile:
     ----------
     file : str
         Path as the user wrote it.
-    data : Any
-        Dict, list and scalars. Keys are always text.
+    data : dict, list, str, int, float, bool or None
+        Contents as dictionaries, lists and scalars. Keys are always text.
     lines : Mapping[KeyPath, int]
         Key path -> line, counted from 1; for a mapping's entry the line of its key.
     prefix : KeyPath
@@ -98,7 +98,7 @@ def parse_yaml(text: str, file: str = "") -> YamlFile:
 
 
 def _read(text: str, file: str) -> tuple[Any, dict[KeyPath, int]]:
-    """Return data and lines as in `YamlFile`.
+    """Return the data of a YAML text, and key path -> line of each value.
 
     libyaml takes a tenth of the time. A text that it or the builder refuses is read again by the parser in Python,
     which knows YAML 1.2 and gives the texts and lines of the messages.
@@ -124,7 +124,7 @@ def _read(text: str, file: str) -> tuple[Any, dict[KeyPath, int]]:
 
 
 def _built(parsed: Iterable[Any], file: str) -> tuple[Any, dict[KeyPath, int]]:
-    """Return data and lines from the events of either parser."""
+    """Return the data, and key path -> line of each value, from the events of either parser."""
     builder = _Builder(file)
     for event in parsed:
         builder.take(event)
@@ -137,7 +137,7 @@ _read_cached = lru_cache(maxsize=CACHED)(_read)
 
 
 def _copied(value: Any) -> Any:
-    """Return a copy that the caller may change."""
+    """Return a copy of cached plain data, which the caller may change."""
     if isinstance(value, dict):
         return {key: _copied(item) for key, item in value.items()}
     return [_copied(item) for item in value] if isinstance(value, list) else value
