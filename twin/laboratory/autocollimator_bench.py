@@ -130,7 +130,7 @@ class Bench:
         return 0.5 * self.spec.mirrors.aperture / self.focal_length
 
     def frame(self, unit: int) -> np.ndarray:
-        """Return the axes X, Y, Z of frame 1-XYZ or 2-XYZ in the bench's frame as columns, (3, 3)."""
+        """Return the axes X, Y, Z of autocollimator 1's or 2's frame as columns in the bench's frame, (3, 3)."""
         return about_axis(0, self.mirror_angle if unit == 2 else 0.0)
 
 
@@ -212,10 +212,12 @@ def _autocollimator_bodies(spec: AutocollimatorTestSpec, unit: int, pose: Pose) 
 AIM_TOLERANCE = 1e-9
 """Tolerance of the ray aiming at the mirror, metres."""
 MAP_TERMS = 15
-"""Number of Zernike terms of the map from pupil nodes to ray directions."""
+"""Number of Zernike terms that interpolate ray directions between the nodes of the mirror."""
 FINE = 2
-"""Samples per pixel side. Whole pixels would sample the irradiance at 0.43 cycles per pixel, too near to the limit of
-0.5 for the exact pixel filter; on half pixels it is exact, and the mean of four of them is the mean over a pixel.
+"""Number of samples along each side of a pixel.
+
+Whole pixels would sample the irradiance at 0.43 cycles per pixel, too near to the limit of 0.5 for the exact pixel
+filter; on half pixels it is exact, and the mean of four of them is the mean over a pixel.
 """
 CHUNK = 24
 """Number of states that are traced and rendered at once, to limit memory."""
@@ -272,7 +274,7 @@ class AutocollimatorPath:
 
     @cached_property
     def response(self) -> PixelResponse:
-        """Filter by the pinhole and by one sample, 1/FINE of a pixel's side, applied to the image of a point.
+        """Filter of the pinhole and of one sample (1/FINE of a pixel's side), applied to the image of a point.
 
         Raises
         ------
@@ -290,7 +292,11 @@ class AutocollimatorPath:
 
     @cached_property
     def _slopes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Operators on smooth functions: node values to Zernike terms (T, N), and terms to d/dx and d/dy (N, T)."""
+        """Matrices for derivatives of smooth functions over the mirror.
+
+        They are (T, N) from values at N nodes to T Zernike terms, and (N, T) from the terms to d/dx and to d/dy at the
+        nodes.
+        """
         x, y = self.nodes.x, self.nodes.y
         root = np.sqrt(self.nodes.weight)
         solve = np.linalg.pinv(zernike.basis(MAP_TERMS, x, y) * root[:, None]) * root
@@ -299,7 +305,10 @@ class AutocollimatorPath:
 
     @cached_property
     def _start(self) -> tuple[np.ndarray, np.ndarray]:
-        """Aim parameters (2, N, 2) and their Jacobian for the unperturbed bench."""
+        """Initial aim parameters of the N rays of both autocollimators, (2, N, 2), and their Jacobian.
+
+        They are those of the unperturbed bench.
+        """
         placed = self.bench.assembly.place()
         fan, systems = self._fan(placed, [{}])
         middle, slope = aim(self.backend, systems, fan, np.zeros((1, 2)), tolerance=AIM_TOLERANCE)
@@ -308,7 +317,7 @@ class AutocollimatorPath:
 
     @property
     def _targets(self) -> np.ndarray:
-        """Aim points on the mirror, (N, 2), metres."""
+        """Points on the mirror at which the N rays are aimed, (N, 2), metres."""
         return 0.5 * self.bench.spec.mirrors.aperture * np.stack([self.nodes.x, self.nodes.y], axis=-1)
 
     def _fan(self, placed: PlacedBodies, states: Sequence[State]) -> tuple[RayFan, SystemBatch]:
@@ -320,7 +329,7 @@ class AutocollimatorPath:
         return RayFan(origin, view, transverse_axes(view, up)), systems
 
     def rays(self, states: Sequence[State]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Trace the rays to the CCDs, unit by unit.
+        """Trace N rays of both autocollimators in S states to the CCDs, one autocollimator after the other.
 
         Returns
         -------
@@ -339,7 +348,10 @@ class AutocollimatorPath:
     def _traced(
         self, placed: PlacedBodies, states: Sequence[State], keep: Sequence[int] = ()
     ) -> tuple[np.ndarray, Traced]:
-        """Return the launch points in the bench's frame, (2 S, N, 3), and the traced rays at the CCDs."""
+        """Return launch points in the bench's frame, (2 S, N, 3), and the traced rays at the CCDs.
+
+        There are N rays of each autocollimator in each of S states.
+        """
         fan, systems = self._fan(placed, states)
         start, slope = (np.repeat(a, len(states), axis=0) for a in self._start)
         q, _ = aim(self.backend, systems, fan, self._targets, start, slope, AIM_TOLERANCE)
@@ -348,7 +360,7 @@ class AutocollimatorPath:
         return position, trace(self.backend, systems_back, make_rays(self.backend, position, direction), keep)
 
     def polylines(self, state: State) -> np.ndarray:
-        """Return rays of both autocollimators as points in the bench's frame, (2, N, 7, 3), metres.
+        """Return N rays of both autocollimators as points in the bench's frame, (2, N, 7, 3), metres.
 
         The seven points are the pinhole, the five surfaces and the CCD.
         """
@@ -375,7 +387,7 @@ class AutocollimatorPath:
         return SpotWindows(*(np.concatenate([part[k] for part in parts], axis=1) for k in (0, 1)))
 
     def _pieces(self, states: Sequence[State]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield photons and window corners of CHUNK states at a time."""
+        """Yield photons and window corners of the images, CHUNK states at a time."""
         kernel_radius = self.response.reach
         count = FINE * self.window + 2 * kernel_radius
         grid = Grid(-0.5 * (count - 1) * self.pitch / FINE, self.pitch / FINE, count)
@@ -405,7 +417,7 @@ class AutocollimatorPath:
         return PupilField(u, v, phase - phase[:, :1], amplitude, self.bench.spec.autocollimator.wavelength)
 
     def _corner(self, position: np.ndarray, valid: np.ndarray) -> np.ndarray:
-        """Return the first pixels (B, 2) of the windows around the mean of rays (B, N, 3) on the CCDs."""
+        """Return the first pixels of B windows, (B, 2), around the mean of N rays each, (B, N, 3), on the CCDs."""
         share = self.nodes.share * valid
         mean = np.einsum("bn,bnk->bk", share, position[..., 1::-1]) / share.sum(axis=1, keepdims=True)
         pixel = mean / self.pitch + 0.5 * (np.array(self.shape) - 1)
@@ -424,7 +436,7 @@ class AutocollimatorPath:
 def window_pattern(
     detector: EmvaDetector, corner: np.ndarray, window: int, seed: int, key: tuple[int, ...]
 ) -> FixedPattern:
-    """Return the fixed pattern of windows of one large CCD, (S, window, window).
+    """Return the fixed pattern of S windows of one large CCD, (S, window, window).
 
     A pixel has the same gain and offset in every window that contains it.
 
@@ -490,7 +502,7 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class SeriesResult:
-    """Readings of one series.
+    """Readings of one rotation series.
 
     Attributes
     ----------
@@ -499,7 +511,7 @@ class SeriesResult:
     readings : (2, rows, 2) ndarray
         Rotations of both mirrors about X and Y of their autocollimator, relative to the reading at zero, radians.
     sigma : (2, rows, 2) ndarray
-        Standard deviations of the readings by image noise alone, radians.
+        Standard deviations of the readings due to image noise alone, radians.
     """
 
     series: Series
@@ -508,7 +520,10 @@ class SeriesResult:
 
     @property
     def scale(self) -> float:
-        """Factor applied to the readings of mirror 2: 1 (X), 1 / cos b (Y), 1 / sin b (Z)."""
+        """Factor applied to the readings of mirror 2: 1 (X), 1 / cos b (Y), 1 / sin b (Z).
+
+        The angle b is that between the mirrors' normals.
+        """
         return 1.0 / autocollimator.relation_factor(self.series.axis, 2, 2.0 * self.series.half_angle)
 
     @property
@@ -521,14 +536,14 @@ class SeriesResult:
     def mean_difference(self) -> float:
         """Mean absolute difference between mirror 1 and scaled mirror 2, radians.
 
-        About Z, where mirror 1 has no reading, the commanded angle of the turntable takes its place.
+        About Z, where mirror 1 has no reading, it is compared with the commanded angle of the turntable.
         """
         first, second = self.columns
         return autocollimator.mean_difference(self.series.angles if self.series.axis == "Z" else first, second)
 
     @property
     def from_exact(self) -> np.ndarray:
-        """Readings minus the exact readings of ideal mirrors, lens and turntable, (2, rows, 2), radians."""
+        """Readings minus those of ideal mirrors, lens and turntable, (2, rows, 2), radians."""
         args = self.series.axis, self.series.angles
         return self.readings - np.stack(
             [autocollimator.exact_reading(*args, u, 2.0 * self.series.half_angle) for u in UNITS]
@@ -569,13 +584,13 @@ AIRY_RADII = 4.0
 CALIBRATION_POINTS = 9
 """Number of rotations about each axis at which an autocollimator is calibrated."""
 DRAWS = 4000
-"""Number of drawn benches, without images, from which a spread is computed."""
+"""Number of random benches, without images, from which the spread of the readings is computed."""
 _BENCH, _PATTERN, _READINGS, _FRAMES = range(4)
 """Numbers of the random streams of the seed."""
 
 
 def series_per_axis(spec: AutocollimatorTestSpec) -> tuple[Series, ...]:
-    """Return the main series of the programme: one about each axis."""
+    """Return the main rotation series of the experiment: one about each axis."""
     p = spec.programme
     return tuple(Series(axis, getattr(p.stands, axis), p.table, p.steps) for axis in autocollimator.AXES)
 
@@ -764,12 +779,12 @@ class Reader:
         )
 
     def place(self, mean: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, SpotPositions]:
-        """Measure spots on the whole CCD, (B, 2) row and column, pixels.
+        """Measure spots of B images in pixels of the whole CCD, (B, 2) row and column.
 
         Parameters
         ----------
         mean : (B, H, W) ndarray
-            Mean images of the windows, DN.
+            Mean images of the windows of H rows and W columns, DN.
         corner : (B, 2) ndarray of int
             First pixel of each window on the CCD.
 
@@ -786,7 +801,7 @@ class Reader:
         return spots.position + corner, spots
 
     def expose(self, windows: SpotWindows, stream: tuple[int, ...], seed: int) -> np.ndarray:
-        """Expose frames of both CCDs, uint16 (2, S, frames, window, window)."""
+        """Expose frames of both CCDs in S states, uint16 (2, S, frames, window, window)."""
         out = []
         for n, (photons, corner) in enumerate(zip(windows.photons, windows.corner, strict=True)):
             pattern = window_pattern(self.detector, corner, photons.shape[-1], seed, (_PATTERN, n))

@@ -36,14 +36,16 @@ from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.target_path import TargetPath
 
 NODES = 10
-"""Number of Chebyshev nodes over the field: between them, images of gf7 are accurate to 1e-5 of their peak and their
-centroids to 1 nm.
+"""Number of Chebyshev nodes over the field at which images are computed.
+
+Interpolated between them, images of gf7 are accurate to 1e-5 of their peak and their centroids to 1 nm.
 """
 
 GUARD = 160.0
-"""Distance between the window and the periodic copies of the spot in the Fourier sum, in units of 1/cut-off. The
-irradiance of a clear pupil falls as 1/distance^3: over the window of the pan line a copy is below 1e-6 of the peak, and
-nearly even.
+"""Distance between the window and the periodic copies of the spot in the Fourier sum, in units of 1/cut-off.
+
+The irradiance of a clear pupil falls as 1/distance^3: over the window of the pan line a copy is below 1e-6 of the peak,
+and nearly even.
 """
 
 _RIM = np.pi * np.arange(16) / 16
@@ -59,7 +61,7 @@ class PinholeImages:
     half_field : float
         Largest rotation of the camera to either side, radians.
     fx, fy : ndarray
-        Frequencies along the line (non-negative half) and along the track, (U,), (V,), cycles/m.
+        The U frequencies along the line (non-negative half), (U,), and the V along the track, (V,), cycles/m.
     spectra : (nodes, V, U) ndarray of complex
         Spectra at the nodes of the field; a large uniform bright area would have level 1.
     pitch : float
@@ -140,7 +142,7 @@ class PinholeImages:
         return cls(half_field, fx, fy, spectra, pitch, window, diameter)
 
     def __call__(self, field_angle: float, position: np.ndarray) -> np.ndarray:
-        """Return images at one field angle.
+        """Return S images of the pinhole at one field angle.
 
         Parameters
         ----------
@@ -169,7 +171,7 @@ class PinholeImages:
 
 
 def centroid_offset(path: TargetPath, state: State, directions: np.ndarray) -> np.ndarray:
-    """Return the energy centroid of the image of a point minus its chief ray along the line, (F,), metres.
+    """Return the energy centroid of a point's image minus its chief ray along the line at F fields, (F,), metres.
 
     It is the mean slope of the wavefront over the pupil, the same for all wavelengths, and is computed from the phase
     of the transfer function at a ten-thousandth of the cut-off frequency.
@@ -185,12 +187,12 @@ def centroid_offset(path: TargetPath, state: State, directions: np.ndarray) -> n
 
 
 def field_nodes(half_field: float) -> np.ndarray:
-    """Return the field angles (NODES,) of the nodes to which ``interpolated`` refers, radians."""
+    """Return the field angles of the Chebyshev nodes at which images are computed, (NODES,), radians."""
     return np.asarray(half_field * _nodes())
 
 
 def interpolated(values: np.ndarray, half_field: float, field_angle: np.ndarray) -> np.ndarray:
-    """Evaluate the polynomial through values (NODES,) at the nodes at field angles (M,); returns (M,)."""
+    """Return the polynomial through values at the nodes, (NODES,), evaluated at M field angles, (M,)."""
     return np.array([_node_weights(angle / half_field) @ values for angle in field_angle])
 
 
@@ -212,13 +214,15 @@ def _extent_x(image: Disk | Polygon) -> float:
 
 
 MIN_WIDTH = 2.0
-"""Diameter of the pinhole's image, pixels, below which pixel sampling moves an energy centroid by more than 0.001
-pixel.
+"""Smallest allowed diameter of the pinhole's image, pixels.
+
+Below it, pixel sampling moves an energy centroid by more than 0.001 pixel.
 """
 
 MARGIN = 6
-"""Pixels between the centroid's window and the edge of the image: four rows of background, and room for the spot's
-position between pixels.
+"""Smallest distance between the centroid's window and the edge of the image, pixels.
+
+It leaves four rows of background, and room for the spot's position between pixels.
 """
 
 BLUR = 3.0
@@ -230,7 +234,7 @@ _BENCH, _SETTING, _READING, _PATTERN, _NOISE = range(10, 15)
 
 @dataclass(frozen=True, eq=False)
 class DistortionTruth:
-    """True values that the analysis must not see, for N points and S sets.
+    """True values that the analysis must not use, for N points and S sets of repeated exposures.
 
     Attributes
     ----------
@@ -256,7 +260,7 @@ class DistortionTruth:
 
 @dataclass(frozen=True, eq=False)
 class DistortionRecord:
-    """Measurements that a test gives to the analysis: N points, S sets.
+    """Measurements that a test gives to the analysis, for N points and S sets of repeated exposures.
 
     Attributes
     ----------
@@ -375,7 +379,7 @@ class DistortionBench:
 
     @property
     def middle_column(self) -> float:
-        """Column of the line's middle, where L = 0."""
+        """Column of the line CCD at the middle of the line, where the position along the line is 0."""
         return 0.5 * (self.ccd.band.pixels - 1)
 
     def positions(self, axis: np.ndarray, field_angle: np.ndarray) -> np.ndarray:
@@ -386,7 +390,7 @@ class DistortionBench:
     def record(
         self, table: TurntableModel, seed: int, advance: Advance = silent
     ) -> tuple[DistortionRecord, DistortionTruth]:
-        """Carry out one test.
+        """Simulate one test: rotate the table, expose the spots and return measurements and true values.
 
         Parameters
         ----------
@@ -448,7 +452,7 @@ class DistortionBench:
 
 
 def _rotated(axis: np.ndarray, field_angle: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Return directions of the light (M, 3) after rotations (M,), radians, about an axis (3,)."""
+    """Return directions of the light after M rotations, (M, 3); the rotations, (M,), are about an axis, radians."""
     return np.asarray(rotation_matrix(field_angle[:, None] * axis) @ direction)
 
 

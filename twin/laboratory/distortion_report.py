@@ -30,7 +30,7 @@ RAW, COMPENSATED = "angles as read", "compensated angles"
 SHOWN = 3
 """Number of points whose frames are saved: first, middle, last."""
 ZERO_SHARE = 0.3
-"""Fraction of the principal point's sigma beyond which the report mentions the shift by the zero of the angles."""
+"""Shift of the principal point due to the zero of the angles, relative to its sigma, above which it is reported."""
 
 
 def distortion_report(run: DistortionRun) -> Report:
@@ -110,7 +110,7 @@ def _limit(run: DistortionRun) -> str:
 
 
 def _shares(run: DistortionRun) -> dict[str, float]:
-    """Return the variance of the principal distance by cause, square metres."""
+    """Return cause -> its contribution to the variance of the principal distance, square metres."""
     fit, means = run.compensated.fit, run.means
     k = fit.terms.index("principal_distance")
     row = gain(design(fit.angle, fit.terms))[k]
@@ -220,7 +220,7 @@ def _warnings(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _summary(run: DistortionRun, data: Mapping[str, Any]) -> Table:
-    """Return the table of the main results."""
+    """Return the table of principal distance, principal point and distortion with their sigmas."""
     truth = data.get("truth")
     keys = ["principal_distance_mm", "principal_point_mm", "correlation", "radial3_mm", "rms_compensated_um"]
     keys += [*(["rms_raw_um"] * (run.compensation is not None)), "chi_square", "degrees_of_freedom"]
@@ -286,7 +286,7 @@ ESTIMATES = {
     "constant": "constant, balanced f, p (adopted)",
     "constant_radial3": "constant, f, p, radial (joint)",
 }
-"""Name of an estimate -> its description for readers."""
+"""Name of an estimate -> its description in reports."""
 
 
 def _joint(joint: Mapping[str, Any]) -> Section:
@@ -331,7 +331,7 @@ def _joint(joint: Mapping[str, Any]) -> Section:
 
 
 def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
-    """Return the section on the estimators and on what can be observed."""
+    """Return the section on the estimates by each equation and on which quantities can be observed."""
     heads, digits = (["estimate", *(q.shown_head for q in ESTIMATE)], [None, *(q.decimals for q in ESTIMATE)])
     rows: list[tuple[Cell, ...]] = [(ESTIMATES[name], *record.values()) for name, record in data["estimates"].items()]
     constant_text = (
@@ -479,7 +479,7 @@ def _spot_svg(run: SimulatedDistortion) -> str:
 
 
 def _dress(axes: Axes, columns: int = 3) -> None:
-    """Add a light grid, and a legend of some columns with room above the data."""
+    """Add a light grid to axes, and a legend of some columns with room above the data."""
     low, high = axes.get_ylim()
     # room for the legend above the data
     axes.set_ylim(low, high + 0.18 * (high - low))

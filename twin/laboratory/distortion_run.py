@@ -51,13 +51,12 @@ from twin.laboratory.measured_readings import (
 from twin.laboratory.turntable_run import TurntableModel, rms, usable_fits
 
 CLOSED_FORMS = tuple(name for name in FITS if name != "network")
-"""Fits of the dividing error that compete for the compensation. The network, which takes minutes to train, is ranked by
-the turntable test only.
+"""Names of the fits of the dividing error from which the compensation is chosen.
+
+The network, which takes minutes to train, is ranked by the turntable test only.
 """
 MAX_FIELD_ANGLE = np.radians(40.0)
-"""Angle from the middle of the line, radians, beyond which a reading is taken for a mistake; the model's tangents end
-at 45 deg.
-"""
+"""Largest plausible angle from the middle of the line, radians; the model's tangents end at 45 deg."""
 _EXACT = 1e-9
 """Nominal noise of the true positions, metres; the estimates from them do not depend on it."""
 _GREY, _SPOT_PIXEL = 2.0, 33.0
@@ -73,7 +72,7 @@ class Estimate:
     f, p : float
         Principal distance and principal point, metres; p is zero where it is not fitted.
     distortion : (N,) ndarray
-        Distortion of the points, metres.
+        Distortion of the N points, metres.
     f_sigma, p_sigma : float or None
         Standard deviations, metres; None where an equation gives none.
     """
@@ -98,7 +97,7 @@ class DistortionRun:
     approximate_f : float
         Approximate principal distance, metres, used to compare sets with each other.
     reading : (N, S) ndarray
-        Readings of the turntable, radians.
+        Readings of the turntable at N points in S sets, radians.
     present : (N, S) ndarray of bool
         Exposures that were made.
     calibration : CalibrationSeries or None
@@ -136,17 +135,17 @@ class DistortionRun:
 
     @property
     def rejected(self) -> NDArray[np.bool_]:
-        """Exposures that Chauvenet's criterion rejects, (N, S)."""
+        """Mask of the exposures that Chauvenet's criterion rejects, (N, S) for N points and S sets."""
         return self.present & ~self.means.keep
 
     @cached_property
     def line(self) -> interior.LineOrientation:
-        """Joint model with compensated angles in the terms of a payload's line."""
+        """Joint model with compensated angles, as the parameters of a line in a payload's file."""
         return interior.line_orientation(self.compensated.smooth)
 
     @cached_property
     def estimates(self) -> Mapping[str, Estimate]:
-        """Estimates by the printed equations and by the fits with a constant, all with compensated angles."""
+        """Name -> estimate by the printed equations and by the fits with a constant, all with compensated angles."""
         return _estimates(self.compensated.fit, self.compensated.smooth, self.compensated.zero)
 
 
@@ -189,25 +188,26 @@ class SimulatedDistortion(DistortionRun):
 
     @cached_property
     def true_distortion(self) -> Array:
-        """True distortion of the chief rays, (N,), metres."""
+        """True distortion of the chief rays at the N points, (N,), metres."""
         return self.true_fit().residual
 
     def error(self, measured: interior.Distortion) -> Array:
-        """Return measured minus true distortion, (N,), metres."""
+        """Return measured minus true distortion at the N points, (N,), metres."""
         return np.asarray(measured.distortion - self.true_distortion)
 
     @cached_property
     def true_estimates(self) -> Mapping[str, Estimate]:
-        """Values of `estimates` from exact chief rays at the true angles."""
+        """Name -> estimate from exact chief rays at the true angles, by the same equations as ``estimates``."""
         return _estimates(self.true_fit(), self.true_fit(interior.SMOOTH), 0.0)
 
 
 def _estimates(
     fit: interior.InteriorOrientation, smooth: interior.InteriorOrientation, zero: float
 ) -> dict[str, Estimate]:
-    """Return the estimates by equations (2), (3) and (4), and by the fits.
+    """Return name -> estimate by the paper's equations (2), (3) and (4), and by the fits with a constant.
 
-    Equation (4) uses the f of (3); equation (2) is evaluated once more with angles counted from `zero`.
+    Equation (4) uses the principal distance of (3); equation (2) is evaluated once more with angles counted from
+    `zero`.
     """
     position, angles = fit.position, fit.angle
 
@@ -231,14 +231,17 @@ def _estimates(
 
 
 def _calibrated(fit: interior.InteriorOrientation) -> Array:
-    """Return c + f tan W - p tan^2 W of a fit at its angles, from which distortion counts, (N,), metres."""
+    """Return the distortion-free positions c + f tan W - p tan^2 W of a fit at its N angles W, (N,), metres.
+
+    c is the constant, f the principal distance, p the principal point; distortion is measured from these positions.
+    """
     tangent = np.tan(fit.angle)
     c, f, p = (fit.value(term) for term in interior.CALIBRATED)
     return np.asarray(c + f * tangent - p * tangent**2)
 
 
 def measure(bench: DistortionBench, seed: int, advance: Advance = silent) -> SimulatedDistortion:
-    """Calibrate the table, carry out the test and measure it.
+    """Simulate the calibration of the table and the distortion test, and analyse both.
 
     Raises
     ------
@@ -291,7 +294,7 @@ def reduce(
     Parameters
     ----------
     reading : (N, S) ndarray
-        Readings of the turntable, radians.
+        Readings of the turntable at N points in S sets, radians.
     spots : Spots
         Spots on the line.
     zero : float
@@ -437,7 +440,7 @@ def _locate(bench: DistortionBench, record: DistortionRecord) -> interior.Spots:
 def run_distortion(
     setup: ExperimentSetup[Any], backend: Backend, seed: int, advance: Advance = silent
 ) -> DistortionRun:
-    """Run ``python -m twin.lab distortion``.
+    """Run the test of ``python -m twin.lab distortion``, simulated or from measurements.
 
     Raises
     ------
@@ -544,14 +547,14 @@ TRUE_ESTIMATE: Record[_Pair] = Record(
 
 
 def _f_error(run: SimulatedDistortion) -> float:
-    """Return the error of the balanced principal distance in its sigmas."""
+    """Return the error of the principal distance from the fit with a constant, in its sigmas."""
     fit = run.compensated.fit
     error = fit.value("principal_distance") - run.true_fit().value("principal_distance")
     return float(error / fit.sigma("principal_distance"))
 
 
 def _correlation(run: DistortionRun) -> float:
-    """Return the correlation of principal distance and principal point."""
+    """Return the correlation coefficient of the errors of principal distance and principal point."""
     fit = run.compensated.fit
     return float(fit.correlation[fit.terms.index("principal_distance"), fit.terms.index("principal_point")])
 
@@ -572,7 +575,7 @@ def _files(run: DistortionRun) -> list[DataFile] | None:
 
 
 def _from_mean(run: DistortionRun) -> Array:
-    """Return rejected exposures minus the mean of their point, in the quantity in which sets are compared, metres."""
+    """Return how far rejected exposures are from the mean of their point, metres on the line."""
     rest = run.compensated.position - run.approximate_f * np.tan(run.compensated.angle)
     return np.asarray((rest - run.means.mean(rest)[:, None])[run.rejected])
 

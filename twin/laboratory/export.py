@@ -23,7 +23,7 @@ from twin.laboratory.focus_run import SimulatedFocus, SimulatedState, recorder_o
 from twin.laboratory.turntable_run import TurntableRun
 
 Files: TypeAlias = Mapping[str, str | bytes]
-"""Path in the folder -> contents."""
+"""Path of a file in the export folder -> its contents."""
 COMPARISONS, HELD_OUT, SPOTS = "comparisons.csv", "held_out.csv", "spots.csv"
 """Names of tables."""
 

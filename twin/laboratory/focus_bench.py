@@ -1,11 +1,11 @@
 """Simulated bench of the focal-plane alignment: a collimator with a slanted edge, the camera, its line CCDs.
 
-Frame of all numbers: the focal-plane frame of the camera's prescription (X' flight direction, Y' along the line, Z'
-along the light). A ``Pose`` places the focal-plane assembly in it, and the chip of each band lies at a height above the
+All numbers are in the focal-plane frame of the camera's prescription (X' flight direction, Y' along the line, Z' along
+the light). A ``Pose`` places the focal-plane assembly in it, and the chip of each band lies at a height above the
 assembly.
 
-Through-focus measurement of all sites: move the target, record the edge, measure its MTF, fit the vertex of the MTF
-curve.
+At every site the target is moved through focus, its edge recorded, the MTF measured, and the vertex of the MTF curve
+fitted.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Site:
 
     @property
     def best(self) -> float:
-        """Z' of best focus, metres: the mean of the two edges' best foci, which astigmatism separates."""
+        """Position Z' of best focus, metres: the mean of the two edges' best foci, which astigmatism separates."""
         return float(np.mean([self.edge_focus[edge] for edge in DIRECTIONS]))
 
     @property
@@ -243,21 +243,22 @@ class FocusBench:
 
 
 def _modulus(optics: EdgeOptics, defocus: float, frequency: float) -> float:
-    """Return the modulus of the optical transfer at one frequency."""
+    """Return the modulus of the optics' transfer function at one spatial frequency, cycles/m."""
     return float(np.abs(optics.at(defocus, np.array([frequency])))[0])
 
 
 def _longitudinal(local: LocalMap, normal: np.ndarray) -> float:
-    """Return the longitudinal magnification in the direction of an edge's normal.
+    """Return the longitudinal magnification in the direction of an edge's normal: image shift per target shift.
 
-    A target moved by s adds s |p|^2 / 2F^2 to the path at p in the entrance pupil. By Lagrange's invariant p = F J^T u
-    for direction cosines u at the image and the map's Jacobian J, so the image's curvature is s J J^T.
+    A target moved by s adds s |p|^2 / 2F^2 to the path at the point p of the entrance pupil, with the collimator's
+    focal length F. By Lagrange's invariant p = F J^T u for direction cosines u at the image and the map's Jacobian J,
+    so the image's curvature is s J J^T.
     """
     return float(np.sum((local.jacobian.T @ normal) ** 2))
 
 
 def best_focus(imager: EdgeImager, frequency: float) -> float:
-    """Return the defocus at which the MTF is largest, metres."""
+    """Return the defocus at which an edge's MTF at a spatial frequency (cycles/m) is largest, metres."""
 
     def loss(defocus: float) -> float:
         return -imager.mtf(defocus, frequency)
@@ -272,19 +273,21 @@ NYQUIST = 0.5
 """Nyquist frequency, cycles per pixel."""
 
 VERTEX_ERROR = 0.5e-6
-"""Standard deviation of the error common to all vertices, metres, from the difference between the true MTF curve near
-its peak and the fitted form: wavefronts of 0.2 waves shift them by this much. Without noise the vertices of the
-example are up to 0.6 um off.
+"""Standard deviation of the error common to all fitted vertices, metres.
+
+It is due to the difference between the true MTF curve near its peak and the fitted form: wavefronts of 0.2 waves shift
+the vertices by this much. Without noise the vertices of the example are up to 0.6 um off.
 """
 
 VERTEX_TREND = 0.15e-6
-"""Standard deviation of the change of this error from the middle to the ends of the line and of the bands, metres, as
-the wavefront and the wavelength change.
+"""Standard deviation of the variation of the vertices' common error over the focal plane, metres.
+
+The variation is that from the middle to the ends of the line and of the bands, as wavefront and wavelength change.
 """
 
 _OFFSET, _FRAMES = range(2)
 _COARSE = 4
-"""Least number of positions of the first scan within the defocus at which all contrast is lost."""
+"""Smallest number of positions of the first scan within the defocus at which all contrast is lost."""
 _ATTEMPTS = 3
 """Largest number of scans of one site."""
 
@@ -312,7 +315,8 @@ class SiteScan:
     Attributes
     ----------
     shift : mapping
-        Edge -> shifts of the image in the edge's direction, metres, (Z,), computed from the target's shifts.
+        Edge -> shifts of the image at Z positions, in the edge's direction, metres, (Z,), computed from the target's
+        shifts.
     mtf, sigma : mapping
         Edge -> MTF at the Nyquist frequency and its standard deviation, (Z,); the latter is infinite where no edge
         could be measured.
@@ -341,7 +345,7 @@ class SiteScan:
 
     @property
     def defocus_sigma(self) -> float:
-        """Standard deviation of `defocus` by noise, metres; ``VERTEX_ERROR``, common to all sites, adds to it."""
+        """Standard deviation of `defocus` due to noise, metres; ``VERTEX_ERROR``, common to all sites, adds to it."""
         return float(np.sqrt(sum(v.sigma**2 for v in self.vertex.values())) / len(self.vertex))
 
 
@@ -354,7 +358,7 @@ class NyquistMtf:
     by_edge : mapping
         Edge -> MTF at the Nyquist frequency and its standard deviation.
     frames : mapping
-        Edge -> recorded frames (frames, region, region).
+        Edge -> recorded frames, (frames, region, region), DN.
     """
 
     by_edge: Mapping[str, tuple[float, float]]

@@ -46,7 +46,7 @@ def _shown(run: FocusRun) -> list[tuple[int, FocusState, str]]:
 
 
 def through_focus_svg(run: FocusRun) -> str:
-    """Draw the curves through focus of every band, in both directions, before the first and after the last shims."""
+    """Draw the MTF through focus of every band, in both directions, before the first and after the last shims."""
     bands, shown = list(dict.fromkeys(run.bands))[:_MOST_BANDS], _shown(run)
     with svg.look("through-focus"):
         columns, each = min(len(bands), _COLUMNS), -(-len(bands) // _COLUMNS)
@@ -65,7 +65,7 @@ def through_focus_svg(run: FocusRun) -> str:
 
 
 def _curves(axes: Axes, run: FocusRun, state: FocusState, band: str) -> None:
-    """Draw the curves through focus of one band."""
+    """Draw the measured MTF and the fitted curves through focus of one band."""
     scans = [scan for scan, name in zip(state.scans, run.bands, strict=True) if name == band]
     for number, scan in enumerate(scans):
         colour = FIELD_COLOURS[number % len(FIELD_COLOURS)]
@@ -186,7 +186,7 @@ def edges_svg(run: SimulatedFocus) -> str:
 
 
 MOVED = {"image": "image, along the light", "target": "target, along the light", "focal_plane": "CCD, along the light"}
-"""Moved part -> its description for readers."""
+"""Part that was moved through focus -> its description in reports."""
 
 
 def focus_report(run: FocusRun) -> Report:
@@ -258,7 +258,7 @@ def _facts(run: FocusRun, test: MeasuredFocusSpec) -> tuple[tuple[str, str], ...
 
 
 def _thousands(value: float) -> str:
-    """Format a large number with narrow spaces between groups of thousands."""
+    """Format a large number with narrow spaces between groups of three digits."""
     return f"{value:,.0f}".replace(",", "\u202f")
 
 
@@ -382,7 +382,7 @@ def _warnings(run: FocusRun, data: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _summary(data: Mapping[str, Any]) -> Table:
-    """Return the table of the main results."""
+    """Return the table of the largest distance from best focus, the fitted plane and the shims, with sigmas."""
     plane = data["plane"]
     rows: list[tuple[Cell, ...]] = [
         ("largest distance from best focus [µm]", data["confocal_um_max"], data["confocal_um_sigma"]),

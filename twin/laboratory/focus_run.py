@@ -71,17 +71,17 @@ class FocusState:
 
     @property
     def defocus(self) -> np.ndarray:
-        """Measured defocus of the CCDs, (N,), metres, positive downstream of best focus."""
+        """Measured defocus of the CCDs at the N sites, (N,), metres, positive downstream of best focus."""
         return np.array([scan.defocus for scan in self.scans])
 
     @property
     def defocus_sigma(self) -> np.ndarray:
-        """Standard deviation of `defocus` by noise, (N,), metres."""
+        """Standard deviation of the defocus at the N sites due to noise, (N,), metres."""
         return np.array([scan.defocus_sigma for scan in self.scans])
 
     @property
     def skew(self) -> tuple[float, float]:
-        """Common shift of all vertices if the curves may be skewed, and its standard deviation by noise, metres.
+        """Common shift of all vertices if the fitted curves may be skewed, and its sigma due to noise, metres.
 
         It is the weighted mean over the sites for each direction, averaged over the directions.
         """
@@ -95,7 +95,7 @@ class FocusState:
 
     @property
     def confocal(self) -> tuple[float, float]:
-        """Largest distance of a CCD from best focus and its standard deviation by noise, metres."""
+        """Largest distance of a CCD from best focus and its standard deviation due to noise, metres."""
         return float(np.max(np.abs(self.defocus))), float(np.max(self.defocus_sigma))
 
 
@@ -180,7 +180,7 @@ class Shimming:
 
     @property
     def systematic(self) -> np.ndarray:
-        """Sigmas of piston, slope_x and slope_y by the vertices' common error, (3,), metres and radians.
+        """Sigmas of piston and slopes along X' and Y' due to the vertices' common error, (3,), metres and radians.
 
         This part is the same in every alignment of a camera.
         """
@@ -189,7 +189,7 @@ class Shimming:
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance (3, 3) of piston, slope_x, slope_y by noise and the vertices' common error."""
+        """Covariance (3, 3) of piston, slope_x, slope_y due to noise and the vertices' common error, SI units."""
         return self.plane.noise_covariance + np.diag(self.systematic**2)
 
     @property
@@ -202,7 +202,7 @@ class Shimming:
 
     @property
     def change_sigma(self) -> np.ndarray:
-        """Standard deviation of the exact changes of the shims, (H,), metres, with the vertices' common error."""
+        """Standard deviation of the unrounded changes of the H shims, (H,), metres, with the vertices' common error."""
         holes, up = self.plan.mount.holes, self.plan.mount.normal
         lever = np.cross(holes, up)
         # a piston moves along Z'; a slope along X' is a rotation about -Y', one along Y' about X'
@@ -281,7 +281,10 @@ class SimulatedFocus(FocusRun):
         return self.bench.budget()
 
     def true_plane(self, number: int) -> np.ndarray:
-        """Return piston and slopes (3,) of the true defocus with the weights of ``shimmings[number].plane``."""
+        """Return piston and slopes, (3,), of the plane through the true defocus, metres and radians.
+
+        Its weights are those of ``shimmings[number].plane``.
+        """
         plane = self.shimmings[number].plane
         weight = 1.0 / np.sqrt(plane.sigma**2 + plane.extra_sigma**2)
         design = np.column_stack([np.ones(len(weight)), plane.position]) * weight[:, None]
@@ -290,7 +293,7 @@ class SimulatedFocus(FocusRun):
 
 
 def run_focus(setup: ExperimentSetup[Any], backend: Backend, seed: int, advance: Advance = silent) -> FocusRun:
-    """Run ``python -m twin.lab focus``.
+    """Run the alignment of ``python -m twin.lab focus``, simulated or from measurements.
 
     Raises
     ------
@@ -422,13 +425,13 @@ def plan_shimming(
     Parameters
     ----------
     places : (N, 2) ndarray
-        Positions X', Y' of the sites, metres.
+        Positions X', Y' of the N sites, metres.
     state : FocusState
         Measured state; without a level of the line its rotation about Z' is not corrected.
     mount : Mount
         Mounting surface with its holes.
     present : (H,) ndarray
-        Present thickness of the shims, metres.
+        Present thickness of the H shims, metres.
     vertex : tuple of float
         Standard deviations of the error common to all vertices and of its trend, metres.
 
@@ -563,12 +566,12 @@ def _on_new_shims(pose: Pose, plan: ShimPlan, mount: Mount, setting: float) -> P
 
 
 def _holes(values: Iterable[Any]) -> dict[str, Any]:
-    """Return values of the mounting holes, (H, ...), by the holes' names."""
+    """Return name of the hole -> value, from values of the H mounting holes, (H, ...)."""
     return {f"hole_{k + 1}": value for k, value in enumerate(values)}
 
 
 def _ground(metres: Any) -> Any:
-    """Return whole grinding steps in micrometres, rounded to picometres."""
+    """Return thicknesses of shims, metres, as whole grinding steps in micrometres, rounded to picometres."""
     return np.round(UM * np.asarray(metres), 6)
 
 
@@ -578,7 +581,7 @@ def _mtf(state: SimulatedState, edge: str, which: int) -> dict[str, float]:
 
 
 def _shims(state: SimulatedState) -> Shimming:
-    """Return the shims that led to a state."""
+    """Return the shims that led to the placement of a state."""
     assert state.shims is not None
     return state.shims
 

@@ -48,7 +48,7 @@ IMAGE_COLUMNS = (
     *(Column(name, needed=False, whole=True, least=1.0, most=1e5) for name in ("height", "width")),
 )
 _FALSE_ALARM = 1e-3
-"""Probability that any row of a sound table is excluded."""
+"""Probability that any line of a table without errors is excluded as an outlier."""
 _REGION = ("row", "column", "height", "width")
 
 
@@ -77,7 +77,7 @@ class _Place:
 
 @dataclass(frozen=True, eq=False)
 class RowFault:
-    """Row of the table with the reason why it, or its image, is excluded or doubtful."""
+    """Line of the table with the reason why it, or its image, is excluded or doubtful."""
 
     file: str
     line: int
@@ -162,12 +162,12 @@ def read_focus(files: FocusFiles, advance: Advance = silent) -> FocusReadings:
 
 
 def _faults(table: Table, reasons: Mapping[int, str]) -> tuple[RowFault, ...]:
-    """Return the rows of a table that have reasons."""
+    """Return those lines of a table for which there is a reason of exclusion or doubt."""
     return tuple(RowFault(table.file, int(table.lines[row]), reasons[row]) for row in sorted(reasons))
 
 
 def _per_shift(table: Table, files: FocusFiles) -> Array | float:
-    """Return the factor from a shift in the table to a shift of the image along the light."""
+    """Return the shift of the image along the light per unit of shift in the table."""
     if files.moved != "target":
         if "per shift" in table:
             raise table.error(0, "per shift", "only a target's shift differs from the image's", allowed="moved: target")

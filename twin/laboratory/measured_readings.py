@@ -27,7 +27,7 @@ Integers = NDArray[np.int64]
 MAX_ANGLES = 3000
 """Largest number of different angles of a series: the fits have matrices with this many rows and columns."""
 MAX_CELLS = 30_000_000
-"""Largest number of angles times the largest number of repeats, to limit memory."""
+"""Largest product of number of angles and number of repeats, to limit memory."""
 READING_TOLERANCE = 1e-9
 """Difference below which two readings are repeats of the same angle, radians (0.0002 arcsec)."""
 MAX_DIFFERENCE_CHANGE = np.radians(1.0)
@@ -182,7 +182,7 @@ def read_turntable(files: TurntableFiles) -> tuple[Comparisons, ...]:
 
 
 def calibrated_text(angle: Array) -> str:
-    """Describe the region in which a turntable is calibrated at angles (N,), and the gaps in it."""
+    """Describe the region in which a turntable is calibrated, from its N angles, (N,), and the gaps in it."""
     holes = [f"{a:.9g} to {b:.9g}" for a, b in np.degrees(gaps(angle))]
     first, last = np.degrees(angle[[0, -1]])
     return f"{first:.9g} to {last:.9g} deg" + (f" without the gaps {', '.join(holes)} deg" if holes else "")
@@ -194,7 +194,7 @@ def unwrapped(reading: Array, around: float | None = None) -> Array:
     Parameters
     ----------
     reading : (N,) ndarray
-        Readings, radians.
+        The N readings, radians.
     around : float, optional
         Reading from which none shall be farther than half a turn. By default the circle is cut in its widest arc
         without a reading: 350, 355, 0, 5 deg become -10, -5, 0, 5 deg.
@@ -396,18 +396,18 @@ def _groups(table: Table) -> Integers:
 
 
 class _Cells:
-    """Sorted rows of a table as a matrix of groups and their members.
+    """Lines of a table as a matrix: a row for each group (such as an angle), with its members as columns.
 
     Parameters
     ----------
     table
-        Table with the rows.
+        Table with the lines.
     group
-        Group of each sorted row, (rows,), non-decreasing.
+        Group of each sorted line, (lines,), non-decreasing.
     order
-        Row of the table of each sorted row, (rows,).
+        Line of the table of each sorted line, (lines,).
     slot
-        Column of each sorted row in the matrix; by default members of a group one after the other.
+        Column of each sorted line in the matrix; by default members of a group one after the other.
     """
 
     def __init__(self, table: Table, group: Integers, order: Integers, slot: Integers | None = None) -> None:
@@ -423,11 +423,11 @@ class _Cells:
         self.present[self.group, self.slot] = True
 
     def at(self, slot: Integers) -> _Cells:
-        """Return the rows of this matrix in other columns."""
+        """Return the same lines in a matrix with other columns."""
         return _Cells(self.table, self.group, self.order, slot)
 
     def matrix(self, value: Array | Integers, empty: float | None = 0.0) -> np.ndarray:
-        """Return values of the table's rows as a matrix.
+        """Return values of the table's lines as a matrix, groups by members.
 
         Empty cells get ``empty``, or with None the first value of their group.
         """
@@ -439,7 +439,7 @@ class _Cells:
         return out
 
     def centre(self, value: Array) -> Array:
-        """Return the mean of every group, (N,); exactly the value where all are equal."""
+        """Return the mean of each of N groups, (N,); exactly the value where all are equal."""
         least, most = (np.full(len(self.count), side) for side in (np.inf, -np.inf))
         np.minimum.at(least, self.group, value[self.order])
         np.maximum.at(most, self.group, value[self.order])

@@ -30,7 +30,7 @@ FIT_NAMES = {
     "fourier": "Fourier series",
     "network": "network",
 }
-"""Fit -> its name for readers."""
+"""Key of a fit of the dividing error -> its name in reports."""
 COLOURS = {
     "piecewise_linear": svg.ORANGE,
     "polynomial": svg.PURPLE,
@@ -146,7 +146,7 @@ def _slow_truth(model: TurntableModel, at: np.ndarray) -> np.ndarray:
 
 
 def _readings(run: TurntableRun) -> str:
-    """Describe the readings that were compared."""
+    """Describe the turntable readings that were compared with the reference: number, range and repeats."""
     series = run.series
     first, last = np.degrees(run.compensation.region)
     least, most = int(np.min(series.counts)), int(np.max(series.counts))
@@ -266,12 +266,12 @@ def _ranking(result: Mapping[str, Any]) -> Table:
 
 
 def _noise(run: TurntableRun) -> float:
-    """Return the sigma of a compensated angle by noise of the calibration, RMS over its readings, arcsec."""
+    """Return the sigma of a compensated angle due to noise of the calibration, RMS over its readings, arcsec."""
     return float(np.sqrt(np.mean(np.diag(run.compensation.fit.covariance(run.series.angle))))) / ARCSEC
 
 
 def _left(run: TurntableRun, result: Mapping[str, Any]) -> Table:
-    """Return the table of the remaining error of a compensated angle."""
+    """Return the table of the error that remains in an angle after compensation."""
     noise = "noise of the calibration, mean over its readings [arcsec]", DecimalNumber(_noise(run), 4)
     lines = [noise, *turntable_run.COMPENSATION.lines(result["compensation"])]
     title = "Remaining error of a compensated angle"
@@ -279,7 +279,7 @@ def _left(run: TurntableRun, result: Mapping[str, Any]) -> Table:
 
 
 def _chi_square(result: Mapping[str, Any]) -> Table:
-    """Return the table of chi-square of the chosen fit."""
+    """Return the table of chi-square of the chosen fit and its degrees of freedom."""
     keys = ["fit_chi_square", "fit_degrees_of_freedom", "heldout_chi_square", "heldout_degrees_of_freedom"]
     lines = TURNTABLE.lines(result, keys if result["heldout_degrees_of_freedom"] else keys[:2])
     note = (

@@ -69,20 +69,23 @@ class Harmonics:
 
     @classmethod
     def draw(cls, order: ArrayLike, rms: Array, rng: np.random.Generator) -> Harmonics:
-        """Draw normal coefficients, with which the mean square of harmonic k over the circle is rms_k^2 on average."""
+        """Draw normal coefficients of harmonics with given RMS.
+
+        The mean square of harmonic k over the circle is rms_k^2 on average.
+        """
         k = np.asarray(order, np.int64)
         cosine, sine = rng.standard_normal((2, len(k))) * rms
         return cls(k, cosine, sine)
 
     def __call__(self, reading: ArrayLike) -> Array:
-        """Return the sum at readings, in their shape."""
+        """Return the sum at turntable readings in radians, in their shape, radians."""
         at = np.asarray(reading, np.float64)
         phase = at.ravel()[:, None] * self.order
         return (np.cos(phase) @ self.cosine + np.sin(phase) @ self.sine).reshape(at.shape)
 
     @property
     def rms(self) -> float:
-        """RMS over the full circle, radians."""
+        """RMS of the function over the full circle, radians."""
         return float(np.sqrt(0.5 * np.sum(self.cosine**2 + self.sine**2)))
 
 
@@ -100,7 +103,7 @@ class DividingError:
 
     @classmethod
     def draw(cls, spec: DividingErrorSpec, seed: int) -> DividingError:
-        """Draw a table, which is determined by specification and seed."""
+        """Draw the dividing error of a table, which is determined by specification and seed."""
         rng = np.random.default_rng(stream(seed, _TABLE))
         g, sub = spec.graduation, spec.subdivision
         lines = np.arange(g.first, g.last + 1)
@@ -139,7 +142,7 @@ class TurntableModel:
 
     @cached_property
     def error(self) -> DividingError:
-        """True dividing error of this table; the analysis does not get it."""
+        """True dividing error of this table, which the analysis does not know."""
         return DividingError.draw(self.spec.dividing_error, self.seed)
 
     def true_angle(self, reading: ArrayLike, rng: np.random.Generator | None = None) -> Array:
@@ -175,7 +178,7 @@ class TurntableModel:
         return rng.normal(0.0, self.spec.dividing_error.repeatability, shape)
 
     def calibrate(self) -> CalibrationSeries:
-        """Simulate the regional comparison."""
+        """Simulate the comparison of the table with the reference at equidistant readings of the region."""
         plan = self.spec.calibration
         return self._compare(self._steps(0.0, plan.count), plan.repeats, _CALIBRATION)
 
@@ -192,7 +195,7 @@ class TurntableModel:
         return np.asarray(plan.first + plan.step * (np.arange(count) + start), np.float64)
 
     def _compare(self, angle: Array, repeats: int, number: int) -> CalibrationSeries:
-        """Simulate comparisons of the table with the reference."""
+        """Simulate repeated comparisons of the table with the reference at given readings."""
         rng = np.random.default_rng(stream(self.seed, number))
         reference = self.spec.reference
         shape = len(angle), repeats
@@ -252,7 +255,7 @@ class TurntableRun:
         return {name: trial.fit for name, trial in self.choice.trials.items()}
 
     def residual(self, name: str) -> Array:
-        """Return measured - fitted dividing error at the calibrated readings, (N,), radians."""
+        """Return measured - fitted dividing error at the N calibrated readings, (N,), radians."""
         return self.series.mean - self.fits[name](self.series.angle)
 
     def true_residual(self, name: str) -> Array:
@@ -265,7 +268,7 @@ class TurntableRun:
         return self.held_out.mean - self.fits[name](self.held_out.angle)
 
     def held_out_rms(self, name: str) -> float | None:
-        """Return the RMS of `held_out_residual`, radians; None without held-out readings."""
+        """Return the RMS of measured - fitted dividing error at the held-out readings, radians; None without them."""
         return None if self.held_out is None else rms(self.held_out_residual(name))
 
     def _judged(self, name: str) -> float:
@@ -393,7 +396,7 @@ def usable_fits(
 
 
 def rms(value: Array) -> float:
-    """Return the root mean square."""
+    """Return the root mean square of an array."""
     return float(np.sqrt(np.mean(value**2)))
 
 
@@ -495,7 +498,7 @@ POINTS: Record[_Points] = Record(
 
 
 def _each(series: CalibrationSeries, values: Any) -> list[Any]:
-    """Return values (N, repeats) of a series, reading by reading, without those of comparisons that were not made."""
+    """Return values of a series, (N, repeats) for N readings, as a list per reading, without missing comparisons."""
     return [row[taken] for row, taken in zip(values, series.taken, strict=True)]
 
 
@@ -511,7 +514,7 @@ def _parts(run: TurntableRun) -> dict[str, float]:
 
 
 def rejected_rows(tables: tuple[Comparisons, ...]) -> list[dict[str, Any]]:
-    """Return the rows of `REJECTED` of all tables that were read."""
+    """Return the comparisons that Chauvenet's criterion rejects, of all tables that were read, for turntable.json."""
     return [row for table in tables for row in REJECTED.rows(table)]
 
 
