@@ -197,7 +197,7 @@ class AsBuiltBench(Site):
         return tuple(kind.read() for kind in self.kinds)
 
     def estimate(self, data: Sequence[np.ndarray], start: np.ndarray | None = None) -> StateEstimate:
-        """Estimate the parameters.
+        """Estimate the as-built parameters of the instrument from the readings of all measurements.
 
         Parameters
         ----------
@@ -209,7 +209,7 @@ class AsBuiltBench(Site):
         Raises
         ------
         InputError
-            Errors or light of a measurement are impossible.
+            The errors of a measurement are impossible, or its light is lost.
         """
         try:
             return estimate_state(self.parameters.prior, self.groups(data), self.predict, self.slope, start)

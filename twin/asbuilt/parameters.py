@@ -186,7 +186,8 @@ class Parameters:
     def temperatures(self, values: np.ndarray, bodies: Sequence[str]) -> np.ndarray:
         """Return the temperatures of the named bodies above nominal, one row per state, kelvin.
 
-        A body without its own temperature has that of the nearest body that carries it.
+        The array has the shape (S, bodies). A body without its own temperature has that of the nearest body that
+        carries it.
 
         Array dimensions: S states.
         """

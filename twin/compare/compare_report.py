@@ -403,7 +403,7 @@ def numbers(comparison: Comparison) -> Mapping[str, Any]:
 
 
 def _plain(one: NumberDifference | ArrayDifference, without: str, *derived: str) -> dict[str, Any]:
-    """Return the fields of a difference, without one of them and with derived numbers, as plain data for JSON.
+    """Return the fields of a difference but one, and numbers derived from them, as plain data for JSON.
 
     None for numbers that are not finite.
     """

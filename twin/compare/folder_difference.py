@@ -476,7 +476,7 @@ def _csv(content: bytes) -> Content:
 
 
 def _cell(text: str) -> Leaf:
-    """Return a cell as a number if possible, otherwise as text."""
+    """Return a cell of a CSV table as a number if possible, otherwise as text."""
     for kind in (int, float):
         with suppress(ValueError):
             return kind(text)

@@ -32,7 +32,7 @@ class FolderState:
     additional : tuple[str, ...]
         Files that the run did not write.
     inputs_changed : tuple[str, ...]
-        Input files outside the folder that have changed since.
+        Input files outside the folder that have changed since the run.
     inputs_gone : tuple[str, ...]
         Input files that are missing.
     """
@@ -106,7 +106,7 @@ def _manifest(folder: Path) -> Manifest:
     Raises
     ------
     InputError
-        There is none; the message says what the folder is instead.
+        The folder has no manifest of a finished run; the message says what the folder is instead.
     """
     manifest = run_folder.read_manifest(folder)
     if manifest is not None:

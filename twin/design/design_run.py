@@ -51,7 +51,7 @@ _REMEDIES = {"envelope": "a larger envelope", "clearance": "a smaller clearance"
 
 @dataclass(frozen=True, eq=False)
 class DesignRun:
-    """Optimised camera.
+    """Result of the optimisation of a camera's prescription.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class DesignRun:
     searched : Search
         Results of the optimisation from all starts.
     text : str
-        File of the new camera.
+        Text of the new camera's file.
     warnings : tuple of str
         Warnings for the user.
     """

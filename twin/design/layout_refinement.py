@@ -240,7 +240,7 @@ the second, J/10 and 0.02 J at the third.
 
 @dataclass(frozen=True)
 class LayoutNumber:
-    """Continuous parameter of a layout.
+    """Continuous parameter of a monitor layout, such as the position of a beam in the pupil.
 
     Attributes
     ----------
@@ -251,7 +251,7 @@ class LayoutNumber:
     name : str
         Name of the parameter, one of ``monitor_layout.CONTINUOUS``.
     order : int
-        Order of the differences, 2, 4 or 6.
+        Order of the central differences with respect to it, 2, 4 or 6.
     """
 
     beams: Layout

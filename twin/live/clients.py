@@ -232,7 +232,7 @@ class Client:
     async def send(
         self, as_text: Callable[[str], Awaitable[None]], as_bytes: Callable[[bytes], Awaitable[None]]
     ) -> None:
-        """Send queued messages, without end.
+        """Send queued messages to the page until it disconnects.
 
         Raises
         ------

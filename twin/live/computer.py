@@ -46,7 +46,7 @@ class RequestHandler:
     backend
         Backend that traces.
     advance
-        Called with each part of the preparation.
+        Callback that receives the name of each part of the preparation.
     run
         Number of one of a study's runs, from 0; None for its base.
 
@@ -162,11 +162,11 @@ ATTEMPTS = 3
 
 
 class ComputerLost(Exception):
-    """End of the computing process; the message says how it ended."""
+    """Error that the computing process has ended; the message says how."""
 
 
 class CannotStart(Exception):
-    """Failure to build the instrument; the message is that of a command."""
+    """Error that the instrument cannot be built; the message is that of a command."""
 
 
 class Computer:
@@ -199,7 +199,7 @@ class Computer:
         Parameters
         ----------
         advance : Callable[[str], None]
-            Called with each part when it begins.
+            Callback that receives the name of each part of the preparation when it begins.
 
         Raises
         ------

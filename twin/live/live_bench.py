@@ -121,7 +121,7 @@ class LiveBench:
         Parameters
         ----------
         advance : Callable[[str], None]
-            Called with each part when it begins.
+            Callback that receives the name of each part of the preparation when it begins.
         """
         experiment = self.twin.experiment
         advance("trace the unperturbed instrument")
@@ -228,7 +228,7 @@ class LiveBench:
         Parameters
         ----------
         asked : AskedState
-            The state.
+            State of the knobs that the page requests.
 
         Returns
         -------
@@ -482,7 +482,7 @@ def job_text(bench: LiveBench, asked: AskedState) -> str:
     bench : LiveBench
         Instrument that is evaluated.
     asked : AskedState
-        The state.
+        State of the knobs to be saved.
 
     Raises
     ------

@@ -165,7 +165,7 @@ _MESSAGE: TypeAdapter[Message] = TypeAdapter(Annotated[Message, Field(discrimina
 
 
 class BadMessage(ValueError):
-    """Invalid message of a page."""
+    """Error that a message of a page is not valid."""
 
 
 def read_message(text: str | bytes) -> Message:

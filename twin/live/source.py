@@ -221,7 +221,10 @@ def _is_instrument(file: Path) -> bool:
 
 
 def _of_measurement(file: Path) -> Source:
-    """Return the unperturbed instrument of measured frames; the perturbation is what was to be measured."""
+    """Return the unperturbed instrument with which frames were measured.
+
+    The perturbation is not known; it is what the measurement was to find.
+    """
     model = MeasurementSetup.read(file).model
     if model is None:
         text = "this measurement uses the geometry of the cameras alone, without an instrument to show"

@@ -181,7 +181,7 @@ class SingleReadings:
 
 
 def single_readings(entries: Sequence[Mapping[str, Any]], quantities: Sequence[Quantity]) -> SingleReadings:
-    """Return the values of single readings of the monitor.
+    """Return the quantities, with sigmas, that single readings of the monitor give without the filter.
 
     Parameters
     ----------

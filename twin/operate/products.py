@@ -263,7 +263,7 @@ def scene_time(scene: ExportSource) -> int:
     Raises
     ------
     Problem
-        The source does not have one moment.
+        The source does not have a single time.
     """
     setup = scene.setup
     if not isinstance(setup, AngleSetup):
@@ -487,7 +487,7 @@ NUMBERS = "products.json"
 
 
 def _cameras(products: Products) -> dict[str, dict[str, float]]:
-    """Return group -> quantities with their sigmas, in the units given by the ends of the keys."""
+    """Return each camera's (or other group's) quantities with sigmas, in the units at the ends of their keys."""
     out: dict[str, dict[str, float]] = {}
     for k, quantity in enumerate(products.course.quantities):
         group = out.setdefault(quantity.group, {})

@@ -318,7 +318,7 @@ class SimulatedRecord:
 def simulate_record(
     plan: OperationSetup, experiment: MonitorExperiment, what: Simulation, advance: Advance
 ) -> SimulatedRecord:
-    """Draw a life, trace and render its states, and recover the monitor's readings.
+    """Draw the motions of a simulated life, trace and render its states, and recover the monitor's readings.
 
     Parameters
     ----------

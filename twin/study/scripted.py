@@ -49,7 +49,7 @@ class Perturbed(Protocol):
 
 @dataclass(frozen=True)
 class Spread:
-    """Number that varies in a study.
+    """Number of a perturbation that is given as a range, and so varies in a study.
 
     Attributes
     ----------
@@ -246,7 +246,7 @@ def config_text(
 
 
 def _by_node(vary: Mapping[str, Mapping[str, Any] | str]) -> dict[str, dict[str, Any]]:
-    """Return the keys of the perturbation by body, with motions given as text expanded."""
+    """Return the perturbation of each body by key, with motions given as text ("M2 shift z") expanded."""
     out: dict[str, dict[str, Any]] = {}
     for name, motion in vary.items():
         if isinstance(motion, Mapping):

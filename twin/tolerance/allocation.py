@@ -27,7 +27,7 @@ from twin.tolerance.tolerance_bench import ToleranceBench
 DRAWS = 2000
 """Number of cameras (random draws) from which the limits are chosen."""
 CHECKED = 1000
-"""Number of these cameras that are traced exactly in every round."""
+"""Number of the ``DRAWS`` cameras that are traced exactly in every round."""
 ROUNDS = 6
 """Largest number of rounds in which limits are changed and the model is computed again."""
 BOUND = 2.0

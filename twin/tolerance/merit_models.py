@@ -1,4 +1,4 @@
-"""Models of the merits to the second order, sensitivities, and inverse limits for a specified loss.
+"""Second-order models of merits, sensitivities, and inverse limits (tolerance sizes for a specified loss).
 
 Where a camera is at its optimum the first derivative vanishes, and the second derivative gives the cost of a motion. So
 the models describe the merits' smooth parts to the second order, and every sensitivity and every inverse limit is
@@ -171,7 +171,7 @@ class Sensitivities:
     problems : tuple of str
         Reason why no light reaches the image with a tolerance at its limits, (E,); empty where it does.
     model : MeritModel
-        Model of all parameters together.
+        Second-order model of the merits in all varied parameters together.
     """
 
     nominal: np.ndarray

@@ -40,7 +40,7 @@ _MORE = 7919
 _NOTHING = 1e-15
 """Size of a motion, in metres or radians, below which it is rounding error."""
 EXACT = 4
-"""Number of cameras in which the derivatives of the monitor are traced as a check."""
+"""Number of cameras in which the monitor's derivatives are traced exactly, to check the interpolated ones."""
 NEAR_MODEL = 0.05
 """Relative difference between a model's quantile and that of the traced cameras, above which a warning is given."""
 _PAIR, _DRAWN, _SHOWN, _MODELLED = 6.6e3, 32.0, 120.0, 40.0

@@ -575,10 +575,10 @@ class Operation:
             raise Problem("the time is before the first reading", utc_text(time), allowed)
 
     def _smoothing_inputs(self, time: int) -> tuple[SeriesFilter, FilterState, list[Observed], list[Array]]:
-        """Return the inputs of a smoother that reaches back to a time.
+        """Return the inputs of a smoother that estimates states from a given time on.
 
         They are the filter with all detected jumps as steps, the state at which it begins, the observations from there
-        on, and the undetected shares of jumps before each.
+        on, and, before each, the share of the mean square of each motion's jumps that could not be detected.
         """
         entry_filter, start = self._entry_filter, self._checkpoint_before(time)
         told = None if start is None else start.time

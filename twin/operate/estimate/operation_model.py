@@ -173,7 +173,7 @@ def read_plan(path: Path, history: History) -> OperationSetup:
     path : Path
         The file.
     history : History
-        Record of the instrument that the plan has to be of.
+        Record, for whose instrument the plan has to be.
 
     Raises
     ------

@@ -78,7 +78,7 @@ def run_entries(place: Path, kind: str, moment: int, history: History, assume_in
     Parameters
     ----------
     place : Path
-        The folder, or the file of results in it.
+        Run folder, or the file of results in it.
     kind : str
         Kind of reading; empty for the one that the folder holds.
     moment : int
@@ -195,7 +195,7 @@ def read_telemetry(path: Path, history: History) -> TelemetrySpec:
     path : Path
         The YAML file.
     history : History
-        Record of the instrument that the tables have to be of.
+        Record, for whose instrument the tables have to be.
 
     Raises
     ------

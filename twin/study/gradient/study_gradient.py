@@ -541,12 +541,12 @@ class _GradientResponse:
 
 
 def study_gradient(setup: StudySetup, backend: Backend, advance: Advance = silent) -> Gradient:
-    """Differentiate a study at its base.
+    """Compute the derivatives of a study's responses with respect to its factors, at the base job's values.
 
     Parameters
     ----------
     setup : StudySetup
-        The study; its design is not used.
+        Study with base job, factors and responses; its design is not used.
     backend : Backend
         Array backend of the ray trace.
     advance : Advance
@@ -671,7 +671,7 @@ class _Traced:
             raise _refused(self.setup, factor, change, error) from None
 
     def _exact(self, chain: Chain, about: State, table: Gradient) -> dict[int, float]:
-        """Fill in the derivatives by AD, and return the steps for the differences with respect to these factors."""
+        """Fill in derivatives by automatic differentiation; return the steps for differences with the same factors."""
         self.advance(AD_PART, 0, 1)
         motions = list(dict.fromkeys(motion for slopes in self.slopes.values() for motion in slopes))
         spots: np.ndarray = np.zeros((*chain.nominal.shape[1:], 0))

@@ -24,7 +24,7 @@ class _NoBasis(Exception):
 
 
 def axis_functions(axis: tuple[Factor, ...], good: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the orthonormal basis functions 1, 2, ... of an axis at the runs: values (n, m) and degrees (m,).
+    """Return the orthonormal basis functions of a factor's axis at the runs: values (n, m) and degrees (m,).
 
     Each function has mean 0 and mean square 1 under the axis' distribution, and different ones are orthogonal: Legendre
     polynomials for a uniform factor, Hermite polynomials for a normal one, Gram-Schmidt on the distribution itself for
@@ -193,7 +193,7 @@ It is multiplied by the root of the number of runs, and is five standard deviati
 
 @dataclass(frozen=True)
 class Index:
-    """Sensitivity index of an axis.
+    """Sensitivity indices of an axis: one factor, or several that vary together.
 
     Attributes
     ----------

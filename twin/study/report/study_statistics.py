@@ -105,7 +105,7 @@ class Response(Series):
 
     @cached_property
     def constant(self) -> bool:
-        """True if all numbers are equal within rounding."""
+        """True if the response has the same value in all runs, within rounding."""
         if len(self.known) == 0:
             return True
         # 64 units in the last place, the rounding error of sums over a few hundred terms
@@ -485,9 +485,9 @@ class Effect:
     factor : str
         Name of the factor.
     swing : Estimate
-        Change of the response from the factor's 5 % to its 95 % quantile, in the response's unit; for a text the
-        largest minus the smallest mean of its values, at equal other factors. The quantiles are those of the factor's
-        distribution where runs are drawn from it.
+        Change of the response as the factor goes from its 5 % to its 95 % quantile, in the response's unit; for a text
+        the largest minus the smallest mean of its values, at equal other factors. The quantiles are those of the
+        factor's distribution where runs are drawn from it.
     coefficient : Estimate or None
         Standardised regression coefficient, sigmas of the response per sigma of the factor; None for texts.
     rank : Estimate or None
@@ -605,7 +605,8 @@ def _effect(
 ) -> Effect:
     """Return the effect of a factor on a response from its coefficients in the linear model.
 
-    ``moved`` (m, n) is the influence of each run on each coefficient, ``t`` the quantile of Student's distribution.
+    ``moved`` (m, n) is the influence of each run on each coefficient, and ``t`` the quantile of Student's distribution
+    for the confidence interval.
 
     Array dimensions: m coefficients, n runs.
     """

@@ -287,7 +287,7 @@ def leaf(tree: Any, key: KeyPath) -> Any:
     tree : dict or list
         Results as nested mappings and lists.
     key : KeyPath
-        Keys and list indices from its root.
+        Keys and list indices from the root of the results.
 
     Raises
     ------

@@ -385,7 +385,7 @@ class Plan:
 
     @cached_property
     def seeds(self) -> np.ndarray | None:
-        """Seed of every run, (runs,) int64; None if all runs have the base's."""
+        """Seed of every run, (runs,) int64; None if all runs have the base job's seed."""
         if self.setup.study.noise == "shared":
             return None
         seed = self.setup.study.design.seed
@@ -450,7 +450,7 @@ def _column(setup: StudySetup, name: str, sampled: np.ndarray) -> Column:
 
 
 def _like(setup: StudySetup, name: str, sampled: np.ndarray) -> np.ndarray:
-    """Return numbers without a unit as integers if the base has an integer and all of them are whole."""
+    """Return a factor's pure numbers as integers if the base job has an integer there and all are whole."""
     factor = setup.study.factors[name]
     node = leaf(setup.tree, factor.places[0]) if factor.places else None
     whole = isinstance(node, int) and not isinstance(node, bool) and factor.unit is None
@@ -470,7 +470,7 @@ def _telling(column: Column, limits: list[float]) -> list[Any]:
 
 
 STARTED = 110e6
-"""Memory for writing the report of a study of any size, beside the imported program, bytes."""
+"""Memory in bytes for writing the report of a study of any size, in addition to the imported program."""
 CELL = 120.0
 """Memory in bytes for each number of a run: computation, data set and text table together."""
 _KEPT = 5

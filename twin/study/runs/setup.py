@@ -264,7 +264,7 @@ def _unset(tree: Tree, factor: FactorSpec) -> list[KeyPath]:
 
 
 def _with_tables(study: StudySpec) -> StudySpec:
-    """Return the study with the values of its tables' columns."""
+    """Return the study in which each factor from a table holds the values of its column."""
     factors = dict(study.factors)
     tables: dict[str, dict[str, list[Any]]] = {}
     named: dict[str, dict[str, KeyPath]] = {}
