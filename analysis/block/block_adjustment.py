@@ -174,7 +174,7 @@ class BlockAdjustment:
 
     @cached_property
     def _filled(self) -> Array:
-        """Adjusted points, with start values for undetermined ones."""
+        """Adjusted coordinates of the points, or start values where they are undetermined, ITRS, in metres."""
         return np.where(np.isfinite(self.ground), self.ground, self.assembly.block.points.start)
 
     @property

@@ -289,7 +289,7 @@ class Corrections:
     time: Array
 
     def taken(self, which: Indices) -> Corrections:
-        """Return the corrections of selected observations (k,)."""
+        """Return the corrections at the times of k selected observations, given by their indices."""
         return replace(self, time=self.time[which])
 
     @cached_property

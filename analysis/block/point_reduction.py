@@ -337,7 +337,7 @@ class Heights:
 
 
 _PIECE = 4_000
-"""Number of points that are linearised at once."""
+"""Number of points whose equations are linearised at once, which limits the memory."""
 _FLUSH = 4_000_000
 """Number of contributions to entries of the reduced matrix that are collected before they are summed, which limits the
 memory.

@@ -518,7 +518,9 @@ class Adjustment:
 
 
 _CONVERGED = 1e-6
-"""Step of a converged iteration, in sigmas; a step that rounding keeps from decreasing also ends it."""
+"""Largest Gauss-Newton step of a converged iteration, in sigmas; a step that no longer decreases because of rounding
+ends it, too.
+"""
 _HUBER_ROUNDS = 6
 """Number of first rounds with Huber weights before those of IGG III."""
 

@@ -201,7 +201,7 @@ def _solved(
 
 
 def _datum(rays: Mapping[str, Rays], shared: SharedNoise, inverse: Array) -> tuple[Datum, ...]:
-    """Return sigmas of the constant and the slope of the attitude's errors over all rays, fitted by least squares."""
+    """Return the sigmas of the mean and of the slope in time of the attitude's errors over all rays of the pass."""
     if not any(part.turns for part in shared.parts[_NAME]):
         return ()
     time = np.concatenate([r.time for r in rays.values() if r.time is not None])

@@ -158,7 +158,7 @@ class _Lobe:
         return p * form, np.stack([form, -2 * a * distance * p * slope, p * slope * distance**2], axis=2)
 
     def _newton(self, mask: NDArray[np.bool_], steps: int) -> Array:
-        """Take bounded Gauss-Newton steps with the points of the mask.
+        """Improve the parameters of B curves by bounded Gauss-Newton steps with the points of the mask.
 
         Returns
         -------

@@ -457,7 +457,7 @@ class Fits:
         return noise, self._hidden(), *self.relief.square(self.spread.variance, self._coloured(noise), common)
 
     def _coloured(self, noise: Array) -> Array:
-        """Return the (n,) factor by which the correlation of residuals raises the variance of the position."""
+        """Return the factor by which correlation of residuals raises the variance of each of n positions."""
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(np.trace(noise, axis1=1, axis2=2) / np.trace(self.spread.plain, axis1=1, axis2=2))
 
@@ -591,7 +591,7 @@ def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: Ma
 def _windows(
     image: NDArray[np.generic], templates: Array, start: Array, reach: int, options: MatchOptions
 ) -> tuple[Array, Array, NDArray[np.int8]]:
-    """Return grey values (n, p), middles of the windows (n, 2) and the reason why a window is unusable."""
+    """Return the p grey values of n windows (n, p), their middles (n, 2), and why a window is unusable."""
     reason = np.zeros(len(templates), np.int8)
     anchor = np.rint(start)
     fits = np.all((anchor >= reach) & (anchor <= np.array(image.shape) - 1 - reach), axis=1)
@@ -625,10 +625,11 @@ def _best_smoothing(
     affine: Array,
     options: MatchOptions,
 ) -> tuple[Index, tuple[Array, Array]]:
-    """Return the (n,) index of each point's strongest acceptable low-pass and the decreases of residuals and noise.
+    """Return the index of the strongest acceptable low-pass of each of n points, and the decreases that it causes.
 
     A low-pass is acceptable if, after one linear step, the template predicts the image as well as with the best
-    low-pass. The decreases against the first low-pass are those of `template_noise`. Points not selected get 0.
+    low-pass. The decreases, relative to the first low-pass, are those of the residuals and of the noise's energy for
+    `template_noise`. Points not selected get 0.
     """
     best, lowered = np.zeros(len(grey), np.intp), (np.zeros(len(grey)), np.zeros(len(grey)))
     if not selected.size:

@@ -18,7 +18,9 @@ from analysis.matching.correlation import checked_image
 _DEGREE = 5
 """Degree of the splines."""
 _HALO = 22
-"""Pixels around a patch that its spline uses: the prefilter decays by 0.43 per pixel, so the rest is 1e-8."""
+"""Width of the border around a patch that its spline uses, in pixels: the prefilter's response decays by a factor of
+0.43 per pixel, so what is omitted is 1e-8.
+"""
 _SUPPORT = 3
 """Number of knots at each side that a spline value depends on directly."""
 _RIM = 10

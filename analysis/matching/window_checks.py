@@ -164,7 +164,7 @@ def _halves(side: int) -> list[NDArray[np.bool_]]:
 LAG = 3
 """Largest lag of correlated residuals, in pixels along rows and columns."""
 _LAGS = [(r, c) for r in range(LAG + 1) for c in range(-LAG, LAG + 1) if r > 0 or c > 0]
-"""Half of the lags; the others follow by symmetry."""
+"""Lags (rows, columns) of the correlation of residuals, in pixels: one of each pair of opposite lags."""
 _LEAST = 0.5
 """Smallest variance relative to that for white residuals: noisy estimates of the correlation must not reduce the
 variance of a position below it.

@@ -121,7 +121,7 @@ def spline_blend(time: Array, interval: float) -> tuple[NDArray[np.intp], Array]
 
 
 def _covariance(count: int) -> Array:
-    """Return the (count, count) covariance of neighbouring spline coefficients, for readings of unit variance."""
+    """Return the covariance of `count` neighbouring spline coefficients, for independent readings of unit variance."""
     n = np.arange(count)
     return np.asarray(toeplitz(3.0 * (-_RHO) ** n * (n + (1 + _RHO**2) / (1 - _RHO**2))))
 
@@ -410,7 +410,7 @@ class CalibratedLine:
         return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
 
     def origin(self, pixel: Array) -> Array:
-        """Return an (n, 3) point on the ray of each pixel (n,), body frame, in metres."""
+        """Return a point on the ray of each of n pixels, (n, 3), body frame, in metres."""
         return self._series(self.origins, pixel)
 
     def _series(self, coefficients: Array, pixel: Array) -> Array:
@@ -552,7 +552,7 @@ _SHARE = 0.9
 _DIRECTIONS = 0.5 * np.pi * (np.arange(32) + 0.5) / 32
 """Angles of the midpoint rule over a quarter circle, accurate to 1e-12 of CE90 for any ratio of the axes."""
 _FARTHEST = 40.0
-"""Upper bound of an error radius, in standard deviations."""
+"""Upper end of the interval in which the radius of a 90 % error is searched, in standard deviations."""
 
 
 @dataclass(frozen=True)

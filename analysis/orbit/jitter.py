@@ -57,7 +57,9 @@ from analysis.arrays import Array, MeasurementError
 from analysis.statistics import robust_sigma
 
 OVERSAMPLING = 6
-"""Frequencies per inverse of the observed time span; the highest of them then has at least 98 % of a line's power."""
+"""Number of periodogram frequencies per inverse of the observed time span. The nearest of them then has at least 98 %
+of the power of an oscillation.
+"""
 BLIND = 0.1
 """Response of the observations to an oscillation about an axis, as a fraction of the largest response at any frequency,
 below which a frequency counts as blind.
@@ -556,7 +558,9 @@ _FINE, _PADDED = 16, 4
 loses at most 3 % of its power by either.
 """
 _WIDEST = 2**18
-"""Largest number of resolution elements that are transformed."""
+"""Largest number of resolution elements (inverse of the observed time span) over which the Fourier transform of the
+alias search extends.
+"""
 _REGULAR = 1e-4
 """Regularisation of the amplitudes about all axes, as a fraction of the weight of the best determined combination of
 axes. It keeps amplitudes finite where observations cannot separate two axes.

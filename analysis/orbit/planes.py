@@ -380,7 +380,7 @@ def _gauss_helmert(station: Station, strip: Strip, arm: Array, normal: Array) ->
 
 @dataclass(frozen=True, eq=False)
 class _DistanceNoise:
-    """Covariance diag(own) + shared of the points' distances from a plane through the station, in m^2.
+    """Covariance of the distances of n points from a plane through the station, in m^2: diag(own) + shared.
 
     Attributes
     ----------
@@ -415,7 +415,7 @@ class _DistanceNoise:
 
 
 def _tangent(normal: Array) -> Array:
-    """Return (3, 2) orthonormal columns perpendicular to a unit vector."""
+    """Return two orthonormal vectors perpendicular to a unit vector, as the columns of a (3, 2) array."""
     return np.asarray(np.linalg.svd(normal[None, :])[2][1:].T)
 
 

@@ -33,7 +33,9 @@ _RANK = 1e-11
 """Smallest singular value that is used, relative to the largest: an image determines fewer combinations than a cubic
 ratio has coefficients, and the others stay small."""
 _DAMPING = (0.0, 1e-8, 1e-6, 1e-4, 1e-2, 1.0)
-"""Strengths of the regularisation of the denominators; the last one almost leaves polynomials."""
+"""Strengths of the regularisation of the denominators that are tried; with the largest, denominators are almost 1 and
+the ratios almost polynomials.
+"""
 _STEP = 1e-6
 """Step of a numerical derivative with respect to ground coordinates, relative to the half extent of the fitted area."""
 _ARRIVED = 1e-9

@@ -85,7 +85,7 @@ determinant of 1e-9 leaves six correct digits.
 
 
 class OrientationError(MeasurementError, ValueError):
-    """Readings that do not determine the requested quantities; the message says what to change."""
+    """Error for readings that do not determine the requested quantities; the message says what to change."""
 
 
 def readings(position: ArrayLike, angle: ArrayLike) -> tuple[Array, Array]:

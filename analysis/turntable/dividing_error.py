@@ -62,7 +62,9 @@ MOST_ORDER = 30
 PERIODS = (1.05, 1.1, 1.25, 1.5, 2.0)
 """Fundamental periods of the Fourier series that are tried, in lengths of the range."""
 SMOOTHINGS = (0.0, *np.logspace(-8.0, 1.0, 46))
-"""Smoothing parameters that are tried, for angles in units of the mean step and weights of mean one."""
+"""Smoothing parameters of the spline that are tried, for angles in units of the mean step and weights with a mean of
+one.
+"""
 SLACK = 1e-9
 """Tolerance, in radians, within which an angle equals that of a point."""
 GAP_ORDER = {"piecewise_linear": 2, "polynomial": 0, "cubic_spline": 4, "fourier": 0, "network": 0}

@@ -204,7 +204,7 @@ MOST_BYTES = 100_000_000
 MOST_POINTS = 20_000_000
 """Largest number of points of a map."""
 _ZEMAX_UNITS = {0: 1e-3, 1: 1e-2, 2: 25.4e-3, 3: 1.0}
-"""Metres for each unit flag of a Grid Sag file."""
+"""Size, in metres, of the unit that each unit flag of a Zemax Grid Sag file means."""
 _CODEV_NO_DATA = -32768
 """Integer value that marks missing data in CODE V files whose header does not define another by the keyword NDA."""
 _CODEV_DATA = ("WFR", "SUR", "FIL")

@@ -237,7 +237,7 @@ def explained(errors: Console, left: Callable[[], str] = no_results_kept) -> Ite
     errors : Console
         Console for the sentence.
     left : callable
-        Returns the text that says what is kept of interrupted work.
+        Function that returns the text on what is kept of interrupted work.
     """
     try:
         yield

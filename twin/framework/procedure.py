@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from twin.framework.run_folder import RunFolder
 
 Advance = Callable[[str, int, int], None]
-"""Function called with the part of the work in progress, the number of its pieces that are done, and their total."""
+"""Function called with the part of the work in progress, the number of its steps that are done, and their total."""
 
 
 WRITE = "write the run folder"

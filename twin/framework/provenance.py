@@ -319,7 +319,7 @@ def checks_in(numbers: Mapping[str, Any]) -> tuple[SelfCheck, ...]:
 
 
 def _checks(tree: Any, path: str) -> Iterator[SelfCheck]:
-    """Yield the self-checks below a path."""
+    """Yield the self-checks among nested numbers, named by their paths."""
     if isinstance(tree, Mapping):
         limit = next((float(tree[name]) for name in WITHIN if isinstance(tree.get(name), int | float)), None)
         for key, value in tree.items():

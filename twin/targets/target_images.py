@@ -326,7 +326,7 @@ _FOCUS = 1e-6
 
 
 class TargetLostError(PhysicalError):
-    """Target that cannot be imaged in this state; the message says where and why."""
+    """Error for a target that cannot be imaged in a state of the camera; the message says where and why."""
 
 
 @dataclass(frozen=True, eq=False)
