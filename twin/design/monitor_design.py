@@ -80,7 +80,7 @@ class MonitorDesignRun:
         return max(sigmas[key] for sigmas in facts.sigmas.values() for key in self.bench.goals_of(goal))
 
     def merit(self, facts: LayoutFacts) -> float:
-        """Return a layout's merit: the largest ratio of a standard deviation to its goal; 1 or less reaches all goals."""
+        """Return a layout's merit: the largest ratio of a standard deviation to its goal (1 reaches all goals)."""
         return merit(facts.sigmas, self.bench)
 
 

@@ -295,7 +295,7 @@ class _MarginModel:
         return self._margins(self.bench.values(parts))
 
     def passing(self, level: np.ndarray) -> float:
-        """Return the share of the cameras that meet all requirements, with limits at exp(level) times the present ones."""
+        """Return the share of cameras that meet all requirements, with limits at exp(level) times the present ones."""
         return float(np.mean(self._worst(self.model.parts(np.exp(level))) + self.offset <= 0.0))
 
     def quantile(self, level: np.ndarray) -> tuple[float, np.ndarray]:
@@ -363,7 +363,10 @@ class _MarginModel:
         return low
 
     def _between(self, inside: np.ndarray, outside: np.ndarray, total: np.ndarray) -> np.ndarray:
-        """Return the cheapest step reaching the required yield on the line from ``inside``, which does, to ``outside``."""
+        """Return the cheapest passing step on the line from ``inside``, which passes, to ``outside``.
+
+        A step of the limits passes if it reaches the required yield.
+        """
         best = inside
         for part in np.linspace(0.0, 1.0, 17)[1:]:
             step = inside + part * (outside - inside)

@@ -103,7 +103,7 @@ class StudySetup:
         return replace(issue, file=source.file, line=source.line(key), key=(*source.prefix, *key))
 
     def factor_at(self, place: KeyPath) -> tuple[str, KeyPath] | None:
-        """Return name and key of the factor that sets the value at ``place`` of the base job, or one above or below it."""
+        """Return name and key of the factor that sets the base job's value at ``place``, or one above or below it."""
         for name, factor in self.study.factors.items():
             scaled = [(scale.key, ("scales", k)) for k, scale in enumerate(factor.scales)]
             for changed, where in (*((p, factor.key_of(k)) for k, p in enumerate(factor.places)), *scaled):
