@@ -52,13 +52,13 @@ class Wavefront:
     Attributes
     ----------
     x, y : (N,) ndarray
-        Points of the stop in units of its radius.
+        N points of the stop in units of its radius.
     weight : (N,) ndarray
         Weights of a mean over the light, which sum to 1; negative where a shadow is subtracted.
     error : (N,) ndarray
         Wavefront error, metres, positive where the wavefront is ahead of the reference sphere.
     coefficients : (J,) ndarray
-        Coefficients of terms in Noll's order that are orthonormal over the light, metres rms: Zernike's over a clear
+        Coefficients of J terms in Noll's order that are orthonormal over the light, metres rms: Zernike's over a clear
         pupil, annular ones over a ring. Their squares and that of the residual add up to the square of ``rms``.
     rms : float
         Root mean square of the error, metres.
@@ -273,7 +273,7 @@ def mtf(
     camera : Camera
         Camera whose wavelength is used by default.
     frequency : (M,) array_like
-        Spatial frequencies, cycles per metre.
+        M spatial frequencies, cycles per metre.
     field : (float, float)
         Angles x and y of the far point, radians.
     azimuth : float

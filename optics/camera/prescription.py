@@ -157,7 +157,8 @@ class Camera:
     image_tilt : (float, float, float)
         Rotation vector of the image plane about the point where the axis meets it, radians.
     medium : {"vacuum", "air"}
-        What the camera stands in: catalogues of glasses state indices against air, which light in vacuum does not have.
+        What the camera stands in: glass catalogues give refractive indices relative to air, which differ from those in
+        vacuum.
 
     Raises
     ------

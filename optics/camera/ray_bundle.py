@@ -37,7 +37,7 @@ class LightLostError(PhysicalError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class TracedRays:
-    """Rays on the image plane of a camera.
+    """N rays on the image plane of a camera.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class TracedRays:
     path : (N,) ndarray
         Optical path from the launch points, metres.
     valid : (N,) ndarray of bool
-        Rays that meet every surface within its clear aperture; other numbers of the rest mean nothing.
+        Rays that meet every surface within its clear aperture; the other numbers of rays that do not are meaningless.
     reached : (N,) ndarray of bool
         Rays that meet every surface and are not totally reflected in glass, be they within the clear apertures or not.
     hits : (N, K, 3) ndarray
@@ -93,7 +93,7 @@ def launch_rays(camera: Camera, field: Field = (0.0, 0.0), pupil: ArrayLike | No
     field : (float, float)
         Angles x and y of the far point, radians.
     pupil : (N, 2) array_like, optional
-        Points of the stop in units of its radius; by default the 12 rings of 48 points of a quadrature.
+        N points of the stop in units of its radius; by default the 12 rings of 48 points of a quadrature.
 
     Returns
     -------
@@ -139,7 +139,7 @@ def trace(camera: Camera, position: ArrayLike, direction: ArrayLike) -> TracedRa
     camera : Camera
         Camera to trace through.
     position : (N, 3) array_like
-        Launch points before the first surface, metres, in the camera's frame.
+        N launch points before the first surface, metres, in the camera's frame.
     direction : (N, 3) or (3,) array_like
         Directions of the light; they need not have unit length.
 
@@ -151,7 +151,7 @@ def trace(camera: Camera, position: ArrayLike, direction: ArrayLike) -> TracedRa
     Raises
     ------
     ValueError
-        The shapes are others, or a number is not finite.
+        The shapes differ from these, or a number is not finite.
 
     Examples
     --------
@@ -332,7 +332,7 @@ def distortion(camera: Camera, fields: ArrayLike) -> np.ndarray:
     camera : Camera
         Camera with a focal length.
     fields : (F, 2) array_like
-        Angles x and y of far points, radians; none on the axis, where distortion is not defined.
+        Angles x and y of F far points, radians; none on the axis, where distortion is not defined.
 
     Returns
     -------

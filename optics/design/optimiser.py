@@ -1,11 +1,12 @@
 """Optimisation of a mirror prescription by constrained least squares with exact Jacobians, from one or several starts.
 
 Constraints are linearised at every step and fulfilled exactly (``optics.numerics.constrained_least_squares``), so that
-no penalty term balances image errors against constraints. A much shorter envelope is reached in steps, each from the
-one before. The result from one start is a local optimum, and another may be better; ``search`` tries several.
+no penalty term balances image errors against constraints. A much shorter envelope (the extent of all surfaces along z)
+is reached in steps, each from the one before. The result from one start is a local optimum, and another may be better;
+``search`` tries several.
 
 The first start is the prescription itself with the envelope shortened in steps, the second the same with it shortened
-at once; others are drawn at random about it, alternately in steps and at once.
+at once; others are random prescriptions about it, alternately in steps and at once.
 """
 
 from __future__ import annotations
@@ -26,7 +27,10 @@ from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 
 STEP_ITERATIONS = 4
-"""Number of iterations at each step of the envelope before the last: enough to stay near the optimum of that length."""
+"""Number of iterations at each step in which the envelope is shortened, before the last step.
+
+They are enough to stay near the optimum of that length.
+"""
 ITERATIONS = 400
 """Largest number of iterations at the last step."""
 TOLERANCE = 1e-6
@@ -430,7 +434,7 @@ class Attempt:
     Attributes
     ----------
     drawn : bool
-        True when the start was drawn at random; False when it is the prescription itself.
+        True when the start was random; False when it is the prescription itself.
     steps : int
         Number of steps of the envelope.
     design : Design, optional

@@ -138,7 +138,10 @@ def clip(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np.ndar
 
 
 def padded(polygons: np.ndarray, corners: int) -> np.ndarray:
-    """Return N polygons (N, V, D) of V corners with corners repeated until each has at least ``corners``."""
+    """Return polygons with corners repeated until each has at least ``corners``.
+
+    ``polygons`` (N, V, D) are N polygons of V corners with D columns, of which x and y come first.
+    """
     missing = corners - polygons.shape[1]
     if missing <= 0:
         return polygons
@@ -146,7 +149,10 @@ def padded(polygons: np.ndarray, corners: int) -> np.ndarray:
 
 
 def compact(polygons: np.ndarray) -> np.ndarray:
-    """Return N polygons (N, V, D) of V corners, less those that coincide, to rounding, with the corner before."""
+    """Return polygons without the corners that coincide, to rounding, with the corner before them.
+
+    ``polygons`` (N, V, D) are N polygons of V corners with D columns, of which x and y come first.
+    """
     step = polygons[..., :2] - np.roll(polygons[..., :2], 1, axis=1)
     selected = np.hypot(step[..., 0], step[..., 1]) > _COINCIDENT
     return _packed(polygons, selected)

@@ -70,7 +70,7 @@ class Polyhedron:
     Attributes
     ----------
     vertices : (V, 3) ndarray
-        Corners, metres.
+        V corners, metres.
     rings : tuple of tuple of int
         For each half-space the corners of its face, counterclockwise as seen from outside; empty when the half-space
         has no face, or none wider than ``MERGE_LENGTH``. Every edge is in two rings, once in each direction.
@@ -296,13 +296,13 @@ class SolidMesh:
     Attributes
     ----------
     vertices : (V, 3) ndarray
-        Corners.
+        V corners.
     triangles : (T, 3) ndarray
-        Corner indices of a closed mesh with outward winding.
+        Corner indices of the T triangles of a closed mesh with outward winding.
     face_of : (T,) ndarray
         Index of each triangle's face in ``Solid.faces``.
     polygons : tuple of (K, 3) ndarray
-        Corners of each face in order, counterclockwise as seen from outside; (0, 3) for a ground face that the other
+        K corners of each face in order, counterclockwise as seen from outside; (0, 3) for a ground face that the other
         faces cut off.
     """
 

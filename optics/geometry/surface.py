@@ -226,7 +226,8 @@ def level(
 ) -> tuple[Any, Any, Any, Any]:
     """Return the level function G of a surface and its gradient, on Dr.Jit arrays.
 
-    With h the sum of all terms beyond the conic and of the figure, and w = z - h(x, y), the surface is where
+    With c the curvature and k the conic constant of the surface, h the sum of all terms beyond the conic and of the
+    figure, and w = z - h(x, y), the surface is where
 
         G = w - c/2 (x^2 + y^2 + (1 + k) w^2) = 0,
 
@@ -247,7 +248,7 @@ def level(
     Returns
     -------
     tuple
-        G, metres, and its derivatives by x, y and z.
+        G, metres, and its derivatives with respect to x, y and z.
     """
     import drjit as dr
 

@@ -178,7 +178,7 @@ class PlacedBodies:
         return Pose(self.rotation[state, i].real, self.translation[state, i].real)
 
     def size(self, path: str) -> np.ndarray:
-        """Return the size of one body relative to nominal in each state, (S,) (real part)."""
+        """Return the size of one body relative to nominal in each of S states, (S,) (real part)."""
         return np.asarray(self.scale[:, self.index[path]].real)
 
 
@@ -240,7 +240,7 @@ class RigidTree:
     def place(
         self, states: Sequence[State] = ({},), step: Sequence[tuple[str, str, int]] | None = None
     ) -> PlacedBodies:
-        """Return the world poses of all bodies in each state.
+        """Return the world poses of all bodies in each of several states.
 
         Parameters
         ----------

@@ -38,7 +38,7 @@ class Polygon:
     Attributes
     ----------
     vertices : (V, 2) ndarray
-        Vertices in order, metres.
+        V vertices in order, metres.
 
     Raises
     ------
@@ -73,18 +73,18 @@ class Polygon:
     def spectrum(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
         """Return the Fourier transform of the polygon, in m^2.
 
-        The sum over the edges loses eps * perimeter / (|k| area) of the area to rounding. Because the normals of a
-        closed outline sum to 0, 1 may be subtracted from every exp * sinc; where |k| times the polygon's radius is
-        below 1 this is done (with all differences in closed form), and the loss stays at eps * perimeter * radius /
-        area down to f = 0.
+        The sum over the edges loses eps * perimeter / (|k| area) of the area to rounding, with k = 2 pi times the
+        frequency and eps the relative rounding error. Because the normals of a closed outline sum to 0, 1 may be
+        subtracted from every exp * sinc; where |k| times the polygon's radius is below 1 this is done (with all
+        differences in closed form), and the loss stays at eps * perimeter * radius / area down to f = 0.
 
         Parameters
         ----------
         fx : ndarray
             Frequencies along x, cycles/m, of at most two axes.
         fy : ndarray
-            Frequencies along y, cycles/m; they broadcast with ``fx``. A product grid, fx (C,) and fy (R, 1), is fast:
-            its complex exponentials are computed per axis.
+            Frequencies along y, cycles/m; they broadcast with ``fx``. A product grid of C by R frequencies, fx (C,) and
+            fy (R, 1), is fast: its complex exponentials are computed per axis.
 
         Returns
         -------
@@ -121,7 +121,7 @@ class Polygon:
         Parameters
         ----------
         point_map : callable
-            Map (N, 2) -> (N, 2), metres.
+            Map of N points (N, 2) -> (N, 2), metres.
         tolerance : float
             Largest distance of the new edges from the mapped ones, metres.
 
@@ -285,7 +285,7 @@ class HalfPlane:
         Parameters
         ----------
         point_map : callable
-            Map (N, 2) -> (N, 2), metres.
+            Map of N points (N, 2) -> (N, 2), metres.
         step : float
             Step along the edge and its normal over which the map is differentiated (central differences), metres.
 
@@ -319,7 +319,7 @@ class _Edges:
 
     @classmethod
     def of(cls, start: np.ndarray, orientation: float) -> _Edges:
-        """Return the edges of a closed outline from its corners (V, 2).
+        """Return the edges of a closed outline from its V corners (V, 2).
 
         ``orientation`` is +1 for counterclockwise corners, -1 for clockwise ones.
         """
@@ -392,7 +392,7 @@ def _wave_numbers(fx: np.ndarray, fy: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _polyline(
     curve: Callable[[np.ndarray], np.ndarray], spans: int, point_map: PointMap, tolerance: float
 ) -> np.ndarray:
-    """Return points (N, 2) on the image of a closed curve, close enough for chords within the tolerance (metres).
+    """Return N points (N, 2) on the image of a closed curve, close enough for chords within the tolerance (metres).
 
     ``curve`` maps the parameter 0 <= t < ``spans`` to points and is smooth between integer t. Each span is divided
     evenly into as few parts as its curvature requires; a chord's distance from the curve falls with the square of their
@@ -426,7 +426,7 @@ def _polyline(
 
 
 def _apply(point_map: PointMap, points: np.ndarray) -> np.ndarray:
-    """Return the mapped points (N, 2), after checking shape and finiteness."""
+    """Return N mapped points (N, 2), after checking shape and finiteness."""
     mapped = np.asarray(point_map(points), float)
     if mapped.shape != points.shape:
         raise ValueError(f"the map must take (N, 2) to (N, 2), but took {points.shape} to {mapped.shape}")

@@ -197,7 +197,7 @@ def fit(last: int, x: Any, y: Any, values: Any, weights: Any | None = None) -> n
     last : int
         Highest Noll index.
     x, y : (N,) array_like
-        Unit-disk coordinates.
+        Unit-disk coordinates of N points.
     values : (..., N) array_like
         Values to fit, e.g. optical path differences in metres.
     weights : (N,) array_like, optional

@@ -12,8 +12,8 @@ is the fraction that leaves the specular beam. Inside glass the components are t
 
 Sampling of lobes. d is drawn in closed form from the Harvey-Shack function h(x) = (1 + x^2)^(-g/2), x = d / l. An ABg
 lobe has l = B^(1/g) and f = A/B / (1 + x^g) = A/B h(x) rho(x), where rho = (1 + x^2)^(g/2) / (1 + x^g) lies between 1
-and 2^(g/2 - 1). So d is drawn with the power of the upper bound, and a draw is accepted with the probability rho /
-max(rho). Rejected draws, and draws outside the unit circle (no such direction exists), stay in the specular beam:
+and 2^(g/2 - 1). So a random d is drawn for the power of the upper bound, and accepted with the probability rho /
+max(rho). Rejected directions, and those outside the unit circle (no such direction exists), stay in the specular beam:
 energy is conserved for every angle of incidence without any table.
 
 Tables. A table gives f (1/sr, scattered radiance over incident irradiance) for angles of incidence t and directions

@@ -227,12 +227,12 @@ class _Model:
         return self.sample.d_constraints
 
     def solve(self, residuals: np.ndarray, constraints: np.ndarray, fraction: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the step (V,) and the Lagrange multipliers (C,) for given residuals and constraints at its start.
+        """Return the step (V,) of V variables and the multipliers (C,) of C constraints.
 
-        ``fraction`` is the fraction of the violations that the step has to remove. With R p = z - q, where R is
-        ``triangle``, p the step and q the residuals times the transpose of ``basis``, the shortest z is computed: for
-        equations by their pseudoinverse, for inequalities G z <= h by the dual problem, the y >= 0 with the smallest
-        |G^T y|^2 / 2 + h y.
+        ``residuals`` and ``constraints`` are those at the start of the step, and ``fraction`` is the fraction of the
+        violations that the step has to remove. With R p = z - q, where R is ``triangle``, p the step and q the
+        residuals times the transpose of ``basis``, the shortest z is computed: for equations by their pseudoinverse,
+        for inequalities G z <= h by the dual problem, the y >= 0 with the smallest |G^T y|^2 / 2 + h y.
         """
         low, high = self.room
         eye = np.eye(len(low))

@@ -191,7 +191,7 @@ def surviving_rays(
     names : sequence of str
         Elements in the order in which light meets them.
     position : ndarray
-        Ray positions in the world frame, metres, broadcastable to (N, 3).
+        Positions of N rays in the world frame, metres, broadcastable to (N, 3).
     direction : ndarray
         Unit directions in the world frame, broadcastable to (N, 3).
     state : State, optional

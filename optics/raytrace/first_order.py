@@ -269,13 +269,13 @@ def chief_rays(
     to_object : SystemBatch
         The same systems, continued to the first mirror.
     points : (B, M, 3) ndarray
-        Image points in the world frame, metres.
+        M image points in the world frame, metres.
     guess : ndarray
         Rough direction from the image to the last mirror, broadcastable to (B, M, 3).
     transverse : (3,) ndarray
         Direction near which the first transverse axis is taken.
     start : (ndarray, ndarray), optional
-        Parameters and Jacobian of nearby rays, as for ``aim_chief_rays``.
+        Parameters (B, M, 2) and Jacobian (B, M, 2, 2) of nearby rays, as ``aim_chief_rays`` returns them.
 
     Returns
     -------

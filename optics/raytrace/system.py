@@ -116,7 +116,7 @@ class SystemBatch:
 
     @cached_property
     def values(self) -> tuple[ElementNumbers, ...]:
-        """Numbers that the trace reads per element, each of shape (B,)."""
+        """Numbers that the trace reads per element, each of shape (B,) for B systems."""
         return map_leaves(lambda row: self.numbers[row], self.form[0])
 
     def upload(self, backend: Backend, separate: bool = False) -> UploadedSystems:

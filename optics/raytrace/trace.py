@@ -280,8 +280,8 @@ def rows(vector: Any, count: int) -> np.ndarray:
 def make_rays(backend: Backend, position: np.ndarray, direction: np.ndarray, path: np.ndarray | None = None) -> Rays:
     """Upload rays given by positions in metres and unit directions, broadcastable to each other.
 
-    Shape (N, 3) or (3,) makes rays that every system gets; (B, N, 3) makes each of B systems its own. A direction (3,)
-    is kept as one vector: a trace through conics is limited by the memory that it reads.
+    Shape (N, 3), or (3,) for one ray, makes N rays that every system gets; (B, N, 3) makes each of B systems its own. A
+    direction (3,) is kept as one vector: a trace through conics is limited by the memory that it reads.
 
     Parameters
     ----------

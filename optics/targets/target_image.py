@@ -211,7 +211,7 @@ def target_image(
     target : Target
         Target in the image plane.
     transfer : callable
-        Transfer function H; called with arrays (N,) of frequencies inside the cut-off.
+        Transfer function H; called with arrays (N,) of N frequencies inside the cut-off.
     cutoff : float
         Frequency above which H is 0, cycles/m.
     x : Grid

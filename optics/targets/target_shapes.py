@@ -1,4 +1,4 @@
-"""Test targets of optical benches as vector shapes: knife edge, bar group, star, pinhole; those of a camera's windows.
+"""Test targets as vector shapes: knife edge, bar group, star, pinhole, and those of a camera's windows.
 
 A target lies in its own plane, in metres about the origin. ``Target.mapped`` maps it into an image plane, where columns
 count along x and rows along y. Levels are transmittances, 0 to 1.
@@ -44,7 +44,7 @@ class Target:
                 raise ValueError(f"transmittances of a target lie between 0 and 1, found {level}")
 
     def mapped(self, point_map: PointMap, tolerance: float = BEND_TOLERANCE) -> Target:
-        """Return the target under a smooth map of points (N, 2) -> (N, 2), metres, such as a camera's chief rays.
+        """Return the target under a smooth map of N points (N, 2) -> (N, 2), metres, such as a camera's chief rays.
 
         Parameters
         ----------

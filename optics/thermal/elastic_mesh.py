@@ -238,7 +238,10 @@ _Edges = list[tuple[int, int]]
 
 
 def _separated(points: np.ndarray, least: float) -> np.ndarray:
-    """Return those of P points (P, 3) that are farther than ``least`` metres from all selected before, (K, 3)."""
+    """Return those of P points (P, 3) that are farther than ``least`` metres from all those selected before.
+
+    The result (K, 3) holds K points.
+    """
     selected: list[np.ndarray] = []
     for point in points:
         if all(np.linalg.norm(point - other) > least for other in selected):

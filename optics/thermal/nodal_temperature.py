@@ -39,7 +39,7 @@ class _Interpolator:
     Parameters
     ----------
     nodes : (N, 3) ndarray
-        Nodes, with extents of about 1.
+        N nodes, with extents of about 1.
     values : (N,) ndarray
         Values at the nodes.
 
@@ -119,7 +119,7 @@ class NodalTemperature:
         Parameters
         ----------
         points : (N, 3) array_like
-            Nodes, metres.
+            N nodes, metres.
         values : (N,) array_like
             Change of temperature at the nodes, kelvin.
 

@@ -82,7 +82,7 @@ class Formula:
     Attributes
     ----------
     field : callable
-        Points (P, 3) in metres -> displacements (P, 3) in metres.
+        P points (P, 3) in metres -> displacements (P, 3) in metres.
     """
 
     field: Callable[[np.ndarray], np.ndarray]

@@ -156,7 +156,7 @@ class PupilField:
         return PupilField(self.u[piece], self.v[piece], self.eikonal[piece], self.amplitude[piece], self.wavelength)
 
     def scaled_by(self, size: np.ndarray) -> PupilField:
-        """Return the field in coordinates x / size, y / size: those of pixels scaled by ``size``, (B,), per image.
+        """Return the field in coordinates x / size, y / size: those of pixels scaled by ``size``, (B,), in B images.
 
         Phases u x + v y stay, and so does the power: an image is then photons per area of the nominal pixels.
         """
@@ -388,7 +388,7 @@ all.
 
 
 def _waves(frequency: np.ndarray, grid: Grid, factor: np.ndarray | float, kind: type) -> np.ndarray:
-    """Return factor * exp(i frequency * point) for frequencies (..., N), rad/m, on a grid: (..., N, count).
+    """Return factor * exp(i frequency * point) for N frequencies (..., N), rad/m, on a grid: (..., N, count).
 
     Built by doubling: the wave at a point m steps from the first is the wave at the first times exp(i frequency m
     step), with m = 1, 2, 4, ... from one phasor that is squared in double precision. Each sample is a product of at

@@ -223,8 +223,8 @@ def outlines_on_stop(
     Parameters
     ----------
     positions : (B, N, 2) ndarray
-        Intersections of the rays through ``nodes`` with the surface, in its own x and y, metres; also of rays that
-        edges block.
+        Intersections of N rays through ``nodes`` with the surface, in its own x and y, metres; also of rays that edges
+        block.
     edges : sequence of Edge
         Edges of the surface; light passes where all let it.
     nodes : PupilNodes
@@ -282,7 +282,11 @@ def outlines_on_stop(
 
 
 def _passes_all(edge: Edge, around: np.ndarray, bright: np.ndarray) -> bool:
-    """Return True for a clear edge without a hole that passes all illuminated positions (B, N, 2)."""
+    """Return True for a clear edge without a hole that passes all illuminated rays.
+
+    ``around`` (B, N, 2) are positions of N rays in B images near the edge, and ``bright`` is the mask of illuminated
+    rays.
+    """
     if edge.blocks or (isinstance(edge.shape, Circle) and edge.shape.inner):
         return False
     return bool(np.all(edge.passes(around[..., 0], around[..., 1]), where=bright))

@@ -62,7 +62,7 @@ def path_to_sphere(
     Parameters
     ----------
     position : (..., N, 3) ndarray
-        Points of the rays near the image, metres.
+        Points of N rays near the image, metres.
     direction : (..., N, 3) ndarray
         Unit directions there.
     path : (..., N) ndarray
@@ -115,7 +115,7 @@ def fit_wavefront(
     Parameters
     ----------
     x, y : (N,) ndarray
-        Pupil coordinates on the unit disk.
+        Pupil coordinates of N rays on the unit disk.
     weight : (N,) ndarray
         Quadrature weights.
     difference : (..., N) ndarray
@@ -146,7 +146,7 @@ def orthonormal_parts(
     Parameters
     ----------
     x, y : (N,) ndarray
-        Pupil coordinates on the unit disk.
+        Pupil coordinates of N rays on the unit disk.
     weight : (N,) ndarray
         Quadrature weights over the illuminated part; 0 where there is no light.
     difference : (N,) ndarray
@@ -202,7 +202,7 @@ def fit_part(x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.nd
     Parameters
     ----------
     x, y : (N,) ndarray
-        Pupil coordinates near the unit disk.
+        Pupil coordinates of N rays near the unit disk.
     weight : (N,) ndarray
         Area weights, with a positive sum.
     difference : (N,) ndarray
@@ -270,7 +270,7 @@ def aim_collimated(
     launch : (3,) or (B, 3) ndarray
         World point of the beam before the first mirror, metres; rays start on the plane wavefront through it.
     target : (N, 2) or (B, N, 2) ndarray
-        Stop coordinates, common or of each system, metres at its nominal size.
+        Stop coordinates of N rays, common or of each system, metres at its nominal size.
     first : (3,) ndarray, optional
         World vector near which the first axis of the wavefront lies, not along the beam; by default the coordinate axis
         least aligned with it, which is not the same for all directions.
@@ -361,7 +361,8 @@ def imaging_rays(
     nodes : PupilNodes
         N nodes of a quadrature over the unit disk.
     first : (3,) ndarray, optional
-        World vector near which the first axis of the wavefront lies, as for ``aim_collimated``.
+        World vector near which the first axis of the wavefront lies; by default the coordinate axis least aligned with
+        the beam.
 
     Raises
     ------

@@ -137,7 +137,7 @@ def vignetted_pupils(
     pupils : sequence of PupilFunction
         B pupils without shadows.
     u, v : (B, N) ndarray
-        Direction cosines along the detector's two axes at nodes of the stop.
+        Direction cosines along the detector's two axes at N nodes of the stop.
     nodes : PupilNodes
         Nodes of the stop.
     outlines : StopOutlines

@@ -383,8 +383,8 @@ class TransferTable:
         Raises
         ------
         ValueError
-            Arguments are invalid as for ``polychromatic_transfer``, or the wavefront has so many waves that the table
-            would become too large.
+            A number is not finite or not positive, weights are negative or all zero, or the wavefront has so many waves
+            that the table would become too large.
         """
         wavelengths, share = _band(wavelengths, weights)
         wavelengths, share = wavelengths[share > 0.0], share[share > 0.0]

@@ -525,10 +525,10 @@ def quadrature_within(polygons: np.ndarray, radius: np.ndarray, count: int) -> t
 
 
 def _selected(pairs: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the selected pairs of points of N boundaries, packed as (2, N, W), and the mask (N, W) of valid ones.
+    """Return the selected pairs of points of N boundaries, packed, and the mask (N, W) of valid ones.
 
-    ``pairs`` (2, N, V) are V pairs per boundary, and ``mask`` (N, V) selects among them. In the padding both points of
-    a pair coincide.
+    ``pairs`` (2, N, V) are V pairs per boundary, and ``mask`` (N, V) selects up to W of them, which are returned as (2,
+    N, W). In the padding both points of a pair coincide.
     """
     counts = np.sum(mask, axis=1)
     width = max(int(np.max(counts, initial=0)), 1)

@@ -239,7 +239,7 @@ class PupilStack:
         wavelength : float
             Wavelength, metres.
         shadows : (B, K, V, 2) ndarray, optional
-            K polygons of V corners on the stop's unit disk that do not overlap; None for none.
+            K polygons of V corners on the stop's unit disk that do not overlap; None without shadows.
         bright : (B, N) ndarray of bool
             Mask of the nodes outside the shadows; the values of the others are ignored.
         """

@@ -199,7 +199,7 @@ class PupilEdge:
             )
 
     def boundary(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return complex edge points at angles (radians) of the stop's rim, and their derivatives by the angle.
+        """Return complex edge points at angles (radians) of the stop's rim, and their derivatives (per radian).
 
         They have the angles' shape; for S edges (S, ...).
         """

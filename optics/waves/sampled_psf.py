@@ -24,12 +24,12 @@ def encircled_energy(
     Parameters
     ----------
     psf : (R, C) array_like
-        Irradiance per area: rows along y, columns along x. If it integrates to 1, as that of `psf` does over the whole
-        plane, energies are shares of all light; else divide by the total.
+        Samples of the irradiance, 1/m^2: R rows along y, C columns along x. If it integrates to 1, as that of `psf`
+        does over the whole plane, energies are shares of all light; else divide by the total.
     step : float
         Distance between samples, metres.
     radius : (M,) array_like
-        Radii of the circles, metres.
+        Radii of M circles, metres.
     centre : (float, float), optional
         Centre x, y from the middle of the grid, metres; by default the centroid of the samples.
 
@@ -45,8 +45,8 @@ def encircled_energy(
 
     Notes
     -----
-    The Fourier series of the samples is integrated over the disk exactly: a disk of radius r has the transform
-    r J1(2 pi f r) / f. No pixel is cut by the circle.
+    The Fourier series of the samples is integrated over the disk exactly: a disk of radius r has the transform r J1(2
+    pi f r) / f. No pixel is cut by the circle.
 
     Examples
     --------
@@ -86,14 +86,14 @@ def mtf_from_psf(psf: ArrayLike, step: float) -> tuple[np.ndarray, np.ndarray, n
     Parameters
     ----------
     psf : (R, C) array_like
-        Irradiance: rows along y, columns along x.
+        Irradiance: R rows along y, C columns along x.
     step : float
         Distance between samples, metres.
 
     Returns
     -------
     frequency : (M,) ndarray
-        Frequencies from 0 to half the sampling frequency, cycles per metre.
+        M frequencies from 0 to half the sampling frequency, cycles per metre.
     along_x, along_y : (M,) ndarray
         Modulation of patterns that vary along x and along y, 1 at zero frequency.
 
