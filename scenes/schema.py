@@ -166,7 +166,7 @@ def write_schemas(folder: Path, instruments: Mapping[str, Mapping[str, NodeInfo]
     folder : Path
         Folder to write into.
     instruments : Mapping[str, Mapping[str, NodeInfo]]
-        Instruments whose nodes the schema of jobs lists, as for ``with_nodes``.
+        Instruments whose nodes the schema of jobs lists.
 
     Raises
     ------

@@ -158,7 +158,10 @@ def _difference(traced: np.ndarray, stated: float) -> float:
 
 
 def _cause(spec: CameraSpec, traced: float, focal_lengths: FocalLengths, place: bool) -> tuple[str, str | None]:
-    """Return the likely mistake, in words and as the corrected line of the file; an empty text if none is found."""
+    """Return the likely mistake as a sentence and as the corrected line of the file.
+
+    The sentence is empty if no single mistake explains the difference.
+    """
     for factor, what in _UNITS:
         if abs(factor * traced / spec.focal_length - 1.0) <= LARGEST_DIFFERENCE:
             right = format_quantity(spec.focal_length / factor, LENGTH)
@@ -840,7 +843,10 @@ def _chief(
 
 
 def _derived(spec: CameraSpec, backend: Backend, check_stated: bool) -> CameraModel:
-    """Return the model of a camera, as `derive_camera` does, but raise the errors of the ray trace unchanged."""
+    """Trace a prescription and return its camera model; errors of the ray trace are raised unchanged.
+
+    `derive_camera` reports them as input errors.
+    """
     surfaces = {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}
     names = tuple(spec.mirrors)
     bare = _bare(spec, surfaces, {})

@@ -102,7 +102,7 @@ class Component:
 
     @property
     def name(self) -> str:
-        """Name of the component as in ``correlations``: ``base/forward/M2 shift z``."""
+        """Name of the component in a disturbances file, such as ``base/forward/M2 shift z``."""
         return f"{self.body} {self.what}"
 
     @property

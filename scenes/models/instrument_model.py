@@ -110,7 +110,7 @@ class MisplacedError(PhysicalError, ValueError):
     key : KeyPath
         Key of the file to change, in its form for all channels.
     remedy : str
-        Value to choose there, in words.
+        Advice on the value to choose there.
     channel : tuple[str, str] or None
         Camera and name of the channel concerned, whose own key takes precedence; None if no single channel is.
     """

@@ -97,7 +97,7 @@ class HeatedBody:
     coverage : Coverage or None
         Coverage of the body by the nodes; None for a body without finite elements.
     faces : Mapping[str, HeatedFace]
-        Body of each optical face -> change by the residual.
+        Body of each optical face -> its change due to the residual temperatures.
     index_path : float
         Largest optical path that the index change of the residual may cause, in metres; 0 for bodies that are not
         glass.

@@ -223,7 +223,7 @@ class TemperatureError(PhysicalError, ValueError):
     origin
         Path of the body whose temperature was specified (bodies that it carries inherit it).
     allowed
-        Allowed values, in words.
+        Text of the allowed values.
     """
 
     def __init__(self, problem: str, origin: str, allowed: str) -> None:

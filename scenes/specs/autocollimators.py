@@ -143,7 +143,7 @@ class StandSpec(Spec):
 
 
 class ProgrammeSpec(Spec):
-    """Programme of rotations of the turntable, of which the autocollimators take readings.
+    """Programme of rotations of the turntable, between which the autocollimators take readings.
 
     Attributes
     ----------

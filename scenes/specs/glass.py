@@ -126,7 +126,8 @@ class LensGlassSpec(Spec):
         wavelength : float
             Wavelength, in metres.
         medium : {'vacuum', 'air'}
-            Medium to which the index refers, as in ``index``. The medium itself is not heated.
+            Medium to which the index refers: ``air`` of 20 C and 1013 hPa, or ``vacuum``. The medium itself is not
+            heated.
 
         Raises
         ------

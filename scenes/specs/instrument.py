@@ -125,7 +125,7 @@ GlassName = Annotated[str, Field(strict=True), name_in("glass", GLASSES, glass)]
 
 
 MadeOf = Annotated[str, Field(strict=True), Catalogued(lambda name: _spelt(name), MATERIALS)]
-"""Name of a glass, or of the material of a frame that carries mirrors; see ``check_made``."""
+"""Name of a glass, or of the material of a frame that carries mirrors, which kinds without glass allow."""
 
 
 def _spelt(name: str) -> str:
@@ -769,7 +769,7 @@ def as_built_file(
     Raises
     ------
     ValueError
-        The state cannot be expressed, as in ``as_built_of``.
+        A motion has a scale, a stretch, an index gradient or a grid, which the file cannot express.
     """
     spec = AsBuiltInstrumentSpec.model_construct(
         name=name, description=description, design=name, as_built=as_built_of(state), disturbances=disturbances

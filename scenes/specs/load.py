@@ -312,7 +312,7 @@ def load_named(
     folder : str
         Folder of the library, for a name.
     reference : str | Path
-        Reference as in `load_instrument`.
+        Name in the library, path, or the mapping itself.
     owner : Spec | None
         Specification that has the reference.
     key : KeyPath
@@ -321,7 +321,7 @@ def load_named(
     Raises
     ------
     InputError
-        The file is missing or invalid, as in `load_instrument`.
+        The file is missing or invalid.
     """
     return validate(model, read_reference(folder, reference, owner, key))
 

@@ -211,7 +211,7 @@ def per_channel(files: Any, channel: str) -> tuple[str, ...]:
 
     Parameters
     ----------
-    files : Any
+    files : Mapping[str, tuple[str, ...]] or None
         Channel -> files; None for no files.
     channel : str
         Name of the channel.

@@ -153,9 +153,9 @@ def put(keys: dict[str, Any], kind: str, axis: str, value: Any, nothing: Any) ->
         Kind of the perturbation, one of ``KINDS``.
     axis : str
         ``x``, ``y`` or ``z``, a figure's term, or empty.
-    value : Any
+    value : str or float
         Value of the component.
-    nothing : Any
+    nothing : str or float
         Value of the other components of a vector, if they are not set.
     """
     *above, last = key_below(kind, axis)

@@ -177,7 +177,7 @@ def resolve_on(owner: Spec, instrument: str, disturbances: Any = None) -> Resolv
         File with the keys `instrument` and `disturbances`.
     instrument : str
         Reference to the instrument.
-    disturbances : Any
+    disturbances : str, mapping or None
         Reference to the disturbances, as in a job; None for the instrument's.
 
     Raises

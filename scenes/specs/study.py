@@ -187,9 +187,9 @@ class TableSpec(Spec):
 
 
 class ScaleSpec(Spec):
-    """Number in the base that a factor scales: it is multiplied by a power of factor / factor in the base.
+    """Number in the base that is multiplied by a power of the ratio of a factor to its base value.
 
-    The scaled number is that of the base, or the one set by another factor. Several factors may scale one number.
+    The number is that of the base, or the one set by another factor. Several factors may scale one number.
 
     Attributes
     ----------

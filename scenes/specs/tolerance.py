@@ -88,7 +88,7 @@ class Varied(Spec):
         Raises
         ------
         Problem
-            The amount has another unit than the motion's, or is not greater than zero where it has to be.
+            The unit of the amount is not one of the motion, or the amount must be greater than zero and is not.
         """
         kind = self.parts[1]
         try:

@@ -216,7 +216,7 @@ def rows_apart(path: str | Path, most: int) -> list[tuple[int, list[str] | str]]
     Parameters
     ----------
     path : str or Path
-        Path of the file, as for `read_table`.
+        Path of the file: UTF-8 text with commas, semicolons or tabs between the cells.
     most : int
         Largest size, in bytes.
 
@@ -285,7 +285,7 @@ def rows_of(path: str | Path, most: int) -> list[tuple[int, list[str]]]:
     Parameters
     ----------
     path : str | Path
-        Path of the file, as for ``read_table``.
+        Path of the file: UTF-8 text with commas, semicolons or tabs between the cells.
     most : int
         Largest size, in bytes.
 

@@ -350,8 +350,8 @@ class TitledSpec(Spec):
         ----------
         remark : str
             Lines of the comment.
-        others : Any
-            Plain data that replace the values of keys.
+        others : keyword arguments
+            Keys of the file with other values, as plain data.
         """
         head = "".join(f"# {line}\n" for line in remark.splitlines())
         plain = {**self.plain(), **others}
@@ -407,7 +407,7 @@ def short_for(key: str | None, *types: type, schema: Any = PydanticUndefined) ->
         Key for which the value is short; None for a list that holds the value.
     types : type
         Types of a value that is a short form.
-    schema : Any
+    schema : type
         Type that the JSON Schema shows to editors; by default the long form.
     """
 

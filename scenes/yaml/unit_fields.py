@@ -53,7 +53,7 @@ class Quantity:
 
     @cached_property
     def limits(self) -> str:
-        """Limits in words, for messages and JSON Schema."""
+        """Text of the limits, for messages and JSON Schema."""
         parts = []
         if self.above_zero:
             parts.append("greater than zero")

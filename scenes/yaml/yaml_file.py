@@ -71,7 +71,7 @@ class YamlFile:
     prefix: KeyPath = ()
 
     def part(self, *key: str | int) -> "YamlFile":
-        """Return the part of the file at an existing key; its faults are reported at their lines of the whole file."""
+        """Return the part of the file below an existing key; its faults are reported with lines of the whole file."""
         data = self.data
         for name in key:
             data = data[name]
@@ -92,7 +92,13 @@ def read_yaml(path: str | Path) -> YamlFile:
 
 
 def parse_yaml(text: str, file: str = "") -> YamlFile:
-    """Read YAML from text; `file` is its name in error messages. Raises InputError as `read_yaml` does."""
+    """Return the data and lines of YAML text; `file` is its name in error messages.
+
+    Raises
+    ------
+    InputError
+        The text is not YAML of the supported subset, or is too large or too deeply nested.
+    """
     data, lines = (_read_cached if len(text) <= LONGEST_CACHED else _read)(text, file)
     return YamlFile(file, _copied(data), dict(lines))
 

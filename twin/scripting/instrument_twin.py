@@ -294,7 +294,7 @@ class InstrumentTwin:
             Number of frames of each exposure; by default that of the job or the instrument.
         seed : int or None
             Seed of all noise; by default that of the job (1 unless it sets another).
-        render : Any
+        render : keyword arguments
             Further keys of `render:` in a job's YAML, such as ``stray=True``, ``quality=True`` or ``images=["spots",
             "knife_edge"]``.
 

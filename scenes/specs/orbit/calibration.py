@@ -231,7 +231,7 @@ class CalibrationErrorsSpec(ErrorsSpec):
 
 
 class LaunchSpec(Spec):
-    """Prior of the change by the launch, as standard deviations.
+    """Prior standard deviations of the changes due to the launch.
 
     The adjustment uses it only for parameters that the points determine less well. An estimate far beyond it indicates
     wrong ground coordinates or a wrong camera file, which the fit alone does not show.
@@ -321,7 +321,7 @@ class OrbitCalibrationSpec(TitledSpec):
     strip : StripSpec | None
         Strip adjustment of every pass on tie points; by default there is none.
     launch : LaunchSpec
-        Prior of the change by the launch.
+        Prior standard deviations of the changes due to the launch.
     limits : MapLimitsSpec
         Largest RMS errors for the verdict.
     repeats : int

@@ -118,8 +118,8 @@ class AttitudeFileSpec(Spec):
     scalar : {'last', 'first'} | None
         Position of a quaternion's scalar part, the cosine of half the rotation angle.
     turns : {'body_to_frame', 'frame_to_body'} | None
-        Sense of the quaternion q: whether v' = q v q* transforms the components of a vector v from body axes to the
-        frame, or from the frame to body axes.
+        Sense of the quaternion q: v' = q v q* transforms the components of a vector v from body axes to the frame
+        (`body_to_frame`), or from the frame to body axes (`frame_to_body`).
     body_axes : tuple[str, str, str]
         Directions of the file's body x, y and z in flight, as [forward, right, down].
     sequence : {'xyz', 'xzy', 'yxz', 'yzx', 'zxy', 'zyx'} | None
@@ -282,8 +282,8 @@ class QuaternionSpec(Spec):
     scalar : {'first', 'last'}
         Position of the scalar part (the cosine of half the rotation angle) among the four.
     turns : {'body_to_frame', 'frame_to_body'}
-        Sense of the quaternion q: whether v' = q v q* transforms the components of a vector v from body axes to the
-        frame, or from the frame to body axes.
+        Sense of the quaternion q: v' = q v q* transforms the components of a vector v from body axes to the frame
+        (`body_to_frame`), or from the frame to body axes (`frame_to_body`).
     """
 
     scalar: Literal["first", "last"]
@@ -525,7 +525,7 @@ class MeasuredCalibrationSpec(MeasuredTestSpec):
     strip : bool
         True to adjust every pass on its tie points before check points are intersected.
     launch : LaunchSpec
-        Prior of the change by the launch.
+        Prior standard deviations of the changes due to the launch.
     limits : MapLimitsSpec
         Largest RMS errors for the verdict.
     """

@@ -66,7 +66,7 @@ class MotionSpec(Spec):
     duration : float
         Duration of the linear growth to `rotate` and `shift`, in seconds; 0 for a step.
     period : float | None
-        Period of an oscillation `rotate` x sin(2 pi (t - begin)/period) at all times, instead of `duration`, in
+        Period of an oscillation `rotate` x sin(2 pi (t - begin)/period) at all times t, instead of `duration`, in
         seconds.
     """
 
