@@ -134,7 +134,7 @@ class CameraRun:
     without_mtf : str
         Reason why there is no MTF; empty where there is one.
     field : (A, B, 2) ndarray
-        Fields of the map of wavefront errors, A along the line and B along the track.
+        Fields of the map of wavefront errors: A fields along the line and B along the track.
     errors : (A, B) ndarray
         Rms wavefront errors of the map, waves.
     distortion : Distortion

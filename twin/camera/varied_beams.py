@@ -233,7 +233,10 @@ class VariedBeams:
         return [in_glass(state, steps) for state in states for steps in self._glass]
 
     def _owners(self, count: int) -> np.ndarray:
-        """Return the index of the state and wavelength of each beam for S = ``count`` states, (S * K * F,)."""
+        """Return the index of the state and wavelength of each beam, (S * K * F,).
+
+        There are S = ``count`` states, K wavelengths and F fields.
+        """
         return np.repeat(np.arange(count * len(self._glass)), len(self.fields))
 
     def _fan_for(self, count: int) -> RayFan:

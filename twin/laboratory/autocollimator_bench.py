@@ -695,7 +695,7 @@ def declared_spread(
     series : Series
         Series of the experiment.
     image_sigma : float
-        Standard deviation of one reading by image noise, radians.
+        Standard deviation of one reading due to image noise, radians.
     draws : int
         Number of drawn benches.
     seed : int

@@ -101,7 +101,8 @@ class PinholeImages:
         state : State
             State of the camera.
         directions : callable
-            Function from rotations of the camera (M,), radians, to directions of the light (M, 3) in the world frame.
+            Function from M rotations of the camera, (M,), radians, to directions of the light, (M, 3), in the world
+            frame.
         half_field : float
             Largest rotation of the camera to either side, radians.
         target : Target
@@ -294,7 +295,7 @@ class DistortionBench:
     images : PinholeImages
         Images of the pinhole.
     field_angle : (N,) ndarray
-        Nominal field angles W of the points, radians, increasing.
+        Nominal field angles W of the N points, radians, increasing.
     centre_direction : (3,) ndarray
         Direction of the light that is imaged to the middle of the line.
     design_offset : (N,) ndarray

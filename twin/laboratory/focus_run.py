@@ -114,7 +114,7 @@ class SimulatedState(FocusState):
     focus : tuple of NyquistMtf
         MTF of the sites with the target at the collimator's focus; empty when it was not measured.
     true_defocus : (N,) ndarray
-        True defocus of the CCDs, metres, positive downstream of best focus.
+        True defocus of the CCDs at the N sites, metres, positive downstream of best focus.
     true_level : float
         True rotation of the line about Z', radians.
     shims : Shimming or None

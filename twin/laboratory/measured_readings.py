@@ -108,7 +108,7 @@ class Comparisons:
     series : CalibrationSeries
         Series for the analysis.
     lines : (N, repeats) ndarray of int
-        Line of each comparison in the file; 0 where none was made.
+        Line in the file of each comparison at N readings; 0 where none was made.
     file : DataFile
         File that holds the series.
     head : str

@@ -58,7 +58,7 @@ class Harmonics:
     Attributes
     ----------
     order : (K,) ndarray of int
-        Periods in a full turn, k.
+        Numbers k of periods in a full turn, for K harmonics.
     cosine, sine : (K,) ndarray
         Coefficients, radians.
     """

@@ -162,7 +162,7 @@ def sample_bsdf(
     floor : Dr.Jit array
         Smallest probability of drawing from a lobe that exists.
     near : Dr.Jit array
-        Share of the directions that are drawn with ``near_distance``, None for none.
+        Share of the directions that are drawn with ``near_distance``; None if none are.
     leaving : OutgoingPaths
         Paths as they would continue without scattering.
     drawn : TableSampling or None
@@ -170,7 +170,7 @@ def sample_bsdf(
 
     Returns
     -------
-    tuple of (Any, Any, Any, Any)
+    tuple of (Dr.Jit Vector3, Dr.Jit array, Dr.Jit array, Dr.Jit random generator)
         Direction, event, weight and random generator.
     """
     import drjit as dr

@@ -86,7 +86,7 @@ class Limits:
         Smallest probability of each possible direction after none, one, and more unlikely ones; 0: proportional to
         power.
     scatter_floors : sequence of Dr.Jit arrays
-        Smallest probability of drawing a direction from a scatter lobe, likewise.
+        Smallest probability of drawing a direction from a scatter lobe, after none, one, and more unlikely ones.
     near : Dr.Jit array
         Share of these directions that are drawn close to the specular one.
     weak : Dr.Jit array
@@ -116,11 +116,11 @@ class Launch:
     rng : Dr.Jit random generator
         Random generator of the path.
     segment : Dr.Jit array
-        Row of the clear segment that it is on, 0 for none.
+        Index of the clear segment that it is on; 0 if it is on none.
     length : Dr.Jit array
-        Optical path so far, metres.
+        Optical path length so far, metres.
     body : Dr.Jit array
-        Number of the glass body that it is in, 0 for none.
+        Number of the glass body that it is in; 0 outside of glass.
     ahead : Dr.Jit array
         Distance ahead at which the search for the next surface starts, metres.
     signature : Dr.Jit array
@@ -332,7 +332,7 @@ class Shares:
         Refractive index before over that behind, and cosine of the angle of refraction, 0 for total reflection; None
         without glass.
     marks : sequence of Dr.Jit arrays
-        Marks of measured finishes, see ``tables.MARKS``.
+        Numbers of the tables of measured surface finishes, see ``tables.MARKS``.
     """
 
     reflected: Any

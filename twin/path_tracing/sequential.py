@@ -475,7 +475,7 @@ class Departures:
         stretch : NominalPart
             Paths.
         numbers : (N,) ndarray
-            Numbers of the paths in the run.
+            Numbers of the N paths in the run.
         learned : LearnedRoulette or None
             Russian roulette, None to follow all paths.
         again : bool

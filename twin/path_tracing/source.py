@@ -75,7 +75,7 @@ class DiskSource:
         Parameters
         ----------
         directions : (N, 3) ndarray
-            Unit vectors.
+            The N directions, unit vectors.
         room : float
             Radius of the narrow cone relative to the smallest one about their middle.
         share : float
@@ -164,7 +164,7 @@ def start(backend: Backend, source: Source, chosen: np.ndarray, total: int, seed
     source : Source
         Source of the paths.
     chosen : (N,) ndarray
-        Numbers of the paths in the run.
+        Numbers of the N paths in the run.
     total : int
         Number of paths of the run.
     seed : int

@@ -186,7 +186,7 @@ def trace_stray(
     channels : Sequence[Channel] or None
         Channels whose sources emit; all by default.
     finishes : Finishes or None
-        Finishes of the surfaces.
+        Surface finishes (scatter, coatings); None uses the built-in ones.
     baffles : Iterable[Plate]
         Baffles of the scene.
     sampling : Sampling
@@ -326,9 +326,9 @@ def stray_light(
     seed : int
         Seed of the random numbers.
     progress : callable or None
-        Called with the number of paths done and of all.
+        Called with the number of paths done and the number of all.
     finishes : Finishes or None
-        Finishes of the surfaces, None for the built-in ones.
+        Surface finishes (scatter, coatings); None uses the built-in ones.
 
     Raises
     ------

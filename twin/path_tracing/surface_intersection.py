@@ -49,7 +49,7 @@ class Flight:
     coherent : Dr.Jit mask
         Mask of the paths that follow their neighbours.
     segment : Dr.Jit array
-        Row of the clear segment of each path, 0 for none.
+        Index of the clear segment of each path; 0 if it is on none.
     segments : bool
         The scene has clear segments.
     """
@@ -79,7 +79,7 @@ class NextSurface:
     expected : Dr.Jit mask
         Mask of the paths that are only expected to meet it, by their clear segment.
     segment : list of Dr.Jit arrays
-        Row of the segment after it, and code of its end, see ``tables.segment_table``.
+        Index of the segment after it, and code of its end, see ``tables.segment_table``.
     """
 
     near: Any
@@ -186,7 +186,7 @@ class Intersection:
     kind : Dr.Jit array
         Bits of the surface's kind.
     row : list of Dr.Jit arrays
-        Numbers of its geometry.
+        Numbers that describe the surface in the geometry table.
     """
 
     distance: Any

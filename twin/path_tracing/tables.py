@@ -1,4 +1,7 @@
-"""Numbers of the prescription and measured finishes, as flat tables in the backend's memory that each path reads."""
+"""Numbers of the prescription and of measured surface finishes, as flat tables in the backend's memory.
+
+Each path reads the numbers of the surfaces that it meets.
+"""
 
 from __future__ import annotations
 
@@ -321,7 +324,7 @@ class SceneTables:
     grids, samples : Dr.Jit array
         (surfaces * GRID_ROW) numbers of grid figures, and the coefficients of all; width 1 if there are none.
     finishes : Dr.Jit array
-        (surfaces * 3 * FINISH_ROW) finishes.
+        (surfaces * 3 * FINISH_ROW) surface finishes.
     planes : Dr.Jit array
         (surfaces * 4) world normal and offset of flat faces.
     body_first, body_faces : Dr.Jit array

@@ -337,7 +337,10 @@ def _state(test: Spec, files: tuple[str, ...], offset: Shape, key: KeyPath) -> S
 
 
 def _stacked(test: Spec, files: tuple[str, ...], key: KeyPath) -> np.ndarray:
-    """Return N frames of all files in order, (N, H, W), in an unnamed temporary file if they are many."""
+    """Return the N frames of all files in order, each H rows by W columns, (N, H, W).
+
+    Many frames are kept in an unnamed temporary file.
+    """
     images = [_opened(test, file, key) for file in files]
     stack: np.ndarray | None = None
     count = unreleased = 0

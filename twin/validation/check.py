@@ -411,7 +411,7 @@ class Check(Spec):
         Distance of the nearest alternative statement from this one, in the unit of the row; if tolerance plus noise
         exceed it, the row confirms nothing. None only if nothing can be compared.
     against : str
-        The alternative statement, a phrase that continues "told from".
+        The alternative statement, a phrase that completes "distinguished from".
     basis : {"printed", "chosen", "theory"}
         Basis of agreement, see AGREED; for ``chosen`` the inputs are passed to `evaluate`.
     theory : str

@@ -289,7 +289,7 @@ def _row(result: CheckResult) -> tuple[Marked, ...]:
 
 
 def _typeset(text: str) -> str:
-    """Return text with minus signs in place of hyphens before numbers."""
+    """Return text with minus signs instead of hyphens before numbers."""
     return re.sub(r"(?<![\w.,-])-(?=[\d.])|(?<=\de)-(?=\d)", "\N{MINUS SIGN}", text)
 
 

@@ -222,7 +222,10 @@ def centroid_scatter(budget: ErrorBudget, groups: int) -> tuple[tuple[float, flo
 
 
 def _positions(budget: ErrorBudget, images: np.ndarray, frames: int) -> np.ndarray:
-    """Return energy centroids of N images for each of C channels, (N, C, 2), from images (C, N, H, W), in pixels."""
+    """Return energy centroids of N images for each of C channels, (N, C, 2), in pixels.
+
+    The images are (C, N, H, W), of H rows and W columns.
+    """
     count, spots = images.shape[1], images.shape[0]
     flat = np.swapaxes(images, 0, 1).reshape(-1, *images.shape[2:]).astype(np.float64)
     with one_blas_thread():

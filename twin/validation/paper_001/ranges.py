@@ -317,9 +317,9 @@ class Range(Domain):
     sign : int
         +1 or -1.
     raw : mapping of str to ndarray
-        Error over the true change from images, (N, 2), by form, for the figure.
+        Set of formulas -> N pairs of true change and error from images, (N, 2), for the figure.
     raw_traced : mapping of str to ndarray
-        Traced values of the same.
+        Pairs of true change and error from the ray trace, as ``raw``.
     trace_gap : float
         Largest difference of a traced spot shift from the rendered one, in pixels.
     """
@@ -424,7 +424,7 @@ def single_range(bench: Bench, wide: Bench, parameter: str, sign: int, count: in
 
 
 def _joined(parts: Mapping[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return set of formulas -> (N, 2) errors over the N changes, ascending in the change."""
+    """Return set of formulas -> N pairs of true change and error, (N, 2), ascending in the change."""
     out = {}
     for form, pieces in parts.items():
         joined = np.concatenate(pieces)

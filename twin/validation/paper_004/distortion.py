@@ -87,7 +87,7 @@ class Perspective:
         Parameters
         ----------
         where : (N,) ndarray
-            Positions of chief rays along the line, metres.
+            Positions of N chief rays along the line, metres.
         turn : (N,) ndarray
             Angles W of their directions, radians.
         tilted : bool
