@@ -526,7 +526,7 @@ _KINDS = ("white", "walk", "slow")
 _LARGEST = 4000
 """Largest number of unknowns of a process that is tested, because its matrices are dense."""
 _LEAST = 2.0
-"""Smallest redundancy of an error model for which its neighbours are tested."""
+"""Smallest redundancy of an error model for which its serial correlation is tested."""
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ Kind = Literal["constant", "rate", "white", "walk", "slow", "orbital", "jitter"]
 KINDS: tuple[Kind, ...] = ("constant", "rate", "white", "walk", "slow", "orbital", "jitter")
 """Names of the kinds of error models: stochastic processes and constants of attitude and station errors."""
 STEPPED = ("white", "walk", "slow", "jitter")
-"""Error models with unknowns at multiples of an interval."""
+"""Kinds of error models whose unknowns lie at whole multiples of a time interval."""
 _GAP = 18
 """Gap, in intervals, from which on segments of a spline's unknowns are treated as independent; their correlation is
 1e-9.
@@ -236,7 +236,7 @@ class Support:
 
 
 def _chain(correlation: Array, variance: Array) -> sparse.csr_matrix:
-    """Return the precision (k, k) of a first-order autoregression of k values, without the variance of the first.
+    """Return the precision (k, k) of a first-order autoregression of k values, without a prior on the first.
 
     Each value is `correlation` times the one before plus independent noise of the given `variance`.
     """

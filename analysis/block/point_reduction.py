@@ -125,7 +125,7 @@ class LineImage:
         return np.concatenate([self.corrections.columns, change], axis=1)
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """Return whitened collinearity misclosures of image points, with derivatives by unknowns and ground points."""
+        """Return whitened collinearity misclosures of image points, with derivatives for unknowns and ground points."""
         rays, camera = self.rays, self.camera.drifted(self.unit * x[self.change])
         corrections = self.corrections.taken(which)
         rotation, shift = corrections.at(x)
@@ -196,7 +196,7 @@ class Pointings:
         return self.corrections.columns
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """Return whitened misclosures of range and beam direction, with derivatives by unknowns and ground points."""
+        """Return whitened misclosures of range and beam direction, with derivatives for unknowns and ground points."""
         corrections = self.corrections.taken(which)
         rotation, shift = corrections.at(x)
         attitude = self.attitude[which]
@@ -273,7 +273,7 @@ class FixedPoints:
         return np.broadcast_to(self.datum, (len(self.point), len(self.datum)))
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """Return whitened misclosures of surveyed coordinates, with derivatives by the common shift and the points."""
+        """Return whitened misclosures of surveyed coordinates, with derivatives for the common shift and points."""
         white = self.white[which]
         shift = x[self.datum] if len(self.datum) else np.zeros(3)
         miss = np.einsum("nij,nj->ni", white, ground - self.given[which] + shift)
@@ -324,7 +324,7 @@ class Heights:
         return np.broadcast_to(self.common, (len(self.point), 1))
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """Return whitened misclosures of heights, with derivatives by the common height error and the points."""
+        """Return whitened misclosures of heights, with derivatives for their common error and the points."""
         normal, sigma = self.normal[which], self.sigma[which]
         above = np.sum(normal * (ground - self.place[which]), axis=1) - self.unit * float(x[self.common[0]])
         by_x = np.broadcast_to(-self.unit / sigma[:, None, None], (len(which), 1, 1))

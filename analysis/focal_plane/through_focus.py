@@ -41,7 +41,7 @@ QUARTIC = 0.3
 FRACTION = 0.5
 """Fraction of the peak above which the fitted curve uses points."""
 LEAST_POINTS = 5
-"""Smallest number of positions of a fit."""
+"""Smallest number of different focus positions to which a through-focus curve is fitted."""
 WIDEST_FRACTION = 0.3
 """Fraction of the peak to which the window may extend if it holds too few points."""
 _ROUNDS, _NEWTON_STEPS = 12, 4
@@ -232,11 +232,11 @@ def _solve(design: Array, weight: Array, data: Array) -> Array:
 
 
 _SIGNIFICANT = 5.0
-"""Significance, in sigmas, of a curvature, a slope or a contrast. It is higher than for a single test because the
-highest of many positions is tested.
+"""Significance, in sigmas, from which a curvature, a slope or a contrast of a through-focus curve counts as real. It is
+higher than for a single test because the highest of many positions is tested.
 """
 _HINT = 3.0
-"""Significance, in sigmas, of a curvature that suffices if the peak exceeds the rest of the scan as well."""
+"""Significance, in sigmas, from which a curvature counts as real if the peak also exceeds the rest of the scan."""
 _MISFIT = 10.0
 """Chi-square per degree of freedom that, near an end of the scan, means a flank and not a peak."""
 _FORM = 0.02

@@ -71,7 +71,7 @@ class Matches:
 
     @property
     def texts(self) -> tuple[str, ...]:
-        """Descriptions (n,) of the reasons."""
+        """Descriptions of the verdicts on the n matches."""
         return tuple(Reason(int(code)).text for code in self.reason)
 
     @property

@@ -370,7 +370,7 @@ def _noise_root(noise: Array) -> Array:
 
 
 _SIGNIFICANT = 3.0
-"""Significance of a principal point, in sigmas: false-alarm rate 0.3 %."""
+"""Ratio to its sigma above which a principal point counts as different from zero: false-alarm rate 0.3 %."""
 POINT_TOLERANCE = 10e-6
 """Largest sigma, in metres, of an observable principal point: about a pixel, the size that paper 004 expects of it."""
 
@@ -948,7 +948,7 @@ class Distortion:
 
     @property
     def distortion(self) -> Array:
-        """Distortion D (N,), in metres."""
+        """Distortion of each of N points: measured image position minus the calibrated model, in metres."""
         return self.fit.residual
 
     @property

@@ -367,7 +367,7 @@ def _linear(basis: Curve, solve: Array, value: Array) -> tuple[Curve, Curve]:
 def _left_out(hat: Array, value: Array) -> float:
     """Return the mean square of the leave-one-out residuals of the inner points.
 
-    It follows from the hat matrix H (N, N), which gives the predictions at the points from their N values y.
+    It follows from the hat matrix H, (N, N), which gives the predictions at N points from their values y.
 
     It is exact for least squares and smoothing splines: (y - H y) / (1 - H_ii). Infinite if a point is always fitted
     exactly.
@@ -671,14 +671,17 @@ class CalibrationSeries:
 
     @cached_property
     def rms_before(self) -> Array:
-        """RMS (N,) of all repeats about their mean, divisor n - 1, in radians."""
+        """RMS of all n repeats at each of N angles about their mean, with the divisor n - 1, in radians."""
         return np.asarray(
             np.std(self.comparisons, axis=1, ddof=1, where=True if self.present is None else self.present)
         )
 
     @cached_property
     def rms_after(self) -> Array:
-        """RMS (N,) of the kept repeats about their mean, divisor n - 1, in radians; of readings, not of means."""
+        """RMS of the n kept repeats at each of N angles about their mean, with the divisor n - 1, in radians.
+
+        It is that of single readings, not of their means.
+        """
         return np.asarray(np.std(self.comparisons, axis=1, ddof=1, where=self.keep))
 
     @property

@@ -437,7 +437,7 @@ def _circle(points: Array) -> tuple[float, float, float]:
 
 
 def _off(points: Array, circle: tuple[float, float, float]) -> Array:
-    """Return the distances of points (N, 2) from a circle, in pixels."""
+    """Return the distances of N points from a circle, in pixels."""
     return np.abs(np.hypot(points[:, 0] - circle[0], points[:, 1] - circle[1]) - circle[2])
 
 

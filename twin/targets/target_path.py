@@ -55,7 +55,7 @@ WORST_PLACED = 5e-3
 
 MAP_POINTS = 7
 MAP_ORDER = 4
-"""Chief rays per axis for the local mapping from angles to the image, and the order of its polynomial."""
+"""Order of the polynomial of the local mapping from target to image, and number of chief rays per axis for its fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ class LocalMap:
 
     @property
     def jacobian(self) -> np.ndarray:
-        """Derivative d(along, across)/d(target coordinates) at the centre, (2, 2)."""
+        """Derivative of image coordinates (along, across) with respect to target coordinates at the centre, (2, 2)."""
         return np.asarray(self.coefficients[1:3].T / self.scale)
 
 
