@@ -308,8 +308,8 @@ _DISCORDANT = 2.0 * math.log(1e3)
 probability of 1e-3 (chi-square with two degrees of freedom).
 """
 _SIGNIFICANT = 2.0
-"""Significance, in standard deviations, above which the mean difference between coarse and all detail is added to the
-covariance of all points.
+"""Significance, in standard deviations, above which the excess variance of the differences between coarse and all
+detail is added to the covariance of all points.
 """
 _CLIPPED = 3.0
 """Largest normalised distance with which a point enters the common estimate, in units of the median distance."""
