@@ -1,7 +1,7 @@
-"""Statistical functions: chi-square, binomial intervals, robust scales, Rice's distribution, weighted least squares.
+"""Statistical functions: chi-square, binomial intervals, robust scales, Rice's distribution, least squares.
 
-The chi-square functions are those that ``scipy.stats.chi2`` calls, with results equal to the last bit, without
-loading that package, which takes a tenth of the time of a short command.
+The chi-square functions are those that ``scipy.stats.chi2`` calls, with results equal to the last bit, without loading
+that package, which takes a tenth of the time of a short command.
 
 A modulation is the modulus of a Fourier coefficient. Noise makes the modulus longer on average: where the signal
 vanishes, sigma sqrt(pi/2) remains (Rice, Bell Syst. Tech. J. 24, 46 (1945)).

@@ -1,4 +1,4 @@
-"""State of an instrument by Bayesian least squares on an exact model, its observability, and the next alignment move.
+"""State of an instrument by Bayesian least squares on an exact model, its observability, and the next move.
 
 A state is an amount for each of M motions with a joint normal prior, x = m + G u with the prior mean m, a root G of the
 prior covariance and independent u ~ N(0, I). Measurements are groups of numbers y = h(x) + B b + e: h is the traced
@@ -39,7 +39,7 @@ Predict = Callable[[Array], Array]
 S is the number of states, D of measured numbers (group after group), M of motions. The result is NaN where the light is
 lost.
 
-Dimensions: S states, M motions, D measured numbers.
+Dimensions: S states, D measured numbers, M motions.
 """
 Slope = Callable[[Array], Array]
 """Function from one state (M,) to the derivatives (D, M) of the measurements.
@@ -148,7 +148,7 @@ class MeasuredGroup:
     blocks: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        """Raise ValueError if shapes do not match."""
+        """Raise ValueError if the lengths of values, covariance, biases and labels do not match."""
         count = len(self.values)
         if self.covariance.shape != (count, count) or self.biases.shape != (count, len(self.bias_sigmas)):
             raise ValueError(f"measurement {self.name}: covariance or biases do not have the shape for {count} numbers")
@@ -231,7 +231,10 @@ class ConsistencyTest:
         return cls(name, float(chi_square), degrees, p_value)
 
     def passes(self, looks: int = 1, false_alarm: float = FALSE_ALARM) -> bool:
-        """Return True if the numbers are consistent, as one of several groups (``looks``) that are tested together."""
+        """Return True if the numbers are consistent with their prediction.
+
+        The probability ``false_alarm`` is shared among ``looks`` groups that are tested together.
+        """
         return not self.degrees or self.chi_square <= float(limit_of(false_alarm / max(1, looks), self.degrees))
 
 
@@ -323,7 +326,7 @@ class StateEstimate:
 
     @property
     def variance_factor(self) -> float:
-        """Chi-square per degree of freedom of everything together if its test fails, else 1."""
+        """Chi-square per degree of freedom of all measurements together if their test fails, else 1."""
         return 1.0 if self.whole.passes() else self.whole.chi_square / self.whole.degrees
 
     def draw(self, rng: np.random.Generator, count: int) -> Array:
@@ -417,7 +420,7 @@ def _gauss_newton(
     def whitened(rows: Array) -> Array:
         """Return measured numbers (D, ...) of all groups transformed to independent numbers of unit variance, (R, ...).
 
-        Dimensions: R whitened measured numbers, D measured numbers.
+        Dimensions: D measured numbers, R whitened measured numbers.
         """
         ends = np.cumsum([0, *(len(group.values) for group in groups)])
         return np.concatenate([w @ rows[a:b] for w, a, b in zip(whiteners, ends[:-1], ends[1:], strict=True)])
@@ -470,7 +473,7 @@ def _tested(
     steps: int,
     moved: float,
 ) -> StateEstimate:
-    """Return the estimate with posterior covariance and all tests."""
+    """Return the estimate with its posterior covariance and the consistency tests of all groups and blocks."""
     values, vectors = np.linalg.eigh(table.T @ table)
     # the symmetric root, since states are drawn with it: eigenvectors of equal eigenvalues depend on rounding
     root = (vectors / np.sqrt(1.0 + np.clip(values, 0.0, None))) @ vectors.T
@@ -548,7 +551,7 @@ class Combination:
 
     @property
     def known(self) -> bool:
-        """True if the measurements determine the combination."""
+        """True if the measurements determine the combination: its sigma has fallen below DETERMINED."""
         return self.sigma < DETERMINED
 
     def of(self, amounts: Array, prior_sigma: Array, mean: Array) -> Array:
@@ -745,7 +748,10 @@ def merit_reduction(
 
 
 def _bounded(slope: Array, residual: Array, low: Array, high: Array) -> Array:
-    """Return the amounts within limits that minimise |residual + slope amounts|; fixed where both limits are equal."""
+    """Return the moves within limits that minimise |residual + slope amounts|, a linear least-squares problem.
+
+    A move is fixed where both of its limits are equal.
+    """
     out = np.clip(np.zeros(slope.shape[1]), low, high)
     length = np.linalg.norm(slope, axis=0)
     used = (length > 0.0) & (high > low)

@@ -110,7 +110,7 @@ class TimeLaw:
         return np.asarray(out)
 
     def step_probability(self, time: ArrayLike) -> Array:
-        """Return the probability that the step of an event has occurred by a time, s, of any shape."""
+        """Return the probability that the step of an event has occurred by a time in seconds (any shape)."""
         at, chance = np.array(self.event).T
         when = np.asarray(time, np.float64)
         if len(at) == 1:
@@ -205,7 +205,7 @@ class Disturbances:
     jump_false_alarm: float = FALSE_ALARM
 
     def __post_init__(self) -> None:
-        """Raise ValueError if shapes do not match."""
+        """Raise ValueError if the shapes of the arrays do not match the number of motions."""
         count = len(self.labels)
         shapes = {
             "spots": (self.spots.shape[0], count),
@@ -453,17 +453,17 @@ class Consistency:
 
     @property
     def agrees(self) -> bool:
-        """True if chi-square does not exceed the limit."""
+        """True if the shifts agree with the prior: chi-square does not exceed the limit."""
         return self.chi_square <= self.limit
 
     @property
     def chance(self) -> float:
-        """Probability of so large a chi-square under the prior (p-value)."""
+        """Probability of a chi-square at least this large if the prior is right (p-value)."""
         return float(chance_beyond(self.chi_square, self.degrees))
 
     @property
     def chance_sigma_noise(self) -> float:
-        """Standard deviation of ``chance`` due to the noise of the images, to first order."""
+        """Standard deviation of the p-value ``chance`` due to the noise of the images, to first order."""
         return float(density(self.chi_square, self.degrees)) * self.sigma_noise
 
     @staticmethod

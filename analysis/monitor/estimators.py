@@ -129,7 +129,7 @@ class Estimator(ABC):
 
 
 class PerCameraEstimator(Estimator):
-    """Estimator that treats each camera's spots separately."""
+    """Estimator that computes each camera's parameters from that camera's own spots alone."""
 
     @abstractmethod
     def camera_gain(self, camera: CameraCalibration, covariance: Array) -> Array:
@@ -208,7 +208,7 @@ class Formula(PerCameraEstimator):
         return out
 
     def read(self, shifts: Shifts) -> Array:
-        """Return the parameters of K cameras in S states, (S, 4 K) rad and m, by exact formulas where there are such."""
+        """Return the parameters of K cameras in S states, (S, 4 K) rad and m, by exact formulas if there are any."""
         if self.exact is None:
             return super().read(shifts)
         parts = []

@@ -1,4 +1,4 @@
-"""State of the filter of a series, with tests of bad readings and probabilities of jumps that are not yet detected.
+"""State of a Kalman filter of a series, with tests of bad readings and probabilities of undetected jumps.
 
 **Undetected jumps.** A jump is reported where hardly any series without one would look like it; long before that, and
 where it stays too small for ever, a jump may be more likely than none. Score b and information J of a step of
@@ -50,7 +50,7 @@ from analysis.monitor.jump_detection import Amounts, Candidate, Jump
 class Observed:
     """One reading at one time: of all spots, of d temperature sensors, or of d combinations of camera parameters.
 
-    Dimensions: D spot coordinates (row and column of every spot), P parameters.
+    Dimensions: D spot coordinates (row and column of every spot).
 
     Attributes
     ----------
@@ -250,18 +250,12 @@ class FilterState:
 
     @property
     def mean(self) -> Array:
-        """Mean of the states, (n,).
-
-        Dimensions: n states of the filter.
-        """
+        """Mean of the n states of the filter, (n,)."""
         return self.state.mean
 
     @property
     def covariance(self) -> Array:
-        """Covariance of the states, (n, n).
-
-        Dimensions: n states of the filter.
-        """
+        """Covariance of the n states of the filter, (n, n)."""
         return self.state.covariance
 
     @property
@@ -282,8 +276,6 @@ It is above 1 since the readings that indicated the jump and its size are used o
 @dataclass(frozen=True, eq=False)
 class JumpingBody:
     """Body whose motions jump at a known rate.
-
-    Dimensions: q values that readings can contain (outputs).
 
     Attributes
     ----------
@@ -539,10 +531,7 @@ def bad_reading(white: Array, root: Array, noise: Array) -> BadReading | None:
 
 
 def _with_errors(precision: Array, pulled: Array, variance: Array) -> Array:
-    """Return the log likelihood ratios for errors at the 1, 2, ... D coordinates that explain most, (D,).
-
-    Dimensions: D spot coordinates (row and column of every spot).
-    """
+    """Return the log likelihood ratios for errors at the 1, 2, ... D coordinates that explain most, (D,)."""
     free, total, out = np.ones(len(pulled), bool), 0.0, np.empty(len(pulled))
     for number in range(len(pulled)):
         inner = 1.0 + variance * np.diag(precision)

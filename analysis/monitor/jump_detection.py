@@ -223,7 +223,7 @@ class Step:
         return cls(jump.parts or ((jump.motions, jump.times**2),), jump.chances, moment)
 
     def step_probability(self, time: float) -> float:
-        """Return the probability that it has occurred by a time, s."""
+        """Return the probability that the step has occurred by a time in seconds."""
         at, chance = np.array(self.chances).T
         if len(at) == 1:
             return float((time >= at[0]) * chance[0])
@@ -418,8 +418,6 @@ def jump_scale(information: Array, score: Array) -> float:
 
     It is at least the size of the jump itself, and at least 1.
 
-    Dimensions: r motions of the body that may jump.
-
     Parameters
     ----------
     information : (r, r) ndarray
@@ -609,13 +607,13 @@ class Bodies:
     def spots(self) -> list[Array]:
         """Effect of unit amounts of each body on the q outputs, one array (q, r) for each body.
 
-        Dimensions: q values that readings can contain (outputs), r motions of the body that may jump.
+        Dimensions: r motions of the body that may jump.
         """
         return [candidate.spots for candidate in self.own]
 
     @property
     def parts(self) -> tuple[tuple[tuple[int, ...], float], ...]:
-        """Motions of each body, and their relative variance times the probability of the body."""
+        """For each body, the indices of its motions and their relative variance times the body's probability."""
         chance = self.weight.sum(axis=1)
         rows = zip(self.own, chance.tolist(), self.times, strict=True)
         return tuple((candidate.motions, share * times**2) for candidate, share, times in rows)

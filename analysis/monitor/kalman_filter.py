@@ -200,14 +200,11 @@ class SeriesFilter:
 
     @cached_property
     def _step_ends(self) -> Array:
-        """First and last possible time of each of the S known steps, (S, 2) s.
-
-        Dimensions: S steps.
-        """
+        """First and last possible time of each of the S known steps, (S, 2) s."""
         return np.array([(step.chances[0][0], step.chances[-1][0]) for step in self.steps]).reshape(-1, 2)
 
     def _with_steps(self, covariance: Array, then: float, now: float) -> Array:
-        """Return the covariance with the steps that occur between two times."""
+        """Return a covariance of the states with the variance of all known steps between two times added."""
         if not self.steps:
             return covariance
         ends = self._step_ends
@@ -227,7 +224,7 @@ class SeriesFilter:
 
     @cached_property
     def walking(self) -> NDArray[np.int_]:
-        """Indices of the motions that jump at a known rate, (m,).
+        """Indices of the motions that jump at a known rate, (m,); a random walk stands for their undetected jumps.
 
         Dimensions: m motions that jump at a known rate.
         """
@@ -255,7 +252,7 @@ class SeriesFilter:
         return np.asarray(self.window * len(self.candidates) / np.minimum(share, 1.0))
 
     def _limit(self, current: FilterState) -> float:
-        """Return the log likelihood ratio below which no candidate can be detected, whatever its number of motions."""
+        """Return the smallest log likelihood ratio at which a jump can be detected, for any number of motions."""
         between = current.until - current.after
         return float(limit_of(self.stated.jump_false_alarm / self.looks(between.max()), 1))
 
@@ -525,7 +522,7 @@ class SeriesFilter:
         Parameters
         ----------
         track : Track
-            Filter at the time of the reading.
+            Filter propagated to the time of the reading.
         observed : Observed
             Reading.
         w : Whitened or None
@@ -556,7 +553,7 @@ class SeriesFilter:
         return subthreshold_share(limit, seen)
 
     def _detected(self, current: FilterState) -> Jump | None:
-        """Return the most likely jump if it is significant; None otherwise."""
+        """Return the most likely jump if it is significant at the false-alarm probability; None otherwise."""
         track = current.jump_track
         # no candidate explains more than arbitrary outputs would; the factor 1.01 covers rounding
         information = track.information + _NEARLY * np.trace(track.information, 0, 1, 2)[:, None, None] * np.eye(
@@ -619,7 +616,7 @@ class SeriesFilter:
 
     @cached_property
     def jumping_bodies(self) -> tuple[JumpingBody, ...]:
-        """Bodies that jump at a known rate."""
+        """Bodies whose jumps have a known rate (mean time between two jumps)."""
         return jumping_bodies(self.stated, self.candidates) if self.unfound else ()
 
     def mixture(self, current: FilterState) -> FilterState:
@@ -663,7 +660,7 @@ class SeriesFilter:
         Parameters
         ----------
         current : FilterState
-            State so far, from `mixture` to include undetected jumps.
+            State after the readings so far; the result of `mixture` includes undetected jumps.
         time : float
             Time not before that of the state, s.
         """
@@ -968,7 +965,7 @@ class DetectionPower:
 
     @property
     def plain(self) -> dict[str, float | None]:
-        """Smallest detectable sizes by share of detected jumps and number of readings, as plain data; None if larger."""
+        """Smallest detectable sizes as plain data, by share of detected jumps and readings; None if unknown."""
         keys = [f"{round(100 * share)}_percent_within_{n}" for n in READINGS for share in SHARES]
         return {
             key: size if size == size else None for key, size in zip(keys, self.sizes.ravel().tolist(), strict=True)
@@ -1035,10 +1032,7 @@ def _test(spots: Array, information: Array, chance: float) -> tuple[Array, float
 def _detection_rates(
     spots: Array, informations: Array, tests: Sequence[Sequence[tuple[Array, float]]], rng: np.random.Generator
 ) -> Array:
-    """Return the fraction of simulated jumps of each of S sizes that is detected within 1 to N readings, (N, S).
-
-    Dimensions: S sizes.
-    """
+    """Return the fraction of simulated jumps of each of S sizes that is detected within 1 to N readings, (N, S)."""
     amounts = rng.standard_normal((_DRAWS, spots.shape[1]))
     amounts *= np.sqrt(spots.shape[1]) / np.linalg.norm(amounts, axis=1, keepdims=True)
     step, noise, before = amounts @ spots.T, np.zeros((_DRAWS, len(spots))), np.zeros_like(informations[0])

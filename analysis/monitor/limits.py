@@ -134,6 +134,8 @@ def unchanged_quantities(
 class Split:
     """Contributions of each motion of the prior and of the noise to the variances of Q quantities.
 
+    Dimensions: M motions.
+
     Attributes
     ----------
     before : (Q, M) ndarray
@@ -233,7 +235,7 @@ class LeastObservable:
     amounts : (M,) ndarray
         Motions in standard deviations.
     change : float
-        Change of the quantity by these motions, equal to its posterior standard deviation.
+        Change of the quantity due to these motions, equal to its posterior standard deviation.
     spots : (D,) ndarray
         Spot shifts due to these motions, px.
     noise : (D,) ndarray

@@ -244,7 +244,7 @@ def observability(
 
 
 def _statements(reports: list[MotionReport], family: list[str], rank: int, coordinates: int) -> list[str]:
-    """Return sentences on the family as a whole, then on each motion that is misreported."""
+    """Return sentences on what the spots can separate: all fitted motions together, then each misreported motion."""
     seen = "Four" if coordinates == 4 else str(coordinates)
     lines = [
         f"{seen} spot coordinates observe {rank} independent combination{'s' if rank != 1 else ''} of {len(reports)} "

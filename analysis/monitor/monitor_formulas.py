@@ -1,4 +1,4 @@
-"""Formulas of paper 001: camera parameters from spot shifts, change of the intersection angle, errors on the ground.
+"""Formulas of paper 001: camera parameters from spot shifts, change of the intersection angle, ground errors.
 
 Paper 001 is Wang et al., Acta Photonica Sinica 47(10) 1012001, 2018.
 
@@ -165,7 +165,7 @@ class CameraParameters(StateArrays):
 
     @property
     def vector(self) -> Array:
-        """Changes [d_alpha, d_beta, d_gamma (rad), d_f (m)], (..., 4)."""
+        """Changes of the camera's parameters d_alpha, d_beta, d_gamma (rad) and d_f (m), (..., 4)."""
         return np.stack([self.d_alpha_rad, self.d_beta_rad, self.d_gamma_rad, self.d_f_m], axis=-1)
 
     @property
@@ -331,7 +331,7 @@ class IntersectionAngleChange(StateArrays):
     Attributes
     ----------
     change_rad : (...) ndarray
-        New angle minus nominal angle, rad.
+        Angle of the changed instrument minus nominal angle, rad.
     sigma_rad : (...) ndarray
         Standard deviation of its error, rad.
     sigma_noise_rad : (...) ndarray or None

@@ -172,17 +172,17 @@ class Parameter:
 
     @property
     def file_unit(self) -> str:
-        """Unit as written in keys: ``um``."""
+        """Unit of the parameter as written in keys of files, such as ``um``."""
         return self.key.rpartition("_")[2]
 
     @property
     def unit(self) -> str:
-        """Unit as shown to readers: ``µm``."""
+        """Unit of the parameter as shown in tables and reports, such as ``µm``."""
         return self.file_unit.replace("um", "µm")
 
     @property
     def label(self) -> str:
-        """Column head: ``Δα [arcsec]``."""
+        """Head of the parameter's column in tables, with its unit: ``Δα [arcsec]``."""
         return f"{self.symbol} [{self.unit}]"
 
     @property

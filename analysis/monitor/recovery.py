@@ -445,7 +445,7 @@ class _Steps:
 
 
 MeasuredSpots: TypeAlias = tuple[SpotPositions, FitStates]
-"""Spot positions with the goodness of their fits."""
+"""Measured spot positions together with the goodness of their fits."""
 
 
 @shows()

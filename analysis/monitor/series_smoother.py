@@ -390,7 +390,7 @@ class _Search:
         return detected
 
     def _look(self, known: list[Jump]) -> Jump | None:
-        """Return the most likely further jump if it is significant; None otherwise."""
+        """Return the most likely jump that is not known yet if it is significant; None otherwise."""
         jump = most_likely_jump(self._steps(with_jumps(self.stated, known)), self.may, self.stated)
         return jump if jump is not None and jump.chance <= self.stated.jump_false_alarm else None
 

@@ -225,12 +225,12 @@ class StateSpace:
 
     @cached_property
     def size(self) -> int:
-        """Number of states n."""
+        """Number of states of all time laws together."""
         return self._blocks[-1].at.stop if self._blocks else 0
 
     @property
     def width(self) -> int:
-        """Number of spot coordinates D."""
+        """Number of spot coordinates (row and column of every spot)."""
         return int(self.stated.spots.shape[0])
 
     def outputs_of(self, motions: Sequence[int] | range) -> Array:
@@ -426,7 +426,7 @@ class StateSpace:
 
     @cached_property
     def _stepping_blocks(self) -> tuple[_Block, ...]:
-        """Blocks with events, whose process noise depends on the time and not on the interval alone."""
+        """Blocks of states with events, whose variance depends on the time and not on the interval alone."""
         return tuple(block for block in self._blocks if block.law.event or any(law.event for law, _ in block.steps))
 
     def outputs(self, mean: Array, covariance: Array, time: float) -> tuple[Array, Array, Array]:
@@ -532,7 +532,7 @@ class StateSpace:
 
     @cached_property
     def _growing_blocks(self) -> tuple[_Block, ...]:
-        """Blocks with trends and relaxations, whose amplitude depends on the time."""
+        """Blocks of states of trends and relaxations, whose effect on the outputs depends on the time."""
         return tuple(block for block in self._blocks if (block.law.trend_s, block.law.relaxation_s) != (None, None))
 
     @cached_property
@@ -541,9 +541,9 @@ class StateSpace:
 
     @cached_property
     def basis(self) -> Array:
-        """Effect of the states where all amplitudes are 1, (D + P, n).
+        """Effect of the n states on the outputs where the amplitudes of all time laws are 1, (D + P, n).
 
-        Dimensions: D spot coordinates (row and column of every spot), P parameters, n states of the filter.
+        Dimensions: D spot coordinates (row and column of every spot), P parameters.
         """
         rows = np.zeros((self.width + self.stated.parameters.shape[0], self.size))
         for block in self._blocks:
@@ -552,7 +552,7 @@ class StateSpace:
 
     @cached_property
     def _heat_states(self) -> dict[int, int]:
-        """Index of the state of each motion with a sensor."""
+        """Index of a motion that is a temperature with a sensor -> index of its state."""
         heat = [block for block in self._blocks if block.kind == "heat"]
         return {motion: block.at.start + k for block in heat for k, motion in enumerate(block.motions)}
 
@@ -657,7 +657,7 @@ def _is_level(law: TimeLaw) -> bool:
 
 
 def _spanned(columns: Array) -> tuple[Array, Array]:
-    """Return orthonormal vectors that span the columns, and their singular values."""
+    """Return orthonormal vectors that span the columns of a matrix, and their singular values."""
     left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     significant = sizes > _NOTHING * max(sizes[0], 1e-300)
     return np.asarray(left[:, significant]), np.asarray(sizes[significant])

@@ -55,7 +55,7 @@ _FIRST, _SECOND = (index[:, None] for index in np.triu_indices(4))
 class EdgeDesign:
     """Least-squares design matrix of an edge-spread function: one row for each of N pixels, one column per unknown.
 
-    Dimensions: N pixels, M pixels in the core, K terms of uneven light.
+    Dimensions: M pixels in the core, K terms of uneven light.
 
     Attributes
     ----------
@@ -141,7 +141,7 @@ class EdgeDesign:
     def normal_matrix(self, weight: Array | None = None) -> Array:
         """Return the normal matrix of the least-squares problem, (P, P), with weights (N,) of the pixels.
 
-        Dimensions: N pixels, P coefficients of the edge-spread function.
+        Dimensions: P coefficients of the edge-spread function, N pixels.
         """
         count = self.spline_count
         size = count + 6
@@ -267,8 +267,6 @@ class EdgeSpread:
 
         All at once, the linear algebra library would split the work over threads, which on a busy machine wait for each
         other a hundred times longer than the solution takes.
-
-        Dimensions: P coefficients of the edge-spread function.
         """
         columns = range(0, right.shape[1], 8)
         return np.hstack([cho_solve(self.factor, right[:, k : k + 8], check_finite=False) for k in columns])

@@ -1,4 +1,4 @@
-"""Slanted edge in several frames: its position in each of them, and the MTF of the frames aligned where it moves.
+"""Slanted edge in several frames: its position in each of them, and the MTF of the aligned frames.
 
 The mean of frames between which the edge moves by d rms has an MTF that is lower by the fraction (2 pi f d)^2 / 2 at
 the frequency f, which the mean does not show. Every page is therefore compared with the mean: its position, angle and
@@ -158,7 +158,7 @@ class _Run:
 
         ``frames`` is the number of frames averaged into all pages together.
 
-        Dimensions: H rows, W columns, P pages.
+        Dimensions: H rows, W columns.
         """
         count = len(stack.line)
         rounded = [rounding_residual(rms, self.step) for rms in shift.page_noise]

@@ -1,4 +1,4 @@
-"""Modulation transfer function (MTF) from one slanted edge, after ISO 12233, with propagated standard deviations.
+"""Modulation transfer function (MTF) from one slanted edge, after ISO 12233, with standard deviations.
 
 Steps: the edge's line from row centroids (`edge_location`); all pixels projected on the edge's *normal* and a
 least-squares edge-spread function through them (`edge_fit`); angle, position and a test for curvature by one

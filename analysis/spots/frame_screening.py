@@ -1,4 +1,4 @@
-"""Screening of the frames of one spot in one state: pixels and frames that disagree with the others are excluded.
+"""Screening of the frames of one spot in one state: pixels and frames that disagree with others are excluded.
 
 The reference is the median of the frames. Each frame is fitted to it by its light, its level and a small movement
 (first and second derivatives of the reference). Residuals larger than the noise are excluded from the mean: cosmic rays

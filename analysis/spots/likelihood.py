@@ -112,7 +112,7 @@ def maximum_likelihood_fit(
 def _score(
     rule: _Rule, image: Array, which: NDArray[np.intp], edge_px: float, keep_maps: bool, max_iterations: int
 ) -> SpotPositions:
-    """Fit a few images of a batch by Fisher scoring; arguments as in `maximum_likelihood_fit`."""
+    """Fit a few images of a batch by Fisher scoring, from a second start as well where one is needed."""
     count, height, width = image.shape
     noise, frames = rule.noise, rule.frames
     row, column, background, _, _ = spot_image.coarse(image, frames, noise)
@@ -246,7 +246,7 @@ class _Rule:
         return end
 
     def deviance(self, found: _Scored) -> Array:
-        """Return minus twice the log-likelihood of the last step, (B,).
+        """Return minus twice the log-likelihood of each spot at the last step, (B,).
 
         Dimensions: B spots.
         """
@@ -364,7 +364,7 @@ def _step(
 
 
 def image_bound(light: ArrayLike, background: float, noise: NoiseModel, frames: int) -> Array:
-    """Return the Cramer-Rao bound of the positions of spots given by noise-free images, (B, 2, 2) px^2.
+    """Return the Cramer-Rao bound of the positions of spots given due to noise-free images, (B, 2, 2) px^2.
 
     Dimensions: B spots, H rows, W columns.
 
@@ -415,8 +415,6 @@ NOT_CONVERGED = "the fit does not converge from either of two starts; the spot d
 @dataclass(frozen=True, eq=False)
 class FitStates(StateArrays):
     """Goodness of fit of spots: arrays (B,) for B spots, or (S, C) for S states of C spots.
-
-    Dimensions: B spots, S states, C spots.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Noise model of a linear detector, as a function of the mean grey value, and the noise of rounding to grey values.
+"""Noise model of a linear detector as a function of the mean grey value, with the noise of rounding.
 
 The model is that of EMVA Standard 1288, release 3.1, eq. 9-12 and 33-35. Grey values are in DN as recorded, with the
 black level and the dark signal still in. Two kinds of noise are kept apart because they behave differently in a

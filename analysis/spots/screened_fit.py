@@ -1,4 +1,4 @@
-"""Fit of the calibrated spot shape to a mean image with missing pixels, uneven background, further spots or smear.
+"""Fit of the calibrated spot shape to an image with missing pixels, uneven background, more spots or smear.
 
 Pixels that are not good have no weight; one that is the mean of fewer frames has more noise. The model is
 

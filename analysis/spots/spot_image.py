@@ -237,7 +237,10 @@ def soft_window(position: Array, height: int, width: int, radius: float) -> tupl
 
 
 def sane(theta: Array) -> NDArray[np.bool_]:
-    """Return the mask (B,) of fitted Gaussians whose parameters are finite, positive and of finite size."""
+    """Return the mask (B,) of fitted Gaussians whose parameters are finite, positive and of finite size.
+
+    Dimensions: B spots.
+    """
     good = np.all(np.isfinite(theta), axis=1) & (theta[:, 2] > 0) & (theta[:, 4] > 0)
     if theta.shape[1] > 5:
         good &= theta[:, 4] * theta[:, 6] > theta[:, 5] ** 2
@@ -253,7 +256,7 @@ def gaussian(
     the coefficient a, or the coefficients a, b and c, of the squared distance in the exponent. The weight is the soft
     circular window over the model's total variance.
 
-    Dimensions: B spots, K parameters, P pixels.
+    Dimensions: B spots.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Detection of defects that are the same in all frames of a spot, and centroids of images in which they are repaired.
+"""Detection of defects that are the same in all frames of a spot, and centroids of repaired images.
 
 The repaired image is c = u d + (1 - u) m(q) - e(q), with the image d, the mask u of the pixels that are used, the
 fitted model m and the part e of it that is neither the spot nor its level. The parameters q are fitted to d itself, so

@@ -668,6 +668,8 @@ class _CameraBench:
         They are complex (B, M), with the mask (B,) of the known ones, as from ``_transfer``.
 
         All wavelengths refer to one image point, so that lateral colour blurs.
+
+        Dimensions: B beams, M frequencies.
         """
         total, known = np.zeros((len(illuminated), len(self.frequency)), complex), np.ones(len(illuminated), bool)
         for colour, weight in zip(self.colours, self.weights / np.sum(self.weights), strict=True):

@@ -40,7 +40,7 @@ _PARAMETERS = 4
 class Information:
     """Information of a layout's spots about its cameras.
 
-    Dimensions: n rows of coefficients, C spots.
+    Dimensions: C spots.
 
     Attributes
     ----------

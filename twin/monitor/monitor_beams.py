@@ -237,8 +237,6 @@ class MonitorBeams:
 
         The first gives the T terms from values on the N nodes, (T, N); the others give the values and their derivatives
         with respect to x and y from the terms, (N, T) each.
-
-        Dimensions: T Zernike terms, N nodes of the aperture.
         """
         return self._series(MAP_TERMS)
 

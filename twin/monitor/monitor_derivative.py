@@ -253,6 +253,8 @@ _Tangents = list[dict[Path, np.ndarray]]
 """For each element of one sequence, number's path -> its derivative with respect to M motions, (C, M).
 
 C is the number of channels; derivatives that are all zero are left out.
+
+Dimensions: C channels (one spot each).
 """
 
 
@@ -488,7 +490,7 @@ def derivative_changes(
     roots = {name: f"{BASE}/{name}" for name in path.instrument.cameras}
 
     def affected_cameras(state: State) -> set[str]:
-        """Return the cameras whose spots' or lines' light a state affects."""
+        """Return the cameras whose spots or lines of sight a state changes."""
         inside = {name for name, root in roots.items() if any(f"{body}/".startswith(f"{root}/") for body in state)}
         return inside | set(path.moved_cameras(state))
 
@@ -586,9 +588,9 @@ def motion_models(
 
 
 def _prior_states(prior: DisturbancePrior, thermal: ThermalModel, amounts: np.ndarray) -> list[State]:
-    """Return the states of the prior's amounts (S, P), in standard deviations.
+    """Return the states of the instrument that amounts of the prior's motions make.
 
-    Dimensions: S states, P motions.
+    The amounts (S, P) of P motions in S states are in prior standard deviations.
     """
     return states_of(amounts * prior.sigma, prior.components, thermal)
 
@@ -606,7 +608,7 @@ def _of_families(cameras: Mapping[str, CameraCalibration], trace: Callable[[Sequ
 
 
 def _spots_of(cameras: Mapping[str, CameraCalibration]) -> list[slice]:
-    """Return the slice of each camera's spot coordinates among all."""
+    """Return for each camera the slice of its spot coordinates (rows and columns) among those of all cameras."""
     ends = np.cumsum([0, *(2 * len(camera.channels) for camera in cameras.values())]).tolist()
     return [slice(a, b) for a, b in pairwise(ends)]
 
@@ -629,9 +631,9 @@ def _family_amounts(cameras: Mapping[str, CameraCalibration], noise: np.ndarray)
 
 
 def _together(motions: Sequence[ElementaryMotion], amounts: np.ndarray) -> list[State]:
-    """Return the states of amounts (S, P), in SI units, of motions that have one pivot for each body.
+    """Return the states of the instrument that amounts of elementary motions make.
 
-    Dimensions: S states, P motions.
+    The amounts (S, P) of P motions in S states are in SI units; all motions of a body have one pivot.
     """
     states: list[State] = []
     for row in amounts.tolist():

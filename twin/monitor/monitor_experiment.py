@@ -1,4 +1,4 @@
-"""Monitoring experiment: perturb the instrument, render the images of its area CCDs, and recover the perturbation."""
+"""Monitoring experiment: perturb the instrument, render images of its area CCDs, and recover the perturbation."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ class MonitorExperiment:
 
     @cached_property
     def detector(self) -> EmvaDetector:
-        """Model of the area CCDs."""
+        """Model of the area CCDs by their data sheet."""
         return EmvaDetector.from_sheet(self.resolved.area_detector, self.exposure)
 
     @cached_property
@@ -195,7 +195,7 @@ class MonitorExperiment:
 
     @cached_property
     def thermal(self) -> ThermalModel:
-        """Thermal model of the instrument."""
+        """Thermal model of the instrument: how temperatures deform its bodies and change its glasses."""
         return ThermalModel(self.instrument)
 
     def state(self, job: JobSpec, progress: Callable[[str], None] = lambda path: None) -> State:
@@ -303,7 +303,7 @@ class MonitorExperiment:
 
     @cached_property
     def sight(self) -> LineSight:
-        """Lines of sight of the line CCDs."""
+        """Ray trace of the lines of sight of the cameras' line CCDs."""
         return LineSight(self.instrument, self.backend)
 
     @cached_property

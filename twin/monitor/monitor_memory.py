@@ -56,7 +56,7 @@ def pieces(count: int, each: int) -> Iterator[slice]:
 
 
 DRAWN = 410e6
-"""Memory of drawing and writing a job, in bytes; for small jobs it is most of the memory."""
+"""Memory that drawing figures and writing files of a job takes, in bytes; for small jobs it is most of the memory."""
 _PIXEL = 380.0
 """Bytes per pixel of a spot's image during the measurement and the analysis of its limits: photons 24, fixed pattern
 16, mean frames and maps of the fits before and after 64, images and maps of a state of the prior 85, the current fit
@@ -131,7 +131,7 @@ class MonitorSize:
 
     @property
     def rays(self) -> int:
-        """Number of rays for sharp spots of all channels, anywhere on their CCDs."""
+        """Number of traced rays that sharp spots of all channels need, wherever they are on their CCDs."""
         return self.spots * NodeClasses(self.phase, (0.5 * self.rows, 0.5 * self.columns)).sharp_count
 
     def parts(self, detector: EmvaDetector) -> Mapping[str, float]:

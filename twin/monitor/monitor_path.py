@@ -82,7 +82,7 @@ class MonitorPath(MonitorBeams):
 
     @cached_property
     def node_classes(self) -> NodeClasses:
-        """Classes of pupil nodes for this instrument's images."""
+        """Ladder of pupil quadratures from which the images of this instrument take their nodes."""
         phase = 2.0 * np.pi * self.numerical_aperture * self.pitch / self.wavelength
         return NodeClasses(phase, (0.5 * self.shape[0], 0.5 * self.shape[1]))
 
@@ -295,7 +295,7 @@ class MonitorPath(MonitorBeams):
         return out
 
     def _of_cameras(self, names: tuple[str, ...]) -> MonitorPath:
-        """Return the path of these cameras alone."""
+        """Return the optical path restricted to the channels of the named cameras."""
         if names not in self._parts:
             self._parts[names] = MonitorPath(self.instrument, self.backend, None if self._sized else self.nodes, names)
             self._parts[names].checked = self.checked
@@ -447,7 +447,7 @@ class MonitorPath(MonitorBeams):
 
 
 class _OnSpots(MonitorBeams):
-    """Beams whose positions count from the centre of their own spot, wherever it is."""
+    """Monitor beams whose positions on the CCD count from the centre of their own spot, wherever it is."""
 
     def _with(self, nodes: PupilNodes) -> MonitorBeams:
         return _OnSpots(self.instrument, self.backend, nodes, self.cameras)

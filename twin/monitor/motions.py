@@ -43,7 +43,7 @@ class ElementaryMotion:
 
     @property
     def unit(self) -> str:
-        """Unit in tables: arcsec, um, ppm or nm."""
+        """Unit of the motion in tables: arcsec, um, ppm or nm."""
         return _UNITS[self.kind][0]
 
     @property
@@ -117,7 +117,7 @@ def other_motions(instrument: Instrument, camera: str) -> tuple[ElementaryMotion
 
 
 def _six(body: str, name: str, pivot: str) -> list[ElementaryMotion]:
-    """Return the three shifts and three rotations of a body."""
+    """Return the three shifts and three rotations of a body as elementary motions."""
     shifts = [ElementaryMotion(body, "shift", a, pivot, f"{name} along {_AXES[a]}") for a in range(3)]
     return shifts + [ElementaryMotion(body, "rotate", a, pivot, f"{name} about {_AXES[a]}") for a in range(3)]
 

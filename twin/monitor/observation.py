@@ -34,8 +34,6 @@ Record: TypeAlias = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray | Measur
 From expected photons (S, C, rows, columns) of S states and C channels, and state numbers (S,), it returns the frames
 before, (C, frames, rows, columns) for all states or (S, C, frames, rows, columns), or already measured spots before;
 and the frames after, (S, C, frames, rows, columns).
-
-Dimensions: S states, C channels.
 """
 
 
@@ -124,12 +122,12 @@ class Observation:
 
     @property
     def numbers(self) -> np.ndarray:
-        """Numbers of the measured states."""
+        """Numbers of the states that could be measured, which select their random streams."""
         return self.light.numbers[self.measured]
 
     @property
     def truth(self) -> Truth:
-        """True changes of the measured states."""
+        """True changes of the cameras in the states that could be measured."""
         return self.light.truth.at(self.measured)
 
 
@@ -227,7 +225,7 @@ def light_of(
 
 
 def why_lost(experiment: MonitorExperiment, state: State) -> str:
-    """Return why the light of a state is lost; empty if it is not."""
+    """Return the reason why the light of a state does not reach the area CCDs; empty if it does."""
     try:
         light_of(experiment, [state], np.zeros(1, int))
     except LOST as error:

@@ -31,8 +31,6 @@ class Reading:
 
     Numbers are arrays over S states, (S,), or floats of one state. For a whole time series they are root mean squares.
 
-    Dimensions: S states.
-
     Attributes
     ----------
     group : str
@@ -64,7 +62,7 @@ class Reading:
 
     @property
     def camera(self) -> str:
-        """Camera of the change; empty for what two cameras read together."""
+        """Name of the camera that changes; empty for what two cameras read together."""
         return "" if self.group in (ANGLE_GROUP, GROUND_GROUP) else self.group
 
     @property
@@ -74,7 +72,7 @@ class Reading:
 
     @property
     def name(self) -> str:
-        """Name in sentences: ``Δα of forward``."""
+        """Name of the change in sentences, such as ``Δα of forward``."""
         if self.group == GROUND_GROUP:
             return f"{self.parameter.symbol} on the ground"
         return f"{self.parameter.symbol} of {self.camera}" if self.camera else self.parameter.symbol
@@ -155,7 +153,7 @@ class ReadingTable:
     ground_residuals: Mapping[str, Mapping[str, Any]]
 
     def __iter__(self) -> Iterator[Reading]:
-        """Iterate over the rows."""
+        """Iterate over the readings (rows of the table)."""
         return iter(self.rows)
 
     def at(self, state: int) -> ReadingTable:
@@ -174,7 +172,7 @@ class ReadingTable:
 
     @property
     def rms(self) -> ReadingTable:
-        """Root mean squares over the states, of cameras and their angle."""
+        """Table of the root mean squares over the states, for the cameras and their intersection angle."""
         rows = (row.each(lambda number: float(np.sqrt(np.mean(np.square(number))))) for row in self.rows)
         return ReadingTable(tuple(row for row in rows if row.group != GROUND_GROUP), {})
 
@@ -189,7 +187,7 @@ class ReadingTable:
         return tuple(row for row in self.rows if row.estimator == estimator and not np.all(np.isnan(row.sigma)))
 
     def by_change(self) -> list[list[Reading]]:
-        """Return the rows of all estimators for each change."""
+        """Return for each change the list of its readings by all estimators."""
         out: dict[tuple[str, str], list[Reading]] = {}
         for row in self.rows:
             out.setdefault((row.group, row.parameter.key), []).append(row)
@@ -353,6 +351,6 @@ def _sigma(combination: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
     ``combination`` holds the coefficients (P, 4), ``covariance`` the covariances of the parameters (S, 4, 4).
 
-    Dimensions: S states, P changes.
+    Dimensions: S states.
     """
     return np.asarray(np.sqrt(np.einsum("pi,sij,pj->sp", combination, covariance, combination)))

@@ -125,7 +125,7 @@ class ErrorBudget:
 
     @property
     def causes(self) -> tuple[str, ...]:
-        """Causes in the order of the file, without those that are zero."""
+        """Names of the causes in the order of the disturbances file, without those that are zero."""
         return tuple(dict.fromkeys(c.cause for c in self.prior.components))
 
     @property
@@ -239,7 +239,7 @@ class ErrorBudget:
         return glass[0], glass[1], rms[1] / rms[0]
 
     def _transfers(self) -> list[np.ndarray]:
-        """Return the vectors from the entry to the exit footprint of every 180-deg prism, in its frame."""
+        """Return for every 180-deg prism the vector from where light enters to where it leaves it, in its frame."""
         tree = self.experiment.instrument.assembly.tree
         out = []
         for channel in self.experiment.instrument.channels:
@@ -332,8 +332,6 @@ def _three_sigma(values: np.ndarray) -> tuple[float, float]:
     """Return three times the rms of values (S, ...) about zero, and the standard deviation of that number.
 
     The standard deviation follows from the scatter between the S states.
-
-    Dimensions: S states.
     """
     square = np.mean(values.reshape(len(values), -1) ** 2, axis=1)
     mean = float(np.mean(square))

@@ -343,7 +343,7 @@ def run_series(
 
 
 def too_large(job: JobSpec, k: int, reason: str) -> InputError:
-    """Return the error about the state at time number ``k``, which cannot be rendered."""
+    """Return the error for a state, that at time number ``k``, which cannot be rendered."""
     course = _course(job)
     changed = {"temperature": list(course.temperature), "motion": list(course.motion)}
     parts = {name: f"{name}s of {', '.join(nodes)}" for name, nodes in changed.items() if nodes}
@@ -368,7 +368,7 @@ MIN_LIGHT = 0.5
 def _warnings(
     experiment: MonitorExperiment, course: CourseSpec, saturated: np.ndarray, share: np.ndarray
 ) -> tuple[str, ...]:
-    """Return warnings about saturated pixels and lost light."""
+    """Return warnings for the user about saturated pixels and lost light in the images of a course."""
     out = []
     for i, channel in enumerate(experiment.path.channels):
         bad = np.flatnonzero(saturated[:, i])

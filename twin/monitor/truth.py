@@ -1,4 +1,4 @@
-"""True changes of a perturbed instrument, by exact chief rays in the base frame; no formula of the papers is used."""
+"""True changes of a perturbed instrument, by exact chief rays in the base frame, without any formula."""
 
 from __future__ import annotations
 
@@ -226,7 +226,7 @@ class LineSight:
 
     @cached_property
     def nominal(self) -> np.ndarray:
-        """Unperturbed directions from the line CCDs' points to the scene, in the world: (cameras, 1, LINE_POINTS, 3)."""
+        """Unperturbed directions in the world from points of the line CCDs, (cameras, 1, LINE_POINTS, 3)."""
         return self.trace([{}])
 
     @cached_property
@@ -270,7 +270,10 @@ class LineSight:
 
 
 def _about(sight: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Return axes X, Y, Z as columns, with Z along a line of sight and Y as near to ``across`` as possible."""
+    """Return the axes X, Y, Z of a line of sight as columns of a matrix.
+
+    Z is along the line of sight, and Y as near to the direction ``across`` as possible.
+    """
     x = np.cross(across, sight)
     x = x / np.linalg.norm(x)
     return np.stack([x, np.cross(sight, x), sight], axis=-1)

@@ -79,11 +79,11 @@ class ReadNoise:
 
     @property
     def fixed_variance_e2(self) -> float:
-        """Variance that stays from frame to frame, in electrons squared: zero."""
+        """Variance over pixels that is the same in every frame, in electrons squared: zero for read noise."""
         return 0.0
 
     def temporal_variance_e2(self, electrons: Any) -> float:
-        """Return the variance within a pixel, the same at every signal, in electrons squared."""
+        """Return the variance of read noise from frame to frame, the same at every signal, in electrons squared."""
         return self.sigma_e**2
 
     def fixed_e(self, shape: tuple[int, ...], rng: np.random.Generator) -> None:
@@ -113,11 +113,11 @@ class FixedOffsets:
 
     @property
     def fixed_variance_e2(self) -> float:
-        """Variance over the pixels, in electrons squared."""
+        """Variance of the fixed offsets over the pixels, in electrons squared."""
         return self.sigma_e**2
 
     def temporal_variance_e2(self, electrons: Any) -> float:
-        """Return the variance from frame to frame, in electrons squared: zero."""
+        """Return the variance from frame to frame, in electrons squared: zero for fixed offsets."""
         return 0.0
 
     def fixed_e(self, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
@@ -265,7 +265,7 @@ class EmvaDetector:
 
     @classmethod
     def _sheet_names(cls) -> list[str]:
-        """Return the names of the numbers in a data sheet."""
+        """Return the names of those attributes that are numbers of a data sheet."""
         return [field.name for field in fields(cls) if field.name != "noise"]
 
     @cached_property
@@ -280,7 +280,7 @@ class EmvaDetector:
 
     @property
     def max_dn(self) -> int:
-        """Largest grey value of the converter."""
+        """Largest grey value that the converter can output, 2**bit_depth - 1."""
         return self._sheet.max_dn
 
     @property
@@ -497,7 +497,7 @@ class EmvaDetector:
 
     @property
     def _read_sigma_e(self) -> float:
-        """Temporal noise without shot noise at a full well, in electrons rms."""
+        """Temporal noise at a full well without its shot noise, in electrons rms."""
         if not self.noise:
             return self.dark_noise_e
         further = sum(float(term.temporal_variance_e2(self.full_well_e)) for term in self.noise)

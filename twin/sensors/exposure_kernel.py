@@ -116,7 +116,7 @@ class Reading:
     ) -> None:
         """Record frames of images with compiled kernels.
 
-        Dimensions: F frames, P pixels.
+        Dimensions: F frames.
 
         Parameters
         ----------
@@ -202,7 +202,7 @@ class _Numbers:
         return cls(mean, shift, _aligned(np.uint64, frames, lanes), normals)
 
     def expect(self, expected: Callable[[int], tuple[np.ndarray, np.ndarray]], images: range) -> None:
-        """Set the expected electrons of some images."""
+        """Set the expected electrons and the black levels of some images of the group."""
         for position, image in enumerate(images):
             for row, values in zip((self.mean, self.shift), expected(image), strict=True):
                 row[position * values.size : (position + 1) * values.size] = values.reshape(-1)
@@ -257,7 +257,7 @@ def _key(stream: np.random.SeedSequence) -> _Key:
 
 
 def _shared_numbers(streams: Sequence[np.random.SeedSequence], most: int) -> dict[_Key, _SharedNumbers]:
-    """Return memory for the numbers of each stream of several images, for ``most`` streams at most."""
+    """Return memory for the random numbers of each stream that several images share, ``most`` streams at most."""
     several = [key for key, times in Counter(map(_key, streams)).items() if times > 1]
     return {key: _SharedNumbers() for key in several[:most]}
 
@@ -466,7 +466,7 @@ def _grey(electrons: Any, normal: Any, shift: Any, numbers: Sequence[Any]) -> An
 
 
 def _cell(mean: Any, word: Any) -> tuple[Any, Any, Any]:
-    """Return the row of the table, the smallest quantile in its cell, and whether the cell has others."""
+    """Return the table's row for a mean, the smallest quantile in its cell, and whether the cell has others."""
     import drjit as dr
     from drjit.llvm import UInt32
 
@@ -477,7 +477,10 @@ def _cell(mean: Any, word: Any) -> tuple[Any, Any, Any]:
 
 
 def _looked_up(mean: Any, word: Any, normal: Any, shift: Any, numbers: Sequence[Any]) -> tuple[Any, Any]:
-    """Return the grey values of one frame, and whether the table or the expansion leaves each number open."""
+    """Return the grey values of one frame as far as the table or the expansion determines them.
+
+    The second result is True for each number that they leave open.
+    """
     import drjit as dr
     from drjit.llvm import Float64
 

@@ -161,7 +161,7 @@ class LineCcd:
         return self.detector.noise_model(self.exposure)
 
     def pattern(self, seed: np.random.SeedSequence) -> FixedPattern:
-        """Return gain and offset of every column of the line, (1, pixels)."""
+        """Return relative response and offset of every column of the line, (1, pixels), drawn from a seed."""
         return self.detector.fixed_pattern((1, self.band.pixels), seed)
 
     def expose(
@@ -300,7 +300,7 @@ class Collection:
         return np.sqrt(np.maximum(self.mean_square(nu, motion), 0.0))
 
     def smear(self, motion: Motion) -> float:
-        """Return the rms displacement of the image about its mean over the collection, in pixels."""
+        """Return the rms displacement of the image about its mean while light is collected, in pixels."""
         lag, weight = self._lags(motion.highest)
         # the variance about a mean is half of the mean square of all differences
         return float(np.sqrt(max(float(weight @ (motion.variance - motion.covariance(lag))), 0.0)))
@@ -378,7 +378,7 @@ class Motion:
 
     @property
     def variance(self) -> float:
-        """Variance of the motion, in pixels^2."""
+        """Variance of the image's displacement, in pixels^2."""
         return float(0.5 * self.amplitude @ self.amplitude + self.level @ (self.last - self.first))
 
     def covariance(self, lag: np.ndarray) -> np.ndarray:

@@ -300,7 +300,7 @@ class _Plan:
             out[:, self.large] = _by_series(self.mean[self.large], word.take(self.large, axis=1))
 
     def _decided(self, guide: _Guide, which: np.ndarray, cell: np.ndarray, word: np.ndarray) -> np.ndarray:
-        """Return the quantiles that the table leaves open, for the means of the given indices."""
+        """Return the Poisson quantiles that the table leaves open, for the means of the given indices."""
         mean = self.mean[which]
         mean[mean >= TABLE_END] = 0.0
         number = guide.least.take(cell).astype(np.int64)
