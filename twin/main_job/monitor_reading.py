@@ -1,4 +1,4 @@
-"""Result of reading a monitor's images, simulated or recorded, and its JSON form (the content of recovered.json)."""
+"""Changes of the cameras estimated from a monitor's images, and their JSON form (recovered.json)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from twin.uncertainty.monitor_limits import short_text, unobserved_texts
 @shows("cameras", "frames", "centroid", "recovery")
 @dataclass(frozen=True, eq=False)
 class MonitorReading:
-    """Reading of one state of a monitor, with its covariance and the checks of it.
+    """Changes of the cameras estimated from a monitor's images of one state, with covariance and checks.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class MonitorReading:
     centroid : str
         Method that locates the spots.
     earlier_doubts : tuple of str
-        Reasons why sigma does not hold that were known before the spots were read.
+        Reasons why sigma does not hold that were known before the spots were measured.
     truth : Truth or None
         True changes, for simulated states.
     together : int

@@ -494,7 +494,10 @@ class JointMotions(MonitorImages):
         return self.ratio(sides)
 
     def stray(self, motion: str, wrong: str, right: str) -> Ratio:
-        """Return the spots' common displacement along the wrong axis, relative to that along the right axis."""
+        """Return the spots' common displacement along axis ``wrong`` over the size of that along axis ``right``.
+
+        The motion should move the spots along ``right`` only.
+        """
 
         def share(camera: str) -> Measured:
             left, other, sigma = self.spots(camera, motion, wrong)

@@ -282,8 +282,8 @@ class Rank:
     ----------
     unknowns : int
         Number of unknowns.
-    open : int
-        Number of undetermined combinations.
+    open : tuple of Combination
+        Undetermined combinations.
     weak_sigma : float
         Sigma of nadir y, in metres, with nadir x fixed.
     moved : float
