@@ -305,13 +305,13 @@ class MeritFunction:
     Attributes
     ----------
     backend : Backend
-        Backend of the trace.
+        Backend of the ray trace.
     beams : Beams
-        Fields and pupils.
+        Field points, entrance pupil and pupil nodes.
     operands : Operands
         Targets and limits.
     passages : tuple of Passage
-        Beams and the surfaces that they pass.
+        Segments of the beams that pass surfaces, with these surfaces and the sides in y.
     """
 
     backend: Backend

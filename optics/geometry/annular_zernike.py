@@ -13,7 +13,10 @@ from optics.numerics.quadrature import disk
 
 @lru_cache(maxsize=512)
 def _circle_terms(index: int, inner: float) -> tuple[tuple[int, float], ...]:
-    """Return the Zernike circle polynomials whose sum is an annular one: pairs of Noll index and factor."""
+    """Return the Zernike circle polynomials that add up to an annular one: pairs of Noll index and factor.
+
+    ``index`` is the Noll index and ``inner`` the inner radius of the ring relative to the outer one.
+    """
     n, m = noll_to_nm(index)
     same = [j for j in range(1, index + 1) if noll_to_nm(j)[1] == m]
     nodes = disk(n + 2, 4 * n + 8, inner)

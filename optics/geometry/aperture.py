@@ -128,7 +128,7 @@ class Circle:
 
 @dataclass(frozen=True)
 class _HalfSizeShape:
-    """Shape with two half-sizes, ``half_x`` and ``half_y``, about ``centre`` (metres)."""
+    """Shape with half-sizes ``half_x`` and ``half_y`` along x and y about ``centre`` (metres): rectangle or ellipse."""
 
     half_x: float
     half_y: float
@@ -235,7 +235,7 @@ class Ray:
     centre: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Check the width."""
+        """Check that the width is positive."""
         if not self.width > 0.0:
             raise ValueError(f"a vane needs a width, found {self.width}")
 
@@ -260,7 +260,7 @@ class Polygon:
     centre: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Check the corners."""
+        """Check that there are three corners or more."""
         if len(self.corners) < 3:
             raise ValueError(f"a polygon needs three corners or more, found {len(self.corners)}")
 

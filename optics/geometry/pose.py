@@ -136,7 +136,7 @@ class Pose:
         return matvec(self.rotation, np.asarray(points)) + self.translation
 
     def inverse(self) -> Pose:
-        """Return the transform from the parent's frame to the body's."""
+        """Return the inverse transform, from the parent's frame to the body's."""
         return Pose(self.rotation.T, -matvec(self.rotation.T, self.translation))
 
     def __matmul__(self, other: Pose) -> Pose:

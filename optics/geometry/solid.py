@@ -31,7 +31,8 @@ if TYPE_CHECKING:  # imported late: it takes 0.3 s
     import trimesh
 
 MAX_EXTENT = 100.0
-"""Half-width of the box to cut from, metres; a body that extends farther from the origin counts as open."""
+"""Half-width of the box from which bodies are cut, metres; a body that reaches farther from the origin counts as open.
+"""
 
 MERGE_LENGTH = 1e-7
 """Length below which edges are removed, and thickness below which a body counts as empty, metres.

@@ -135,7 +135,7 @@ class GridFigure:
 
 @dataclass(frozen=True, eq=False)
 class SummedFigure:
-    """Sum of Zernike terms and a grid, the figure of a deformed mirror."""
+    """Figure error of a deformed mirror: the sum of Zernike terms and a sampled grid."""
 
     terms: ZernikeFigure
     grid: GridFigure
@@ -290,7 +290,7 @@ def level(
 
 
 def newton_step(p: Any, d: Any, t: Any, surface: SurfaceNumbers, table: Any = None, active: Any = True) -> Any:
-    """Improve by one Newton step the distance t, in metres, from points p along unit directions d to a surface.
+    """Return the distances from points along rays to a surface, improved by one Newton step.
 
     Parameters
     ----------
@@ -401,7 +401,7 @@ class Surface:
 
     @property
     def is_plane(self) -> bool:
-        """True when the ideal shape is flat."""
+        """True when the ideal shape, without its figure error, is flat."""
         return self.curvature == 0.0 and not any(self.even) and not self.terms
 
     @property

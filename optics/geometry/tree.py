@@ -173,12 +173,12 @@ class PlacedBodies:
     scale: np.ndarray
 
     def pose(self, path: str, state: int = 0) -> Pose:
-        """Return the world pose of one body in one state (real part)."""
+        """Return the world pose of one body in one state; of complex poses the real part."""
         i = self.index[path]
         return Pose(self.rotation[state, i].real, self.translation[state, i].real)
 
     def size(self, path: str) -> np.ndarray:
-        """Return the size of one body relative to nominal in each of S states, (S,) (real part)."""
+        """Return the size of one body relative to nominal in each of S states, (S,); of complex sizes the real part."""
         return np.asarray(self.scale[:, self.index[path]].real)
 
 

@@ -168,7 +168,7 @@ class Disk:
     stretch: np.ndarray = field(default_factory=lambda: np.eye(2))
 
     def __post_init__(self) -> None:
-        """Check and freeze."""
+        """Freeze the arrays, and check that the radius is positive and the stretch has an inverse."""
         object.__setattr__(self, "centre", _vector(self.centre, "the centre of a disk"))
         object.__setattr__(self, "stretch", _frozen(self.stretch))
         if not (np.isfinite(self.radius) and self.radius > 0.0):
@@ -178,7 +178,7 @@ class Disk:
 
     @property
     def area(self) -> float:
-        """Area, m^2."""
+        """Area of the disk or ellipse, m^2."""
         return float(np.pi * self.radius**2 * abs(np.linalg.det(self.stretch)))
 
     @property
@@ -267,7 +267,7 @@ class HalfPlane:
     normal: np.ndarray
 
     def __post_init__(self) -> None:
-        """Check and freeze."""
+        """Freeze the arrays, check that the normal is not zero, and scale it to unit length."""
         object.__setattr__(self, "point", _vector(self.point, "the point of a half plane"))
         normal = _vector(self.normal, "the normal of a half plane")
         length = float(np.hypot(*normal))

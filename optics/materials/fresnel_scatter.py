@@ -746,7 +746,7 @@ of it falls into the angles that the lobe covers.
 """
 
 PAINT = ABg(5.0e-3, 0.1, 2.0)
-"""Forward lobe of black paint around its weak gloss."""
+"""Scatter lobe of black paint about the specular direction, around its weak gloss."""
 
 MIRROR = Finish(reflectance=0.98, scatter=POLISH)
 """Metal mirror with a protected coating."""

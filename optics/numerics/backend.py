@@ -143,7 +143,7 @@ def _aligned(values: np.ndarray) -> np.ndarray:
 
 
 def load_backend(name: str = "llvm") -> Backend:
-    """Return the backend ``llvm`` or ``cuda``.
+    """Return the float64 array types of the Dr.Jit backend ``llvm`` (CPU) or ``cuda`` (GPU).
 
     Raises
     ------

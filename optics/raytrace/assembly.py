@@ -18,7 +18,7 @@ from optics.numerics.number_tree import FrozenMap
 
 
 class Interaction(Enum):
-    """Interaction of a ray with a surface."""
+    """What a surface does with a ray: reflect it, refract it, reflect it totally, or let it pass."""
 
     REFLECT = "reflect"
     REFRACT = "refract"

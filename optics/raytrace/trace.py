@@ -186,8 +186,7 @@ share, are compiled already: those of lanes take seconds.
 """
 
 MIN_LANE_RAYS = 1 << 15
-"""Smallest number of rays for which lanes (one system per SIMD lane) are used: fewer take some milliseconds either way.
-"""
+"""Smallest number of rays for which each SIMD lane traces one system: fewer take some milliseconds either way."""
 
 MAX_RECORDINGS = 16
 """Largest number of recordings (instructions kept for replay) of one trace in one thread.

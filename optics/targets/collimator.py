@@ -47,8 +47,8 @@ class Collimator:
             Transverse coordinates from the collimator's axis, metres.
         target_shift : float
             Displacement of the target from the focus, along the direction of the light (toward the collimator's optics,
-            so that the beam diverges), metres. The camera's image then moves along the direction of the light by
-            ``target_shift * (f / focal_length)**2`` (Newton's equation).
+            so that the beam diverges), metres. The image in a camera of focal length f then moves along the direction
+            of the light by ``target_shift * (f / focal_length)**2`` (Newton's equation).
 
         Returns
         -------

@@ -146,7 +146,9 @@ def pinhole(diameter: float) -> Target:
 SPOKES = 36
 """Number of bright spokes of a window's Siemens star."""
 STAR_SHARE = 0.9
-"""Radius of a window's star, as a fraction of half the window. The Nyquist frequency lies 11.5 pixels from its middle.
+"""Radius of a window's Siemens star relative to half the window's side.
+
+The Nyquist frequency lies 11.5 pixels from its middle.
 """
 
 PINHOLE = 1.0

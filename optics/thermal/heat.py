@@ -63,7 +63,7 @@ class Temperatures:
         return Temperatures(self.change + other.change, self.gradient + other.gradient)
 
     def __getitem__(self, states: np.ndarray) -> Temperatures:
-        """Return the temperatures of the states of the given indices."""
+        """Return the temperature fields of some of the states, given by their indices."""
         return Temperatures(self.change[states], self.gradient[states])
 
     def at(self, point: np.ndarray) -> np.ndarray:

@@ -382,8 +382,9 @@ _NODES = 4096
 """Number of nodes per block where the field is sampled."""
 
 _BLOCK_SUM = 160
-"""Number of nodes per partial sum: sums of sums have less rounding error than one long sum, in single precision above
-all.
+"""Number of nodes that are added up in one partial sum; the partial sums are then added.
+
+Sums of sums have less rounding error than one long sum, above all in single precision.
 """
 
 

@@ -28,7 +28,7 @@ from optics.waves.pupil_shadow import RIM_SIDES, SMALLEST, quadrature_within, se
 from optics.waves.pupil_terms import products, smooth_terms, to_terms
 
 DEGREE = 10
-"""Degree of the polynomials that map the stop to a surface."""
+"""Degree of the polynomials that map a point of the stop to the point where its ray meets a surface."""
 
 ROUND_SIDES = (48, 96, 192)
 """Numbers of sides, tried in this order, of the polygon of equal area that represents a round edge.
@@ -282,10 +282,10 @@ def outlines_on_stop(
 
 
 def _passes_all(edge: Edge, around: np.ndarray, bright: np.ndarray) -> bool:
-    """Return True for a clear edge without a hole that passes all illuminated rays.
+    """Return True for a clear edge without a hole that passes all illuminated rays, with a margin.
 
-    ``around`` (B, N, 2) are positions of N rays in B images near the edge, and ``bright`` is the mask of illuminated
-    rays.
+    ``around`` (B, N, 2) are the positions of N rays in B images, moved outward by the margin, and ``bright`` is the
+    mask of illuminated rays.
     """
     if edge.blocks or (isinstance(edge.shape, Circle) and edge.shape.inner):
         return False

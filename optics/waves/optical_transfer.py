@@ -255,7 +255,8 @@ def _blocks(
 
 
 FINER = (4, 8, 16, 32, 64)
-"""Numbers of additional nodes that are tried."""
+"""Numbers of additional nodes along each direction that are tried, in this order, until a transfer function converges.
+"""
 
 CONVERGED = 2e-4
 """Largest change of a transfer function due to additional nodes with which there are enough nodes."""
@@ -611,7 +612,7 @@ class VariedTransfer:
 
     @property
     def known(self) -> float:
-        """MTF of the known pupil."""
+        """MTF (0 to 1) of the known pupil, about which the wavefronts vary."""
         return float(abs(sum(np.sum(terms.phasors) for terms in self.colours)))
 
     def modulation(self, paths: np.ndarray) -> np.ndarray:

@@ -36,7 +36,7 @@ from optics.waves.pupil_terms import (
 )
 
 DEGREE = 8
-"""Degree of the polynomials.
+"""Degree of the polynomials for eikonal and amplitude over a pupil without vignetting.
 
 The library's gf7 leaves an eikonal residual of 1e-8 wavelengths, nominal or perturbed; with 5 nm of every Zernike term
 to seventh order on each mirror it leaves 2e-5.
