@@ -73,9 +73,9 @@ def main(
 
         python -m twin.camera my_camera.yaml --perturb "M2 shift z 20 um" --perturb "M2 rotate x 3 arcsec"
 
-    With --refocus the image plane is moved to the smallest mean square wavefront error over the field, with `--refocus
-    --tilt` it is tilted about the line as well. The camera's file with that plane and all comments is in artefacts/,
-    ready for use.
+    With --refocus the image plane is moved to the smallest mean square wavefront error over the field, and with
+    `--refocus --tilt` it is tilted about the line as well. The camera's file with that plane and all comments is in
+    artefacts/, ready for use.
 
     With --perturb, --temperature or a job the camera is analysed in that state, and the first paragraph describes the
     effect. Bodies are named by their path or its last parts, as in a job's file.
