@@ -53,7 +53,7 @@ def _explained(errors: Console) -> Iterator[None]:
 
 
 def _quantity(option: str, text: str | None, kind: Kind) -> float | None:
-    """Return the value of an option with a unit, in SI."""
+    """Return the value of a command-line option given as text with a unit, in SI; None if it is not given."""
     if text is None:
         return None
     try:
@@ -74,7 +74,7 @@ def _check_out(out: Path, suffixes: Sequence[str], force: bool) -> None:
 
 
 def _write(out: Path, content: bytes) -> None:
-    """Write a file atomically."""
+    """Write a file so that it never exists half-written, even if the program is interrupted."""
     handle, name = -1, ""
     try:
         handle, name = tempfile.mkstemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent)

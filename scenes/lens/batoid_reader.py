@@ -60,7 +60,7 @@ class _Reader:
         self.named: dict[float, CatalogueGlass] = {}
 
     def error(self, key: KeyPath, problem: str, found: object = None, allowed: str | None = None) -> InputError:
-        """Return an error at a key of the file."""
+        """Return an input error that names the file and the line of a key, for the caller to raise."""
         text = None if found is None else shown(found)
         return InputError(Issue(problem, self.file, self.line(key), key, text, allowed))
 

@@ -162,7 +162,7 @@ class ReadCamera:
     rays: int
 
     def summary_lines(self, lens: Prescription) -> list[str]:
-        """Return the lines of a summary for the user."""
+        """Return a summary of the camera and of the conversion for the user, line by line."""
         camera = self.camera
         mirrors = sum(m.light is None for m in camera.mirrors.values())
         faces = sum(m.light == "refracts" for m in camera.mirrors.values())
@@ -537,7 +537,7 @@ def _derived(lens: Prescription, plain: dict[str, Any], backend: Backend) -> Cam
 
 
 def _pupil(lens: Prescription, narrow: CameraModel, plain: dict[str, Any], backend: Backend, width: Width) -> float:
-    """Return the diameter of the entrance pupil, in metres."""
+    """Return the diameter of the entrance pupil that the prescription or the user's option defines, in metres."""
     if width.pupil is not None:
         return width.pupil
     allowed = "the entrance pupil's diameter: --pupil"

@@ -179,7 +179,7 @@ def zemax_text(lens: Prescription) -> str:
     number = 0
 
     def surface(kind: str, *rest: str, thickness: float = 0.0, curvature: float = 0.0) -> None:
-        """Append the statements of one surface."""
+        """Append the Zemax statements of one surface, of a type, with further statements, thickness and curvature."""
         nonlocal number
         stop = [r for r in rest if r == "STOP"]
         others = [r for r in rest if r != "STOP"]
@@ -214,7 +214,7 @@ def zemax_text(lens: Prescription) -> str:
 
 
 def _number(value: float) -> str:
-    """Return a number with all its digits."""
+    """Return a number as text with all digits of the float."""
     return repr(float(value))
 
 

@@ -80,7 +80,7 @@ _REFUSED = {
 
 @dataclass
 class CodevSurface:
-    """State of a surface while its statements are read."""
+    """Surface of a CODE V file: what the statements read so far say about it."""
 
     name: str
     line: int
@@ -101,7 +101,7 @@ class CodevSurface:
 
 @dataclass
 class CodevSystem:
-    """State of a file while it is read."""
+    """Optical system of a CODE V file: surfaces and settings from the statements read so far."""
 
     source: Source
     scale: float = 1e-3

@@ -477,13 +477,13 @@ class Prescription:
 
     @property
     def image(self) -> LensSurface:
-        """Last surface."""
+        """Surface of the image, the last of the prescription."""
         return self.surfaces[-1]
 
     def error(
         self, problem: str, line: int | None = None, found: str | None = None, allowed: str | None = None
     ) -> InputError:
-        """Return an error at a line of the file."""
+        """Return an input error that names the prescription's file and a line of it, for the caller to raise."""
         return InputError(Issue(problem, self.file, line or None, (), found, allowed))
 
     def with_notes(self, *notes: Note) -> Prescription:

@@ -82,7 +82,7 @@ class Source:
         allowed: str | None = None,
         suggestion: str | None = None,
     ) -> InputError:
-        """Return an error at a line of the file."""
+        """Return an input error that names the file and a line of it, for the caller to raise."""
         text = None if found is None else shown(found)
         return InputError(Issue(problem, self.file, line, (), text, allowed, suggestion))
 

@@ -67,7 +67,7 @@ _EDGES = {
 
 @dataclass
 class _Surface:
-    """State of a surface while its statements are read."""
+    """Surface of a Zemax file: what the statements read so far say about it."""
 
     number: int
     line: int
@@ -89,7 +89,7 @@ class _Surface:
 
 @dataclass
 class _System:
-    """State of a file while it is read."""
+    """Optical system of a Zemax file: surfaces and settings from the statements read so far."""
 
     source: Source
     scale: float = 1e-3
@@ -213,7 +213,7 @@ def _take_system(system: _System, s: Statement) -> None:
 
 
 def _positive(source: Source, s: Statement, what: str) -> float:
-    """Return a number of a statement that must be positive."""
+    """Return the first number of a statement; raise InputError if it is not positive."""
     value = source.finite(s, 0, what)
     if not value > 0.0:
         raise source.error(f"{what} is not greater than zero", s.line, s.text)

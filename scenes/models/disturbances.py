@@ -63,7 +63,7 @@ UNITS: Mapping[str, tuple[str, float]] = {
 }
 """Kind of component -> the unit in which its amounts are printed, and the size of that unit in SI."""
 HEAT = ("temperature", "gradient")
-"""Kinds of components that act through the thermal model."""
+"""Kinds of components that are temperatures; the thermal model computes their effect on the bodies."""
 SINGLE = ("scale", "radius", "conic", "index", "temperature")
 """Kinds of components without an axis, of which a body has only one, such as its scale."""
 _NEEDS = {"gradient": "temperature"}
@@ -531,7 +531,7 @@ def _some(paths: Sequence[str]) -> str:
 
 
 def _possible(info: NodeInfo, transparent: bool) -> set[str]:
-    """Return the kinds of changes that a node allows."""
+    """Return the kinds of components (shift, figure, temperature ...) that a body allows."""
     return {*info.allows, *(("index_gradient",) if transparent else ())}
 
 

@@ -193,7 +193,7 @@ def _no_cameras(camera_specs: Mapping[str, object], backend: Backend) -> tuple[I
 def _build(
     spec: InstrumentSpec, camera_specs: Mapping[str, object], backend: Backend, free_beams: bool, free_bodies: bool
 ) -> Instrument:
-    """Build an instrument without the cache."""
+    """Build an instrument anew, without looking it up in the cache."""
     if spec.monitor is not None:
         monitor_chain.check_prisms(spec)
     derived: dict[str, CameraModel] = {}

@@ -298,7 +298,7 @@ def _apart(one: FaceChange, other: FaceChange, radius: float) -> float:
 
 
 def _in_words(field: Temperature) -> str:
-    """Return a linear field as text of a job's file."""
+    """Return a linear temperature field as text in the form of a job's file."""
     slope = ", ".join(f"{g:.6g} K/m" for g in field.gradient)
     return f"temperature: {{change: {field.change:.6g} K, gradient: [{slope}]}}"
 

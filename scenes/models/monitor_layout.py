@@ -147,7 +147,7 @@ class Beam:
 
 
 CONTINUOUS = tuple(item.name for item in fields(Beam) if item.name not in {"prisms", "area_ccd"})
-"""Names of the continuous numbers of a beam."""
+"""Names of the numbers of a beam that vary continuously, unlike its prisms and its area CCD."""
 Layout = tuple[Beam, ...]
 
 

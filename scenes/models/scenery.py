@@ -394,7 +394,7 @@ class MeasuredFinishes:
         return out
 
     def warnings(self) -> tuple[str, ...]:
-        """Return warnings about the tables."""
+        """Return a warning for each table of scattering that is not reciprocal, with the rms of the difference."""
         out = []
         for kind, scatter in self.scatter.items():
             rms = scatter.table.reciprocity()

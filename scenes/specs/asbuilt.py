@@ -123,7 +123,7 @@ class WavefrontReadingsSpec(ReadingsSpec):
 
     @property
     def numbers(self) -> range:
-        """Noll indices of the terms that are used."""
+        """Noll indices of the Zernike terms that are used, from the first to the last of `terms`."""
         return range(noll(self.terms[0]), noll(self.terms[1]) + 1)
 
     @property
@@ -165,7 +165,7 @@ class FocusReadingsSpec(ReadingsSpec):
 
     @property
     def has_data(self) -> bool:
-        """True if there are values."""
+        """True if the file holds measured positions of best focus."""
         return self.values is not None or self.file is not None
 
 
@@ -202,7 +202,7 @@ class MtfReadingsSpec(ReadingsSpec):
 
     @property
     def has_data(self) -> bool:
-        """True if there are values."""
+        """True if the file holds measured MTF values."""
         return self.along_line is not None
 
 
@@ -307,13 +307,13 @@ class SightReadingsSpec(ReadingsSpec):
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """Names of the measured quantities among the four."""
+        """Names of the quantities that are measured: alpha, beta, gamma or principal_distance."""
         names = ("alpha", "beta", "gamma", "principal_distance")
         return tuple(name for name in names if getattr(self, f"sigma_{name}") is not None)
 
     @property
     def has_data(self) -> bool:
-        """True if there are values."""
+        """True if the file holds measured angles or a measured principal distance."""
         return getattr(self, self.measured[0]) is not None
 
 
@@ -344,7 +344,7 @@ class TemperatureReadingsSpec(ReadingsSpec):
 
     @property
     def has_data(self) -> bool:
-        """True if there are values."""
+        """True if the file holds measured temperatures."""
         return self.values is not None
 
 
@@ -379,7 +379,7 @@ class PositionReadingsSpec(ReadingsSpec):
 
     @property
     def has_data(self) -> bool:
-        """True if there are values."""
+        """True if the file holds measured positions."""
         return self.values is not None
 
 

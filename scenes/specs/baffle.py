@@ -158,7 +158,7 @@ class BaffleSpec(Spec):
         return self
 
     def plates(self, name: str) -> tuple[Plate, ...]:
-        """Return the part as flat plates with this name."""
+        """Return the baffle as flat plates that all have the given name."""
         pose = Pose(rotation_matrix(self.rotate), self.position)  # type: ignore[arg-type]
         width, height, length = self.width or 0.0, self.height or 0.0, self.length or 0.0
         radius = 0.5 * (self.diameter or 0.0)
@@ -245,7 +245,7 @@ class SurfaceEdgeSpec(Spec):
 
     @property
     def shape(self) -> str:
-        """Shape of the edge, whether clear or blocking."""
+        """Shape of the edge, such as ``circle``, whether it transmits or blocks light inside."""
         return self.clear or self.blocks or ""
 
     def to_edge(self) -> Edge:

@@ -47,7 +47,7 @@ class CollimatorSpec(Spec):
 
     @property
     def model(self) -> Collimator:
-        """Optical model of the collimator."""
+        """Optical model of the collimator, which computes its images."""
         terms = {noll(term): size for term, size in self.wavefront.items()}
         return Collimator(self.focal_length, 0.5 * self.aperture, terms)
 

@@ -94,7 +94,7 @@ class DetectorSpec(TitledSpec):
 
     @property
     def saturation_e(self) -> float:
-        """Electrons of a pixel at saturation."""
+        """Number of electrons in a pixel at which the response ceases to be linear."""
         return min(self.full_well_e, (self.max_dn - self.offset_dn) / self.system_gain_dn_per_e)
 
     def check_exposure(self, exposure: float) -> None:

@@ -220,7 +220,7 @@ class CorrelationSpec(Spec):
 
     @property
     def table(self) -> tuple[tuple[float, ...], ...]:
-        """Correlation matrix."""
+        """Correlation matrix of the components, also where the file gives a single correlation."""
         if self.matrix is not None:
             return self.matrix
         count, value = len(self.between), self.correlation
@@ -233,7 +233,7 @@ JOINT = "joint"
 MOST_JOINT = 200
 """Largest number of joint components: a config.yaml holds the matrix of their correlations."""
 MOST_JOINT_BYTES = 4 << 20
-"""Largest size of a table of their correlations, in bytes."""
+"""Largest size of a file with the correlations of joint components, in bytes."""
 _AXES = ("x", "y", "z")
 
 
@@ -506,7 +506,7 @@ class CauseChangeSpec(_CauseKeys):
 
     @property
     def set_keys(self) -> Mapping[str, Any]:
-        """Keys that the job sets, with their values."""
+        """Key of the cause -> its new value, for the keys that the job sets."""
         return {name: getattr(self, name) for name in self.model_fields_set if getattr(self, name) is not None}
 
     def apply_to(self, cause: CauseSpec) -> CauseSpec:

@@ -191,7 +191,7 @@ class Prism180Spec(Spec):
 
     @property
     def reflector(self) -> Reflector:
-        """Reflector of this kind."""
+        """Geometry of the faces or mirrors of this kind of reflector."""
         return REFLECTORS[self.kind or "lateral_transfer"]
 
     @model_validator(mode="after")
@@ -233,7 +233,7 @@ class Prism0Spec(Spec):
 
     @property
     def reflector(self) -> Reflector:
-        """Reflector of this kind."""
+        """Geometry of the faces or mirrors of this kind of reflector."""
         return REFLECTORS[self.kind or "rhomboid"]
 
     @model_validator(mode="after")

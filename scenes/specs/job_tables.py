@@ -47,7 +47,7 @@ class TemperatureSpec(Spec):
 
     @property
     def linear(self) -> Temperature:
-        """Linear temperature field."""
+        """Temperature change as a linear function of the position, for the thermal model."""
         return Temperature(self.change, self.gradient)
 
     @property
@@ -320,7 +320,7 @@ class FinishesSpec(Spec):
 
     @property
     def tables(self) -> dict[tuple[str, str], FinishTableSpec]:
-        """Kind of surface and property -> table."""
+        """(Kind of surface, property) -> file of the measured table."""
         both = (
             (kind, what, getattr(spec, what)) for kind, spec in self.by_kind.items() for what in ("bsdf", "coating")
         )

@@ -24,7 +24,7 @@ from scenes.yaml.yaml_file import read_yaml
 
 Event = Literal["safe_mode", "heater_set_point", "refocus", "eclipse_season_begins", "eclipse_season_ends"]
 EVENTS: tuple[str, ...] = get_args(Event)
-"""Events in operation, other than readings."""
+"""Names of the events that a record of operation may contain, besides readings."""
 
 
 ENDINGS: Mapping[str, tuple[Kind, str]] = FrozenMap(

@@ -169,7 +169,7 @@ def _check_as_built(value: Mapping[str, PlainPerturbationSpec]) -> Mapping[str, 
 
 
 AsBuilt = Annotated[Paths[PlainPerturbationSpec], IN_WORDS, AfterValidator(_check_as_built)]
-"""Node -> deviation of the built body from the design."""
+"""Path of a node -> deviation of the built body from the design."""
 
 
 Perturbed = TypeVar("Perturbed", bound=PlainPerturbationSpec)
@@ -262,7 +262,7 @@ def perturbation_text(perturb: Mapping[str, PlainPerturbationSpec]) -> str:
 
 
 def _short(value: Any) -> str:
-    """Return a quantity, or several, in short form."""
+    """Return a quantity as short text; several, such as the components of a vector, in parentheses."""
     if isinstance(value, dict):
         known = {key: part for key, part in value.items() if part not in ("0 K", ["0 K/m"] * 3)}
         return ", ".join(f"{key} {_short(part)}" for key, part in known.items())

@@ -513,7 +513,7 @@ class CameraSetup(Spec):
 
     @property
     def job(self) -> JobSpec:
-        """Job that perturbs the camera's instrument."""
+        """Job of the instrument that carries the camera, with the camera's perturbations."""
         job = JobSpec.model_construct(instrument=self.mounted_instrument[0].name, perturb=self.perturb)
         return job.with_source(self._source)
 

@@ -115,7 +115,7 @@ class SpectrumSpec(Spec):
 
     @model_serializer(mode="wrap")
     def _short(self, handler: SerializerFunctionWrapHandler) -> Any:
-        """Return an even band as its two wavelengths."""
+        """Return the spectrum in the form of a file; an evenly distributed band as its two wavelengths."""
         full = handler(self)
         return full["between"] if self.between is not None and self.black_body is None else full
 

@@ -310,7 +310,7 @@ MERIT_UNITS: Mapping[str, Kind | None] = FrozenMap(
 """Kind of a merit -> kind of quantity of its value; None for a number (waves of the design wavelength, MTF)."""
 MORE_IS_BETTER = ("mtf",)
 OF_MONITOR = ("monitor_angle", "monitor_focus")
-"""Kinds of merits that concern the readings of a monitor."""
+"""Kinds of merits that are standard deviations of the monitor's readings."""
 POSTERIOR = "posterior"
 """Estimator of a monitor's readings with the smallest variance."""
 

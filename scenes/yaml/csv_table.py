@@ -24,7 +24,7 @@ LARGEST_NUMBER = 1e100
 """Largest absolute value of a number in a table, in the table's unit: results computed from larger ones would overflow.
 """
 LARGEST_TABLE = 1 << 30
-"""Largest size of a table, in bytes."""
+"""Largest size of a CSV file, in bytes."""
 _HEAD = re.compile(r"(?P<name>[^\[\]]*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
 _DELIMITERS = (",", ";", "\t")
 _LEAST, _MOST = -np.inf, np.inf

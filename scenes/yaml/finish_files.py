@@ -48,7 +48,7 @@ from scenes.yaml.units import ANGLE, LENGTH, SCALE
 
 ENDING = ".bsdf"
 LARGEST = 64 << 20
-"""Largest size of a file, in bytes."""
+"""Largest size of a BSDF or coating file, in bytes."""
 MOST_ANGLES = {"SampleRotation": 360, "AngleOfIncidence": 181, "ScatterAzimuth": 721, "ScatterRadial": 2000}
 TIS_TOLERANCE = 0.25
 """Largest relative difference between the total integrated scatter (TIS) that a file states and the integral of its

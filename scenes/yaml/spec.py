@@ -482,7 +482,7 @@ _LIMITS = {
 
 
 def _issue(model: type[Spec], detail: ErrorDetails, source: Source) -> Issue:
-    """Return the issue of a pydantic error."""
+    """Return the issue, with file, line and plain message, for an error that pydantic reports."""
     key, value = detail["loc"], detail["input"]
     # The fault is in the key itself, not in its value.
     of_key = bool(key) and key[-1] == "[key]"

@@ -84,7 +84,7 @@ class Terminal(Console):
     """Terminal for results that leaves a closed pipe to ``to_stdout``."""
 
     def on_broken_pipe(self) -> None:
-        """Raise the exception again."""
+        """Raise the exception of a closed pipe again, so that ``to_stdout`` handles it."""
         raise
 
 

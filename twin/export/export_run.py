@@ -33,7 +33,7 @@ from twin.framework.report import Report, Section
 from twin.framework.run_folder import Manifest, RunFolder, altered, finished_manifest
 
 Card = tuple[str, str | int | float, str]
-"""Keyword, value, and comment with the unit in brackets."""
+"""FITS header card: keyword, value, and comment with the unit in brackets."""
 _SCALE, _TIE, _KEYS = 33550, 33922, 34735
 _GEODETIC_3D = 4979
 _CHECKED = "of the file as it was written"
@@ -304,7 +304,7 @@ class Exported:
     changed: tuple[str, ...]
 
     def numbers(self) -> dict[str, Any]:
-        """Return the contents of files.json."""
+        """Return the contents of files.json: the files written, with their columns and sources."""
         tables = {
             table.name: {one.name: {"unit": one.unit, "description": one.description} for one in table.columns}
             for table in self.described

@@ -164,7 +164,7 @@ class Studio:
 
 
 def _sensor(mi: Any, view: View) -> Any:
-    """Return Mitsuba's description of the camera."""
+    """Return Mitsuba's description of the camera of a view."""
     look = mi.ScalarTransform4f().look_at(
         origin=view.eye.tolist(), target=(view.eye + view.forward).tolist(), up=view.up.tolist()
     )
@@ -184,7 +184,7 @@ def _sensor(mi: Any, view: View) -> Any:
 BLUR, BLUR_SHARE = (6.0, 16.0), 0.025
 """Over how many pixels the light on a flat patch is averaged: limits, and share of the root of its area."""
 EXPOSURE = 0.88
-"""Factor from radiance to exposed radiance."""
+"""Factor by which radiance is multiplied before the tone curve."""
 SHOULDER = 0.75
 """Exposed radiance above which the tone curve compresses, so that highlights keep detail."""
 
@@ -237,7 +237,7 @@ def denoised(image: np.ndarray, patches: np.ndarray) -> np.ndarray:
 
 
 def displayed(light: np.ndarray) -> np.ndarray:
-    """Convert radiance to sRGB grey values, uint8."""
+    """Convert radiance to sRGB grey values, uint8, with exposure and tone curve applied."""
     x = np.clip(EXPOSURE * light, 0.0, None)
     room = 1.0 - SHOULDER
     x = np.where(x > SHOULDER, SHOULDER + room * -np.expm1(-(x - SHOULDER) / room), x)

@@ -181,7 +181,7 @@ class InstrumentTwin:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of its cameras."""
+        """Names of the instrument's cameras."""
         return tuple(self.resolved.instrument.cameras)
 
     @property

@@ -234,7 +234,7 @@ class RasterFileSpec(_HeightsFileSpec):
 _FILE_NAMES = ("file", "geoid", "earth_orientation")
 """Keys of specifications whose values are paths of files in other formats."""
 FILE_KEYS = ("platform", "orbit", "attitude", "lines", "ground", "image_points", "tie_points")
-"""Keys of a pass whose values are its tables."""
+"""Keys of a pass whose values are paths of its tables."""
 
 
 def with_absolute_files(

@@ -489,7 +489,7 @@ class OrbitMonitorSpec(TitledSpec):
 
     @property
     def times_key(self) -> KeyPath:
-        """Key of the times in the file."""
+        """Key of the file that gives the times: that of the course, or of the readings of the closed loop."""
         return ("mechanisms", "readings") if self.course is None else ("course",)
 
     @property
@@ -513,7 +513,7 @@ class OrbitMonitorSpec(TitledSpec):
 
     @property
     def reference_index(self) -> int:
-        """Number of the reference time, counted from 0."""
+        """Index, counted from 0, of the time at which the cameras were calibrated, among the times of the course."""
         number = index_of_value(self.reference_time, self.times)
         assert number is not None
         return number
