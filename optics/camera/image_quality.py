@@ -35,7 +35,7 @@ from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import DEGREE, VIGNETTED_RINGS, PupilFunction, fit_pupils
 
 _STATISTICS_PHASE = 36.0
-"""Phase from the middle to the rim of the stop, radians, that sets the number of quadrature nodes for rms values.
+"""Phase from the middle to the rim of the stop, radians, that sets the number of nodes for rms values.
 
 It gives twelve rings of nodes, enough to integrate the square of a smooth wavefront error.
 """

@@ -90,7 +90,7 @@ class Prescription:
     field_bias: float
 
     def __post_init__(self) -> None:
-        """Freeze and check the names."""
+        """Make the mappings immutable, and check that shapes, poses and stop have matching names."""
         object.__setattr__(self, "surfaces", FrozenMap(self.surfaces))
         object.__setattr__(self, "poses", FrozenMap(self.poses))
         if set(self.surfaces) != set(self.poses) or self.stop not in self.names[:-1]:

@@ -53,7 +53,7 @@ _Corner = tuple[int, int, int, int]
 """Corner in homogeneous integer coordinates (x, y, z, w) with w > 0: the point (x, y, z) / w."""
 
 _Rings = dict[int, list[int]]
-"""Corners of each face, counterclockwise as seen from outside, by face number."""
+"""Face number -> indices of the corners of that face, counterclockwise as seen from outside."""
 
 
 class OpenBodyError(PhysicalError, ValueError):

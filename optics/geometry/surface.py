@@ -29,7 +29,7 @@ class ZernikeFigure:
     terms: Mapping[int, float] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
-        """Freeze the mapping of terms."""
+        """Make the mapping of Zernike terms immutable."""
         if not self.radius > 0.0:
             raise ValueError(f"a figure needs a positive radius, found {self.radius}")
         object.__setattr__(self, "terms", FrozenMap({int(k): float(v) for k, v in self.terms.items()}))

@@ -40,7 +40,7 @@ class Body:
     scales: bool = True
 
     def __post_init__(self) -> None:
-        """Freeze the pivots."""
+        """Make the mapping of pivots immutable."""
         pivots = {
             ORIGIN: (0.0, 0.0, 0.0),
             **{k: (float(v[0]), float(v[1]), float(v[2])) for k, v in self.pivots.items()},
@@ -107,7 +107,7 @@ class Motion:
     abbe: float = 0.0
 
     def __post_init__(self) -> None:
-        """Freeze the figure."""
+        """Make the mapping of figure terms immutable."""
         object.__setattr__(self, "figure", FrozenMap(self.figure))
 
     @property

@@ -42,7 +42,7 @@ Tree = TypeVar("Tree")
 
 
 def leaves(tree: Any) -> dict[Path, Any]:
-    """Return path -> leaf for every number in a tree, in the order of its fields."""
+    """Return a mapping from path to number for every number in a tree, in the order of its fields."""
     out: dict[Path, Any] = {}
     _collect(tree, (), out)
     return out
@@ -146,7 +146,7 @@ def _all(branches: tuple[Any, ...] | None, count: int) -> tuple[Any, ...]:
 
 
 def with_leaf(tree: Tree, path: Path, value: Any) -> Tree:
-    """Return a copy of the tree with another number at ``path``.
+    """Return a copy of the tree in which the number at ``path`` is replaced by ``value``.
 
     Raises
     ------
@@ -160,7 +160,7 @@ def with_leaf(tree: Tree, path: Path, value: Any) -> Tree:
 
 
 def _rebuilt(tree: Any, path: Path, value: Any) -> Any:
-    """Return a copy of a branch with another number at ``path``."""
+    """Return a copy of a branch in which the number at ``path`` is replaced by ``value``."""
     if not path:
         return value
     first, rest = path[0], path[1:]

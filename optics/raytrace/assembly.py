@@ -158,7 +158,7 @@ class Assembly:
     above_d: Mapping[str, float] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
-        """Freeze the mappings and check that every name exists."""
+        """Make the mappings immutable, and check that every body and element that they name exists."""
         paths = set(self.tree.paths)
         for name, element in self.elements.items():
             if name != element.name:

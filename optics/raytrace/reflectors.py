@@ -217,9 +217,9 @@ def _beam_height(width: float) -> float:
 
 
 def null_point(length: float, width: float) -> tuple[float, float, float]:
-    """Return the apex of the 180-deg prism's reflecting faces in its frame, metres.
+    """Return the point about which rotations of the 180-deg prism leave the beam unchanged, in its frame, metres.
 
-    Rotations about it leave the beam unchanged.
+    It is the apex in which the planes of the prism's reflecting faces meet.
     """
     return (0.0, 0.0, _beam_height(width) + 0.5 * length)
 

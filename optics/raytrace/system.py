@@ -150,7 +150,7 @@ class SystemBatch:
         return UploadedSystems(backend, self.structure, self.form, tuple(numbers_in(derived)), grids, self.count, True)
 
     def take(self, systems: np.ndarray) -> SystemBatch:
-        """Return the systems of the given indices."""
+        """Return some of the systems, given by their indices."""
         if np.array_equal(systems, np.arange(self.count)):
             return self
 

@@ -35,7 +35,7 @@ class Collimator:
     wavefront: Mapping[int, float] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
-        """Freeze the wavefront."""
+        """Make the mapping of wavefront terms immutable."""
         object.__setattr__(self, "wavefront", FrozenMap(self.wavefront))
 
     def path(self, point: np.ndarray, target_shift: float = 0.0) -> np.ndarray:

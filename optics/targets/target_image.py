@@ -282,7 +282,7 @@ def _finite_image(
 
 @dataclass(frozen=True)
 class _Band:
-    """Transfer function between two smooth low passes: inside the first and outside the second."""
+    """Transfer function limited to a band of frequencies: multiplied by the difference of two smooth low passes."""
 
     transfer: Transfer
     width: float

@@ -35,7 +35,7 @@ class Temperature:
         return float(self.change + inner(np.array(self.gradient), point))
 
     def seen_from(self, child: Pose) -> Temperature:
-        """Return the field in the frame of a body with pose ``child`` in this one's frame."""
+        """Return the same field in the frame of another body, whose pose in this body's frame is ``child``."""
         return Temperature(self.at(child.translation), triple(matvec(child.rotation.T, np.array(self.gradient))))
 
 
@@ -71,7 +71,7 @@ class Temperatures:
         return np.asarray(self.change + inner(self.gradient, point))
 
     def seen_from(self, child: Pose) -> Temperatures:
-        """Return the fields in the frame of a body with pose ``child`` in this one's frame."""
+        """Return the same fields in the frame of another body, whose pose in this body's frame is ``child``."""
         return Temperatures(self.at(child.translation), matvec(child.rotation.T, self.gradient))
 
 

@@ -62,11 +62,11 @@ _ROUNDING = 1e-14  # metres rms; a smaller residual is rounding and gets no grid
 
 
 class NodesError(PhysicalError, ValueError):
-    """The nodes do not describe the face.
+    """The nodes of a table do not describe the optical face.
 
     Attributes
     ----------
-    allowed
+    allowed : str
         What is allowed, in words.
     """
 

@@ -349,7 +349,7 @@ class Bonded:
     about: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
+        """Check that expansion, temperature change and fixed point are finite."""
         if not np.all(np.isfinite([self.expansion, self.change, *self.about])):
             raise ValueError("a foundation needs a finite expansion, temperature change and fixed point")
 

@@ -74,7 +74,7 @@ class StopOutlines:
         return StopOutlines(self.clear + other.clear, self.blocked + other.blocked)
 
     def take(self, images: np.ndarray | slice) -> StopOutlines:
-        """Return the outlines of the images of the given indices."""
+        """Return the outlines of some of the images, given by their indices."""
         return StopOutlines(tuple(p[images] for p in self.clear), tuple(p[images] for p in self.blocked))
 
     def shadows(self, count: int, further: Sequence[np.ndarray] = ()) -> np.ndarray:

@@ -402,9 +402,10 @@ def _between(clear: Sequence[np.ndarray], blocked: Sequence[np.ndarray]) -> list
 
 
 def _rule(low: float, high: float, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Fejer's rule over an interval that gets its part of ``number`` lines over [-1, 1].
+    """Return Fejer's rule over the interval from ``low`` to ``high``: positions, weights, and coarser weights.
 
-    The result is positions, weights, and weights of the rule on every third position.
+    The interval gets its part of ``number`` lines over [-1, 1]. The coarser weights are those of the rule on every
+    third position.
     """
     count = max(_MIN_LINES, 3 * int(np.ceil(number * (high - low) / 6.0)))
     half = 0.5 * (high - low)

@@ -325,7 +325,10 @@ _DENSE = (1536, 512)
 """Number of cells of a table's spline from zero to the cut-off, and around the circle."""
 
 _PAD = 12
-"""Number of cells beyond the edges of the spline: the effect of an edge on a cubic spline falls by 0.27 per cell."""
+"""Number of cells by which the spline is extended beyond its edges.
+
+The effect of an edge on a cubic spline falls by a factor of 0.27 per cell.
+"""
 
 _MOST_NODES = 400
 """Largest number of radial nodes of a table."""

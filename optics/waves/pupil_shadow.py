@@ -106,7 +106,7 @@ class PupilShadow:
         return 1 + int(np.ceil(8.0 * float(np.max(np.ptp(self.pieces, axis=-2), initial=0.0))))
 
     def take(self, which: np.ndarray | slice) -> PupilShadow:
-        """Return the shadows of the pupils of the given indices."""
+        """Return the shadows of some of the pupils, given by their indices."""
         return PupilShadow(self.pieces[which], self.radius[which])
 
     def whole(self, count: int) -> tuple[np.ndarray, np.ndarray]:

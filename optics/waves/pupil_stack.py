@@ -266,7 +266,7 @@ class PupilStack:
         return np.asarray(np.arange(-last, last + 1) ** 2 @ np.abs(self.harmonics) - 1.0)
 
     def take(self, which: np.ndarray | slice) -> PupilStack:
-        """Return the pupils of the given indices."""
+        """Return some of the pupils, given by their indices."""
         return PupilStack(
             self.centre[which],
             self.axes[which],
