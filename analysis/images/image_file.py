@@ -98,7 +98,7 @@ def full_scale(dtype: np.dtype[Any], bits: int | None = None) -> float:
 
 
 def different_pages(path: Path, kinds: dict[str, list[int]], choose: str) -> ImageError:
-    """Return the error for pages that do not belong together.
+    """Return the error to be raised for pages of a file that differ in size or type, so that they are no series.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def different_pages(path: Path, kinds: dict[str, list[int]], choose: str) -> Ima
 
 
 def no_such_page(path: Path, page: int, count: int, choose: str) -> ImageError:
-    """Return the error for a page that does not exist.
+    """Return the error to be raised for a page that does not exist in a file.
 
     Parameters
     ----------
@@ -788,7 +788,9 @@ def _reason(error: Exception) -> str:
 
 
 def tone_curve(gamma: str | None, full_scale: float) -> Callable[[Array], Array]:
-    """Return the function from the file's grey values to grey values linear in light, both up to the full scale.
+    """Return the function from the file's grey values to grey values that are linear in light.
+
+    Both range up to the full scale of the file's number type. ``gamma`` names the tone curve: ``srgb`` or an exponent.
 
     Raises
     ------

@@ -289,7 +289,7 @@ class Disturbances:
         return np.asarray(root @ root.T)
 
     def scaled(self, factors: Sequence[float] | Array) -> Disturbances:
-        """Return the prior with its standard deviations multiplied by factors (M,).
+        """Return the prior with the standard deviation of each motion multiplied by a factor.
 
         Dimensions: M motions.
 
@@ -315,7 +315,7 @@ class Disturbances:
         return self.scaled(np.sqrt(np.maximum(moments[:, 0] + moments[:, 2] - 2.0 * moments[:, 1], 0.0)))
 
     def with_copies(self, which: Sequence[int], times: float, law: TimeLaw) -> Disturbances:
-        """Return the prior with independent copies of some motions added.
+        """Return the prior with independent copies of some motions added, which have another law in time.
 
         The copies are correlated among each other as the originals are.
 
@@ -492,9 +492,9 @@ def chi_squares(shifts: Array, noise: Array, stated: Disturbances) -> Array:
     shifts : (T, D) ndarray
         Measured shifts, px.
     noise : (T, D, D) ndarray
-        Covariance of the shifts, px^2.
+        Covariance of the spot shifts due to noise, px^2.
     stated : Disturbances
-        Prior.
+        Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     """
     return np.array([consistency(s, r, stated, {}, 0.0).chi_square for s, r in zip(shifts, noise, strict=True)])
 
@@ -515,9 +515,9 @@ def consistency(
     shift : (D,) ndarray
         Measured shifts, px.
     noise : (D, D) ndarray
-        Covariance of the shifts, px^2.
+        Covariance of the spot shifts due to noise, px^2.
     stated : Disturbances
-        Prior.
+        Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     others : mapping of str to (D, k) ndarray, or None
         Further bodies that the prior does not contain, with the spot shifts of their motions, px, that are tested as
         suspects too.

@@ -150,9 +150,9 @@ class Track:
     response : (L, n, q) ndarray
         Response of the mean to steps of unit outputs.
     score : (L, q) ndarray
-        Score b of each step (see the module).
+        Score b of each step: weighted sum of the readings after it, from which its size is estimated.
     information : (L, q, q) ndarray
-        Information J of each step.
+        Information J (inverse covariance) of each step's size.
     """
 
     mean: Array
@@ -202,7 +202,7 @@ class PendingReading:
     ingested : FilterState
         State of the filter if the reading is good.
     innovation : Innovation
-        Innovation of the reading.
+        Difference of the reading from its prediction, with the decisions that followed.
     log_odds : float
         Logarithm of the odds that it is bad.
     """
@@ -303,7 +303,7 @@ def jumping_bodies(
     Parameters
     ----------
     stated : Disturbances
-        Prior of the disturbances.
+        Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     may : sequence of Candidate
         Motions, alone or of one body together, that may jump.
     otherwise : float or None
@@ -403,7 +403,7 @@ def mixture(mean: Array, covariance: Array, hints: Sequence[Hint], moved: Sequen
     covariance : (n, n) ndarray
         Covariance of the states without a jump.
     hints : sequence of Hint
-        Hypotheses of each body.
+        Hypotheses of a jump for each body, with their weights.
     moved : sequence of (L, n, r) ndarrays
         Effect of unit amounts before each reading on the present states, for each body.
     """
@@ -429,9 +429,10 @@ def undetected_variance(
     Parameters
     ----------
     score : sequence of (N, r) ndarrays
-        Score of unit amounts before each of N readings, by all readings, for each body.
+        For each body, the score of a step of unit amounts before each of N readings: weighted sum of all readings, from
+        which the amounts are estimated.
     information : sequence of (N, r, r) ndarrays
-        Information on these, for each body.
+        For each body, the information (inverse covariance) on these amounts.
     gap : (N,) ndarray
         Time since the reading before, s; 0 where there is none.
     bodies : sequence of JumpingBody

@@ -440,7 +440,7 @@ def with_jumps(stated: Disturbances, found: Sequence[Jump]) -> Disturbances:
     Parameters
     ----------
     stated : Disturbances
-        Prior of the disturbances.
+        Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     found : sequence of Jump
         Jumps of their motions.
     """
@@ -547,11 +547,11 @@ class Bodies:
     times : tuple of float
         Ratio of each body's jump to the prior standard deviations.
     weight : (B, L) ndarray
-        Probabilities; their sum is 1.
+        Probability of each hypothesis (body and place); their sum is 1.
     judged : tuple of Amounts
-        Amounts by the filter that detects jumps.
+        Estimated amounts of the jump, by the filter that detects jumps.
     amounts : tuple of Amounts
-        Amounts by the filter of the estimate.
+        Estimated amounts of the jump, by the filter of the estimate.
     """
 
     own: tuple[Candidate, ...]
@@ -586,7 +586,8 @@ class Bodies:
         gap : (L,) ndarray
             Time since the reading before each, s.
         looking : tuple of ndarray
-            Score (L, q) and information (L, q, q) that give the probabilities of bodies and places.
+            Score (L, q) and information (L, q, q) of a step in each gap, which give the probabilities of bodies and
+            gaps.
         state : tuple of ndarray
             Score and information that give the amounts for the estimate.
         """
@@ -660,10 +661,10 @@ def mixture_moments(amounts: Sequence[Amounts], effects: Sequence[Array], weight
     ----------
     amounts : sequence of Amounts
         Amounts of B bodies at L places.
-    does : sequence of (o, r) ndarrays
+    effects : sequence of (o, r) ndarrays
         Effect of unit amounts, for each body.
     weight : (B, L) ndarray
-        Probabilities; their sum is 1.
+        Probability of each hypothesis (body and place); their sum is 1.
     """
     each = np.stack([amount.mean @ effect.T for amount, effect in zip(amounts, effects, strict=True)])
     mean = np.einsum("bk,bko->o", weight, each)

@@ -103,13 +103,14 @@ class _Evaluation:
     Attributes
     ----------
     before, after : FilterState
-        State at its time without and with the reading.
+        State of the filter at the time of the reading, without it and with it.
     innovation : Innovation
-        Innovation of the reading.
+        Difference of the reading from its prediction, with the decisions that followed.
     log_odds : float
         Logarithm of the odds that it is bad.
     likely : float
-        Logarithm of the density of the reading, good or bad, with a jump or without one.
+        Logarithm of the predicted probability density at the reading, whether it is good or bad, with a jump or without
+        one.
     bad : BadReading or None
         Evidence that it is bad; None where that was not computed.
     """
@@ -257,12 +258,12 @@ class SeriesFilter:
         return float(limit_of(self.stated.jump_false_alarm / self.looks(between.max()), 1))
 
     def start(self, time: float) -> FilterState:
-        """Return the state before any reading.
+        """Return the state of the filter before any reading, as the prior gives it.
 
         Parameters
         ----------
         time : float
-            Time not after the first reading, s.
+            Time of that state, s, not later than the first reading.
         """
         mean, covariance = self.space.start(time)
         covariance = self._with_steps(covariance, -math.inf, time)

@@ -114,7 +114,7 @@ def unchanged_quantities(
     Parameters
     ----------
     stated : Disturbances
-        Prior of the disturbances.
+        Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     cameras : mapping of str to CameraCalibration
         Calibration of each camera.
     ground : GroundGeometry or None
@@ -195,9 +195,9 @@ def split(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> Split
     rows : (Q, 4 K) ndarray
         Coefficients of each quantity on the parameters of all cameras (rad and m).
     stated : Disturbances
-        Prior of the disturbances.
+        Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     noise : (D, D) ndarray
-        Covariance of the shifts, px^2.
+        Covariance of the spot shifts due to noise, px^2.
     gain : (4 K, D) ndarray
         Gain of an estimator, rad and m per px.
     """
@@ -262,9 +262,9 @@ def least_seen(row: Array, stated: Disturbances, noise: Array) -> LeastObservabl
     row : (4 K,) ndarray
         Coefficients of the quantity on the parameters of all cameras (rad and m).
     stated : Disturbances
-        Prior of the disturbances.
+        Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     noise : (D, D) ndarray
-        Covariance of the shifts, px^2.
+        Covariance of the spot shifts due to noise, px^2.
     """
     b = row @ stated.parameters
     spread = stated.spot_covariance + noise
@@ -286,9 +286,9 @@ def sigma_if_known(rows: Array, stated: Disturbances, noise: Array, groups: Sequ
     rows : (Q, 4 K) ndarray
         Coefficients of each quantity on the parameters of all cameras (rad and m).
     stated : Disturbances
-        Prior of the disturbances.
+        Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     noise : (D, D) ndarray
-        Covariance of the shifts, px^2.
+        Covariance of the spot shifts due to noise, px^2.
     groups : sequence of sequences of str
         For each of G cases, the labels of the known motions; motions correlated with them are then known better, too.
     """
@@ -315,7 +315,7 @@ def with_further_spots(stated: Disturbances, spots: Array, own: Sequence[bool]) 
     Parameters
     ----------
     stated : Disturbances
-        Prior of the disturbances.
+        Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     spots : (D', M) ndarray
         Shifts of the further spots for one standard deviation of the motions, px.
     own : (M,) sequence of bool
@@ -490,7 +490,7 @@ def prior_numbers(stated: Disturbances) -> dict[str, list[int]]:
     Parameters
     ----------
     stated : Disturbances
-        Prior of the disturbances.
+        Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     """
     sizes: dict[tuple[str, str], set[float]] = {}
     whats = [label.removeprefix(f"{body} ") for label, body in zip(stated.labels, stated.bodies, strict=True)]
@@ -514,9 +514,9 @@ def elasticities(rows: Array, stated: Disturbances, noise: Array, gain: Array) -
     rows : (Q, 4 K) ndarray
         Coefficients of each quantity on the parameters of all cameras (rad and m).
     stated : Disturbances
-        Prior of the disturbances.
+        Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     noise : (D, D) ndarray
-        Covariance of the shifts, px^2.
+        Covariance of the spot shifts due to noise, px^2.
     gain : (4 K, D) ndarray
         Gain of the estimator, rad and m per px.
     """
@@ -557,9 +557,9 @@ def unobserved_bodies(rows: Array, stated: Disturbances, noise: Array, gain: Arr
     rows : (Q, 4 K) ndarray
         Coefficients of each quantity on the parameters of all cameras (rad and m).
     stated : Disturbances
-        Prior of the disturbances.
+        Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     noise : (D, D) ndarray
-        Covariance of the shifts, px^2.
+        Covariance of the spot shifts due to noise, px^2.
     gain : (4 K, D) ndarray
         Gain of the estimator, rad and m per px.
     """
@@ -586,7 +586,7 @@ def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, de
     stated : Disturbances
         Prior of the disturbances; its standard deviations are the scales.
     noise : (D, D) ndarray
-        Covariance of the shifts, px^2.
+        Covariance of the spot shifts due to noise, px^2.
     gain : (4 K, D) ndarray
         Gain of the estimator, rad and m per px.
     degrees : float

@@ -399,7 +399,7 @@ def error_floor(stated: Disturbances, rows: Array) -> Array:
     Parameters
     ----------
     stated : Disturbances
-        Prior of the disturbances.
+        Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     rows : (Q, P) ndarray
         Coefficients of the quantities on the parameters.
     """
@@ -419,7 +419,7 @@ def unobservable_modes(stated: Disturbances, rows: Array, scale: Array) -> tuple
     Parameters
     ----------
     stated : Disturbances
-        Prior of the disturbances.
+        Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     rows : (Q, P) ndarray
         Coefficients of the quantities on the parameters.
     scale : (Q,) ndarray

@@ -337,9 +337,9 @@ def read_again(
     readings : mapping of str to LinearReading
         Linear readings of each estimator.
     shift : (S, D) ndarray
-        Shifts, px.
+        Measured spot shifts, px.
     noise : (S, D, D) ndarray
-        Covariance of the shifts, px^2.
+        Covariance of the spot shifts due to noise, px^2.
     rows : (Q, 4 K) ndarray
         Coefficients of the quantities that are tested.
     """
@@ -379,7 +379,7 @@ class _Steps:
     model : MotionModel
         Motions of the estimator.
     shift : (S, D) ndarray
-        Shifts, px.
+        Measured spot shifts, px.
     gain : (S, P, D) ndarray
         Gain G of the motions, their units per px.
     x : (S, P) ndarray
@@ -536,7 +536,7 @@ class Recovery(StateArrays):
         Parameters
         ----------
         disturbances : Disturbances
-            Prior of the disturbances.
+            Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
         state : int
             Index of the state.
         others : mapping of str to ndarray, or None
@@ -549,9 +549,11 @@ class Recovery(StateArrays):
 def measure_spots(
     mean: Array, frames: int, calibration: MonitorCalibration, centroid: str = "ml", threads: int = 1
 ) -> SpotPositions:
-    """Measure every spot of mean frames (B, H, W), B a multiple of the number of spots, in the calibration's order.
+    """Measure the position of every spot in mean frames (B, H, W), in the order of the calibration.
 
-    Dimensions: B images, H rows, W columns.
+    B is the number of images, a multiple of the number of spots; H and W are their rows and columns.
+
+    Dimensions: B images, H rows.
 
     Parameters
     ----------
@@ -581,9 +583,11 @@ def measure_spots(
 def judged_spots(
     mean: Array, frames: int, calibration: MonitorCalibration, centroid: str = "ml", threads: int = 1
 ) -> tuple[SpotPositions, FitStates]:
-    """Measure spots with sigmas scaled by the goodness of their fits; return them with the fits' tests, (B / C, C).
+    """Measure spots, and increase their sigmas where the fits are worse than the noise explains.
 
-    Dimensions: B images, H rows, W columns.
+    The tests of the fits are returned as well, (B / C, C) for B images of C spots.
+
+    Dimensions: H rows, W columns.
 
     Parameters
     ----------
@@ -712,14 +716,14 @@ def recovery_of(
 ) -> Recovery:
     """Return the changes of all cameras from spots that have been measured already.
 
-    Dimensions: S states.
-
     Parameters
     ----------
     first : SpotPositions
-        C spots of the nominal state, or S C, with their maps.
+        Positions of C spots in the nominal state, or of C spots in S nominal states, with their derivatives with
+        respect to every pixel.
     second : SpotPositions
-        S C spots of the states to be measured, state by state, with their maps.
+        Positions of C spots in each of S states to be measured, state by state, with their derivatives with respect to
+        every pixel.
     covariance : (S C, 2, 2) ndarray
         Covariance of their differences, px^2.
     calibration : MonitorCalibration
@@ -815,7 +819,7 @@ def estimates_of(
     ----------
     found : mapping of str to tuple of ndarrays
         For each estimator, changes (S, 4 K) and their covariances (S, 4 K, 4 K) due to noise and of the total error;
-        None for the last without a prior.
+        None instead of the total one without a prior.
     cameras : mapping of str to CameraCalibration
         Calibration of each camera.
     ground : GroundGeometry or None

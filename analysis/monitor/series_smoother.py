@@ -84,7 +84,7 @@ class SeriesChanges:
     values : (T, 4 K) ndarray
         Changes d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other.
     noise : (T, 4 K, 4 K) ndarray
-        Covariance of their errors due to the noise of the shifts.
+        Covariance of the errors of `values` due to the noise of the shifts.
     total : (T, 4 K, 4 K) ndarray
         Covariance of the total error.
     """

@@ -569,7 +569,7 @@ class StateSpace:
         return [(self.factors.start + f, states[self.heat.factors == f]) for f in range(len(self.heat.names))]
 
     def heat_outputs(self, mean: Array, time: float) -> Array:
-        """Return the part of the outputs due to the heat of bodies with sensors, (D + P,).
+        """Return the part of the outputs (spots, parameters) due to the heat of bodies with sensors, (D + P,).
 
         Dimensions: D spot coordinates (row and column of every spot), P parameters, n states of the filter.
 
@@ -680,7 +680,7 @@ def _variance(law: TimeLaw, time: float) -> float:
 
 
 def _step_variance(law: TimeLaw, time: float) -> float:
-    """Return the variance of the steps of a law up to a time, relative to that of one step."""
+    """Return the variance of all steps of a time law up to a time in seconds, relative to that of one step."""
     if law.jump:
         return 0.0
     return float(law.step_probability(time)) if law.event else 1.0

@@ -500,9 +500,9 @@ def fit_rows(rows: EdgeRows, grey: Array, core: float, even: bool, line_steps: i
     rows : EdgeRows
         Rows with their straight lines.
     grey : (N,) ndarray
-        Values of their pixels.
+        Grey values of all pixels of these rows.
     core : float
-        Half width of the spline, px.
+        Half width of the range of the edge-spread function's spline, px.
     even : bool
         True if the light is known to be even.
     line_steps : int

@@ -59,7 +59,7 @@ def energy_centroid(
     Parameters
     ----------
     mean : (B, H, W) array_like
-        Mean frames, DN.
+        Mean frames, DN (grey values).
     frames : int
         Number of frames averaged into each image.
     noise : NoiseModel
@@ -143,7 +143,7 @@ def gaussian_fit(
     Parameters
     ----------
     mean : (B, H, W) array_like
-        Mean frames, DN.
+        Mean frames, DN (grey values).
     frames : int
         Number of frames averaged into each image.
     noise : NoiseModel

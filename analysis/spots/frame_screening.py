@@ -417,7 +417,7 @@ def screen_frames(
     bad : (H, W) ndarray of bool or None
         Pixels that are known to be bad; None if there is none.
     released : callable
-        Function called after some frames have been read.
+        Function called after some frames have been read, so that their memory can be released.
 
     Raises
     ------
@@ -648,7 +648,7 @@ def noise_ratio(
     where : (H, W) ndarray of bool or None
         Pixels to use; None for those beside the spot.
     released : callable
-        Function called after some frames have been read.
+        Function called after some frames have been read, so that their memory can be released.
     """
     stack = _Stack.of(frames, bad, released, blank=True)
     try:
@@ -710,7 +710,7 @@ def observed_noise(
     bad : (H, W) ndarray of bool or None
         Unusable pixels; None if there is none.
     released : callable
-        Function called after some frames have been read.
+        Function called after some frames have been read, so that their memory can be released.
     """
     if ratio is None or ratio <= 1.0:
         return noise
@@ -740,7 +740,7 @@ def subtracted_level(
     bad : (H, W) ndarray of bool or None
         Unusable pixels; None if there is none.
     released : callable
-        Function called after some frames have been read.
+        Function called after some frames have been read, so that their memory can be released.
     """
     stack = _Stack.of(frames, bad, released, blank=True)
     middle = stack.median()[~stack.bad]

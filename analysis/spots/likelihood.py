@@ -73,7 +73,7 @@ def maximum_likelihood_fit(
     Parameters
     ----------
     mean : (B, H, W) array_like
-        Mean frames, DN.
+        Mean frames, DN (grey values).
     frames : int
         Number of frames averaged into each image.
     noise : NoiseModel

@@ -97,7 +97,7 @@ class PixelCorrection:
     bad : (H, W) ndarray of bool
         Pixels that are excluded instead of corrected.
     noise : NoiseModel
-        Noise of a corrected detector: its fixed pattern is the residual of the corrections.
+        Noise of a corrected image, whose fixed pattern is what the corrections leave.
     """
 
     dark: Array

@@ -79,7 +79,7 @@ class ScreenedFit:
     others : (G, 3) ndarray
         Row, column (px) and relative flux of the further spots.
     others_sigma : (G, 3) ndarray
-        Standard deviations of these.
+        Standard deviations of the numbers in `others`.
     smear : (2, 2) ndarray
         Second moments of the smear, px^2; zeros where none was fitted.
     level : (H, W) ndarray
@@ -222,7 +222,7 @@ def fit_screened(
     Parameters
     ----------
     mean : (H, W) ndarray
-        Mean image, DN.
+        Mean image, DN (grey values).
     counts : (H, W) ndarray
         Number of frames averaged in each pixel.
     good : (H, W) ndarray of bool
@@ -313,7 +313,7 @@ def fit_screened(
 
 
 def model_parts(fit: ScreenedFit, template: SpotTemplate) -> tuple[Array, Array, Array]:
-    """Return the derivatives of the fitted image, the part of it that is not the spot, and that part's derivatives.
+    """Return what a fitted image consists of: its derivatives, its part that is not the spot, and that part's ones.
 
     The arrays are the derivatives (K, P) of all pixels with respect to all parameters; the part (P,), DN, that is
     neither the spot nor its level; and the derivatives (K, P) of that part.

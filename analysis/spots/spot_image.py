@@ -141,7 +141,7 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
     Parameters
     ----------
     image : (B, H, W) ndarray
-        Mean frames, DN.
+        Mean frames, DN (grey values).
     frames : int
         Number of frames averaged into each image.
     noise : NoiseModel
@@ -342,8 +342,8 @@ def template_model(
     Parameters
     ----------
     theta : (B, 4) ndarray
-        Row, column (px), flux and background (DN).
-    which : (B,) ndarray of int
+        Row, column (px), flux and background (DN, grey values).
+    index : (B,) ndarray of int
         Index of each spot's shape.
     template : SpotTemplate
         Shapes of the spots.
@@ -410,13 +410,13 @@ def positions(
     maps : (B, 2, H, W) ndarray
         Derivatives of the position with respect to each pixel, px/DN.
     image : (B, H, W) ndarray
-        Mean frames, DN.
+        Mean frames, DN (grey values).
     frames : int
         Number of frames averaged into each image.
     noise : NoiseModel
         Noise of the detector.
     keep_maps : bool
-        Keep `maps` in the result.
+        True to keep `maps` in the result.
     flux : (B,) ndarray
         Flux of each spot, DN.
     background : (B,) ndarray

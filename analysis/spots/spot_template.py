@@ -300,7 +300,7 @@ class SpotTemplate:
             Array to fill, or (B, 4, h, w) for a part; derivatives with respect to the position are in DN/px, those with
             respect to flux and background have no unit.
         theta : (B, 4) ndarray
-            Row, column (px), flux and background (DN).
+            Row, column (px), flux and background (DN, grey values).
         index : (B,) ndarray of int
             Index of each spot's shape in the template.
         part : tuple or None
@@ -383,7 +383,7 @@ class SpotTemplate:
             Row of the spots' centres, detector pixels.
         columns : (B,) ndarray
             Column of the spots' centres, detector pixels.
-        which : (B,) ndarray of int
+        index : (B,) ndarray of int
             Index of each spot's shape.
         """
         limits = np.array([self.supported(t) for t in range(self.count)])[index]

@@ -284,7 +284,7 @@ def refit(
         Noise of the detector.
     template : SpotTemplate
         Template with the spot's one shape.
-    told : tuple of Finding
+    findings : tuple of Finding
         Findings to add.
 
     Raises

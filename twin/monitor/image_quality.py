@@ -67,7 +67,7 @@ class PupilMean:
     nodes
         N nodes of the stop.
     shadows
-        Shadows in B stops; None for free beams.
+        Shadows of bodies in the B stops (one for each beam); None for free beams.
     free
         True for the illuminated nodes of each stop, (B, N); None if rays in the shadows can be used as well.
     """

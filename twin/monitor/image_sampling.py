@@ -160,7 +160,7 @@ class NodeClasses:
         return rings * arms
 
     def nodes(self, number: int) -> PupilNodes:
-        """Return the nodes over the pupil that belong to the class of a number."""
+        """Return the nodes over the pupil of a class, given by its number."""
         return quadrature.disk_for(self.phase(number))
 
     def second_nodes(self, number: int) -> PupilNodes:

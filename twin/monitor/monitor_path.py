@@ -110,7 +110,7 @@ class MonitorPath(MonitorBeams):
         return self._require_class(number, coarse, 0)
 
     def class_beams(self, number: int) -> MonitorBeams:
-        """Return the monitor's beams with the pupil nodes of the class of a number."""
+        """Return the beams with the pupil nodes of a class, given by its number."""
         if not self._sized or number == self._own_class:
             return self
         if number not in self._class_beams:

@@ -203,8 +203,8 @@ class ErrorBudget:
     def halved_glass(self, slope: float) -> tuple[float, float, float]:
         """Compare the spots' response to a temperature gradient before and after halving the 180-deg prisms' glass.
 
-        The rhomboids take over half of the transfer. The same gradients across the prism, once along its y and once
-        along its z, act on both instruments.
+        Rhomboid prisms take over half of the sideways transfer of the light. The same gradients across the prism, once
+        along its y and once along its z, act on both instruments.
 
         Parameters
         ----------
