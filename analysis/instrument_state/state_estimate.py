@@ -88,9 +88,9 @@ class StatePrior:
         labels : sequence of str
             Names of the M motions.
         covariance : (M, M) ndarray
-            Covariance, SI, positive semidefinite.
+            Covariance, SI units, positive semidefinite.
         mean : (M,) ndarray or None
-            Mean, SI; zero by default.
+            Mean, SI units; zero by default.
         """
         mean = np.zeros(len(covariance)) if mean is None else np.asarray(mean, np.float64)
         return cls(tuple(labels), mean, covariance_root(covariance))
@@ -127,9 +127,9 @@ class MeasuredGroup:
     labels : tuple of str
         Names of the D numbers.
     values : (D,) ndarray
-        Measured values, SI.
+        Measured values, SI units.
     covariance : (D, D) ndarray
-        Covariance of their errors, SI.
+        Covariance of their errors, SI units.
     biases : (D, B) ndarray
         Derivatives of the numbers with respect to each bias.
     bias_sigmas : (B,) ndarray
@@ -369,7 +369,7 @@ def estimate_state(
     slope : callable
         Function from one state to the derivatives of the measurements.
     start : (M,) ndarray or None
-        State at which the iteration starts, SI; the prior's mean by default.
+        State at which the iteration starts, SI units; the prior's mean by default.
 
     Raises
     ------
@@ -562,11 +562,11 @@ class Combination:
         Parameters
         ----------
         amounts : (..., M) ndarray
-            States, SI.
+            States, SI units.
         prior_sigma : (M,) ndarray
-            Standard deviations of the prior, SI.
+            Standard deviations of the prior, SI units.
         mean : (M,) ndarray
-            Mean of the prior, SI.
+            Mean of the prior, SI units.
         """
         safe = np.where(prior_sigma > 0.0, prior_sigma, np.inf)
         return np.asarray((amounts - mean) / safe @ self.weights)
@@ -623,13 +623,13 @@ class Actuators:
     names : tuple of str
         Names of the C actuators.
     low, high : (C,) ndarray
-        Limits of the next move, SI.
+        Limits of the next move, SI units.
     steps : (C,) ndarray
-        Step of which moves are whole multiples, SI; 0 for continuous moves.
+        Step of which moves are whole multiples, SI units; 0 for continuous moves.
     relative : (C,) ndarray
         Relative standard deviation of a move.
     absolute : (C,) ndarray
-        Standard deviation of any move, SI.
+        Standard deviation of any move, SI units.
     """
 
     names: tuple[str, ...]
@@ -647,7 +647,7 @@ class Actuators:
         Parameters
         ----------
         wanted : (..., C) ndarray
-            Commanded moves, SI.
+            Commanded moves, SI units.
         errors : (..., 2, C) ndarray
             Standard normal numbers, for the relative and for the absolute error.
         """
@@ -665,7 +665,7 @@ class NextMove:
     Attributes
     ----------
     amounts : (C,) ndarray
-        Amount of each actuator's move, SI.
+        Amount of each actuator's move, SI units.
     expected : float
         Expected merit after the move, by the linear model and with the errors of the move, without the part due to the
         uncertainty of the state.
@@ -726,7 +726,7 @@ def merit_reduction(
     slope : (R, U) ndarray
         Derivatives D of the merit's numbers with respect to these units.
     actuators : Actuators
-        Actuators as in ``best_move``; their steps are ignored, their limits only exclude those that cannot move.
+        Actuators of the instrument; their steps are ignored, their limits only exclude those that cannot move.
     response : (R, C) ndarray
         Derivatives A with respect to the actuators.
     candidates : dict of str to (N, U) ndarray

@@ -317,10 +317,10 @@ def with_further_spots(stated: Disturbances, spots: Array, own: Sequence[bool]) 
     stated : Disturbances
         Prior of the disturbances (motions of bodies), with their effects on spots and parameters.
     spots : (D', M) ndarray
-        Shifts of the further spots for one standard deviation of the motions, px.
+        Shifts of D' further spot coordinates for one standard deviation of the motions, px.
     own : (M,) sequence of bool
-        True for a body that the further spots have a separate copy of, as the prisms of their channels, which moves as
-        much but independently.
+        True for a motion of a body of which the further spots have their own copy (such as the prisms of their
+        channels); the copy moves as much as the original but independently.
     """
     apart = np.array(own, bool)
     copies = np.flatnonzero(apart)

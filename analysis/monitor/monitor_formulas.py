@@ -454,7 +454,7 @@ class GroundError(StateArrays):
     sigma_m : (S, 3) ndarray
         Standard deviation of the error after correction by the estimate.
     sigma_noise_m : (S, 3) ndarray
-        Part of `sigma_m` due to the noise of the images.
+        Standard deviation of the error that is due to the noise of the images alone.
     plan_rms_m, height_rms_m : (S,) ndarray
         Standard deviations after correction, rms over the line: of both plan axes together, and of the height.
     """

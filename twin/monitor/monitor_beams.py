@@ -30,7 +30,7 @@ from twin.monitor.image_sampling import UncertainImageError
 
 @dataclass(frozen=True, eq=False)
 class AimedRays:
-    """Rays from the pinholes, aimed at the nodes, for C channels x S states (channel-major).
+    """Rays from the pinholes, aimed at the nodes, for C channels x S states (all states of a channel together).
 
     Dimensions: N nodes of the aperture.
 

@@ -59,8 +59,8 @@ def ray_tangents(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> tup
     Returns
     -------
     tuple of (RayTangents, ndarray)
-        Derivatives for C channels x M motions (channel-major), in each CCD's frame, per radian, metre or unit; and
-        those of the CCDs' sizes, (C*M,).
+        Derivatives for C channels x M motions (all states of a channel together), in each CCD's frame, per radian,
+        metre or unit; and those of the CCDs' sizes, (C*M,).
     """
     states, steps = _of_one_structure(path, pivot_states(motions)), [motion.step for motion in motions]
     placed = path.instrument.assembly.place(states, steps)
@@ -552,7 +552,8 @@ def motion_models(
 ) -> dict[str, MotionModel]:
     """Return for each estimator that is checked by a ray trace the motions that it assumes.
 
-    The models are the line families of all cameras, and the motions of the prior.
+    The models are the four motions of each camera that paper 001 considers (line families), and the motions of the
+    prior.
 
     Parameters
     ----------

@@ -481,7 +481,7 @@ class MonitorExperiment:
         frames : int
             Number of frames per state.
         seed : int | sequence of int
-            Seed as in ``frames_before``, or one for each state. State number first + s draws from its own stream, so
+            Seed of the CCDs and the noise, or one for each state. State number first + s draws from its own stream, so
             that its frames do not depend on how a series is divided.
         first : int | (S,) ndarray
             Number of the first state, or of each state.
