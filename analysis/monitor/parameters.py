@@ -1,9 +1,9 @@
 """Calibration of a monitor, and the quantities that are read from it.
 
-The calibration contains what is known of the nominal instrument before launch. The quantities that the monitor reads
-are declared here once; a further one is added here. Files, tables, figures, the terminal, scripts, studies and the live
-page take keys, symbols, meanings and digits from here (`twin.monitor.reading_table`), and budgets take their
-coefficients on the camera parameters (`analysis.monitor.limits.quantities`).
+The quantities that the monitor reads are declared here once; a further one is added here. Files, tables, figures, the
+terminal, scripts, studies and the live page take keys, symbols, meanings and digits from here
+(`twin.monitor.reading_table`), and budgets take their coefficients on the camera parameters
+(`analysis.monitor.limits.quantities`).
 
 The calibration contains what is known of the nominal instrument on the ground before launch: all that the analysis of
 the images may use.

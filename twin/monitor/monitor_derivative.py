@@ -59,7 +59,7 @@ def ray_tangents(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> tup
     Returns
     -------
     tuple of (RayTangents, ndarray)
-        Derivatives for C channels x M motions (all states of a channel together), in each CCD's frame, per radian,
+        Derivatives for C channels x M motions (all motions of a channel together), in each CCD's frame, per radian,
         metre or unit; and those of the CCDs' sizes, (C*M,).
     """
     states, steps = _of_one_structure(path, pivot_states(motions)), [motion.step for motion in motions]
