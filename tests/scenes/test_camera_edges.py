@@ -446,5 +446,5 @@ def test_a_field_with_dark_corners_is_taken_to_be_round(backend, tmp_path: Path)
     smaller = replace(
         lens, surfaces=(*lens.surfaces[:-2], replace(field_stop, edges=(Edge(Circle(0.01)),)), lens.image)
     )
-    with pytest.raises(InputError, match="edges leave no light at the end of the field"):
+    with pytest.raises(InputError, match="edges block all light at the end of the field"):
         camera_of(smaller, "round", backend, Width(0.3))

@@ -193,7 +193,7 @@ def test_warnings_of_coverage_and_of_coarse_tables(silica, tmp_path) -> None:
     assert "lie outside of the table's nodes" in texts[0]
     rough = np.random.default_rng(5).normal(0.0, 0.1, len(points))
     texts = warmed(silica, tmp_path, M1, points, rough).warnings(M1)
-    assert "coarser than its field" in texts[0]
+    assert "too coarse for its field" in texts[0]
 
 
 def test_tables_of_another_body_frame_or_unit_are_refused(silica, tmp_path) -> None:

@@ -135,7 +135,9 @@ def test_facets_are_squared_to_cameras_as_built(backend, pair, tmp_path) -> None
     job = tmp_path / "job.yaml"
     job.write_text("instrument: own.yaml\nrender: {frames: 1}\n")
     spec = read(tmp_path, text)
-    with pytest.raises(InputError, match=r"own.yaml:3: as_built.backward: the monitor does not work as the instrument"):
+    with pytest.raises(
+        InputError, match=r"own.yaml:3: as_built.backward: the monitor of the instrument as built does not work"
+    ):
         render_job(resolve(job), backend)
     built = build_instrument(spec, load_cameras(spec), backend)
     turns = facet_alignment(built, backend)

@@ -268,8 +268,8 @@ def test_an_orientation_is_found_after_a_move(backend, tmp_path) -> None:
         ({"one": before}, {}),
     ):
         found = run_check(AsBuiltSetup.read(written(tmp_path, {"wavefronts": measured}, **more)), backend)
-        assert (found.code, one in found.evidence.together) == (0, True)
-        assert (found.evidence.found == one) == (len(found.evidence.together) == 1) == bool(more)
+        assert (found.code, one in found.evidence.indistinguishable) == (0, True)
+        assert (found.evidence.found == one) == (len(found.evidence.indistinguishable) == 1) == bool(more)
 
 
 def test_files_of_the_laboratory_are_read(backend, tmp_path) -> None:

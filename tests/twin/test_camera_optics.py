@@ -87,7 +87,7 @@ def test_beams_of_which_nothing_can_be_told_are_refused(backend, camera, monkeyp
     # more terms than places at which light comes through
     assert np.isfinite(beams.zernike_rows(11)).all()
     few = [one[:9] for one in beams.illuminated_nodes()[0]]
-    monkeypatch.setattr(beams, "lit", lambda: [few])
+    monkeypatch.setattr(beams, "illuminated_nodes", lambda: [few])
     with pytest.raises(UnphysicalError, match="11 Zernike terms are not independent"):
         beams.zernike_rows(11)
     monkeypatch.setattr(varied_beams, "RESIDUAL", 0.0)

@@ -68,7 +68,7 @@ def test_light_of_a_pupil_beyond_all_of_it_is_none(telescope, monkeypatch) -> No
     [
         ({"strehl": 1.2}, "a Strehl ratio: 1.2"),
         ({"rms": 7.9e11}, "an rms wavefront error in waves: "),
-        ({"residual_rms": 1.0}, "the squares of the parts"),
+        ({"residual_rms": 1.0}, "the sum of squares of a wavefront error's parts"),
     ],
 )
 def test_statistics_of_a_wavefront_that_cannot_be_are_none(telescope, monkeypatch, wrong, said) -> None:

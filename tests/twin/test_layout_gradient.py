@@ -102,7 +102,7 @@ def test_a_layout_at_a_limit_has_slopes_and_one_beyond_tells_why(bench: LayoutBe
     assert names == list(CONTINUOUS)
     # the beam's prism stands in its neighbour: it cannot be built, and can be differentiated
     touching = (FIRST, replace(SECOND, prism_180_distance=2.42, pupil_x=0.2))
-    assert "reaches" in bench.try_layout(touching).refused
+    assert "extends" in bench.try_layout(touching).refused
     assert known_of(bench, touching)[STATED_NAME].sigma("angle") > 0.0
     lost = slope_of(bench, LayoutNumber((replace(FIRST, pupil_x=0.6),), 0, "width", 4))
     assert lost.refused != ""

@@ -134,7 +134,7 @@ def test_one_address_does_not_take_the_places_of_others():
     ids=["nothing", "half a head", "half a body"],
 )
 def test_what_is_never_said_whole_has_its_time(said, monkeypatch):
-    monkeypatch.setattr(guard, "HEAD", 0.4)
+    monkeypatch.setattr(guard, "HEAD_TIMEOUT", 0.4)
     with serving(StandIn()) as (port, server), ExitStack() as stack:
         [line] = lines(stack, port, 1, said)
         began = time.monotonic()
@@ -147,7 +147,7 @@ def test_what_is_never_said_whole_has_its_time(said, monkeypatch):
 
 @pytest.mark.second
 def test_the_next_request_of_a_connection_has_its_time_too(monkeypatch):
-    monkeypatch.setattr(guard, "HEAD", 0.4)
+    monkeypatch.setattr(guard, "HEAD_TIMEOUT", 0.4)
     with serving(StandIn()) as (port, _), ExitStack() as stack:
         [line] = lines(stack, port, 1, known("/session", port))
         assert b" 200 " in line.recv(65536)
@@ -158,7 +158,7 @@ def test_the_next_request_of_a_connection_has_its_time_too(monkeypatch):
 
 @pytest.mark.second
 def test_an_answer_that_is_not_taken_is_given_up(monkeypatch):
-    monkeypatch.setattr(guard, "ANSWER", 0.5)
+    monkeypatch.setattr(guard, "ANSWER_TIMEOUT", 0.5)
     with serving(StandIn()) as (port, server), ExitStack() as stack:
         lines(stack, port, 1, known("/three.min.js", port) * 40)
         time.sleep(0.2)
@@ -171,7 +171,7 @@ def test_an_answer_that_is_not_taken_is_given_up(monkeypatch):
 def test_a_page_that_never_reads_is_dropped_and_leaves_nothing(monkeypatch):
     """A client of its own: others read by themselves, in a thread."""
     monkeypatch.setattr("twin.live.clients.SEND_TIMEOUT", 0.3)
-    monkeypatch.setattr(guard, "UNREAD", 0.3)
+    monkeypatch.setattr(guard, "CLOSE_TIMEOUT", 0.3)
     with serving(StandIn(bytes_each=30_000_000)) as (port, server), ExitStack() as stack:
         head = SOCKET.replace(b"127.0.0.1", f"127.0.0.1:{port}".encode())
         said = head + f"Cookie: {COOKIE.format(port=port)}={SECRET}\r\n\r\n".encode()

@@ -240,7 +240,7 @@ def test_a_run_of_uncertainty_opens_its_job(tmp_path):
 
 @pytest.mark.second
 def test_an_orbit_of_drawn_motions_is_no_course():
-    with pytest.raises(InputError, match="there is no course to show"):
+    with pytest.raises(InputError, match="it has no course to show"):
         read_source(str(SCENES / "orbit" / "loop.yaml"))
 
 

@@ -297,7 +297,7 @@ def test_images_without_an_edge_are_told_and_have_no_weight(stack: Path) -> None
     assert np.all(np.abs(after.states[0].defocus - before.states[0].defocus) < 3.0 * before.states[0].defocus_sigma)
     for k in range(9):
         tifffile.imwrite(stack / f"0_along_{k}.tiff", flat)
-    with pytest.raises(InputError, match="of its first image without an edge"):
+    with pytest.raises(InputError, match="reason for its first image without an edge"):
         align_files(test)  # type: ignore[arg-type]
 
 

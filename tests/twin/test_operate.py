@@ -184,7 +184,7 @@ def rewritten(folder: Path, data: object) -> Path:
 
 @pytest.mark.second
 def test_results_that_are_none_are_refused(record: Path, tmp_path: Path) -> None:
-    apart, bare = "times and states that do not belong together", "a state without cameras or without a time"
+    apart, bare = "times and states differ in number", "a state without cameras or without a time"
     cases = [([], "no results"), ({"times_s": [0, 1], "series": [{"cameras": {}}]}, apart), ({"series": {}}, bare)]
     cases += [({"series": [{}]}, bare), ({"times_s": ["x"], "series": [{"cameras": {}}]}, bare)]
     cases += [({"cameras": {"forward": 4_000_001 * "x"}}, "too large")]
@@ -539,7 +539,7 @@ def test_a_reading_against_other_reference_images(record: Path, tmp_path: Path) 
     assert taken("same", 3, 47.5 + 0.0001)[0] == 0
     code, said = taken("other", 4, 47.5014)
     assert code == 2
-    assert "found against other reference images than the reading of 2026-03-05T02:00:00Z" in said
+    assert "measured against other reference images than the reading of 2026-03-05T02:00:00Z" in said
     assert "1.4 sigma" in said
     assert taken("earlier", 1, 47.5014, "--late")[0] == 2
     told = status(record)
@@ -555,7 +555,7 @@ def test_a_reading_against_other_reference_images(record: Path, tmp_path: Path) 
     with made(record) as history:
         done = history.ingest(given("series", own))
     assert done.new == 2
-    assert ["are 0.99 sigma from these" in reason for _, reason in done.refused] == [True, True]
+    assert ["differ by 0.99 sigma" in reason for _, reason in done.refused] == [True, True]
 
 
 def test_a_run_that_was_changed_is_refused(record: Path, tmp_path: Path) -> None:

@@ -258,7 +258,7 @@ def test_what_contradicts_the_plan_is_in_the_numbers(filter_result: FilterResult
         ({"undecided": True}, "the newest reading may be an outlier: y; until then sigmas allow for both"),
         ({"bad_readings": ((1, "x"),) * 3}, "3 readings were rejected as outliers"),
         ({"understated_causes": ("heat", "mounts")}, "sensors of several bodies jointly disagree with heat, mounts"),
-        ({"widened": 1.01}, "all sigmas are inflated by a factor of 1.01"),
+        ({"sigma_inflation": 1.01}, "all sigmas are inflated by a factor of 1.01"),
     ):
         (text,) = replace(calm, **change).warnings
         assert words in text
@@ -278,7 +278,7 @@ def test_what_is_told_of_requirements(filter_result: FilterResult) -> None:
     assert list(told_of(replace(clean(filter_result), requirements=(one, soon, never)))) == [
         ("broken", "Δf of forward exceeds 20 µm with a probability of 12 %; 5.0 % is allowed"),
         (
-            "requirements",
+            "breaks",
             "Δf of forward is expected to exceed 20 µm with a probability above 5.0 % from "
             f"{utc_text(filter_result.time + 3 * DAY)} on",
         ),

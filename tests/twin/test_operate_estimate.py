@@ -405,7 +405,7 @@ def test_a_bad_reading_is_named_left_out_and_forgotten(known, tmp_path, monkeypa
     assert not told.jumps
     ((time, _, _, reason),) = told.excluded
     assert time == life.times[BAD]
-    assert f"entry {BAD + 1}: the row of the spot forward/left is" in reason
+    assert f"entry {BAD + 1}: the row of spot forward/left is" in reason
     assert told.readings == len(entries) - 1
     assert any("rejected as an outlier" in one.text for one in alarms_of(plan.operation, told))
     other = followed(known, tmp_path, entries[:BAD] + entries[BAD + 1 :], "clean").smoothed(life.times)

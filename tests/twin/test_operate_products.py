@@ -229,8 +229,8 @@ def test_times_of_which_nothing_is_known_are_refused(history: History, tmp_path:
     )
     assert "before the first reading" in early.problem
     assert early.allowed == f"a time from {utc_text(START)} to {utc_text(end)}"
-    assert "forecast does not go so far" in late.problem
-    assert "a longer horizon in the plan" in (late.allowed or "")
+    assert "beyond the forecast" in late.problem
+    assert "lengthen the plan's horizon" in (late.allowed or "")
     assert "no reading of the monitor" in none.problem
     assert "twin.operate ingest" in (none.allowed or "")
 

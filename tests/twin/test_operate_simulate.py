@@ -341,14 +341,14 @@ def test_readings_that_could_not_be_are_told(tmp_path: Path, monkeypatch: pytest
     taken = [SimpleNamespace(refused=((3, "no such body"),)), SimpleNamespace(refused=())]
     monkeypatch.setattr(simulation_run, "ingest_files", lambda *_: taken)
     done = run("simulate", PLAN, tmp_path / "record", *words, "--out", tmp_path / "refused")
-    told = "1 of what was simulated was refused, the first: no such body"
+    told = "1 simulated readings were refused, the first: no such body"
     assert (done.exit_code, told in " ".join(done.stderr.split())) == (2, True), done.stderr
     monkeypatch.setattr(
         simulation_run, "simulate_record", lambda *a: SimpleNamespace(readings=(), lost=((when, "it misses"),))
     )
     done = run("simulate", PLAN, *words, "--out", tmp_path / "none")
     said = " ".join(done.stderr.split())
-    assert (done.exit_code, "no state can be read, the first since it misses" in said) == (2, True), said
+    assert (done.exit_code, "the monitor can read no state; the first because: it misses" in said) == (2, True), said
     assert not (tmp_path / "none").exists()
 
 

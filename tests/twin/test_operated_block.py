@@ -146,7 +146,7 @@ TWO = "\nmonitor: {angles: [0.2 arcsec, 0.2 arcsec, 2 arcsec], principal_distanc
     ("old", "new", "told"),
     [
         ("own_lines.yaml", "gf7_lines", "has another principal distance.*5512 mm|7680 mm, not 5512 mm"),
-        ("own_lines.yaml", "turned.yaml", "camera looks elsewhere than this block's; found 26 deg, not 20 deg"),
+        ("own_lines.yaml", "turned.yaml", "camera has another look angle than this block's; found 26 deg, not 20 deg"),
         ("backward", "rear", ": monitor_record.record: .* no camera of this name; found 'rear', allowed: forward, b"),
         ("record: record,", "record: nowhere,", ": monitor_record.record: "),
         ("record: record, plan: plan.yaml", "record: record", "the record has no plan of operation"),

@@ -182,7 +182,7 @@ def test_the_command_writes_them_or_says_why_not(backend, tmp_path, monkeypatch)
     monkeypatch.setitem(picture_light.VARIANTS, "llvm", "llvm_ad_teal")
     result = CliRunner().invoke(command.app, [str(example), "--out", str(tmp_path / "none"), *words])
     assert result.exit_code == 1
-    assert re.search(r"error: the pictures are not complete: .*llvm_ad_teal", result.stderr)
+    assert re.search(r"error: the pictures are incomplete: .*llvm_ad_teal", result.stderr)
     kept = {path.name for path in (tmp_path / "none").iterdir()}
     assert {"manifest.json", "truth.json", "recovered.json", "scene.glb", "report.html"} <= kept
     assert not kept & {shot.name for shot in SMALL}

@@ -155,7 +155,9 @@ def test_a_response_that_the_results_do_not_have(study, backend, tmp_path) -> No
         check_responses(resolve_study(wrong), sample)
     wrong = write_study(tmp_path / "c", ("sigma: [rec", "noise: [rec"))
     alone = r"found recovered\.cameras\.forward\.model\.d_f_um_sigma, .*d_f_um_sigma_noise"
-    with pytest.raises(InputError, match=rf"study.yaml:8: responses\.df\.noise: not the noise alone.*{alone}"):
+    with pytest.raises(
+        InputError, match=rf"study.yaml:8: responses\.df\.noise: not the standard deviation by noise alone.*{alone}"
+    ):
         check_responses(resolve_study(wrong), sample)
 
 

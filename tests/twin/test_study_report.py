@@ -84,7 +84,7 @@ def test_columns_of_one_table_are_one_axis(tmp_path) -> None:
     assert [len(axis) for axis in StudyRuns.of(data, study).axes] == [2, 1]
     words = page(tmp_path, study, {"y": x["a"] + x["c"]})
     # b = 2a: a straight line cannot tell them apart, and says so
-    assert "left out of the model: b" in words
+    assert "excluded from the model: b" in words
     found = json.loads((tmp_path / "statistics.json").read_text("utf-8"))["responses"]["y"]["sobol"]["factors"]
     spread = np.var([0.0, 1.0, 2.0, 3.0, 5.0])
     assert found["a + b"]["first"]["value"] == pytest.approx(spread / (spread + 1.0 / 12.0), abs=1e-9)
