@@ -18,7 +18,7 @@ from optics.numerics.number_tree import FrozenMap
 
 
 class Interaction(Enum):
-    """What a surface does with a ray: reflect it, refract it, reflect it totally, or let it pass."""
+    """Interaction of a ray with a surface: reflection, refraction, total reflection, or none."""
 
     REFLECT = "reflect"
     REFRACT = "refract"

@@ -437,7 +437,7 @@ class MountedCameraSpec(Spec):
 
     @property
     def mirrored(self) -> MountedCameraSpec:
-        """The same camera with all monitor beams through the opposite part of the pupil."""
+        """Copy of the camera with all monitor beams through the opposite part of the pupil."""
         if self.pupil_offset is not None:
             x, y = self.pupil_offset
             return self.model_copy(update={"pupil_offset": (-x, -y)})
