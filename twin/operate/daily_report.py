@@ -441,7 +441,7 @@ def _jump_section(overview: Overview) -> Section | None:
         when = [utc_text(time) for time in (jump.after_us, jump.until_us, jump.detected_us)]
         full.append([*when, jump.body, part, size, sigma, unit, jump.log_ratio, jump.false_alarm, others])
     events = [
-        f"{minute_text(time)}: {name.replace('_', ' ')}" + (f", which steps {', '.join(causes)}" if causes else "")
+        f"{minute_text(time)}: {name.replace('_', ' ')}" + (f", which may step {', '.join(causes)}" if causes else "")
         for time, name, causes in overview.events
     ]
     artefacts: list[Artefact] = []
