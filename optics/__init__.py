@@ -106,7 +106,7 @@ __all__ = [
     "zernike_name",
 ]
 
-_PLACES = {
+_MODULES = {
     "camera.prescription": ("Camera", "OpticalSurface"),
     "camera.ray_bundle": ("TracedRays", "distortion", "launch_rays", "spot_radius", "trace"),
     "camera.image_quality": ("Wavefront", "mtf", "psf", "wavefront"),
@@ -120,14 +120,14 @@ _PLACES = {
 }
 """Name of a module below ``optics`` -> the public names that are imported from it."""
 
-_CALLED = {"fit_zernikes": "fit", "zernike_name": "name", "pupil_quadrature": "disk", "glass": "find_glass"}
+_ALIASES = {"fit_zernikes": "fit", "zernike_name": "name", "pupil_quadrature": "disk", "glass": "find_glass"}
 """Public name of the package -> the name of the same function in its own module, where the two differ."""
 
 
 def __getattr__(name: str) -> Any:
-    for module, names in _PLACES.items():
+    for module, names in _MODULES.items():
         if name in names:
-            value = getattr(importlib.import_module(f"{__name__}.{module}"), _CALLED.get(name, name))
+            value = getattr(importlib.import_module(f"{__name__}.{module}"), _ALIASES.get(name, name))
             globals()[name] = value
             return value
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -528,9 +528,9 @@ def with_sizes(
     """
     members = list(jump.motions)
     prior = jump.times**2 * stated.correlation[np.ix_(members, members)]
-    probability = jump.law.step_probability(when)
-    probability -= 0.0 if reference is None else float(jump.law.step_probability(reference))
-    weights = solve_triangular(root, np.kron(probability[:, None], stated.spots[:, members] @ prior), lower=True)
+    occurred_before = 0.0 if reference is None else float(jump.law.step_probability(reference))
+    occurred = jump.law.step_probability(when) - occurred_before
+    weights = solve_triangular(root, np.kron(occurred[:, None], stated.spots[:, members] @ prior), lower=True)
     sizes = stated.sigmas[members] * (weights.T @ white)
     left = np.maximum(np.diag(prior) - np.sum(weights**2, axis=0), 0.0)
     return replace(jump, sizes=tuple(sizes.tolist()), sigmas=tuple((stated.sigmas[members] * np.sqrt(left)).tolist()))

@@ -157,7 +157,7 @@ class Camera:
     image_tilt : (float, float, float)
         Rotation vector of the image plane about the point where the axis meets it, radians.
     medium : {"vacuum", "air"}
-        What the camera stands in: glass catalogues give refractive indices relative to air, which differ from those in
+        Medium around the camera: glass catalogues give refractive indices relative to air, which differ from those in
         vacuum.
 
     Raises

@@ -12,7 +12,7 @@ import numpy as np
 MAX_NOLL = 66
 """Highest supported Noll index (all terms to radial order 10); beyond it monomials lose digits."""
 RANK_TOLERANCE = 1e-6
-"""Relative size (singular value over the largest) below which combinations of Zernike terms are left out of a fit."""
+"""Relative size (singular value over the largest) below which combinations of Zernike terms are excluded from a fit."""
 
 
 def noll_to_nm(index: int) -> tuple[int, int]:

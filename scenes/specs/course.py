@@ -94,7 +94,7 @@ class TemperatureCourse(Spec):
     """Temperature change of a body at each time of the course.
 
     It is `change` plus the scalar product of `gradient` and the position from the body's origin. It also applies to the
-    bodies that it carries without an entry. A quantity that is left out is zero at all times.
+    bodies that it carries without an entry. A quantity that is omitted is zero at all times.
 
     Attributes
     ----------

@@ -50,7 +50,7 @@ def instrument_text(run: AsBuiltRun) -> str:
 def unknown(run: AsBuiltRun) -> tuple[list[Component], np.ndarray]:
     """Return the uncertain components of bodies' motions and their posterior covariance (C, C), SI.
 
-    Thermal components are left out. Errors of actuator moves are added to the components of the bodies that were moved.
+    Thermal components are omitted. Errors of actuator moves are added to the components of the bodies that were moved.
 
     Array dimensions: C uncertain components.
     """

@@ -252,7 +252,7 @@ def spot_gradient(
 _Tangents = list[dict[Path, np.ndarray]]
 """For each element of one sequence, number's path -> its derivative with respect to M motions, (C, M).
 
-C is the number of channels; derivatives that are all zero are left out.
+C is the number of channels; derivatives that are all zero are omitted.
 
 Dimensions: C channels (one spot each).
 """

@@ -203,7 +203,7 @@ def run_tolerance(
     test, force = setup.test, force or Workforce()
     engine_warnings: dict[
         str, None
-    ] = {}  # what is told twice, of the cameras and of those by which an allocation is judged
+    ] = {}  # each message once, although the cameras and those that judge an allocation both give it
 
     def warn(text: str, further: Callable[[str], None] = force.warn) -> None:
         engine_warnings[text] = None
@@ -320,7 +320,7 @@ class ModelPredictions:
     linear, quadratic : (S, M) ndarray
         Merits to the first and to the second order, SI.
     without : (E, S', M) ndarray
-        Merits to the second order with one tolerance at a time left out, of the first S' cameras.
+        Merits to the second order with one tolerance at a time excluded, of the first S' cameras.
     """
 
     linear: np.ndarray

@@ -13,7 +13,7 @@ Monitoring: the gain of an on-board monitor where the cameras change from field 
 from campaigns with the same random numbers and drifts of several sizes, adjusted as if nothing drifted and with the
 monitor's readings.
 
-Effects on the light that are corrected are left out of these campaigns, and the noise of attitude and orbit is treated
+Effects on the light that are corrected are excluded from these campaigns, and attitude and orbit noise is treated
 as independent: both take most of the time and hardly change the errors at check points.
 """
 

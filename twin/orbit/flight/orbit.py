@@ -1,7 +1,7 @@
 """Satellite orbits, integrated numerically under gravity with the Earth's flattening (J2) and any other `FORCES`.
 
 The flattening's axis is the celestial pole of the epoch; within a day the pole moves by some 0.1 arcsec. Drag, other
-terms of the field, Sun and Moon are left out: over a pass they displace the orbit smoothly by metres, and change
+terms of the field, Sun and Moon are omitted: over a pass they displace the orbit smoothly by metres, and change
 nothing in the geometry of an image, because a precise orbit determination follows them.
 """
 

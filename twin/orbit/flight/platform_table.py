@@ -279,7 +279,7 @@ class TabulatedTrajectory:
     def interpolation_error(self) -> float:
         """RMS error of positions halfway between readings, metres, estimated from the table itself.
 
-        Every second reading is left out, and its deviation from the interpolation of the others is scaled to the full
+        Every second reading is omitted, and its deviation from the interpolation of the others is scaled to the full
         table by the order of the interpolation, 4 or 10. The error is zero where the deviation is the noise of the
         readings, which does not grow with the step.
         """

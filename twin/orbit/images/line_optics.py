@@ -220,7 +220,7 @@ class LineOptics:
         """Return the point spread function on `oversampling` samples per line and pixel, float64, of unit sum.
 
         It is zero from `margin` pixels and lines on, faded out before: so an image does not depend on how it is cut
-        into parts. The diffraction pattern farther out (0.3% at F/6 and 24 pixels) is left out.
+        into parts. The diffraction pattern farther out (0.3% at F/6 and 24 pixels) is omitted.
 
         Returns
         -------

@@ -262,7 +262,7 @@ def read_dimap(path: str | Path, band: str | None = None) -> DimapPass:
     path : str or Path
         File DIM_*.XML of the product.
     band : str or None
-        Band whose looks are read; may be left out where all bands have the same.
+        Band whose looks are read; may be omitted where all bands have the same.
 
     Raises
     ------

@@ -2,7 +2,7 @@
 
 Between the days of a table its numbers are interpolated by cubics through four of them (IERS Gazette 13, 1997). UT1 is
 interpolated as UT1 - TAI, which has no steps. The tables do not contain the effects of ocean tides on pole and UT1
-within a day, which are left out: some 3 cm on the ground.
+within a day, which are omitted: some 3 cm on the ground.
 """
 
 from __future__ import annotations
@@ -249,7 +249,7 @@ _FINALS = {"MJD": (7, 15), "x": (18, 27), "y": (37, 46), "UT1-UTC": (58, 68), "d
 def _finals(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
     """Parse the rows of a finals2000A table: values of Bulletin B where the file has them, else of Bulletin A.
 
-    Days without a prediction of pole and UT1 are left out.
+    Days without a prediction of pole and UT1 are omitted.
     """
     cells, lines = [], []
     for k, line in rows:

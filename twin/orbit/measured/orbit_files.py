@@ -249,7 +249,7 @@ def read_oem(path: str | Path, satellite: str | None = None) -> OrbitReadings:
     path : str or Path
         Path of the file.
     satellite : str or None
-        OBJECT_ID or OBJECT_NAME of the satellite; may be left out where there is only one.
+        OBJECT_ID or OBJECT_NAME of the satellite; may be omitted where there is only one.
 
     Raises
     ------
@@ -285,7 +285,7 @@ def read_aem(path: str | Path, satellite: str | None = None) -> AttitudeReadings
     path : str or Path
         Path of the file.
     satellite : str or None
-        OBJECT_ID or OBJECT_NAME of the satellite; may be left out where there is only one.
+        OBJECT_ID or OBJECT_NAME of the satellite; may be omitted where there is only one.
 
     Raises
     ------
@@ -494,7 +494,7 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
     path : str or Path
         Path of the file.
     satellite : str or None
-        Identifier of the satellite in the file, such as L51; may be left out where there is only one.
+        Identifier of the satellite in the file, such as L51; may be omitted where there is only one.
 
     Raises
     ------

@@ -446,7 +446,7 @@ def read_scene(path: str | Path, band: str | None = None, effects: LightEffects 
     path : str or Path
         File DIM_*.XML of the product.
     band : str or None
-        Band whose looks are read; may be left out where all bands have the same.
+        Band whose looks are read; may be omitted where all bands have the same.
     effects : LightEffects or None
         Effects on the light; None for refraction where the file says so, and nothing else.
 

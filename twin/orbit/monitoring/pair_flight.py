@@ -1,7 +1,7 @@
 """Stereo pair along its orbit: true lines, and the ground points that they measure.
 
 Both views of a point, which are half a minute to a minute apart, use the state at the moment midway between them. Light
-time, aberration and refraction are left out: they are assumed to be corrected.
+time, aberration and refraction are omitted: they are assumed to be corrected.
 """
 
 from __future__ import annotations
