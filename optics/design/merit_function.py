@@ -225,8 +225,8 @@ class Operands:
         ``wavefront`` (rms waves, piston and tilt removed) or ``spot`` (rms about the mean, in units of the wavelength
         times the focal ratio).
     distortion : float
-        Weight of the relative departure of chief rays from L = f tan W, as residual per relative departure; 0 leaves
-        distortion out.
+        Weight of distortion: factor by which the relative departure of a chief ray's image from L = f tan W is
+        multiplied to give a residual of the least squares; with 0, distortion is ignored.
     anamorphism : float, optional
         Largest allowed difference of f along the line from f across it, relative to f across; None: free.
     """
@@ -412,7 +412,7 @@ class MeritFunction:
 
     @property
     def _focal_ratio(self) -> float:
-        """Required principal distance over pupil diameter, for the unit of spot sizes; 1 where it is free."""
+        """Required principal distance over pupil diameter, for the unit of spot sizes; 1 if no distance is required."""
         distance = self.operands.principal_distance
         return 1.0 if distance is None else distance / self.beams.diameter
 

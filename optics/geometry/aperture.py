@@ -1,7 +1,7 @@
 """Clear apertures and light-blocking edges of surfaces, in the surface's own x, y frame.
 
-Every test of a point against an aperture uses the ``contains`` methods of the numbers classes here, which work on
-floats, NumPy arrays and Dr.Jit arrays in kernels.
+Whether a point lies in an aperture is always decided by the ``contains`` methods of ``DiskNumbers``, ``RingNumbers``,
+``RectangleNumbers`` and ``EllipseNumbers``, which work on floats, NumPy arrays and Dr.Jit arrays in kernels.
 
 A surface may have several edges; light passes where all of them let it. ``Edge`` is evaluated with NumPy only, at the
 points where traced rays meet the surface; kernels do not use it.
@@ -319,7 +319,7 @@ class Edge:
 
 
 def outer_edge(aperture: Aperture | None, edges: Sequence[Edge]) -> Aperture | None:
-    """Return the smallest outer edge given for a surface (polygons excluded), else its aperture."""
+    """Return the smallest outer edge that a surface's file gives (polygons excluded), or its aperture if it gives none."""
     stated = [edge.shape for edge in edges if not edge.blocks and isinstance(edge.shape, Aperture)]
     return min(stated, key=lambda shape: shape.enclosing.radius, default=aperture)
 

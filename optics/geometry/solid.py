@@ -125,9 +125,9 @@ def _integers(plane: Iterable[float]) -> _Plane:
 
 
 def _box(planes: list[_Plane], first: int) -> tuple[list[_Corner], _Rings]:
-    """Return corners and faces of the box from which bodies are cut, and append its planes to ``planes``.
+    """Return corners and faces of the large box from which bodies are cut, and append its planes to ``planes``.
 
-    The planes of the box are numbered from ``first``.
+    The six planes of the box get the numbers ``first``, ``first`` + 1, and so on.
     """
     extent = int(MAX_EXTENT)
     corners = [(x, y, z, 1) for x in (-extent, extent) for y in (-extent, extent) for z in (-extent, extent)]
@@ -254,7 +254,7 @@ class Face:
     name : str
         Name within the solid, e.g. ``window``, ``roof_a``.
     body : str
-        Path of the tree's body that carries it (the solid's own, or a child of it when the face can have an angle error
+        Path of the rigid body that carries it (the solid's own, or a child of it when the face can have an angle error
         of its own).
     coating : Coating
         Surface treatment.
@@ -275,7 +275,7 @@ class Solid:
     Attributes
     ----------
     path : str
-        Path of its body in the tree.
+        Path of its rigid body in the tree of bodies.
     material : str
         Name in the catalogues ``optics.materials.glass`` and ``optics.materials.material``.
     faces : tuple of Face

@@ -1,4 +1,4 @@
-"""Surfaces: ideal shape and figure error, on NumPy arrays and, as a level function, in Dr.Jit kernels."""
+"""Optical surfaces: ideal shape and figure error, as NumPy functions and as equation G(x, y, z) = 0 in Dr.Jit kernels."""
 
 from __future__ import annotations
 
@@ -205,7 +205,7 @@ class SurfaceNumbers:
     terms : tuple of SagTerm
         Further terms of the sag, at most one of each kind.
     figure, grid : FigureNumbers and GridNumbers, optional
-        Departures from that shape.
+        Figure error as a polynomial and on a grid.
     """
 
     curvature: Any = None
@@ -224,7 +224,7 @@ class SurfaceNumbers:
 def level(
     x: Any, y: Any, z: Any, surface: SurfaceNumbers, table: Any = None, active: Any = True
 ) -> tuple[Any, Any, Any, Any]:
-    """Return the level function G of a surface and its gradient, on Dr.Jit arrays.
+    """Return the function G(x, y, z) that is zero on a surface, and its gradient, on Dr.Jit arrays.
 
     With c the curvature and k the conic constant of the surface, h the sum of all terms beyond the conic and of the
     figure, and w = z - h(x, y), the surface is where

@@ -146,7 +146,7 @@ class Polygon:
 
 @dataclass(frozen=True, eq=False)
 class Disk:
-    """Disk or ellipse: the points centre + radius * stretch @ p with |p| <= 1.
+    """Disk or ellipse: the points centre + radius * stretch @ p, with p all points of the unit disk.
 
     Attributes
     ----------
@@ -329,8 +329,8 @@ class _Edges:
     def sum(self, kx: np.ndarray, ky: np.ndarray) -> np.ndarray:
         """Return the sum over the edges of (k . n) exp(-i k . m) sinc(k . d/2), for each wave vector k, in rad/m.
 
-        n is the outward normal of an edge, m its midpoint and d its vector, in metres; ``kx`` (., C) and ``ky`` (R, .)
-        are the components of k for C columns and R rows.
+        n is the outward normal of an edge, m its midpoint and d its vector, in metres; ``kx`` and ``ky`` are the
+        components of k: (1, C) and (R, 1) for a grid of C columns and R rows, or both of one shape.
         """
         total = np.zeros(np.broadcast_shapes(kx.shape, ky.shape), complex)
         for m, d, n in zip(self.middle, self.vector, self.normal, strict=True):

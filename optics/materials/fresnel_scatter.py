@@ -2,9 +2,9 @@
 
 Lobes. The ABg and Harvey-Shack lobes depend only on d = |beta - beta0|, the distance of the scattered from the specular
 direction in the plane of direction cosines (components of the unit vectors along the surface; Harvey 1976; Pfisterer,
-"Approximated scatter models for stray light analysis", OPN 2011). The BSDF f is taken *per power of the specular beam
-that it leaves*, so that f(d) d^2(beta) is the scattered fraction into d^2(beta) = cos(theta) d(Omega), and the total
-integrated scatter
+"Approximated scatter models for stray light analysis", OPN 2011). The BSDF f is relative to *the power of the specular
+beam*, from which the scattered light is taken, so that f(d) d^2(beta) is the scattered fraction into d^2(beta) =
+cos(theta) d(Omega), and the total integrated scatter
 
     TIS(beta0) = integral of f(|beta - beta0|) over |beta| < 1
 
@@ -54,7 +54,8 @@ MAX_DISTANCE = 2.0
 """Largest possible distance of two directions in the plane of direction cosines."""
 
 _FLAT = 1e-9
-"""Tolerance of |1 - g/2| below which the integral takes its logarithmic form."""
+"""Tolerance of |1 - g/2| below which the integral of (1 + (d/l)^2)^(-g/2) over a disk is taken as a logarithm (g = 2).
+"""
 
 
 @dataclass(frozen=True)
@@ -731,8 +732,8 @@ class Finish:
     def numbers(self) -> tuple[float, ...]:
         """Numbers for the path tracer.
 
-        They are reflectance, transmission, 1 for bare glass, diffuse fraction, and share, scale, exponent and kind of
-        the lobe.
+        They are reflectance, transmission, 1 for bare glass (else 0), diffuse fraction, and the four numbers of the
+        scatter lobe (``Lobe.numbers``).
         """
         lobe = (0.0, 1.0, 2.0, 0.0) if self.scatter is None else self.scatter.lobe.numbers
         return (self.reflectance, self.transmission, float(self.bare), self.diffuse, *lobe)

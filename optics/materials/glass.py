@@ -506,7 +506,7 @@ def refractive_index(
     wavelength : array_like
         Wavelengths in air, metres, any shape.
     medium : {"air", "vacuum"}
-        What the index is against: air of 20 C and 1013 hPa, as makers state it, or vacuum.
+        Medium relative to which the index is given: air of 20 C and 1013 hPa, as in manufacturers' data, or vacuum.
     temperature : float
         Temperature of the glass, kelvin; other than 293.15 K only where the change of the index is known.
 
@@ -531,8 +531,7 @@ def refractive_index(
     >>> refractive_index("N-BK7", 10e-6)
     Traceback (most recent call last):
     ...
-    optics.numerics.array_math.UnphysicalError: N-BK7: wavelength 10000 nm is outside the range of its dispersion \
-formula, 300 to 2500 nm
+    optics.numerics.array_math.UnphysicalError: N-BK7: wavelength 10000 nm is outside the range of its dispersion formula, 300 to 2500 nm
     """
     if medium not in ("air", "vacuum"):
         raise ValueError(f"medium must be 'air' or 'vacuum', got {medium!r}")

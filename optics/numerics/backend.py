@@ -231,7 +231,7 @@ def one_kernel_thread() -> Iterator[None]:
 
 
 THREADS_VARIABLE = "TWIN_THREADS"
-"""Environment variable that limits ``cores``, for processes that share the machine with others of their kind."""
+"""Environment variable with the largest number of cores that ``cores`` returns, for processes that share a machine."""
 ONE_THREAD = {
     THREADS_VARIABLE: "1",
     "OMP_NUM_THREADS": "1",

@@ -26,9 +26,9 @@ class AimError(PhysicalError, RuntimeError):
 
 @dataclass(frozen=True, eq=False)
 class RayFan:
-    """Family of rays for each of N rays in each of B systems, with two parameters a, b that aim it.
+    """N rays in each of B systems that can be aimed, each by two parameters a and b.
 
-    The parameters move the direction or the launch point.
+    The parameters move the ray's direction or its launch point.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class RayFan:
     moves_position: bool = False
 
     def at(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return launch points and unit directions, (B, N, 3) each, for the parameters (a, b) of each ray.
+        """Return launch points (metres) and unit directions, (B, N, 3) each, for given parameters (a, b) of each ray.
 
         ``q`` (B, N, 2) are these parameters, for N rays in each of B systems.
         """
@@ -98,7 +98,7 @@ def aim(
     systems : SystemBatch
         B systems that end at the target element; apertures are ignored.
     fan : RayFan
-        Families of N rays for each system.
+        N rays for each system, with two parameters each that aim them.
     target : ndarray
         Target x, y on that element, metres at its nominal size, broadcastable to (B, N, 2): points of an aperture,
         which expands with its body.

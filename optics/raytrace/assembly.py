@@ -148,7 +148,7 @@ class Assembly:
     media : mapping of str to float
         Path of a glass body -> its refractive index in vacuum.
     above_d : mapping of str to float
-        Path of a glass body of known dispersion -> that index minus the one at the d line.
+        Path of a glass body of known dispersion -> that index minus the index at the d line (587.6 nm).
     """
 
     tree: RigidTree

@@ -1,6 +1,7 @@
 """Numbers of one element for the trace: its frame, shape and clear aperture, and the media on both sides.
 
-``Structure`` holds what determines the code of a kernel, as against the numbers that it works on.
+``Structure`` holds the properties that determine the code of a kernel (such as the kind of a surface); all others are
+numbers that the kernel reads.
 """
 
 from __future__ import annotations
@@ -136,7 +137,7 @@ def media_along(chain: Sequence[Element]) -> list[Medium]:
 
 
 def structure_of(elements: Sequence[Element]) -> Structure:
-    """Return the structure that serves the nominal elements at the same position of several sequences."""
+    """Return the structure of elements at one position of several sequences, so that one kernel can trace them all."""
     grid = any(_known_figure(e) is not None and e.surface.grid_figure is not None for e in elements)
     apertures = [None if e.aperture is None else type(e.aperture.numbers()) for e in elements]
     kinds = {(e.interaction, e.surface.is_plane, kind) for e, kind in zip(elements, apertures, strict=True)}

@@ -131,12 +131,12 @@ class ReflectorParts:
 
 
 def _no_offset(width: float) -> float:
-    """Return the lateral offset of a reflector whose beam lies in its middle: 0, whatever the width."""
+    """Return 0, the lateral distance of the beam from the middle of a reflector that it passes in the middle."""
     return 0.0
 
 
 def _origin(length: float, width: float) -> tuple[float, float, float]:
-    """Return the origin of the reflector's frame, (0, 0, 0), as its null point, whatever the length and width."""
+    """Return the origin (0, 0, 0) of the reflector's frame as the point about which rotations leave the beam unchanged."""
     return (0.0, 0.0, 0.0)
 
 
@@ -177,7 +177,7 @@ _S = 1.0 / sqrt(2.0)
 
 
 def prism_180(mount: Mount) -> ReflectorParts:
-    """Return the parts of the 180-deg prism, which returns the beam antiparallel at a lateral distance."""
+    """Return the parts of the 180-deg prism, which returns the beam antiparallel and displaced along x."""
     length, width, hand = mount.length, mount.width, mount.hand
     off = roof_offset(width)
     half = 0.5 * width
@@ -340,7 +340,10 @@ def _thickness(width: float) -> float:
 
 
 def _mirror(name: str, position: Sequence[float], direction: np.ndarray) -> Passage:
-    """Return the reflection of the beam at a mirror with a face of its own, at a position (metres) and direction."""
+    """Return the reflection of the beam at a mirror that is a face by itself.
+
+    ``position`` is the beam's centre on the mirror, metres, and ``direction`` is its direction when it arrives.
+    """
     return Passage(name, name, Interaction.REFLECT, np.array(position), direction)
 
 

@@ -372,7 +372,7 @@ def trace(
 
 @dataclass(frozen=True)
 class _TracePlan:
-    """Everything that the instructions of a trace depend on; all else is numbers that they read.
+    """Properties of a trace that determine its instructions; all others are numbers that the instructions read.
 
     Attributes
     ----------
@@ -387,11 +387,11 @@ class _TracePlan:
     differentiable : bool
         True when numbers or rays carry derivatives.
     evaluate : bool
-        True when kernels are launched.
+        True when kernels are launched; False when only their graph is built.
     section : int
-        Number of elements of a kernel.
+        Number of elements that one kernel traces.
     alone : bool
-        True when all elements of one structure share a kernel; ``section`` is then 1.
+        True when each element is a kernel of its own, shared by all elements of its structure; ``section`` is then 1.
     """
 
     backend: Backend
@@ -446,7 +446,7 @@ class _TracePlan:
         return shared if shared is None or self.alone else dr.arange(self.backend.UInt, dr.width(position)) // shared
 
     def _launch(self, leg: range, form: Any, lookup: _Lookup, rays: Any, hits: list[Any], outside: list[Any]) -> None:
-        """Launch the kernel that traces a range ``leg`` of elements, if kernels are launched at its end."""
+        """Launch the kernel that traces a range ``leg`` of elements, if the plan launches kernels (``evaluate``)."""
         import drjit as dr
 
         last = leg.stop == len(self.structure)
