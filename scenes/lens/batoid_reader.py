@@ -46,7 +46,7 @@ _OF_OPTICS = frozenset(
     "type name surface coordSys inMedium outMedium medium items obscuration backDist sphereRadius pupilSize "
     "pupilObscuration R_outer R_inner parent stopSurface".split()
 )
-"""Keys of an optic that describe its position and function, or the start of a wavefront calculation."""
+"""Keys of an optic that describe its position, media and function, or where batoid starts a wavefront calculation."""
 
 
 class _Reader:

@@ -349,9 +349,11 @@ def _tangents_at(model: CameraModel, lens: Prescription, heights: np.ndarray, ba
 
 
 _SMALL_STEP, _STEPS, _REACHED = 1e-6, 40, 1e-9
-"""Tangent for the scale in the middle of the image, largest number of steps to a height, and tolerance of the last but
-one step relative to the largest height. With a distortion of 50 % it reaches 1e-12; heights without a ray do not
-converge."""
+"""Constants of the search for the field direction of a given image height: step of the direction's tangent from which
+the scale in the middle of the image is computed, largest number of iterations, and largest change in the last but
+one iteration, relative to the largest height. With a distortion of 50 % the result is then right to 1e-12 of that
+height; the iteration does not converge for heights that no ray reaches.
+"""
 
 
 def _check(lens: Prescription) -> None:

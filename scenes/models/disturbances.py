@@ -70,7 +70,7 @@ _NEEDS = {"gradient": "temperature"}
 """Kind -> permission that a node must have for it, where the two have different names."""
 
 _Where = Callable[[str, KeyPath, Problem], Issue]
-"""Function that makes an issue from the name of a cause, a key of it and a problem."""
+"""Function that makes the issue (file, line and message) of a problem at a key of a cause, from these three."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Component:
 
     @property
     def what(self) -> str:
-        """Name of the component without the body: ``shift z``."""
+        """Kind and axis of the component without the body's path, such as ``shift z``."""
         if self.kind in SINGLE:
             return self.kind
         return f"{self.kind} {f'Z{self.axis}' if self.kind == 'figure' else AXES[self.axis]}"

@@ -82,9 +82,10 @@ class Instrument:
 
     @property
     def separation(self) -> Mapping[str, float]:
-        """Camera -> distance between its left and right area CCD (the papers' L), in metres.
+        """Camera -> distance between the centres of its left and right area CCD, in metres.
 
-        It is the largest distance between its area CCDs if it has no such pair. Empty without a monitor.
+        The papers listed in docs/conventions.md call it L. It is the largest distance between any two area CCDs of the
+        camera if it has no such pair. Empty without a monitor.
         """
         out: dict[str, float] = {}
         for name in self.cameras if self.channels else ():

@@ -39,7 +39,7 @@ LINEAR_TO = 1e-4
 aluminium expands by 2 nm.
 """
 ROUNDING = 1e-9
-"""Residual of a field, in kelvin, below which it is zero."""
+"""Departure from a linear temperature field, in kelvin, below which it counts as zero."""
 LEAST_INSIDE = 0.5
 """Smallest fraction of the body's volume that the nodes must cover; with less they belong to another body, frame or
 unit.
@@ -132,7 +132,7 @@ class HeatedBody:
         return out
 
     def warnings(self, path: str) -> tuple[str, ...]:
-        """Return warnings about the table of the body ``path``."""
+        """Return warnings about the temperature table of the body ``path``: coverage, interpolation and mesh."""
         out = []
         if self.coverage is not None and self.coverage.outside > SHOWN_OUTSIDE:
             out.append(
@@ -440,9 +440,10 @@ def on_deformed(
     moved: State,
     heated: Mapping[str, HeatedBody] | None = None,
 ) -> State:
-    """Return the state in which the motions of a state act on bodies deformed by tables of nodes.
+    """Return the state that combines motions of bodies with the deformations that tables of nodes describe.
 
-    The deformations are those of tables of displaced nodes and of the residuals of tables of temperatures.
+    The motions act on the deformed bodies. The deformations are those of tables of displaced nodes and of the residuals
+    of tables of temperatures.
 
     Parameters
     ----------

@@ -83,7 +83,7 @@ class Finishes:
     metallised: Finish | None = None
 
     def of(self, coating: Coating) -> Finish:
-        """Return the finish of a glass face with this coating."""
+        """Return the finish of a face of a glass body that has this coating."""
         return {
             Coating.MIRROR: self.mirror if self.metallised is None else self.metallised,
             Coating.TRANSMITTING: self.coated,
@@ -113,7 +113,7 @@ class Detector:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Number of rows and columns."""
+        """Number of rows and number of columns of its pixels."""
         return self.rows, self.columns
 
 

@@ -138,7 +138,7 @@ class Shadows:
         return cls(pieces, owners, *nodes_in_shadows(pieces, _NODES))
 
     def and_edges(self, outlines: Callable[[int], StopOutlines], name: str) -> Shadows:
-        """Return these shadows together with those of the edges of the camera's own surfaces.
+        """Return these shadows combined with those that the edges of the camera's own surfaces cast.
 
         Parameters
         ----------
@@ -214,7 +214,7 @@ class TracedBeams:
     owner : (B,) ndarray of int
         Number of the state that each image belongs to.
     systems : SystemBatch
-        Systems from the scene to the image, B.
+        The B optical systems, one for each image, from the scene to the image.
     rays : ImagingRays
         Rays of the images.
     heading : (3,) or (B, 3) ndarray
@@ -400,7 +400,8 @@ class _Bundle:
     Attributes
     ----------
     start, end : (B, K, 3) ndarray
-        K polynomial coefficients of the rays' points at both surfaces, in metres, for ``products``.
+        Coefficients of the K polynomials in the stop's x and y (``optics.waves.pupil_terms.products``) whose sums are
+        the rays' points at the first and the second surface, in metres.
     middle : (B, 2, 3) ndarray
         Mean points at both surfaces, in metres.
     spread : (B, 2, 3, 2) ndarray

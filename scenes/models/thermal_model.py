@@ -147,7 +147,7 @@ SPACING = 0.25
 CELLS = 8
 """Number of finite elements across a mirror."""
 TERMS = 15
-"""Number of Zernike terms of a deformed face, to fourth order."""
+"""Number of Zernike terms by which a deformed face is described: all up to fourth order."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,7 +54,7 @@ class ReadingsSpec(Spec):
     Attributes
     ----------
     after : str | None
-        Last one of `moves` that had been made before this measurement; by default no move.
+        Name of the last of the `moves` that was made before this measurement; by default none had been made.
     """
 
     after: Name | None = None
@@ -270,7 +270,7 @@ class SightReadingsSpec(ReadingsSpec):
     alpha, beta : float | None
         Rotation of the line of sight about the camera's Y (alpha) or X (beta), in radians.
     gamma : float | None
-        Roll of the line about the line of sight, in radians.
+        Rotation of the line CCD about the line of sight, in radians.
     principal_distance : float | None
         Change of the principal distance, in metres.
     sigma_alpha, sigma_beta, sigma_gamma : float | None
@@ -278,7 +278,8 @@ class SightReadingsSpec(ReadingsSpec):
     sigma_principal_distance : float | None
         Standard deviation of the principal distance, in metres; omitted if it is not measured.
     correlation : tuple[tuple[float, ...], ...] | None
-        Correlation matrix of the measured quantities in this order; by default they are uncorrelated.
+        Correlation matrix of the measured quantities in the order alpha, beta, gamma, principal distance; by default
+        they are uncorrelated.
     """
 
     alpha: Turn | None = None
@@ -446,7 +447,7 @@ class ActuatorSpec(CompensatorSpec):
     carrying
         Further bodies that move rigidly with it.
     range
-        Largest amount in either direction, for all moves together.
+        Largest total amount of all moves together, in either direction.
     step
         Step of which the amount is a multiple, as with shims; by default any amount is possible.
     accuracy

@@ -1,4 +1,7 @@
-"""Test with two autocollimators, the principle experiment of paper 001 (section 3.1)."""
+"""Test with two autocollimators and two mirrors on a turntable: the principle experiment of paper 001 (section 3.1).
+
+Paper 001 is cited in docs/conventions.md.
+"""
 
 from __future__ import annotations
 
@@ -129,12 +132,12 @@ class MirrorsSpec(Spec):
 
 
 class StandSpec(Spec):
-    """Half of the angle between the two mirrors on the turntable in the main series about each axis.
+    """Half of the angle between the two mirrors on the turntable in the main series, by axis of rotation.
 
     Attributes
     ----------
     X, Y, Z : float
-        Half of the angle between the mirrors for rotations about this axis, in radians.
+        Half of the angle between the mirrors for rotations of the turntable about this axis, in radians.
     """
 
     X: HalfAngle
@@ -150,11 +153,12 @@ class ProgrammeSpec(Spec):
     steps : int
         Number of steps after the first reading at zero.
     small, table, large : float
-        Step size, in radians: a smaller one, that of the main series (`table`) and a larger one.
+        Step of the turntable, in radians: a smaller one than in the main series, that of the main series (`table`), and
+        a larger one.
     narrow, wide : float
-        Half angle theta between the mirrors, in radians, in the narrow or the wide arrangement.
+        Half of the angle between the mirrors, in radians, in the narrow or the wide arrangement of the mirrors.
     stands : StandSpec
-        Half angle theta of each axis in the main series.
+        Half of the angle between the mirrors in the main series about each axis.
     """
 
     steps: Annotated[Whole, Field(ge=1, le=100)]

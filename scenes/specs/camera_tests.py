@@ -124,10 +124,14 @@ class ScanSpec(Spec):
 class MountSpec(Spec):
     """Mount of the focal-plane assembly: screws with shims on the mounting surface.
 
+    X', Y' and Z' are the axes of the assembly: flight direction, line and normal; O' is the centre of its panchromatic
+    line.
+
     Attributes
     ----------
     holes : tuple[tuple[float, float, float], ...]
-        Positions of the screw holes in the assembly's frame O'-X'Y'Z', in metres.
+        Positions of the screw holes in the assembly's frame O'-X'Y'Z' (X' flight direction, Y' line, Z' normal), in
+        metres.
     tilt : float
         Angle of the mounting surface's normal from Z', about Y', in radians.
     clearance : float
@@ -387,7 +391,7 @@ class LevelSpec(Spec):
     Attributes
     ----------
     angle : float
-        Rotation of the line from its required direction, about Z', in radians.
+        Rotation of the line from its required direction about Z', the normal of the focal-plane assembly, in radians.
     sigma : float
         Standard deviation of this angle, in radians.
     """
@@ -450,8 +454,8 @@ class MeasuredFocusSpec(TitledSpec):
     shims : tuple[float, ...] | None
         Present thickness of the shim at each hole, in metres; by default the `thickness` of `mount`.
     vertex_error : float
-        Standard deviation of an error common to all vertices that the shape of the through-focus curve causes, in
-        metres; the default holds for F/8 to F/10 and wavefront errors of 0.2 waves.
+        Standard deviation of the error of a best-focus position that the shape of the through-focus curve causes,
+        common to all fields, in metres; the default holds for F/8 to F/10 and wavefront errors of 0.2 waves.
     vertex_trend : float
         Standard deviation of the change of that error from the centre to the ends of the fields, in metres.
     seed : int

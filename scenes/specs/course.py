@@ -62,7 +62,7 @@ Moment = Annotated[float, Quantity(units.MOMENT, largest="100000 h")]
 NO_MOTION: tuple[float, float, float] = (0.0, 0.0, 0.0)
 DEFAULT_PIVOT = "origin"
 FEWEST, MOST = 2, 1000
-"""Numbers of times that a course may have."""
+"""Smallest and largest number of times that a course (time series of states) may have."""
 
 
 def _some_times(times: tuple[float, ...]) -> tuple[float, ...]:

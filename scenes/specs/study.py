@@ -700,10 +700,11 @@ _UNIT_WORDS = frozenset(UNITS) | {"m2", "mm2", "um2"}
 
 
 def unit_of(key: KeyPath) -> str:
-    """Return the unit in the name of a result's key, empty for none.
+    """Return the unit that the name of a result's key contains; empty if it contains none.
 
     Words after the unit are skipped: "um" for d_f_um, d_f_um_sigma_noise and d_f_um_true; "m/arcsec" for
-    height_m_per_arcsec, "1/mm" for nyquist_per_mm. A name below such a key has its unit: "um" for defocus_um, centre.
+    height_m_per_arcsec, "1/mm" for nyquist_per_mm. A name without a unit has that of the key above it: "um" for the key
+    path defocus_um, centre.
     """
     *above, last = [str(part) for part in key if isinstance(part, str)] or [""]
     words = last.removesuffix(NOISE).removesuffix(TOTAL).split("_")

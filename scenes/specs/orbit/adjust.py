@@ -130,14 +130,14 @@ class ReadingLawsSpec(Spec):
 
 
 class TrackerAngleSpec(Spec):
-    """Measured angle between two star trackers: the difference of their constant errors.
+    """Measured relative orientation of two star trackers, which determines the difference of their constant errors.
 
     Attributes
     ----------
     between : tuple[str, str]
         Names of the two star trackers.
     sigma : tuple[float, float, float]
-        Standard deviation about body X, Y and Z, in radians.
+        Standard deviation of the measured rotation about body X, Y and Z, in radians.
     """
 
     between: tuple[Name, Name]
@@ -150,9 +150,10 @@ class BlockPassSpec(Spec):
     Attributes
     ----------
     epoch : str
-        UTC at which the satellite is vertically above the place below.
+        UTC at which the satellite is vertically above the place that `longitude` and `latitude` give.
     longitude, latitude : float | None
-        Geodetic coordinate of this place, in radians; by default that of the area's centre.
+        Geodetic coordinate of the place over which the satellite is at the epoch, in radians; by default that of the
+        area's centre.
     direction : {'descending', 'ascending'}
         Direction of flight: descending to the south, ascending to the north.
     roll : float
@@ -442,7 +443,7 @@ class CameraReadingSpec(Spec):
 
     Attributes
     ----------
-    angles : dict[str, dict[str, tuple[float, float]]]
+    angles : tuple[float, float, float]
         Rotations d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the line of sight), in radians.
     principal_distance : float
         Change d_f of the principal distance, in metres.

@@ -85,7 +85,7 @@ class JitterSpec(Spec):
 
 
 FIRST_YEAR, LAST_YEAR = 1972, 2099
-"""UTC has whole leap seconds since 1972."""
+"""First and last year of the times that files may have: since 1972 UTC differs from TAI by whole leap seconds."""
 ALLOWED = f"date and time in UTC, ISO 8601 and ending in Z, {FIRST_YEAR} to {LAST_YEAR}, e.g. '2011-03-05T03:05:00Z'"
 PATTERN = r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}(:[0-9]{2}(\.[0-9]{1,6})?)?Z$"
 

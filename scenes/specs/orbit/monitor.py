@@ -103,7 +103,7 @@ class MotionSpec(Spec):
 class GroundSpec(Spec):
     """Check points at every time of the course, at random positions that both lines image.
 
-    They are centred where the two views are at equal times before and after.
+    The area is centred where one camera of the pair images the ground as long before that time as the other after it.
 
     Attributes
     ----------

@@ -307,8 +307,8 @@ class ImagePointsSpec(Spec):
     height_sigma : float
         Standard deviation of the reference heights, as their producer states it, in metres.
     roughness : float
-        Rms of the displacement over a patch by attitude noise, in pixels; smaller differences between neighbours are
-        consistent.
+        Standard deviation, in x and in y, of the displacement of points within a patch by attitude noise, in pixels;
+        the consensus test, which compares a match with its neighbours, allows for it.
     false_alarm : float
         Fraction of correct matches that the consensus test may reject.
     """

@@ -109,7 +109,7 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
 
     @property
     def usual_pixels(self) -> int:
-        """Number of pixels of the standard line, on which the positions in the file are counted."""
+        """Number of pixels of the standard line, to which the pixel positions of the strips in the file refer."""
         return self.camera.pixels if self.camera is not None else next(iter(self.pixels.values()))
 
     @property

@@ -1,9 +1,10 @@
 """Images of one patch of ground by the lines of a camera, with control data, and comparison with the truth.
 
-    lines = imaged_lines(sensors, measured, optics, seed) patch = fly_patch(lines, place, (600, 600), ground, control,
-    seed) patch.images["nadir"].frame          # uint16, grey values of the detector
+    lines = imaged_lines(sensors, measured, optics, seed)
+    patch = fly_patch(lines, place, (600, 600), ground, control, seed)
+    patch.images["nadir"].frame                         # uint16, grey values of the detector
     patch.images["nadir"].image_point(row, column)      # line and pixel of the whole image
-    patch.images["nadir"].measured       # Sensor: the laboratory's camera on the measured trajectory
+    patch.images["nadir"].measured                      # Sensor: the laboratory's camera on the measured trajectory
     patch.control.orthophoto, patch.control.dem
 
 An analysis may use `frame`, `window`, `measured` and the control's rasters. `sensor`, `terrain`, the control's errors
