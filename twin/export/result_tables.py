@@ -26,7 +26,7 @@ from twin.framework.owned_files import MANIFEST
 
 POINTS = "artefacts/points.csv"
 NUMBERS = "numbers"
-"""Name of the table of every number of the run."""
+"""Name of the exported table that lists every number of the run's JSON files."""
 _HEADS = ("schema", "reference_frames")
 _OTHER_FILES = (MANIFEST,)
 _HEAD = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]+)\]")
@@ -276,7 +276,7 @@ def _column(name: str, values: Sequence[Any], named: Mapping[str, str] = FrozenM
 
 
 def _kept(name: str, file: str, text: str, named: Mapping[str, str]) -> DataTable | None:
-    """Return the table of a CSV file of the run; None for one without rows."""
+    """Return the table that a run stored as a CSV file, with units and descriptions; None if it has no rows."""
     heads, *rows = list(csv.reader(io.StringIO(text))) or [[]]
     if not rows:
         return None

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FEW = 3
-"""Number of motions listed for each quantity in a report of the main job."""
+"""Number of motions of bodies listed for each quantity in the section of the main job's report."""
 RARE = 1e-3
 """Probability that a spot leaves its CCD below which the report does not mention it."""
 
