@@ -194,7 +194,7 @@ class Camera:
     medium: Literal["vacuum", "air"] = "vacuum"
 
     def __post_init__(self) -> None:
-        """Check that the stop, the signs of the thicknesses and all glasses are possible; raise ValueError otherwise."""
+        """Check that stop, signs of thicknesses and glasses are possible; raise ValueError otherwise."""
         if not isinstance(self.surfaces, Sequence) or not len(self.surfaces):
             raise ValueError("surfaces must be a sequence of at least one OpticalSurface")
         object.__setattr__(self, "surfaces", tuple(self.surfaces))

@@ -287,7 +287,7 @@ def light_nodes(camera: Camera, field: Field, phase: float) -> PupilNodes:
 
 
 def chief_point(camera: Camera, field: Field) -> np.ndarray:
-    """Return where the chief ray of a field point meets the image plane, (3,), metres, even if an edge blocks that ray."""
+    """Return the point where a field's chief ray meets the image plane, (3,), metres, even if an edge blocks it."""
     return np.asarray(trace_stop(camera, field, np.zeros((1, 2))).position[0])
 
 

@@ -319,7 +319,7 @@ class Edge:
 
 
 def outer_edge(aperture: Aperture | None, edges: Sequence[Edge]) -> Aperture | None:
-    """Return the smallest outer edge that a surface's file gives (polygons excluded), or its aperture if it gives none."""
+    """Return the smallest outer edge given for a surface (polygons excluded), or its aperture if there is none."""
     stated = [edge.shape for edge in edges if not edge.blocks and isinstance(edge.shape, Aperture)]
     return min(stated, key=lambda shape: shape.enclosing.radius, default=aperture)
 

@@ -1,4 +1,4 @@
-"""Optical surfaces: ideal shape and figure error, as NumPy functions and as equation G(x, y, z) = 0 in Dr.Jit kernels."""
+"""Optical surfaces: ideal shape and figure error, as NumPy functions and as equation G = 0 in Dr.Jit kernels."""
 
 from __future__ import annotations
 

@@ -531,7 +531,8 @@ def refractive_index(
     >>> refractive_index("N-BK7", 10e-6)
     Traceback (most recent call last):
     ...
-    optics.numerics.array_math.UnphysicalError: N-BK7: wavelength 10000 nm is outside the range of its dispersion formula, 300 to 2500 nm
+    optics.numerics.array_math.UnphysicalError: N-BK7: wavelength 10000 nm is outside the range of its dispersion \
+formula, 300 to 2500 nm
     """
     if medium not in ("air", "vacuum"):
         raise ValueError(f"medium must be 'air' or 'vacuum', got {medium!r}")

@@ -136,7 +136,7 @@ def _no_offset(width: float) -> float:
 
 
 def _origin(length: float, width: float) -> tuple[float, float, float]:
-    """Return the origin (0, 0, 0) of the reflector's frame as the point about which rotations leave the beam unchanged."""
+    """Return (0, 0, 0), the point about which rotations leave the beam unchanged if it is the frame's origin."""
     return (0.0, 0.0, 0.0)
 
 

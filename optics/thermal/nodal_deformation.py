@@ -51,7 +51,7 @@ MAX_SAG_CHANGE = 1e-3
 PRINTED = 0.3
 """Ratio of the leave-out error to the residual above which the residual is attributed to the mesh."""
 SEEN = 1e-9
-"""Error of sag, metres rms, below which no print-through is reported: 1/300 of a wave of reflected light."""
+"""Error of sag, metres rms, below which no mesh print-through is reported: 1/300 of a wave in reflected light."""
 
 _LATTICE = 5  # lattice points per node spacing, by which the cells are measured
 _FINEST = 1200  # largest number of lattice points along the aperture

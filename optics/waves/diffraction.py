@@ -41,17 +41,22 @@ MAX_POINTS = 256
 """
 
 _BEYOND, _BEYOND_IF_LOOSE = 4.0, 3.0
-"""Extent of the samples beyond each end of the points, in Nyquist distances: for 2e-12 and for 1e-8 accuracy."""
+"""Distance by which samples extend beyond each end of the grid, in Nyquist distances: for errors of 2e-12 and of 1e-8.
+"""
 
 _TIGHT, _LOOSE = 2e-12, 1e-8
-"""Largest error of a wave of the band, of amplitude 1."""
+"""Largest error at the grid points of a unit wave that is interpolated from its samples: normal and loose."""
 
 _OVER = 1.35
+"""Factor of the Nyquist number in the number of samples that is tried first."""
 _MORE, _MORE_IF_LOOSE = 22, 14
-"""First number of samples that is tried: ``_OVER`` times the Nyquist number, plus ``_MORE`` (or for 1e-8 accuracy)."""
+"""Numbers added to ``_OVER`` times the Nyquist number to give the first number of samples that is tried.
+
+They are for errors of 2e-12 and of 1e-8.
+"""
 
 _BAND_RATIO = 1.1
-"""Ratio of successive bands for which samples are computed."""
+"""Ratio of one bandwidth to the next in the geometric series of bandwidths for which sets of samples are computed."""
 
 _MAX_RATIO = 0.8
 """Ratio of samples to points above which all points are used instead."""
@@ -158,7 +163,7 @@ class PupilField:
     def scaled_by(self, size: np.ndarray) -> PupilField:
         """Return the field in coordinates x / size, y / size: those of pixels scaled by ``size``, (B,), in B images.
 
-        Phases u x + v y stay, and so does the power: an image is then photons per area of the nominal pixels.
+        Phases u x + v y and the power are unchanged, so that an image gives photons per area of the nominal pixels.
         """
         size = np.asarray(size)[:, None]
         return PupilField(self.u * size, self.v * size, self.eikonal, self.amplitude * size, self.wavelength)

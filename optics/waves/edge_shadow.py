@@ -38,8 +38,11 @@ its polygon.
 """
 
 FINE_SHARE, COARSE_SHARE = 3e-4, 3e-3
-"""Changes of a shadow's share of the stop with twice as many sides: up to the first, the smaller number of sides is
-used, up to the second the larger one, whose error is a third of the change."""
+"""Limits of the change of a shadow's area, as a fraction of the stop, when round edges get twice as many sides.
+
+Up to the first, the smaller number of sides is used; up to the second, the larger one, whose error is a third of the
+change.
+"""
 
 MOST_PIECES = 160
 """Largest number of polygons of a shadow: the time of a transfer function grows with the square of their number."""
@@ -471,7 +474,7 @@ _MIN_HALF_WIDTH = 1e-6
 
 
 def _outside(clear: list[np.ndarray], count: int) -> list[np.ndarray]:
-    """Return what lies outside all clear polygons in the window about the stop, as convex polygons.
+    """Return the part of a window about the stop that lies in none of the clear polygons, as convex polygons.
 
     ``clear`` are polygons (B, V, 2) of V corners in B images.
     """

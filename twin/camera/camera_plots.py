@@ -178,12 +178,12 @@ def axial_figure(run: CameraRun) -> Figure:
 
 
 def _mark(wavelengths: np.ndarray) -> str:
-    """Return the marker of points on curves over few wavelengths; empty for many wavelengths."""
+    """Return the marker for points on curves over the given wavelengths; empty (no marker) if there are many."""
     return "o" if len(wavelengths) < 12 else ""
 
 
 def _over_light(axes: Axes, run: CameraRun, title: str) -> None:
-    """Label axes that show a quantity by wavelength."""
+    """Complete axes that show a quantity over wavelength: zero line, reference wavelength, title and axis label."""
     assert run.colours is not None
     axes.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
     axes.axvline(1e9 * run.colours.reference, color=GREY, lw=0.8, ls=":")

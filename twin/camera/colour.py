@@ -40,7 +40,8 @@ FOCUS_RINGS = 6
 """Rings of the quadrature over the stop by which a focus is found."""
 
 WINDOW, PSF_POINTS = 24.0, 129
-"""Side of a point image's window at least, in the longest wavelength times the F-number, and its points along it."""
+"""Smallest side of a point image's window, in units of the longest wavelength times the F-number, and samples per side.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,7 +310,9 @@ def _sampled(pupil: PupilFunction, wavelength: float, half: float) -> PupilField
 
 
 def evaluate_colours(optics: CameraOptics, spectrum: SpectrumSpec, fields: tuple[Field, ...], sharp: bool) -> Colours:
-    """Compute the polychromatic results of a camera, without MTF if it is not ``sharp``.
+    """Compute the polychromatic results of a camera.
+
+    ``sharp`` is False for a camera with wavefront errors so large that no MTF and no point images are computed.
 
     Raises
     ------
@@ -334,7 +337,7 @@ def evaluate_colours(optics: CameraOptics, spectrum: SpectrumSpec, fields: tuple
 
 @dataclass(frozen=True, eq=False)
 class _AtField:
-    """Polychromatic results at one of the fields."""
+    """View of the polychromatic results that gives the numbers of one field, for optics.json."""
 
     colours: Colours
     number: int

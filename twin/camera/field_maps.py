@@ -54,7 +54,7 @@ class Distortion:
     line_distance : float
         Principal distance of the line, sum(L tan W) / sum(tan^2 W), metres.
     line_point : tuple of float
-        Principal point of the line when it is fitted, and the principal distance of that fit, metres.
+        Principal point of the line and principal distance, metres, when both are fitted to L(tan W).
     residual : (M,) ndarray
         Distortion L - f tan W with ``line_distance``, metres.
     residual_with_point : (M,) ndarray
@@ -183,7 +183,7 @@ class FieldCurves:
 def field_curves(optics: CameraOptics, sharp: bool, count: int = 21) -> FieldCurves:
     """Compute focus, error, illumination and MTF at ``count`` fields along the line.
 
-    The MTF is omitted if the camera is not ``sharp``.
+    ``sharp`` is False for a camera with wavefront errors so large that the MTF is not computed.
     """
     share = np.linspace(-1.0, 1.0, count)
     fields = np.stack([share, np.zeros(count)], axis=-1)
@@ -243,7 +243,10 @@ class ThroughFocus:
 
 
 def through_focus(optics: CameraOptics, fields: tuple[Field, ...], sharp: bool) -> ThroughFocus:
-    """Compute the image quality while the detector moves through focus."""
+    """Compute the image quality at F fields while the detector moves through focus.
+
+    ``sharp`` is False for a camera with wavefront errors so large that the MTF is not computed.
+    """
     spec = optics.model.spec
     f_number = optics.spot().airy / (1.22 * spec.wavelength)
     beams = optics.beams(fields, 6)
@@ -260,7 +263,11 @@ def through_focus(optics: CameraOptics, fields: tuple[Field, ...], sharp: bool) 
 
 
 def _mtf_through_focus(optics: CameraOptics, fields: tuple[Field, ...], defocus: np.ndarray, sharp: bool) -> np.ndarray:
-    """Return the MTF at Nyquist, (F, 2, Z), at F fields, in two directions, for Z defoci; NaN if not sharp."""
+    """Return the MTF at the Nyquist frequency through focus, (F, 2, Z).
+
+    It is for F fields, the directions along line and track, and Z positions of the detector; NaN if not ``sharp``
+    (wavefront errors too large for an MTF).
+    """
     mtf = np.full((len(fields), 2, len(defocus)), np.nan)
     if sharp:
         wavelength = np.array([optics.model.spec.wavelength])

@@ -37,7 +37,7 @@ from twin.camera.camera_optics import CameraOptics, rim
 from twin.framework.record import Quantity, Record
 
 EARLIER = 6.0
-"""Distance before the launch point of the light within which obstacles are searched, metres."""
+"""Distance by which rays are extended backward from the light's launch point to find obstacles there, metres."""
 
 _FIELDS = tuple((x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0))
 _RAYS = 4000
@@ -319,7 +319,7 @@ class FirstOrderData:
 
 
 def _near(value: float) -> float | None:
-    """Return a length, metres, or None for an infinite one."""
+    """Return a length in metres, or None if it is infinite (beyond 1e9 m)."""
     return value if abs(value) < _INFINITE else None
 
 

@@ -37,7 +37,7 @@ waves.
 GRIDS = ((5, 8), (7, 10), (10, 14))
 """Rings of the stop's quadrature and degree of the polynomials for the wavefront, the coarsest first."""
 RESIDUAL = 1e-3
-"""Largest rms of a wavefront that its polynomials may leave, waves."""
+"""Largest accepted rms of a wavefront minus the polynomials fitted to it, waves."""
 
 
 class VignettedBeamError(UnphysicalError):
@@ -108,7 +108,7 @@ class VariedBeams:
     cosines
         Direction cosines (row, column) of its rays at the line CCD, (K, F, N, 2).
     residual
-        Rms that the polynomials leave of its wavefronts, waves.
+        Rms of its wavefronts minus the polynomials fitted to them, waves.
     pieces
         Polygons on the stop's unit disk where its beams are shadowed, (F, P, V, 2): P polygons of V corners per field.
 
@@ -261,7 +261,7 @@ class VariedBeams:
         return np.asarray(np.moveaxis(longer, 1, 2).reshape(len(paths), len(self.fields), -1))
 
     def _light(self, traced: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], aimed: np.ndarray) -> BeamLight:
-        """Return the light at the line CCD from traced rays."""
+        """Return the light at the line CCD (optical paths, chief rays) from traced rays, as ``BeamLight``."""
         position, direction, path, _ = traced
         paths = self._to_sphere(position, direction, path, self.radius)
         eikonals = self._to_sphere(position, direction, path, np.inf) if self._planes else paths

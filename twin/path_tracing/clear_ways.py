@@ -28,7 +28,7 @@ It is three degrees from grazing, more than the triangles' normals differ from t
 """
 
 EXITS = 4
-"""Number of ways in which light can leave a surface: two clear apertures, each with two sides."""
+"""Number of ways in which light can leave a surface: through either of two clear apertures, toward +z or toward -z."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ class Segment:
     end : Patch
         Aperture at the end.
     after : int
-        Index of the family's next segment in the list; -1 if there is none.
+        Index, in the list of segments, of the next one along the same family of paths; -1 if there is none.
     behind : int
         1 where the next segment leaves the end toward -z.
     """
@@ -112,14 +112,18 @@ class Segment:
 
 
 class ClearSegments:
-    """Clear segments along families of paths, up to their detectors.
+    """Clear segments of the nominal light paths to the detectors.
+
+    A family of paths is all paths that meet the same surfaces in the same order; there is one nominal family per
+    detector.
 
     Parameters
     ----------
     scenery : Scenery
         All surfaces.
     families : Mapping[str, Sequence[int]]
-        Detector -> codes of the events before it.
+        Detector -> events (surface and what happens there) of its nominal family, as the numbers of
+        ``path_families.code``.
 
     Attributes
     ----------
@@ -146,7 +150,10 @@ class ClearSegments:
                 self._apertures[name] = [(-1, line[0]), *self._follow(line)]
 
     def _follow(self, line: Sequence[Patch]) -> Iterator[tuple[int, Patch]]:
-        """Add the segments of a family; yield the index of each (-1 if not clear) and the aperture at its end."""
+        """Add the clear segments between successive apertures of a light path to the list of segments.
+
+        Yields the index of each segment (-1 where it is not clear) and the aperture at its end.
+        """
         last = -1
         for start, end in pairwise(line):
             segment = self._between(start, end)
@@ -160,26 +167,26 @@ class ClearSegments:
             yield last, end
 
     def apertures(self, family: str | None = None) -> list[tuple[int, Patch]]:
-        """Return the apertures that a family meets, up to its detector, each with the index of the segment before it.
+        """Return the apertures that the nominal light of a detector meets, each with the index of the segment to it.
 
-        The index is -1 where that segment is not clear. The list is empty for an unknown family.
+        The index is -1 where that segment is not clear. The list is empty for an unknown detector.
 
         Parameters
         ----------
         family : str or None
-            Detector of the family, None for the first one.
+            Name of the detector, None for the first one.
         """
         return self._apertures.get(family or next(iter(self._apertures), ""), [])
 
     def from_source(self, start: Patch, family: str | None = None) -> Segment | None:
-        """Return the segment from a source to the first surface of a family, None where it is not clear.
+        """Return the segment from a source to the first surface of a detector's nominal light, None if not clear.
 
         Parameters
         ----------
         start : Patch
             Emitting disk of the source.
         family : str or None
-            Detector of the family, None for the first one.
+            Name of the detector, None for the first one.
         """
         line = self.apertures(family)
         segment = self._between(start, line[0][1]) if line else None
@@ -318,7 +325,10 @@ def _reaches(triangles: np.ndarray, planes: np.ndarray, margin: float) -> bool:
 
 
 def _cut(corners: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """Return the part of a convex polygon where a linear function, given at its corners, is not positive."""
+    """Return the part of a convex polygon where a linear function is zero or negative.
+
+    ``levels`` are the values of the function at the polygon's corners.
+    """
     out = []
     for k, level in enumerate(levels):
         after = (k + 1) % len(levels)

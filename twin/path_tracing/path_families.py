@@ -24,7 +24,7 @@ class Event(IntEnum):
 
 
 OUTSIDE = 8
-"""Number added to the event where it happens outside a face's clear apertures."""
+"""Number added to the number of an event (``Event``) that happens outside the clear apertures of a surface."""
 
 BITS = 4
 START = 0xCBF29CE484222325
@@ -33,12 +33,15 @@ _WORD = (1 << 64) - 1
 
 
 def code(part: int, event: Event, outside: bool = False) -> int:
-    """Return an event as a number: the index of the part and the kind of event."""
+    """Return the number of an event: index of the surface it happens on, kind of event, and whether outside apertures.
+
+    ``outside`` is True where the path meets the surface outside its clear apertures.
+    """
     return (part + 1) << BITS | (int(event) + (OUTSIDE if outside else 0))
 
 
 def decode(number: int) -> tuple[int, Event, bool]:
-    """Return part, event and True if outside the clear apertures; the inverse of ``code``."""
+    """Return surface index, kind of event, and True if outside the clear apertures: the inverse of ``code``."""
     event = number & (1 << BITS) - 1
     return (number >> BITS) - 1, Event(event % OUTSIDE), event >= OUTSIDE
 
@@ -99,7 +102,7 @@ def nominal_codes(scenery: Scenery, assembly: Assembly, sequence: str) -> tuple[
 
 
 def surface_events(scenery: Scenery, codes: tuple[int, ...]) -> tuple[SurfaceEvent, ...]:
-    """Return the events, with the names of their surfaces, that numeric codes stand for."""
+    """Return the events of a path, with the names of their surfaces, from their numbers (``code``)."""
     parts = scenery.parts
     return tuple(SurfaceEvent(parts[part], event, outside) for part, event, outside in map(decode, codes))
 

@@ -18,14 +18,15 @@ from twin.path_tracing import tables as layout
 from twin.path_tracing.clear_ways import EXITS
 
 REFINEMENTS = 3
-"""Number of Newton steps from the triangle to the surface.
+"""Number of Newton steps from a ray's intersection with a surface's triangles to that with the true surface.
 
 The error falls from below a millimetre to 1e-7 m, 1e-13 m and to rounding, also at grazing incidence.
 """
 
 EXACT = 1e-12
-"""Largest value of the level function, in metres, at which a surface counts as met: some hundred roundings of ten
-metres.
+"""Largest residual of a surface's equation (``optics.geometry.surface.level``), metres, where it counts as met.
+
+It is some hundred rounding errors of a length of ten metres.
 """
 
 AHEAD = 1e-12
@@ -47,7 +48,8 @@ class Flight:
     active : Dr.Jit mask
         Mask of the active paths.
     coherent : Dr.Jit mask
-        Mask of the paths that follow their neighbours.
+        Mask of the paths that were neither scattered nor took an unlikely direction, and so behave like their
+        neighbours.
     segment : Dr.Jit array
         Index of the clear segment of each path; 0 if it is on none.
     segments : bool
@@ -77,7 +79,7 @@ class NextSurface:
     hit : Dr.Jit mask
         Mask of the paths that meet one.
     expected : Dr.Jit mask
-        Mask of the paths that are only expected to meet it, by their clear segment.
+        Mask of the paths that meet it if they hit the aperture at the end of their clear segment; no search was made.
     segment : list of Dr.Jit arrays
         Index of the segment after it, and code of its end, see ``tables.segment_table``.
     """

@@ -115,7 +115,7 @@ def framed(
 SMOOTH = 0.35
 """Angle below which an edge is a facet boundary of a curved surface, radians."""
 BEAM_PIXELS, EDGE_PIXELS = 1.0, 0.55
-"""Radius of beams and of the drawn edges of glass, in pixels at the middle of the picture."""
+"""Radius of drawn light beams and of drawn edges of glass, in picture pixels at the middle of the instrument."""
 GLOW = 1.3
 """Radiance of drawn beams; that of the floor is about 0.9."""
 FLOOR = "floor"
