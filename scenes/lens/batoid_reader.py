@@ -315,7 +315,7 @@ class _Reader:
                 raise self.error((*key, "type"), "this type of medium is not supported", kind, known)
 
     def _keep_sellmeier(self, index: float, b_and_c: list[float]) -> None:
-        """Store a Sellmeier glass under its index.
+        """Store the dispersion formula of a Sellmeier glass under its refractive index, by which it is found later.
 
         The file states no wavelength range, so one between the poles of the formula is assumed.
         """

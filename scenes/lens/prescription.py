@@ -275,7 +275,8 @@ def written(value: float, kind: Kind) -> str:
 
 
 _ROUNDING = {ANGLE.si: 1e-14, LENGTH.si: 1e-15}
-"""SI unit -> rounding error of sums and differences of such numbers; the wavelength of light is 1e8 times as much."""
+"""SI unit -> rounding error of sums and differences of numbers in this unit; a wavelength of light is 1e8 times larger.
+"""
 
 _LARGEST_EDGE = 100.0
 """Size of an aperture or obscuration, in metres, above which it is ignored because no light reaches it."""
@@ -442,8 +443,8 @@ class Prescription:
     wavelengths : tuple[float, ...]
         All wavelengths that the file names, in metres.
     fields : tuple[tuple[float, float], ...]
-        Directions (x, y) from which light comes, as angles of their tangents, in radians; empty where the file defines
-        its fields otherwise.
+        Field angles (x, y), in radians: light travels along (tan x, tan y, 1); empty where the file defines its fields
+        otherwise.
     field_kind : str
         Kind of the file's fields, for messages.
     pupil : Pupil or None

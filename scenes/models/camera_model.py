@@ -408,7 +408,7 @@ def pupil_diameter(backend: Backend, to_stop: SystemBatch, axis: CameraAxis, rad
 def axis_data(
     backend: Backend, imaging: SystemBatch, spec: CameraSpec, axis: CameraAxis, first: np.ndarray
 ) -> Paraxial:
-    """Return the paraxial data about the axis of a camera.
+    """Return the paraxial data (focal length, focus, pupils) about the axis of a camera.
 
     Parameters
     ----------

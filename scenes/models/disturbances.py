@@ -67,7 +67,7 @@ HEAT = ("temperature", "gradient")
 SINGLE = ("scale", "radius", "conic", "index", "temperature")
 """Kinds of components without an axis, of which a body has only one, such as its scale."""
 _NEEDS = {"gradient": "temperature"}
-"""Kind -> permission that a node must have for it, where the two have different names."""
+"""Kind of component -> action that a node must allow for it, for kinds whose name differs from that of the action."""
 
 _Where = Callable[[str, KeyPath, Problem], Issue]
 """Function that makes the issue (file, line and message) of a problem at a key of a cause, from these three."""

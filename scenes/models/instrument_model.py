@@ -113,7 +113,8 @@ class MisplacedError(PhysicalError, ValueError):
     remedy : str
         Advice on the value to choose there.
     channel : tuple[str, str] or None
-        Camera and name of the channel concerned, whose own key takes precedence; None if no single channel is.
+        Camera and name of the channel concerned: where the file has a key for this channel, that is the one to change.
+        None if no single channel is concerned.
     """
 
     def __init__(self, problem: str, key: KeyPath, remedy: str, channel: tuple[str, str] | None = None) -> None:
@@ -122,7 +123,7 @@ class MisplacedError(PhysicalError, ValueError):
 
 
 def key_of(path: str) -> KeyPath:
-    """Return the key of the instrument's file that defines a body, in its form for all channels."""
+    """Return the key of the instrument's file that defines a body; for parts of channels the key for all channels."""
     if path.startswith(CENTRAL_PRISM):
         return (CENTRAL_KEY,)
     prism = prism_of(path)

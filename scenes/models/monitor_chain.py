@@ -507,6 +507,6 @@ def _columns(x: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def _facet_axes(normal: np.ndarray) -> np.ndarray:
-    """Return the rotation matrix of a facet's frame: z along its normal, x along the line (against Y)."""
+    """Return the rotation matrix of a facet's frame: z along its normal, x along the line CCD, toward the base's -Y."""
     x_axis = transverse_axes(normal, np.array([0.0, -1.0, 0.0]))[0]
     return _columns(x_axis, normal)

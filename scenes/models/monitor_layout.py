@@ -59,7 +59,7 @@ class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
 
     @classmethod
     def parts(cls, test: MonitorDesignSpec) -> dict[str, Any]:
-        """Read the start instrument with its cameras, and the parts that the design may choose, by field."""
+        """Read the start instrument, its cameras and the parts to choose from; return field -> content."""
         start = load.load_instrument(test.instrument, test, ("instrument",))
         if start.as_built:
             problem = f"{start.name} is an instrument as built; a layout starts from a drawing"

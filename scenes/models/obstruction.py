@@ -650,7 +650,7 @@ def check_beams(instrument: Instrument, backend: Backend) -> None:
 
 
 def moved_into_beams(instrument: Instrument, backend: Backend, state: State) -> tuple[str, ...]:
-    """Return warnings about bodies that block monitor beams in a perturbed state, without a full stop.
+    """Return warnings, without a full stop, about bodies that block monitor beams in a perturbed state.
 
     Edges of clear apertures vignette the simulated spots; bodies do not.
     """

@@ -291,7 +291,7 @@ class ImagingShadows:
         return centre, size
 
     def _end(self, beams: TracedBeams) -> np.ndarray:
-        """Return the distance along the light from the launch points to the first mirror's middle, for B beams.
+        """Return the distance along the light from its launch points to the middle of the first mirror, for B beams.
 
         Returns
         -------

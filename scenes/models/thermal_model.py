@@ -321,7 +321,7 @@ class ThermalModel:
         return self._owners[path]
 
     def _pieces(self, path: str) -> list[Solid]:
-        """Return a solid and the solids that are parts of it."""
+        """Return a solid (a glass body) together with the smaller solids that are parts of it."""
         return [solid for piece, solid in self.solids.items() if self._owner(piece) == path]
 
     def fields(self, temperatures: Mapping[str, _Field], pieces: bool = True) -> dict[str, _Field]:

@@ -563,7 +563,7 @@ class AsBuiltSpec(Spec):
 
 
 def unknown_within(text: str, found: object, names: Mapping[str, Any], within: tuple[str, ...]) -> Problem:
-    """Return the problem of a name, used at a key below this mapping, that does not exist."""
+    """Return the problem of a name that a key below this mapping uses and that is not among the known names."""
     problem = unknown(text, found, tuple(names))
     return Problem(problem.problem, problem.found, problem.allowed, problem.suggestion, within=within)
 
@@ -584,7 +584,7 @@ class AsBuiltSetup(ExperimentSetup[AsBuiltSpec]):
 
     @classmethod
     def parts(cls, test: AsBuiltSpec) -> dict[str, Any]:
-        """Read the nominal job, and the disturbances from which a simulated instrument is drawn, by field."""
+        """Read the nominal job and the simulated instrument's disturbances; return field of the set-up -> content."""
         base, simulated = resolve_on(test, test.instrument, test.prior), test.simulate
         if simulated is None or simulated.prior is None:
             return {"base": base}

@@ -82,8 +82,9 @@ class Quantity(Generic[S]):
     key : str
         Name in files; the ending names the unit.
     of : callable
-        Function of the source that returns the value in SI units. With ``record``: the source of that record, a list or
-        mapping of sources, or a mapping of such mappings. None if there is no value.
+        Function of the source, the object of which the record lists numbers, that returns the value in SI units. With
+        ``record``: the source of that record, a list or mapping of sources, or a mapping of such mappings. None if
+        there is no value.
     meaning : str
         Description for the reference and for columns of other programs.
     head : str

@@ -60,7 +60,7 @@ class _Limited:
 
     @property
     def followed(self) -> list[tuple[Elasticity, int]]:
-        """Numbers of the prior with the largest elasticities of the quantity's sigma, each with the quantity's index."""
+        """Numbers of the prior on which the quantity's sigma depends most, each with the index of the quantity."""
         largest = sorted(self.limits.elasticities, key=lambda elasticity: -float(elasticity.elasticity[self.q]))[:LINES]
         return [(elasticity, self.q) for elasticity in largest]
 
