@@ -29,7 +29,7 @@ LONGEST = 18
 
 
 def finish(axes: Axes, x_ticks: int | None = 6, y_ticks: int | None = 5) -> None:
-    """Format the axes of a panel with at most the given numbers of ticks; None leaves an axis unchanged."""
+    """Format the axes of a panel with at most ``x_ticks`` and ``y_ticks`` ticks; None leaves that axis unchanged."""
     svg.gridded(axes)
     if x_ticks is not None:
         axes.xaxis.set_major_locator(MaxNLocator(x_ticks, steps=STEPS))
@@ -52,14 +52,14 @@ def short(text: str) -> str:
 
 
 def positions(series: Series) -> np.ndarray:
-    """Return the positions (runs,) of values on an axis: numbers themselves, texts at 0, 1, ..."""
+    """Return the coordinate of each run's value along a plot axis, (runs,): a number itself, texts at 0, 1, ..."""
     if not series.numeric:
         return np.array([np.flatnonzero(series.levels == value)[0] for value in series.values], np.float64)
     return series.values
 
 
 def name_texts(axes: Axes, series: Series, axis: str) -> None:
-    """Label an axis of ``positions`` with the texts; do nothing for numbers."""
+    """Label the ticks of an axis with the text values of a series that ``positions`` placed; do nothing for numbers."""
     if series.numeric:
         return
     ticks, names = np.arange(len(series.levels)), [short(str(level)) for level in series.levels]
@@ -73,16 +73,13 @@ def name_texts(axes: Axes, series: Series, axis: str) -> None:
 
 
 def thinned(good: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
-    """Return the indices of up to ``most`` runs of (n,) ``good``, evenly spaced through the study.
-
-    Array dimensions: n runs.
-    """
+    """Return the indices of up to ``most`` of the runs for which ``good`` is True, evenly spaced through the study."""
     indices = np.flatnonzero(good)
     return indices if len(indices) <= most else indices[np.linspace(0, len(indices) - 1, most).astype(int)]
 
 
 def jitter(series: Series, seed: int) -> np.ndarray:
-    """Return random offsets (runs,) to ``positions`` that keep points of one text from hiding each other."""
+    """Return random offsets of plotted points, (runs,), that keep points with the same text from hiding each other."""
     if not series.numeric:
         return np.random.default_rng(np.random.SeedSequence(seed)).uniform(-0.2, 0.2, len(series.values))
     return np.zeros(len(series.values))
@@ -149,7 +146,7 @@ _TITLES = {"mean": "mean", "sigma": "standard deviation", "p95": "95% quantile",
 
 
 def convergence_figure(analysis: StudyAnalysis, response: Response) -> Figure:
-    """Plot mean, sigma and the upper quantiles of the first n runs, each with its interval."""
+    """Plot mean, sigma and the upper quantiles of the first n runs against n, with their confidence intervals."""
     convergences = analysis.convergences[response.name]
     figure, grid = svg.panels([2.8] * len(convergences), len(convergences))
     for axes, convergence in zip(grid, convergences, strict=True):
@@ -249,7 +246,10 @@ def _lines(axes: Axes, factor: Factor, other: Factor | None, response: Response)
 
 
 def _bars(axes: Axes, factor: Factor, other: Factor | None, response: Response) -> None:
-    """Plot the mean for each text with one standard deviation; as bars if zero is near, else as points."""
+    """Plot the mean of a response for each text value of a factor, with one standard deviation.
+
+    Means are drawn as bars from zero if zero is not far from their range, else as points.
+    """
     groups = _groups(other, response)
     width = 0.8 / len(groups)
     means = [[response.values[runs & (factor.values == level)] for level in factor.levels] for _, runs in groups]
@@ -326,7 +326,7 @@ def _bar_panels(rows: Sequence[int]) -> tuple[Figure, list[Axes]]:
 
 
 def with_tornado(analysis: StudyAnalysis) -> list[Response]:
-    """Return the responses and reported sigmas for which the tornado figure has bars."""
+    """Return the responses and reported sigmas that have at least one bar in the tornado figure."""
     return [r for r in analysis.runs.everything if analysis.effects[r.name] or analysis.linear[r.name] is not None]
 
 
@@ -434,7 +434,10 @@ def chosen(analysis: StudyAnalysis) -> list[Series]:
 
 
 def matrix_figure(analysis: StudyAnalysis) -> Figure:
-    """Plot a matrix of points below the diagonal, rank correlations above it, and distributions on it."""
+    """Plot a matrix of all pairs of the chosen quantities.
+
+    Scatter plots are below the diagonal, rank correlations above it, and histograms on it.
+    """
     variables = chosen(analysis)
     n = len(variables)
     figure = svg.new_figure(min(1.65 * n + 0.6, 10.2), {"h_pad": 0.03, "w_pad": 0.03, "hspace": 0.02, "wspace": 0.02})

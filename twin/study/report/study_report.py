@@ -1,4 +1,4 @@
-"""Report of a study: ``report.html``, its artefacts and ``statistics.json``."""
+"""Report of a study: ``report.html``, the figures and tables in ``artefacts``, and ``statistics.json``."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ STATISTICS = "statistics.json"
 
 
 def _factor_table(runs: StudyRuns) -> Table:
-    """Return the table of factors: name, position in the base, distribution and values run."""
+    """Return the table of factors: name, key in the base job, distribution, and the values of the runs."""
     rows: list[list[Cell]] = []
     for factor in runs.factors:
         positions = [key_text(key) for key in factor.spec.places]
@@ -195,7 +195,7 @@ def _response_table(analysis: StudyAnalysis) -> Table:
 
 
 def _figure(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> SvgFigure | Undrawn:
-    """Return a figure, or a note in its place if it cannot be drawn, so that the numbers beside it are kept."""
+    """Return a figure, or a note instead of it if it cannot be drawn, so that the rest of the report is kept."""
     try:
         with svg.look(f"study-{name}"):
             figure = draw()

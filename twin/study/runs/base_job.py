@@ -1,4 +1,4 @@
-"""Base job of a study: the data that runs change, the evaluation of runs, and the responses that are kept."""
+"""Base job of a study: the data that runs change, the evaluation of runs, and the responses that are recorded."""
 
 from __future__ import annotations
 
@@ -58,11 +58,11 @@ class Failure:
 
 
 Outcome = Mapping[str, Any] | Failure
-"""Results by file, as in the run folder's JSON files without the suffix .json; or the reason why there are none."""
+"""Result of a run: name of a result file without the suffix .json -> its contents; or a `Failure` with the reason."""
 
 
 class BaseJob(Protocol):
-    """Command that a study can vary: how its file is read, and how its runs are evaluated."""
+    """Interface of a command that a study can vary: how its input file is read, and how its runs are evaluated."""
 
     @property
     def model(self) -> type[Spec]:
@@ -73,10 +73,13 @@ class BaseJob(Protocol):
         """Number of consecutive runs that are always evaluated together, on any worker."""
 
     def resolve(self, file: Path | str) -> Spec:
-        """Read the job's file, or a name in the library, with everything it refers to; raise InputError."""
+        """Read the job's file, or a job named in the library, with all its files; raise InputError if invalid."""
 
     def check(self, tree: Tree, backend: Backend) -> None:
-        """Check what needs the built instrument; called once, in a worker, before the study; raise InputError."""
+        """Check what needs the built instrument, and raise InputError if it fails.
+
+        It is called once, in a worker process, before the study.
+        """
 
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
         """Return the outcome of every run.
@@ -106,7 +109,7 @@ class ProcedureBase:
 
     @property
     def model(self) -> type[Spec]:
-        """Class (data model) of the test's set-up."""
+        """Class (data model) of the test's set-up in its input file."""
         return self.procedure.model
 
     @property
@@ -115,7 +118,7 @@ class ProcedureBase:
         return 1
 
     def resolve(self, file: Path | str) -> Spec:
-        """Read the test with everything it refers to; raise InputError."""
+        """Read the test's file with all files it refers to; raise InputError if one is invalid."""
         setup: Any = self.procedure.resolve(file)
         if not isinstance(setup, self.model):
             text = "measurements cannot be varied; a study needs a simulated bench"
@@ -140,7 +143,10 @@ class ProcedureBase:
 
 
 def one_line(error: Exception) -> str:
-    """Return the error's text on one line; an input error without its file, which does not exist."""
+    """Return an error's text on one line, without the file name of an input error.
+
+    The inputs of a run are made in memory, so there is no such file.
+    """
     if not str(error).strip():
         return type(error).__name__
     return "; ".join(line.strip().removeprefix("input: ") for line in str(error).splitlines() if line.strip())
@@ -151,7 +157,7 @@ Tree = dict[str, Any]
 
 
 def with_place(tree: Tree, model: type[Spec], key: KeyPath, neutral: bool = False) -> Tree:
-    """Return a job's plain data in which ``key`` leads to a value; missing optional parts get their defaults.
+    """Return a job's plain data in which the key path ``key`` exists; missing optional parts get their defaults.
 
     Parameters
     ----------
@@ -191,7 +197,7 @@ def with_place(tree: Tree, model: type[Spec], key: KeyPath, neutral: bool = Fals
 
 
 def is_neutral(tree: Tree, model: type[Spec], key: KeyPath) -> bool:
-    """Return True if what ``with_place`` adds to reach ``key`` has the same effect as its absence.
+    """Return True if the entries that ``with_place`` adds to reach ``key`` do not change the job's results.
 
     Parameters
     ----------
@@ -241,7 +247,7 @@ def _fields(annotation: Any) -> tuple[str, ...]:
 
 
 def _default(annotation: Any) -> Any:
-    """Return the plain data of a value's default; None if it has none."""
+    """Return the default of a field of a data model as plain data; None if it has no default."""
     if not _is_model(annotation):
         return {} if typing.get_origin(annotation) is dict else None
     try:
@@ -310,14 +316,14 @@ def leaf(tree: Any, key: KeyPath) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class BlockResult:
-    """Responses of n consecutive runs.
+    """Responses of a block of n consecutive runs.
 
-    Array dimensions: R responses.
+    Array dimensions: n runs, R responses.
 
     Attributes
     ----------
     values : (n, R) ndarray
-        Responses in the study's order, NaN in failed runs and where there is no number.
+        Responses in the study's order, NaN in failed runs and where the results have no number.
     sigmas : (n, R) ndarray
         Total standard deviations of the responses, NaN where none is requested.
     noises : (n, R) ndarray
@@ -338,7 +344,7 @@ class BlockResult:
     doubts: tuple[str, ...]
 
     def fits(self, shape: tuple[int, int]) -> bool:
-        """Return True if these are results of the given numbers of runs and responses; a file may hold anything."""
+        """Return True if the arrays have the shape (runs, responses); data read from a file may not."""
         arrays = all(
             isinstance(item, np.ndarray) and item.shape == shape and item.dtype == float
             for item in (self.values, self.sigmas, self.noises)
@@ -348,17 +354,14 @@ class BlockResult:
 
     @property
     def failed(self) -> np.ndarray:
-        """True for failed runs, (n,).
-
-        Array dimensions: n runs.
-        """
+        """True for each of the n runs that failed, (n,)."""
         return np.array([bool(message) for message in self.messages], bool)
 
     @classmethod
     def of(
         cls, outcomes: Sequence[Outcome], responses: Mapping[str, ResponseSpec], seconds: float = 0.0
     ) -> BlockResult:
-        """Return the block's responses, taken from the outcomes of its runs."""
+        """Return the responses of a block of runs, taken from the results of its runs."""
         values = np.full((len(outcomes), len(responses)), np.nan)
         sigmas, noises = (np.full(values.shape, np.nan) for _ in range(2))
         messages: list[str] = []
@@ -402,7 +405,7 @@ CONTRADICTED = "the shifts of the spots contradict the prior on disturbances"
 
 
 def _doubt(outcome: Mapping[str, Any]) -> str:
-    """Return the reason why the sigmas of a run are not valid, without its numbers; empty where they are."""
+    """Return the reason why the sigmas of a run are not valid, without numbers; an empty text if they are valid."""
     recovered = outcome.get("recovered", {})
     course = outcome.get("course", {}).get("sigma_holds", [])
     if not isinstance(recovered, Mapping) or (recovered.get("sigma_holds", True) and all(course)):
