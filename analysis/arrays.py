@@ -202,18 +202,20 @@ def _range(values: np.ndarray, unit: str) -> str:
 
 
 class StateArrays:
-    """Base class of dataclasses whose fields are arrays of S states along the first axis.
+    """Base class of dataclasses whose fields are arrays with one element for each of S states along the first axis.
+
+    A state is whatever the rows of a result belong to: an epoch, a measurement or a spot.
 
     A field may also be None, a mapping of arrays, or another result of the same states.
     """
 
     def at(self, states: slice) -> Self:
-        """Return the result of a slice of the states.
+        """Return a result that contains only the selected states.
 
         Parameters
         ----------
         states : slice
-            Range along the first axis.
+            Range of states to keep, along the first axis of all arrays.
         """
         return type(self)(**{name: _at(getattr(self, name), states) for name in _names(self)})
 

@@ -1,8 +1,9 @@
 """Normal equations of observations and priors with the ground points eliminated, in pieces of bounded memory.
 
 **Packets.** A packet is the d equations that one measurement of one ground point gives: they depend on the point p and
-on w of the unknowns x. Packet sets of one kind are linearised together and whitened by their a-priori covariance: miss
-+ by_x dx + by_point dp. The elimination knows nothing of cameras.
+on w of the unknowns x. Packet sets of one kind are linearised together and whitened by their a-priori covariance; a
+packet is then its misclosure, the derivatives with respect to x times a step of x, and those with respect to p times a
+step of p. The elimination knows nothing of cameras.
 
 **Elimination.** A ground point occurs only in its own packets, so that its (3, 3) block is inverted alone (Schur
 complement). Points whose packets depend on the same unknowns in the same order form a bundle: their equations make one
@@ -50,7 +51,7 @@ class Packets(Protocol):
 
     @property
     def point(self) -> Indices:
-        """Index (n,) of the ground point that each packet observes."""
+        """Index of the ground point that each of the n packets observes, (n,)."""
 
     @property
     def columns(self) -> Indices:
@@ -78,7 +79,7 @@ class Packets(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class LineImage:
-    """Image points of one line camera in one pass.
+    """Image points of one line camera in one pass, n in number.
 
     Attributes
     ----------
@@ -112,7 +113,7 @@ class LineImage:
 
     @property
     def point(self) -> Indices:
-        """Index (n,) of the ground point of each packet."""
+        """Index of the ground point that each of the n image points shows, (n,)."""
         return self.rays.point
 
     @property
@@ -154,7 +155,7 @@ class LineImage:
 
 @dataclass(frozen=True, eq=False)
 class Pointings:
-    """Laser altimeter footprints: range, and direction of the beam in the body frame.
+    """Laser altimeter footprints, n of them: range, and direction of the beam in the body frame.
 
     Attributes
     ----------
@@ -192,7 +193,7 @@ class Pointings:
 
     @property
     def columns(self) -> Indices:
-        """Indices (n, w) of the unknowns, corrections of the readings, on which each footprint depends."""
+        """Indices (n, w) of the w unknowns, corrections of the readings, on which each of n footprints depends."""
         return self.corrections.columns
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
@@ -240,7 +241,7 @@ class Pointings:
 
 @dataclass(frozen=True, eq=False)
 class FixedPoints:
-    """Surveyed coordinates of control points as observations, with a common shift as an optional unknown.
+    """Surveyed coordinates of n control points as observations, with a common shift as an optional unknown.
 
     Attributes
     ----------
@@ -269,7 +270,7 @@ class FixedPoints:
 
     @property
     def columns(self) -> Indices:
-        """Indices of the unknown common shift for each control point, (n, 3), or (n, 0) if it is not estimated."""
+        """Indices of the common shift for each of n control points, (n, 3), or (n, 0) if it is not estimated."""
         return np.broadcast_to(self.datum, (len(self.point), len(self.datum)))
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
@@ -286,7 +287,7 @@ class FixedPoints:
 
 @dataclass(frozen=True, eq=False)
 class Heights:
-    """Terrain model heights at points, with a common error of the model.
+    """Terrain model heights at n points, with a common error of the model.
 
     Attributes
     ----------
@@ -320,7 +321,7 @@ class Heights:
 
     @property
     def columns(self) -> Indices:
-        """Index (n, 1) of the unknown common height error for each point."""
+        """Index of the unknown common height error for each of n points, (n, 1)."""
         return np.broadcast_to(self.common, (len(self.point), 1))
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
@@ -372,7 +373,7 @@ class PriorGroup:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Ground points whose measurements depend on the same unknowns, so that they are eliminated together.
+    """Group of n ground points that depend on the same unknowns, so that they are eliminated together.
 
     Attributes
     ----------
@@ -495,7 +496,7 @@ class Checked:
 
 @dataclass(frozen=True, eq=False)
 class Reduction:
-    """Observation equations and priors of a block, which eliminates the ground points from them.
+    """Observation equations and priors of a block, with methods that eliminate the ground points from them.
 
     Attributes
     ----------
@@ -571,7 +572,7 @@ class Reduction:
 
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
-        """Mask (m,) of the points that have at least one measurement."""
+        """Mask of those of the m ground points that have at least one measurement, (m,)."""
         mask = np.zeros(self.count, bool)
         for packets in self.sets:
             mask[packets.point] = True
@@ -625,7 +626,7 @@ class Reduction:
         return self.with_priors(self.eliminated(state), state)
 
     def with_priors(self, equations: Eliminated, state: State) -> Reduced:
-        """Return normal equations of measurements with the priors added to them."""
+        """Return the normal equations of the measurements with the priors of the unknowns added."""
         gradient = np.zeros(self.size)
         for prior in self.priors:
             pull = prior.precision @ (state.x[prior.columns] - prior.mean) / state.factor.get(prior.group, 1.0)
@@ -684,7 +685,7 @@ class Reduction:
         return squares
 
     def point_steps(self, state: State, equations: Eliminated, step: Array) -> Array:
-        """Return the (m, 3) steps of the points that correspond to a step of the unknowns, in metres.
+        """Return the steps of the m points, (m, 3), in metres, that correspond to a step of the unknowns.
 
         Parameters
         ----------
@@ -710,7 +711,7 @@ class Reduction:
         state : State
             State at which the equations are linearised.
         spread : (m, 3, 3) ndarray
-            Covariance of the points for known x, in m^2.
+            Covariances of the m points for known unknowns x, in m^2.
         covariance : callable
             Function from the indices of w unknowns to their covariance (w, w).
         """
@@ -760,13 +761,17 @@ class Reduction:
         return Reduction(sets, (), self.size, len(points))
 
     def state_of(self, points: Indices, state: State) -> State:
-        """Return a state for the reduction restricted to selected points: their coordinates and weights."""
+        """Return the part of a state that concerns selected points: coordinates and weights of their measurements."""
         weight = tuple(w[which] for w, which in zip(state.weight, self.packets_at(points), strict=True))
         return State(state.x, state.ground[points], weight, state.factor)
 
 
 def _distinct(rows: Indices) -> tuple[Indices, Indices]:
-    """Return an index of each of the k distinct rows of integers (n, w), and the number of each row among them."""
+    """Return the distinct rows of a table of integers with n rows: an example of each, and the class of every row.
+
+    The first array (k,) has the index of one row of each of the k distinct kinds, the second (n,) the kind, 0 to k - 1,
+    of each row.
+    """
     if not rows.shape[1]:
         return np.zeros(1, np.intp), np.zeros(len(rows), np.intp)
     # hashes by random odd factors almost surely differ for different rows; collisions are checked below
@@ -827,10 +832,10 @@ class Pool(Protocol):
         """Number of worker processes."""
 
     def hold(self, things: Sequence[Any]) -> Sequence[Any]:
-        """Send each object to a process and return handles, which serve as the first argument of work."""
+        """Send each object to one process and return handles that stand for it in the arguments of `results`."""
 
     def results(self, work: Callable[[tuple[Any, ...]], Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Return the results of a function for each of the arguments, in their order."""
+        """Run a function for each of the arguments in the processes and return the results in the same order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -945,7 +950,7 @@ def _eliminated(arguments: tuple[Reduction, State]) -> Eliminated:
 
 
 def _stepped(arguments: tuple[Reduction, State, Array, Array, Array]) -> Array:
-    """Return the steps of the points of a process's share, (m, 3), in metres."""
+    """Return the steps of the m ground points of a process's share, (m, 3), in metres."""
     share, state, spread, start, step = arguments
     no_data = sparse.csc_matrix((0, 0))
     return share.point_steps(state, Eliminated(no_data, np.zeros(0), spread, start, {}), step)

@@ -123,7 +123,7 @@ def standardised_packets(residual: Array, cofactors: Array, weight: Array, unit:
 
 
 def robust_weights(standard: Array, kind: Robust | Literal["accept"]) -> Array:
-    """Return the robust weights of n measurements from their standardised residuals (n, d); d = 2 for image points.
+    """Return the robust weights of n measurements of d equations from their standardised residuals, (n, d).
 
     The weights are Huber's, IGG III, which decrease to zero, or "accept": 1 up to that zero and 0 beyond.
 
@@ -146,7 +146,10 @@ def robust_weights(standard: Array, kind: Robust | Literal["accept"]) -> Array:
 
 
 def limits(rows: int) -> tuple[float, float]:
-    """Return the norms of d standardised residuals above which a measurement is down-weighted and rejected."""
+    """Return the norms of a measurement's standardised residuals above which it is down-weighted and rejected.
+
+    The first norm is exceeded by 5 %, the second by 1e-4 of good measurements of `rows` equations.
+    """
     return float(np.sqrt(chi2.isf(0.05, rows))), float(np.sqrt(chi2.isf(1e-4, rows)))
 
 
@@ -211,7 +214,7 @@ class Reweighted(Protocol[S, T]):
     """Interface of an adjustment that `settled` reweights, with states of type S and solutions of type T."""
 
     def solve(self, at: S, screening: bool) -> tuple[S, T]:
-        """Return state and solution for the weights of a state; a rough solution suffices while screening."""
+        """Return state and solution of the adjustment with fixed weights; a rough solution suffices while screening."""
 
     def judged(self, at: S, found: T) -> tuple[Array, ...]:
         """Return the standardised residuals of each set of observations."""
@@ -239,7 +242,7 @@ def settled(problem: Reweighted[S, T], state: S, rule: Rule) -> tuple[S, T]:
     Raises
     ------
     UnsettledError
-        They do not converge.
+        The weights or the variance factors do not converge.
     """
     factors: list[Mapping[str, float]] = []
     for round_number in range(_ROUNDS):

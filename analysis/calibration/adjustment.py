@@ -184,7 +184,7 @@ class OmittedTermsTest:
     Attributes
     ----------
     terms : Rates, SlowVariations or Steps
-        The omitted terms, G in number.
+        The G terms that the adjustment did not estimate.
     score : (G,) ndarray
         Gradient of half the sum of squares with respect to the terms, where they are zero.
     cofactor : (G, G) ndarray
@@ -251,7 +251,7 @@ class OmittedTermsTest:
 
     @property
     def _largest(self) -> float:
-        """Largest diagonal element of the cofactor matrix."""
+        """Largest variance of the gradient's components, the diagonal elements of the cofactor matrix."""
         return float(np.diag(self.cofactor).max(initial=0.0))
 
     @property
@@ -282,11 +282,11 @@ are not those in the image.
 
 
 class FarPointsError(calibration_parameters.CalibrationError):
-    """Points that lie kilometres from where their image points look, or that contradict each other."""
+    """Error raised for ground points that are kilometres off their image points' rays, or contradict each other."""
 
 
 class NoiseError(calibration_parameters.CalibrationError):
-    """Noise of a single image point that exceeds what is to be estimated.
+    """Error raised if the noise of a single image point exceeds the changes that are to be estimated.
 
     Attributes
     ----------
@@ -378,7 +378,7 @@ def check_places(
 
 
 def _mean_square(covariance: Array) -> Array:
-    """Return the (n,) mean variance over both axes of covariances (n, 2, 2)."""
+    """Return the mean variance over both axes of n covariances (n, 2, 2), as (n,)."""
     return np.asarray(0.5 * np.trace(covariance, axis1=1, axis2=2))
 
 
@@ -396,11 +396,11 @@ class Adjustment:
         Covariance from the a-priori sigmas times `factors`, and from the start values where these fix undetermined
         combinations. Fixed unknowns count as exact: their rows and columns are zero.
     gauge : Gauge
-        Gauge of the adjustment.
+        Rule by which undetermined combinations of unknowns were fixed.
     open : tuple of Combination
-        Combinations that the gauge fixed.
+        Undetermined linear combinations of unknowns, which the gauge fixed.
     weak : tuple of Combination
-        Combinations of low strength that were estimated nevertheless.
+        Linear combinations that the measurements determine only weakly, but that were estimated.
     prior_share : (P,) ndarray
         Fraction, 0 to 1, of each variance that is due to the sigmas of the start values and not to the measurements.
     follow : (P, H) ndarray
@@ -408,11 +408,11 @@ class Adjustment:
     cameras : mapping of str to LineModel
         Cameras with the adjusted interior orientation, in the reference state.
     ground : mapping of str to (m, 3) ndarray
-        Adjusted points of each field, in metres; NaN for rejected points.
+        Adjusted coordinates of the m points of each field, ITRS, in metres; NaN for rejected points.
     ground_covariance : mapping of str to (m, 3, 3) ndarray
         Covariance of the points of each field, in m^2; NaN for rejected points.
     residual : mapping of str to mapping of str to (n, 2) ndarray
-        Standardised residuals of the image points of each field and line.
+        Standardised residuals of the n image points of each field and line.
     weight : mapping of str to mapping of str to (n,) ndarray
         Robust weights of the image points of each field and line.
     chi_square : float
@@ -428,7 +428,7 @@ class Adjustment:
         Total number of Gauss-Newton steps.
     fields : sequence of CalibrationField
         Fields that were adjusted.
-    unseen : callable
+    omitted_terms_test : callable
         Function that tests the residuals for omitted terms.
     """
 
@@ -538,7 +538,7 @@ def adjust(
     variance_components: bool | Collection[str] = False,
     iterations: int = 20,
 ) -> Adjustment:
-    """Adjust all fields simultaneously.
+    """Calibrate line cameras by one simultaneous least-squares adjustment of all passes over test fields.
 
     Parameters
     ----------
@@ -660,7 +660,7 @@ class _Solved:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Constant part of the adjustment during the iteration."""
+    """Input of the adjustment that stays constant during the iteration, with the methods that `reweighting` calls."""
 
     fields: Sequence[calibration_parameters.CalibrationField]
     cameras: Mapping[str, LineModel]
@@ -686,7 +686,7 @@ class _Problem:
         )
 
     def tests(self, state: _Iteration, solution: _Solved) -> dict[str, reweighting.GroupTest]:
-        """Return the test of the residuals' variance of each group of observations, by its name."""
+        """Return the chi-square test of the residuals of each variance group, by the name of the group."""
         return solution.equations.tests(solution.covariance, solution.cofactors, state.weights, self.priors)
 
     def weighed(self, state: _Iteration, weight: tuple[Array, ...], factor: Mapping[str, float]) -> _Iteration:
@@ -860,7 +860,9 @@ class _Problem:
 
 
 def _scores(equations: Equations, standard: Array, weights: Weights) -> Array:
-    """Return the correction of the normal matrix to the covariance of its right side, for Huber's weights, (P, P).
+    """Return the covariance of the right side of the normal equations minus the normal matrix, (P, P).
+
+    The two are equal for weights of 1 and differ with Huber's weights; P is the number of unknowns.
 
     An image point of weight w counts with the variance w in the normal matrix, as if it had that uncertainty. The
     actual variance of a gross error is the square of the limit, whatever its size (Huber 1981, asymptotic covariance).

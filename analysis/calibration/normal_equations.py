@@ -338,7 +338,7 @@ class Equations:
         return np.asarray(cofactors)
 
     def point_covariance(self, covariance: Array) -> Array:
-        """Return the (m, 3, 3) covariance of the adjusted ground points, zero for fixed points."""
+        """Return the covariances of the m adjusted ground points, (m, 3, 3), in m^2; zero for fixed points."""
         by_x, by_z = self._carried
         derivatives = np.asarray(by_x.toarray() + by_z @ self.follow).reshape(len(self.movable), 3, len(covariance))
         total = self.point_inverse.data + derivatives @ covariance @ np.swapaxes(derivatives, 1, 2)
@@ -395,12 +395,18 @@ class Equations:
 
     @cached_property
     def _carried(self) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
-        """Negative derivatives of point coordinates with respect to unknowns, (3m, P), and shared noise, (3m, S)."""
+        """Negative derivatives of the m ground points' coordinates with respect to all unknowns.
+
+        They are (3m, P) for the P unknowns and (3m, S) for the S unknowns of the shared noise, while the points follow
+        them.
+        """
         both, count = (self.point_inverse @ self.cross).tocsc(), self.design.shape[1]
         return both[:, :count].tocsr(), both[:, count:].tocsr()
 
     def _of_shared(self, rows: sparse.csr_matrix, spans: Sequence[tuple[int, int]], size: int) -> Array:
-        """Return the diagonal blocks (n, size, size) of A C A', with C the covariance of the shared-noise unknowns.
+        """Return the n diagonal blocks of A C A', with the covariance C of the S shared-noise unknowns.
+
+        The result is (n, size, size).
 
         A is the matrix `rows`, (n size, S). C is for known other unknowns.
         """
@@ -477,7 +483,7 @@ def assemble(
 
 
 class OmittedTermsModel(Protocol):
-    """Interface of terms that are omitted from the model."""
+    """Interface of error terms (drift rates, slow variations, steps) that an adjustment does not estimate but tests."""
 
     @property
     def size(self) -> int:
@@ -634,7 +640,7 @@ def _root(inverse: Array, used: NDArray[np.bool_]) -> Array:
 
 
 def _blocks(blocks: Array) -> sparse.bsr_matrix:
-    """Return a block diagonal matrix (3m, 3m) from blocks (m, 3, 3)."""
+    """Return a block diagonal matrix (3m, 3m) from m blocks (m, 3, 3)."""
     count = len(blocks)
     return sparse.bsr_matrix((blocks, np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count))
 
@@ -659,7 +665,10 @@ def _point_blocks(point: Array, place: NDArray[np.intp], weight: Array, count: i
 
 
 def _padded(rows: sparse.coo_matrix, size: int) -> tuple[Array, NDArray[np.intp]]:
-    """Return a sparse matrix of n groups of `size` rows in dense form: values (n, size, w) and columns (n, w)."""
+    """Return a sparse matrix of n groups of `size` rows in dense form: values (n, size, w) and columns (n, w).
+
+    w is the largest number of columns in which a group has entries.
+    """
     count, width = rows.shape[0] // size, rows.shape[1]
     key = (rows.row // size).astype(np.int64) * width + rows.col
     used, slot = np.unique(key, return_inverse=True)

@@ -85,7 +85,7 @@ class StripAdjustment:
     Attributes
     ----------
     ground : (m, 3) ndarray
-        Points, ITRS, in metres; NaN where fewer than two rays see one.
+        Coordinates of the m points, ITRS, in metres; NaN where fewer than two rays see one.
     covariance : (m, 3, 3) ndarray
         Covariance of the points, including the remaining errors of attitude and station, in m^2.
     datum : tuple of Datum
@@ -129,7 +129,7 @@ class StripAdjustment:
 def adjust_strip(
     rays: Mapping[str, Rays], cameras: Mapping[str, LineModel], noise: Noise, *, bias: ArrayLike = (0.0, 0.0, 0.0)
 ) -> StripAdjustment:
-    """Adjust one pass on its tie points.
+    """Estimate attitude and station errors within one pass from tie points, without ground control.
 
     Time is linear in the number of points, memory quadratic in the number of readings near rays: 800 attitude readings
     take 50 MB.
@@ -339,7 +339,7 @@ def stepwise(
 
 
 def _used(parameters: Parameters, name: str, line: str) -> Array:
-    """Return the columns of the interior orientation of a line that are unknowns."""
+    """Return the indices, among all unknowns, of those elements of a line's interior orientation that are estimated."""
     columns = parameters.columns[name, line][0]
     return columns[columns >= 0]
 
@@ -352,7 +352,7 @@ def _alternate(
     Returns
     -------
     tuple of ((P,) ndarray, list of float)
-        Total step, and largest step of each round.
+        Total step of the P unknowns, and largest step of each round.
     """
     inverses = [solved(normal[np.ix_(b, b)], np.eye(len(b))) for b in blocks]
     total, gradient = np.zeros(len(normal)), right.copy()

@@ -116,7 +116,7 @@ class RigidMotion:
 
 
 class ObservabilityError(MeasurementError, ValueError):
-    """Measured positions that do not determine piston and both slopes."""
+    """Error raised for measured positions that do not determine piston and both slopes of the focal plane."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +245,7 @@ def fit_focal_plane(
     Parameters
     ----------
     position : (N, 2) array_like
-        Positions X', Y' in the focal plane, in metres.
+        Positions X', Y' of N measurements in the focal plane, in metres.
     defocus : (N,) array_like
         Best focus minus detector along +Z', in metres.
     sigma : float or (N,) array_like
@@ -367,7 +367,7 @@ _LEAST_WIDTH = 1e-3
 
 
 class ShimError(MeasurementError, ValueError):
-    """Motion that cannot be realised with this mount and these shims.
+    """Error raised for a motion that cannot be realised with this mount and these shims.
 
     Attributes
     ----------
@@ -385,12 +385,12 @@ class ShimError(MeasurementError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Mount:
-    """Mounting of the assembly on its pads.
+    """Mounting of a focal-plane assembly on the pads at its screw holes, where shims are inserted.
 
     Attributes
     ----------
     holes : (H, 3) ndarray
-        Centres of the pads in O'-X'Y'Z', in metres.
+        Centres of the H pads in the assembly's frame O'-X'Y'Z', in metres.
     normal : (3,) ndarray
         Unit vector from the structure into the assembly.
     clearance : float
@@ -411,7 +411,7 @@ class Mount:
         Parameters
         ----------
         holes : (H, 3) array_like
-            Centres of the pads in O'-X'Y'Z', in metres.
+            Centres of the H pads in the assembly's frame O'-X'Y'Z', in metres.
         normal : (3,) array_like
             Direction from the structure into the assembly, of any length.
         clearance : float
@@ -458,7 +458,7 @@ class ShimPlan:
     wanted : RigidMotion
         Required motion.
     change : (H,) ndarray
-        Exact change of thickness at each hole, in metres; positive is thicker.
+        Exact change of the shim's thickness at each of the H holes, in metres; positive is thicker.
     change_covariance : (H, H) ndarray
         Covariance of the changes from that of the required motion, without rounding, in m^2.
     rounded_change : (H,) ndarray
@@ -489,7 +489,7 @@ class ShimPlan:
 
     @property
     def change_sigma(self) -> Array:
-        """Standard deviations (H,) of the exact changes, in metres."""
+        """Standard deviations of the exact changes of thickness at the H holes, (H,), in metres."""
         return np.sqrt(np.diag(self.change_covariance))
 
     @property
@@ -519,7 +519,7 @@ def shim_plan(correction: RigidMotion, mount: Mount, present: ArrayLike) -> Shim
     mount : Mount
         Mounting of the assembly.
     present : float or (H,) array_like
-        Present thickness of the shims, in metres.
+        Present thickness of the shims, in metres: one value, or one for each of H holes.
 
     Raises
     ------

@@ -238,7 +238,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _images(units: Any) -> list[Any]:
-    """Return the units of a FITS file that are images; if some are named as the measurement, only these."""
+    """Return the image units of a FITS file; if some are named as the measurement (not error or mask), only these."""
     from astropy.io import fits
 
     kinds = (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)
@@ -356,15 +356,7 @@ def fits_cards(path: Path, number: int) -> dict[str, Any]:
 
 
 def fits_planes(path: Path, pages: Iterable[int]) -> Iterator[NDArray[Any]]:
-    """Yield planes (rows, columns) of physical values.
-
-    Parameters
-    ----------
-    path : Path
-        Path of the file.
-    pages : iterable of int
-        Numbers of the planes.
-    """
+    """Yield image planes (rows, columns) of a FITS file as physical values (BZERO + BSCALE times stored)."""
     with _opened(path) as units:
         planes = _planes(units)
         for number in pages:

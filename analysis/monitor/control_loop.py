@@ -10,8 +10,8 @@ and the mechanism reaches it d readings later, so that the reading after the nex
     L(z) = g z^-(d + 1) / (1 - 1/z),
 
 as for every integrator with a delay (Astrom, Wittenmark, Computer-Controlled Systems, 1997, ch. 3; in adaptive optics:
-Gendron, Lena, Astron. Astrophys. 291, 1994, 337). Its phase is -180 degrees at w = pi / (2 d + 1) per reading, where
-its size is g / (2 sin(w / 2)): the loop is stable below
+Gendron, Lena, Astron. Astrophys. 291, 1994, 337). Its phase is -180 degrees at the angular frequency w = pi / (2 d +
+1), in radians per reading, where its modulus is g / (2 sin(w / 2)): the loop is stable below
 
     g = 2 sin(pi / (4 d + 2)).
 
@@ -208,7 +208,7 @@ def common_margin(
 
 @dataclass(frozen=True)
 class LimitCycle:
-    """Endless cycle of a mechanism that moves by whole steps while the controlled quantity would be constant.
+    """Limit cycle of a mechanism that moves by whole steps, while the uncorrected quantity is constant.
 
     It is the worst case over all positions of the desired value between two steps.
 

@@ -29,7 +29,7 @@ from analysis.monitor.parameters import CameraCalibration
 from optics.numerics.extension_table import ExtensionTable
 
 PARAMETERS_PER_CAMERA = 4
-"""Number of parameters of one camera."""
+"""Number of parameters of one camera: rotations d_alpha, d_beta, d_gamma and change d_f of the principal distance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +116,7 @@ class Estimator(ABC):
         """
 
     def read(self, shifts: Shifts) -> Array:
-        """Return the estimated parameters, (S, 4 K) rad and m: gain times shifts, or something better.
+        """Return the estimated parameters, (S, 4 K) rad and m: gain times shifts, or the result of exact formulas.
 
         Dimensions: S states, K cameras.
 
@@ -192,7 +192,7 @@ class Formula(PerCameraEstimator):
         cameras : mapping of str to CameraCalibration
             Calibration of each camera.
         disturbances : Disturbances or None
-            Not used.
+            Prior of the disturbances; not used here.
         """
         return all(camera.pair is not None for camera in cameras.values())
 

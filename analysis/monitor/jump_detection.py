@@ -54,7 +54,8 @@ _AHEAD = 100.0
 _AGAIN, _TWO_VALUED = 1.0, 1.5
 """For a smoother: weight of the repeated uncertainty of a detected jump in the spots, and of the jump's own square."""
 _INFLATIONS = np.logspace(0.0, 8.0, 161)
-"""Factors by which the prior variance of a jump is increased in the search for the most likely one."""
+"""Factors by which the prior variance of a jump is increased in the search for the variance of the largest likelihood.
+"""
 _SIZES = np.linspace(0.0, 8.0, 401)
 _MEAN_SQUARE = 2.0 * (_SIZES[1] - _SIZES[0]) * _SIZES**2 * np.exp(-0.5 * _SIZES**2) / np.sqrt(2.0 * np.pi)
 """Contribution of each size in _SIZES (in standard deviations) to the mean square of a normal number."""
@@ -198,7 +199,8 @@ class Step:
         Pairs (time, probability that it has occurred by then), s, in the order of time, linear between; one pair (time,
         1) for a known time.
     moment : (D + P, D + P) ndarray or None
-        Mean square of its effect on spots and parameters; None for that of independent parts.
+        Mean square of its effect on the D spot coordinates and P parameters; None if that of the independent `parts`
+        applies.
     """
 
     parts: tuple[tuple[tuple[int, ...], float], ...]
@@ -232,7 +234,9 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Amounts:
-    """Amounts of a jump under each of L hypotheses of its place among the readings.
+    """Estimated amounts of a jump's motions under each of L hypotheses about its time.
+
+    Each hypothesis is that the jump occurred just before a certain reading.
 
     The fields are the means of the amounts (L, r), their covariances (L, r, r) and the log weights of the hypotheses
     (L,).
@@ -246,7 +250,7 @@ class Amounts:
 
     @classmethod
     def of(cls, score: Array, information: Array, outputs: Array, times: float) -> Amounts:
-        """Compute the amounts of a jump from the score and information of a step at each place.
+        """Compute the amounts of a jump from the score and information of a step before each reading.
 
         Dimensions: L gaps between readings, in each of which a step may have occurred, q values that readings can
         contain (outputs), r motions of the body that may jump.
@@ -254,7 +258,7 @@ class Amounts:
         Parameters
         ----------
         score : (L, q) ndarray
-            Score of a step at each place: weighted sum of the whitened readings after it.
+            Score of a step before each reading: weighted sum of the whitened readings after it.
         information : (L, q, q) ndarray
             Information (inverse covariance) on the step's effect on the outputs.
         outputs : (q, r) ndarray
@@ -272,7 +276,7 @@ class Amounts:
 
 
 def candidates(stated: Disturbances) -> tuple[Candidate, ...]:
-    """Return what is tested for jumps: each motion that may jump alone, and all such motions of a body together.
+    """Return the sets of motions that are tested for jumps: each that may jump alone, and those of a body together.
 
     Parameters
     ----------
@@ -300,9 +304,9 @@ def steps(root: Array, white: Array, when: Array, inside: slice, reference: floa
     Parameters
     ----------
     root : (n D, n D) ndarray
-        Lower triangular Cholesky factor L.
+        Lower triangular Cholesky factor L of the covariance of all shifts, in the order of time.
     white : (n D,) ndarray
-        Whitened shifts L^-1 s.
+        Whitened shifts L^-1 s, with the measured shifts s.
     when : (n,) ndarray
         Times of the measurements, s, ascending.
     inside : slice
@@ -459,7 +463,7 @@ def subthreshold_share(limit: float, seen: Array) -> Array:
     limit : float
         Detection limit, in standard deviations of the measured jump.
     seen : (n,) ndarray
-        Size of a jump of one prior standard deviation, in the same unit.
+        Size of a jump of one prior standard deviation, in the standard deviations of the measured jump.
     """
     return np.asarray(ndtr(limit - _SIZES * seen[:, None]) @ _MEAN_SQUARE)
 
@@ -518,9 +522,9 @@ def with_sizes(
     stated : Disturbances
         Prior that contains these motions.
     root : (n D, n D) ndarray
-        Cholesky factor L, with all detected jumps as events.
+        Lower triangular Cholesky factor L of the covariance of all shifts, with all detected jumps as events.
     white : (n D,) ndarray
-        Whitened shifts L^-1 s.
+        Whitened shifts L^-1 s, with the measured shifts s.
     when : (n,) ndarray
         Times of the measurements, s.
     reference : float or None
@@ -538,7 +542,7 @@ def with_sizes(
 
 @dataclass(frozen=True, eq=False)
 class Bodies:
-    """Hypotheses that one of B bodies has jumped before one of L readings.
+    """Hypotheses after a detected jump: which of B bodies has jumped, and before which of L readings.
 
     Attributes
     ----------
@@ -547,7 +551,7 @@ class Bodies:
     times : tuple of float
         Ratio of each body's jump to the prior standard deviations.
     weight : (B, L) ndarray
-        Probability of each hypothesis (body and place); their sum is 1.
+        Probability of each hypothesis (body and reading); their sum is 1.
     judged : tuple of Amounts
         Estimated amounts of the jump, by the filter that detects jumps.
     amounts : tuple of Amounts
@@ -653,18 +657,18 @@ class Bodies:
 
 
 def mixture_moments(amounts: Sequence[Amounts], effects: Sequence[Array], weight: Array) -> tuple[Array, Array]:
-    """Return mean and covariance of the effect of a jump, averaged over bodies and places by their probabilities.
+    """Return mean and covariance of the effect of a jump, averaged over the hypotheses by their probabilities.
 
     Dimensions: o values affected by the jump, r motions of the body that may jump.
 
     Parameters
     ----------
     amounts : sequence of Amounts
-        Amounts of B bodies at L places.
+        Amounts of each of B bodies if it has jumped before each of L readings.
     effects : sequence of (o, r) ndarrays
         Effect of unit amounts, for each body.
     weight : (B, L) ndarray
-        Probability of each hypothesis (body and place); their sum is 1.
+        Probability of each hypothesis (body and reading); their sum is 1.
     """
     each = np.stack([amount.mean @ effect.T for amount, effect in zip(amounts, effects, strict=True)])
     mean = np.einsum("bk,bko->o", weight, each)

@@ -225,7 +225,9 @@ class SeriesFilter:
 
     @cached_property
     def walking(self) -> NDArray[np.int_]:
-        """Indices of the motions that jump at a known rate, (m,); a random walk stands for their undetected jumps.
+        """Indices of the motions that jump at a known rate, (m,).
+
+        A random walk in the filter represents those of their jumps that are too small to be detected.
 
         Dimensions: m motions that jump at a known rate.
         """
@@ -234,9 +236,12 @@ class SeriesFilter:
 
     @cached_property
     def _walk(self) -> Array:
-        """Effect on the level states of the motions that jump at a known rate, times the root of their rate, (r, m).
+        """Random walk of undetected jumps: its effect on the level states per root of time, (r, m).
 
-        Dimensions: r motions of the body that may jump, m motions that jump at a known rate.
+        These are the states that steps change. Column by column it is the effect of a jump of one prior standard
+        deviation of each motion with a known jump rate, times the root of that rate.
+
+        Dimensions: r states that steps change, m motions that jump at a known rate.
         """
         rates = np.array([1.0 / float(self.stated.laws[k].every_s or 1.0) for k in self.walking])
         return self.space.level_of(self.walking.tolist())[self.space.level] * np.sqrt(rates)
@@ -720,7 +725,7 @@ class SeriesFilter:
 
 
 def _symmetric(square: Array) -> Array:
-    """Return a covariance made symmetric to the last bit."""
+    """Return the mean of a square matrix and its transpose, a covariance that is symmetric to the last bit."""
     return np.asarray(0.5 * (square + square.T))
 
 
@@ -1049,7 +1054,7 @@ def _detection_rates(
 
 
 def _smallest_size(found: Array, share: float) -> float:
-    """Return the size from which on a given fraction of jumps is detected; NaN if no size reaches it."""
+    """Return the smallest jump size from which on a given fraction of jumps is detected; NaN if no size reaches it."""
     less = np.flatnonzero(found < share)
     first = less[-1] + 1 if len(less) else 0
     if first == len(_SIZES):

@@ -47,7 +47,7 @@ class Quantity:
     group : str
         Name of a camera, ``intersection_angle`` or ``ground``.
     parameter : Parameter
-        What of that group is read, with its unit.
+        Declaration of the quantity of that camera, pair or ground point, with its unit.
     row : (4 K,) ndarray
         Coefficients of the linear combination, in the quantity's unit per rad of d_alpha, d_beta and d_gamma and per m
         of d_f, of one camera after the other.
@@ -64,7 +64,7 @@ class Quantity:
 
     @property
     def name(self) -> str:
-        """Name in operation plans, group and key: ``forward d_f_um``."""
+        """Name of the quantity in operation plans, made of its group and its key: ``forward d_f_um``."""
         return f"{self.group} {self.parameter.key}"
 
 
@@ -168,7 +168,7 @@ class Split:
 
     @staticmethod
     def by(shares: Array, names: Sequence[str]) -> dict[str, Array]:
-        """Return name -> sum of the contributions of the motions with that name, (Q,).
+        """Return a mapping from each name to the sum of the contributions of the motions with that name, (Q,).
 
         The names are in the order of their first occurrence.
 
@@ -424,18 +424,20 @@ UNOBSERVED = 0.1
 SHARE = 0.01
 """Smallest fraction of the variance of a quantity from which on a body that the spots do not reveal is reported."""
 DEGREES = 4.0
-"""Degrees of freedom of Student's distribution that is assumed for numbers of the prior that are guesses."""
+"""Degrees of freedom of Student's distribution assumed for standard deviations of the prior that are guesses."""
 _DRAWS = 8_000
 _STEPS = 100
 _ROUNDING = 1e-12
-"""Step of a half width, relative to it, at which Newton's method ends; each step doubles the digits."""
+"""Relative step at which Newton's method for the half width of an interval ends; each step doubles the digits."""
 _LEVELS = (0.6826894921370859, 0.9544997361036416, 0.9973002039367398)
 """Probabilities within 1, 2 and 3 standard deviations of a normal error."""
 
 
 @dataclass(frozen=True, eq=False)
 class Elasticity:
-    """Sensitivity of Q quantities to one number of the prior.
+    """Sensitivity of the sigmas of Q quantities to one standard deviation specified in the prior.
+
+    One such number is the standard deviation that a cause gives to a motion of one or several bodies.
 
     Attributes
     ----------
@@ -446,7 +448,7 @@ class Elasticity:
     bodies : tuple of str
         Bodies that have it.
     elasticity : (Q,) ndarray
-        Relative change of sigma per relative change of the number.
+        Relative change of a quantity's sigma divided by the relative change of the number.
     doubled : (Q,) ndarray
         Sigma of the error if the real number is twice as large but the estimator still assumes the original prior.
     told : (Q,) ndarray
@@ -471,9 +473,9 @@ class HeavyTail:
     degrees : float
         Degrees of freedom of Student's distribution.
     rms : (Q,) ndarray
-        Root of the mean square error.
+        Root of the mean square error, in the units of the quantities.
     held : (3, Q) ndarray
-        Half widths of the intervals with the probabilities of 1, 2 and 3 sigma of a normal prior.
+        Half widths of the intervals that contain the error with the probabilities 68.3 %, 95.4 % and 99.7 %.
     beyond : (Q,) ndarray
         Probability of an error beyond 3 of the reported sigmas, 0.0027 for a normal prior.
     """
@@ -485,7 +487,9 @@ class HeavyTail:
 
 
 def prior_numbers(stated: Disturbances) -> dict[str, list[int]]:
-    """Return for each number of the prior the indices of the motions whose standard deviation it is.
+    """Return, for each standard deviation specified in the prior, the indices of the motions that have it.
+
+    The keys of the result name the cause and the kind of motion.
 
     Parameters
     ----------
@@ -505,7 +509,10 @@ def prior_numbers(stated: Disturbances) -> dict[str, list[int]]:
 
 
 def elasticities(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> tuple[Elasticity, ...]:
-    """Return the relative sensitivity of sigma to each number of the prior, largest for the first quantity first.
+    """Return the relative sensitivity of sigma to each standard deviation of the prior, d ln sigma / d ln s.
+
+    Sigma is that of a quantity's error, s the standard deviation that a cause gives to a motion of one or several
+    bodies. The results are in descending order of the first quantity's sensitivity.
 
     Dimensions: Q quantities, K cameras, D spot coordinates (row and column of every spot).
 
@@ -546,7 +553,7 @@ def elasticities(rows: Array, stated: Disturbances, noise: Array, gain: Array) -
 
 
 def unobserved_bodies(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> dict[str, Array]:
-    """Return body -> fraction of each quantity's variance due to its motions that hardly move the spots, (Q,).
+    """Return the fraction of each quantity's variance due to motions that hardly move the spots, (Q,), by body.
 
     Only bodies for which a share exceeds `SHARE` are returned.
 
@@ -573,9 +580,9 @@ def unobserved_bodies(rows: Array, stated: Disturbances, noise: Array, gain: Arr
 
 
 def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, degrees: float = DEGREES) -> HeavyTail:
-    """Compute the errors of an estimator if each number of the prior has Student's distribution.
+    """Compute the errors of an estimator if the motions have Student's and not a normal distribution.
 
-    Each number has one random scale for all its motions, instead of its standard deviation.
+    All motions that share a standard deviation specified in the prior are multiplied by one random scale.
 
     Dimensions: Q quantities, K cameras, D spot coordinates (row and column of every spot).
 
@@ -619,7 +626,7 @@ def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, de
 
 
 def _of(error: Array, indices: Sequence[int]) -> Array:
-    """Return the error per unit of each motion (Q, M), set to zero for all motions but some.
+    """Return the error of each quantity per unit of each motion (Q, M), set to zero except for selected motions.
 
     Dimensions: Q quantities, M motions.
     """
@@ -629,7 +636,7 @@ def _of(error: Array, indices: Sequence[int]) -> Array:
 
 
 def _half_widths(sigma: Array, level: float) -> Array:
-    """Return the half widths of intervals with a given probability for normal errors of random sigmas (N, Q), (Q,).
+    """Return the half widths (Q,) of intervals with a given probability, for normal errors of random sigmas (N, Q).
 
     The probability grows with the half width ever more slowly. Newton's method from 0 therefore approaches from below
     at every step.

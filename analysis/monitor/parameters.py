@@ -218,7 +218,7 @@ The first four are the parameters that estimators determine; a further one is a 
 here is its key.
 """
 ANGLE = Parameter("change_arcsec", "Δθ", "change of the angle between the cameras' lines of sight, opening positive", 4)
-"""Change of the angle between two cameras' lines of sight."""
+"""Change of the angle between the lines of sight of two cameras, as a quantity that the monitor reads."""
 GROUND = (
     Parameter("along_m", "along", "error on the ground along the track", 3),
     Parameter("across_m", "across", "error on the ground across the track, to the right", 3),

@@ -481,7 +481,10 @@ class _Process:
 
 
 def _together(parts: list[tuple[Array, Array]]) -> Array:
-    """Return the sum of Kronecker products: of each time law's covariance over time with that over coordinates."""
+    """Return the covariance of values at several times: sum over time laws of a Kronecker product.
+
+    The factors are each law's covariance over time and its covariance over coordinates.
+    """
     return np.asarray(sum(np.kron(time, block) for time, block in parts))
 
 
@@ -508,7 +511,7 @@ class _Factor:
         return np.asarray(solve_triangular(self.root, left.T, lower=True))
 
     def estimate(self, times: Array, at: Numbers, filtered: SeriesChanges, smoothed: SeriesChanges) -> None:
-        """Fill in the changes at some of the times.
+        """Compute the filtered and smoothed camera changes at selected times and write them into the given results.
 
         Dimensions: T times.
 
@@ -519,9 +522,9 @@ class _Factor:
         at : ndarray of int
             Indices of the times to process.
         filtered : SeriesChanges
-            Filtered changes to fill in.
+            Filtered changes at all times, into which the results are written.
         smoothed : SeriesChanges
-            Smoothed changes to fill in.
+            Smoothed changes at all times, into which the results are written.
         """
         wanted = times[at]
         prior = self.process.parameters(wanted)
@@ -537,7 +540,7 @@ class _Factor:
 
 
 def _positive(prior: Array, gained: Array) -> Array:
-    """Return the prior covariance minus what was gained, without the negative variances that rounding leaves."""
+    """Return the prior covariance minus its reduction by measurements, without negative variances due to rounding."""
     size = np.sqrt(np.diag(prior))
     scale = np.where(size > 0.0, size, 1.0)
     left = (prior - gained) / scale[:, None] / scale

@@ -33,7 +33,7 @@ from analysis.monitor.disturbances import Disturbances, TimeLaw
 _INTERVALS = 200
 """Number of intervals between readings whose state transitions are kept in memory."""
 _NOTHING = 1e-12
-"""Singular value of the scaled effects on the outputs, relative to the largest, below which only rounding is left."""
+"""Singular value of the scaled effects of motions on the outputs, relative to the largest, that is only rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,11 +79,13 @@ class _Block:
     Attributes
     ----------
     kind : str
-        `level` of all that steps, `law` of another law, `heat` of temperatures with sensors, `factor` and `reference`.
+        `level` for everything that changes by steps, `law` for another time law, `heat` for temperatures with sensors,
+        `factor` for the factors of the effect of heat, `reference` for the error of the reference positions.
     law : TimeLaw
         Law in time.
     at : slice
-        Range of the states; for a law with a period the first half is the cosine part, the second the sine part.
+        Range of the block's states among all; for a law with a period the first half is the cosine part, the second the
+        sine part.
     outputs : (D + P, r) ndarray
         Effect of the first r states on spot coordinates (px) and parameters, where the law's amplitude is 1.
     covariance : (r, r) ndarray
@@ -248,7 +250,7 @@ class StateSpace:
 
     @property
     def level(self) -> slice:
-        """Range of the states that steps change; all other states are unchanged by steps."""
+        """Range, among all states, of those that steps (events and jumps) change."""
         return self._blocks[0].at if self._blocks else slice(0, 0)
 
     def level_of(self, motions: Sequence[int]) -> Array:
@@ -312,14 +314,14 @@ class StateSpace:
             spread[part, part] += what
 
     def moved(self, states: Array, then: float, now: float, back: bool = False) -> Array:
-        """Return states, or quantities that propagate as they do, at another time, (..., n, k).
+        """Return states, or vectors that propagate like states, at another time, without process noise, (..., n, k).
 
         Dimensions: n states of the filter, k columns.
 
         Parameters
         ----------
         states : (..., n, k) ndarray
-            States.
+            k columns, each a vector of the n states.
         then : float
             Time of the states, s.
         now : float
@@ -541,9 +543,9 @@ class StateSpace:
 
     @cached_property
     def basis(self) -> Array:
-        """Effect of the n states on the outputs where the amplitudes of all time laws are 1, (D + P, n).
+        """Derivatives of the outputs with respect to the n states if all time laws have the amplitude 1, (D + P, n).
 
-        Dimensions: D spot coordinates (row and column of every spot), P parameters.
+        Outputs are D spot coordinates (row and column of every spot), in px, then P camera parameters.
         """
         rows = np.zeros((self.width + self.stated.parameters.shape[0], self.size))
         for block in self._blocks:
@@ -558,7 +560,7 @@ class StateSpace:
 
     @cached_property
     def factors(self) -> slice:
-        """Range of the states that are factors of the effect of heat."""
+        """Range, among all states, of the factors that multiply the computed effect of heat on light."""
         return next((block.at for block in self._blocks if block.kind == "factor"), slice(0, 0))
 
     @cached_property

@@ -272,7 +272,7 @@ class EdgeSpread:
         return np.hstack([cho_solve(self.factor, right[:, k : k + 8], check_finite=False) for k in columns])
 
     def _local(self, design: EdgeDesign) -> Array:
-        """Return the coefficients of the splines at each pixel of the core, (4, M).
+        """Return the coefficients of the four B-splines that are nonzero at each pixel of the core, (4, M).
 
         Dimensions: M pixels in the core.
         """

@@ -39,7 +39,7 @@ _ROWS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
 
 
 class _Wrong(Exception):
-    """Error of the user's input, described in one sentence."""
+    """Error raised for an invalid input of the user, which its message describes in one sentence."""
 
 
 def run_mtf(

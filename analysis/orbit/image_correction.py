@@ -29,7 +29,7 @@ LEAST_POINTS = {"shift": 1, "affine": 3}
 
 @dataclass(frozen=True, eq=False)
 class ImageCorrection:
-    """Correction of image coordinates, measured minus predicted.
+    """Correction of image coordinates, measured minus predicted, from N points.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ def image_correction(
     Parameters
     ----------
     predicted : (N, 2) array_like
-        Line and sample at which the model sees the points, in pixels.
+        Line and sample at which the model sees the N points, in pixels.
     measured : (N, 2) array_like
         Measured line and sample, in pixels.
     covariance : (N, 2, 2) array_like

@@ -82,7 +82,7 @@ _LEAST_FACTOR = 0.01
 
 
 class JitterError(MeasurementError, ValueError):
-    """Observations that do not allow a jitter analysis."""
+    """Error raised for observations that do not allow a jitter analysis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +225,7 @@ class Observations:
         return np.einsum("rjfk,rja->rfka", both, self.weight).reshape(len(self.value), len(f), 2 * self.axes)
 
     def taken(self, keep: ArrayLike) -> Observations:
-        """Return the observations that a boolean mask (R,) selects."""
+        """Return the observations that a boolean mask, with one element for each observation, selects."""
         where = np.asarray(keep)
         some, group = np.unique(self.group[where], return_inverse=True)
         value, weight, nuisance = self.value[where], self.weight[where], self.nuisance[where]
@@ -250,7 +250,10 @@ class Observations:
         return estimate
 
     def _factors(self) -> Array:
-        """Return the variance factors (K,) of one iteration of `factors`, relative to the present whitening."""
+        """Return the variance factors of the K kinds of errors from one iteration of `factors`, (K,).
+
+        They are relative to the variances that the present whitening assumes.
+        """
         left, known, mix = (self._of_groups(v) for v in (self.rest(self.value)[:, None], self.known, self.mix))
         by_kind = [mix[:, :, k] for k in range(mix.shape[2])]
         spread = [m @ m.swapaxes(1, 2) for m in by_kind]
@@ -304,7 +307,7 @@ class Observations:
         return out
 
     def beside(self, columns: Array) -> Observations:
-        """Return the observations with P more nuisance parameters, given by their derivatives (R, P)."""
+        """Return the R observations with P more nuisance parameters, given by their derivatives (R, P)."""
         return replace(self, nuisance=np.concatenate([self.nuisance, columns], axis=1))
 
 
@@ -512,7 +515,7 @@ class _Products:
         -------
         tuple of ndarray
             Products of all waves with one another, of waves with their slopes with respect to frequency, and of slopes,
-            each (F, 2 A, 2 A), and of waves with the value, (F, 2 A).
+            each (F, 2 A, 2 A) for A axes, and of waves with the observed values, (F, 2 A).
         """
         count, a = len(frequency), self.axes
         t = 2.0 * np.pi * self.time
@@ -873,7 +876,7 @@ def find_jitter(
     Parameters
     ----------
     time : (n,) array_like
-        Times of the observations, in seconds, in any order.
+        Times of the n observations, in seconds, in any order.
     angle : (n,) or (n, A) array_like
         Angles about A axes, in radians; with `lag`, angle at ``time + lag`` minus angle at ``time``, as two bands or
         two rows of chips show it.
@@ -889,7 +892,8 @@ def find_jitter(
     Returns
     -------
     Lines
-        `frequency` (K,), `amplitude` and `phase` (K, A) with `frequency_sigma` and `amplitude_sigma`, strongest first.
+        Oscillations, K of them: `frequency` (K,), `amplitude` and `phase` (K, A) with `frequency_sigma` and
+        `amplitude_sigma`, strongest first.
 
     Raises
     ------
@@ -947,14 +951,14 @@ def _unaliased(
 
     Parameters
     ----------
-    kept : Observations
+    observations : Observations
         Observations that are used.
     lines : Lines or None
         Lines detected before, or None if this is the first.
     fitted : Lines
         These lines and the last one.
-    reach : tuple of float
-        Lowest and highest frequency in which aliases are searched, in hertz.
+    band : tuple of float
+        Lowest and highest frequency between which aliases are searched, in hertz.
     false_alarm : float
         Likelihood ratio to the best frequency above which a frequency is an alias.
     """

@@ -67,11 +67,11 @@ one counts as singular.
 
 
 class PlaneError(MeasurementError, ValueError):
-    """Points that do not determine the plane, or not in the requested form."""
+    """Error raised for points that do not determine a plane, or not in the requested form."""
 
 
 class NearVerticalWarning(UserWarning):
-    """Plane that is so steep in its frame that z = a0 x + a1 y + a2 is biased."""
+    """Warning that a plane is so steep in its frame that the fit of z = a0 x + a1 y + a2 is biased."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ class Station:
 
 @dataclass(frozen=True, eq=False)
 class Strip:
-    """Ground points that one CCD line sees at one moment; errors of different points are independent.
+    """Ground points, n of them, that one CCD line sees at one moment; errors of different points are independent.
 
     Attributes
     ----------
@@ -133,7 +133,7 @@ class Strip:
         Parameters
         ----------
         points : (n, 3) array_like
-            Coordinates, in metres.
+            Coordinates of the n points, in metres.
         noise : float, (n,), (3, 3) or (n, 3, 3) array_like
             Standard deviation of each coordinate in metres, or the covariance in m^2.
 
@@ -161,7 +161,7 @@ class PlaneFit:
     Attributes
     ----------
     method : {'printed', 'corrected', 'tls'}
-        Method of the fit; see the module.
+        Method of the fit: equation 5 of paper 000 as printed or with the corrected sign, or total least squares.
     station : Station
         Station that the plane contains.
     strip : Strip
@@ -399,14 +399,14 @@ class _DistanceNoise:
         return cls(own, float(normal @ station.covariance @ normal))
 
     def weighted(self, rows: Array) -> Array:
-        """Return the inverse covariance of the n distances times a vector (n,) or matrix (n, k)."""
+        """Return the inverse covariance of the n distances times a vector (n,) or k columns (n, k)."""
         weight = 1.0 / self.own
         scaled = (rows.T * weight).T
         ratio = self.shared / (1.0 + self.shared * weight.sum())
         return np.asarray(scaled - ratio * np.multiply.outer(weight, scaled.sum(axis=0)))
 
     def white(self, rows: Array) -> Array:
-        """Return a matrix (n, k) whitened by the symmetric root of the inverse covariance of the n distances."""
+        """Return k columns, (n, k), whitened by the symmetric root of the inverse covariance of the n distances."""
         unit = self.own**-0.5
         total = float(unit @ unit)
         scaled = rows * unit[:, None]
@@ -464,7 +464,7 @@ _FOLDED = 3.0
 
 
 class AngleError(MeasurementError, ValueError):
-    """Planes or rays that determine no angle."""
+    """Error raised for planes or rays that determine no angle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -493,7 +493,7 @@ class PlaneAngles:
 
     @property
     def sigma(self) -> Array:
-        """Standard deviation (m,) of the angles, in radians."""
+        """Standard deviations of the m angles, (m,), in radians."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
@@ -679,8 +679,8 @@ def line_frame(plane: PlaneFit, tangent: ArrayLike, bend: float = 0.0) -> LineFr
     plane : PlaneFit
         Plane fitted to the line's points; not the printed one.
     tangent : (n,) array_like
-        Tangent of the angle of each point from the line of sight along the CCD line, from its pixel number and the
-        interior orientation; either sense of counting.
+        Tangent of the angle of each of the plane's n points from the line of sight along the CCD line, from its pixel
+        number and the interior orientation; either sense of counting.
     bend : float
         Standard deviation, in radians, by which the ends of a line that was straight in the laboratory may have bent
         out of its plane since. The bend is estimated with this sigma as its prior, and the central ray follows it. 0:
@@ -752,7 +752,7 @@ class AlongTrackAngles:
 
     @property
     def sigma(self) -> Array:
-        """Standard deviation (m,) of the angles, in radians."""
+        """Standard deviations of the m angles, (m,), in radians."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
@@ -920,7 +920,7 @@ def sensitivity(
     method : {'printed', 'corrected', 'tls'}
         Method of the plane fit.
     amounts : (k,) array_like, optional
-        Displacements, in metres, rising from 0; 0 to 10 m in steps of 1 m by default.
+        Displacements, k of them, in metres, rising from 0; 0 to 10 m in steps of 1 m by default.
 
     Raises
     ------

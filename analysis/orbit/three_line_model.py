@@ -175,7 +175,7 @@ class LineModel:
         Parameters
         ----------
         body : (n, 3) ndarray
-            Ground points from the body's origin, in its true axes, in metres.
+            Ground points, n of them, from the body's origin, in its true axes, in metres.
         image : (n, 2) ndarray
             x and y in the focal plane, in metres.
 
@@ -223,7 +223,7 @@ class LineModel:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Collinearity misclosures of image points, with derivatives with respect to ground points and camera drift.
+    """Collinearity misclosures of n image points, with derivatives with respect to ground points and camera drift.
 
     Attributes
     ----------

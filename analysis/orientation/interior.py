@@ -85,11 +85,11 @@ determinant of 1e-9 leaves six correct digits.
 
 
 class OrientationError(MeasurementError, ValueError):
-    """Error for readings that do not determine the requested quantities; the message says what to change."""
+    """Error raised for readings that do not determine the requested quantities; the message says what to change."""
 
 
 def readings(position: ArrayLike, angle: ArrayLike) -> tuple[Array, Array]:
-    """Return validated image positions (metres) and angles (radians) as float64 arrays of one shape (..., N).
+    """Return validated image positions (metres) and angles (radians) of N points as float64 arrays (..., N).
 
     Raises
     ------
@@ -159,7 +159,7 @@ def principal_distance_and_point(position: ArrayLike, angle: ArrayLike) -> tuple
     Parameters
     ----------
     position : (..., N) array_like
-        Image positions, in metres.
+        Image positions of N points, in metres; leading axes are sets of points.
     angle : (..., N) array_like
         Angles, in radians, at least two different ones other than zero in each set.
 
@@ -194,7 +194,7 @@ def principal_distance(position: ArrayLike, angle: ArrayLike) -> Array:
     Parameters
     ----------
     position : (..., N) array_like
-        Image positions, in metres.
+        Image positions of N points, in metres; leading axes are sets of points.
     angle : (..., N) array_like
         Angles, in radians.
 
@@ -219,7 +219,7 @@ def principal_point(position: ArrayLike, angle: ArrayLike, principal_distance: A
     Parameters
     ----------
     position : (..., N) array_like
-        Image positions, in metres.
+        Image positions of N points, in metres; leading axes are sets of points.
     angle : (..., N) array_like
         Angles, in radians.
     principal_distance : (...) array_like
@@ -295,7 +295,7 @@ def _check_separable(columns: Array, names: tuple[str, ...], angle: Array) -> No
     Parameters
     ----------
     columns : (N, P) ndarray
-        Columns of the design.
+        Derivatives of the positions of N points with respect to P terms.
     names : tuple of str
         Names of the terms.
     angle : (N,) ndarray
@@ -351,7 +351,7 @@ def _noise_matrix(values: ArrayLike, count: int, name: str) -> Array:
 
 
 def _noise_root(noise: Array) -> Array:
-    """Return the lower Cholesky factor of a covariance (N, N), with which errors are whitened.
+    """Return the lower Cholesky factor of the covariance of N values, (N, N), with which errors are whitened.
 
     Raises
     ------
@@ -392,7 +392,7 @@ class PointReport:
 
 
 def _point_report(names: tuple[str, ...], values: Array, angle: Array, noise: Array) -> PointReport:
-    """Return the observability of p from a fit of these terms, or of a fit with p added.
+    """Return the observability of the principal point from a fit of given terms, or of a fit with it added.
 
     Parameters
     ----------
@@ -401,7 +401,7 @@ def _point_report(names: tuple[str, ...], values: Array, angle: Array, noise: Ar
     values : (P,) ndarray
         Values of the terms, in metres.
     angle : (N,) ndarray
-        Angles, in radians.
+        Angles of N points, in radians.
     noise : (N, N) ndarray
         Covariance of the positions, in m^2.
     """
@@ -519,7 +519,7 @@ class InteriorOrientation:
 
     @property
     def residual_covariance(self) -> Array:
-        """Covariance (N, N) of the residuals, in m^2, of rank N - P."""
+        """Covariance of the residuals of N points, (N, N), in m^2; its rank is N - P for P fitted terms."""
         columns = design(self.angle, self.terms)
         left = np.eye(len(self.angle)) - columns @ gain(columns)
         return np.asarray(left @ self.noise @ left.T)
@@ -546,7 +546,7 @@ def fit_interior_orientation(
     Parameters
     ----------
     position : (N,) array_like
-        Image positions L along the line, in metres.
+        Image positions L of N points along the line, in metres.
     angle : (N,) array_like
         Angles W of the directions, in radians, counted in the same sense.
     covariance : float, (N,) or (N, N) array_like
@@ -770,7 +770,7 @@ def locate_spots(
     Parameters
     ----------
     frames : (N, S, frames, H, W) ndarray of uint16
-        Frames of N points in S sets.
+        Frames, H rows by W columns, of N points in S sets.
     column : (N, S) array_like
         Column of the line at which each image begins.
     middle : float
@@ -953,7 +953,7 @@ class Distortion:
 
     @property
     def sigma(self) -> Array:
-        """Standard deviation (N,) of D, in metres."""
+        """Standard deviation of the distortion of each of N points, (N,), in metres."""
         return np.sqrt(np.maximum(np.diagonal(self.fit.residual_covariance), 0.0))
 
     @property

@@ -194,7 +194,7 @@ class _Scored:
 
 @dataclass(frozen=True, eq=False)
 class _Rule:
-    """Template, noise model and number of frames of a fit, with its iteration."""
+    """Fisher scoring of spots with one template, noise model and number of frames."""
 
     template: SpotTemplate
     noise: NoiseModel
@@ -364,7 +364,7 @@ def _step(
 
 
 def image_bound(light: ArrayLike, background: float, noise: NoiseModel, frames: int) -> Array:
-    """Return the Cramer-Rao bound of the positions of spots given due to noise-free images, (B, 2, 2) px^2.
+    """Return the Cramer-Rao bound of the positions of spots that noise-free images show, (B, 2, 2) px^2.
 
     Dimensions: B spots, H rows, W columns.
 

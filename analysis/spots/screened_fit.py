@@ -313,10 +313,10 @@ def fit_screened(
 
 
 def model_parts(fit: ScreenedFit, template: SpotTemplate) -> tuple[Array, Array, Array]:
-    """Return what a fitted image consists of: its derivatives, its part that is not the spot, and that part's ones.
+    """Return the derivatives of a fitted image, its part that is not the spot, and the derivatives of that part.
 
     The arrays are the derivatives (K, P) of all pixels with respect to all parameters; the part (P,), DN, that is
-    neither the spot nor its level; and the derivatives (K, P) of that part.
+    neither the spot nor the level of the background; and the derivatives (K, P) of that part.
 
     Dimensions: K fitted parameters, P pixels.
 
@@ -341,7 +341,7 @@ def _variance(level: Array, counts: Array, noise: NoiseModel) -> Array:
 
 
 def _cost(design: Array, level: Array, frames: float, noise: NoiseModel, covariance: Array) -> float:
-    """Return by which fraction the position's sigma exceeds that from an undisturbed image."""
+    """Return the relative increase of the position's sigma over that from an image without defects."""
     weighted = design / _variance(level, np.full_like(level, frames), noise)
     ideal = np.linalg.inv(weighted @ design.T)[:2, :2]
     return float(np.sqrt(np.trace(covariance) / np.trace(ideal)) - 1.0)
@@ -439,7 +439,7 @@ class _Model:
         return [0, 1, *(self._others + 3 * k + axis for k in range(len(self.terms.others)) for axis in (0, 1))]
 
     def rests(self, change: Array, inverse: Array) -> bool:
-        """Return True if an iteration step has changed the positions by less than their tolerance."""
+        """Return True if the last iteration step has changed all positions by less than their tolerance."""
         others = self._places[2:]
         sigma = np.sqrt(np.maximum(np.diag(inverse)[others], 0.0))
         return bool(

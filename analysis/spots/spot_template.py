@@ -262,8 +262,8 @@ class SpotTemplate:
         index : (B,) ndarray of int or None
             Index of each spot's shape; default: spot b has shape b modulo T.
         part : tuple or None
-            First pixels (B, 2), one for each spot, and shape (h, w) of the part of the detector to evaluate; default:
-            all of it.
+            First pixels (B, 2), one for each spot, and number of rows h and columns w of the part of the detector to
+            evaluate; default: all of it.
 
         Raises
         ------
@@ -304,8 +304,8 @@ class SpotTemplate:
         index : (B,) ndarray of int
             Index of each spot's shape in the template.
         part : tuple or None
-            First pixels (B, 2), one for each spot, and shape (h, w) of the part of the detector to compute; None for
-            all of it.
+            First pixels (B, 2), one for each spot, and number of rows h and columns w of the part of the detector to
+            compute; None for all of it.
 
         Raises
         ------

@@ -412,9 +412,9 @@ def _uneven(fitted: _Fit, mean: Array, good: Mask, terms: FitTerms, fit: Screene
 
 
 def _spread(terms: FitTerms) -> float:
-    """Return the factor by which the noise in what a smooth background term explains exceeds that of one image.
+    """Return the factor on the variance that noise gives a fitted smooth background term.
 
-    It is larger than 1 for a learnt shape, which contains the noise of another image.
+    It is 1 for a noise-free shape and 2 for a learnt one, which contains the noise of another image.
     """
     return 2.0 if terms.learnt else 1.0
 

@@ -32,7 +32,7 @@ MOST_ITERATIONS, TOLERANCE = 8000, 1e-4
 
 
 class NotConvergedError(MeasurementError, RuntimeError):
-    """Network of which no training converged."""
+    """Error raised if no training of the network converged."""
 
 
 def network(x: Array, y: Array, s: Array, seed: int) -> tuple[dict[str, float], Curve, Curve]:

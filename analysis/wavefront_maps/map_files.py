@@ -48,7 +48,7 @@ _NAMES = {
 
 
 class MapError(MeasurementError, ValueError):
-    """File that cannot be read as a wavefront, or map that does not determine a result.
+    """Error raised for a file that cannot be read as a wavefront, or for a map that does not determine a result.
 
     The message says what to change.
     """

@@ -161,7 +161,7 @@ class Orientation:
         Parameters
         ----------
         coefficients : (..., Z) ndarray
-            Coefficients before the operation.
+            Coefficients of Z terms before the operation.
         terms : sequence of int
             Noll's indices, (Z,).
         """
@@ -192,7 +192,7 @@ class OrientationEvidence:
         p-value of each chi-square.
     allowed : tuple of Orientation
         Orientations that the data do not reject at the false-alarm rate.
-    together : tuple of Orientation
+    indistinguishable : tuple of Orientation
         Orientations that the data do not distinguish from the best one, including it.
     """
 
